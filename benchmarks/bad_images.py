@@ -44,7 +44,12 @@ class Unsure(BootstrapLearner):
 
     def _look(self, traces: Traces, isolated: float | None) -> Traces:
         seen = super()._look(traces, isolated)
-        return Traces(tuple(replace(t, steps=tuple(replace(s, confidence=None) for s in t.steps)) for t in seen.each))
+        return Traces(
+            tuple(
+                replace(t, steps=tuple(replace(s, confidence=None) for s in t.steps))
+                for t in seen.each
+            )
+        )
 
 
 def learners() -> Iterator[tuple[str, BootstrapLearner]]:
@@ -55,13 +60,23 @@ def learners() -> Iterator[tuple[str, BootstrapLearner]]:
     yield "misread=1.5, M, confidence unused", Unsure(FAULTS, by["M"], time_limit=SECONDS)
     yield "misread=1.5, M", BootstrapLearner(FAULTS, by["M"], time_limit=SECONDS)
     yield "misread=1.5, trimmed M", BootstrapLearner(FAULTS, by["trimmed"], time_limit=SECONDS)
-    yield "misread=1.5, isolated images are noise (default)", BootstrapLearner(FAULTS, time_limit=SECONDS)
+    yield (
+        "misread=1.5, isolated images are noise (default)",
+        BootstrapLearner(FAULTS, time_limit=SECONDS),
+    )
 
 
 def with_bad_images(trace: Trace, kind: str, seed: int) -> tuple[Trace, NDArray[np.intp]]:
     """The trace with one image of twenty bad, and which these are."""
-    images, bad = spoilt(images_of(trace), kind, round(SHARE * len(trace)), np.random.default_rng(seed))
-    return replace(trace, steps=tuple(replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True))), bad
+    images, bad = spoilt(
+        images_of(trace), kind, round(SHARE * len(trace)), np.random.default_rng(seed)
+    )
+    return replace(
+        trace,
+        steps=tuple(
+            replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)
+        ),
+    ), bad
 
 
 @dataclass(frozen=True)
@@ -89,11 +104,22 @@ def found(learner: BootstrapLearner, trace: Trace, bad: NDArray[np.intp], other:
         except (LearnerError, PerceptionError):
             return Found(False, True, 0, 0, 0.0)
     truth, labels = true_dstates(trace), np.array(learner.map_.labels)
-    named = {f.step for f in learner.map_.faults if f.kind == "misread"} | set(np.flatnonzero(learner.views_ == NOISE).tolist())
+    named = {f.step for f in learner.map_.faults if f.kind == "misread"} | set(
+        np.flatnonzero(learner.views_ == NOISE).tolist()
+    )
     said = any(issubclass(w.category, DOUBTS) for w in caught)
     meant = {label: _most(truth[labels == label]) for label in set(labels.tolist())}
-    hit = [meant.get(int(label)) == name for label, name in zip(learner.predict(other), true_dstates(other), strict=True)]
-    return Found(one_to_one(labels, truth), said, len(named), len(named & set(bad.tolist())), float(np.mean(hit)))
+    hit = [
+        meant.get(int(label)) == name
+        for label, name in zip(learner.predict(other), true_dstates(other), strict=True)
+    ]
+    return Found(
+        one_to_one(labels, truth),
+        said,
+        len(named),
+        len(named & set(bad.tolist())),
+        float(np.mean(hit)),
+    )
 
 
 def _most(names: NDArray[Any]) -> Any:
@@ -116,9 +142,19 @@ def rows(world: str, tours: int, seeds: list[int], only: str) -> Iterator[str]:
         if only not in name:
             continue
         for kind in KINDS if "default" not in name else (*KINDS, "none"):
-            spoiled = [with_bad_images(d, kind, seed) if kind != "none" else (d, nobody) for d, seed in zip(drives, seeds, strict=True)]
-            got = [found(learner, trace, bad, other) for (trace, bad), other in zip(spoiled, others, strict=True)]
-            hits, named, bad_ones = sum(g.hits for g in got), sum(g.named for g in got), sum(len(bad) for _, bad in spoiled)
+            spoiled = [
+                with_bad_images(d, kind, seed) if kind != "none" else (d, nobody)
+                for d, seed in zip(drives, seeds, strict=True)
+            ]
+            got = [
+                found(learner, trace, bad, other)
+                for (trace, bad), other in zip(spoiled, others, strict=True)
+            ]
+            hits, named, bad_ones = (
+                sum(g.hits for g in got),
+                sum(g.named for g in got),
+                sum(len(bad) for _, bad in spoiled),
+            )
             precision = f"{hits / named:.2f}" if named else "–"
             recall = f"{hits / bad_ones:.2f}" if bad_ones else "–"
             relative = [g.accuracy / c for g, c in zip(got, clean, strict=True)]
@@ -132,7 +168,9 @@ def main() -> None:
     parser.add_argument("--tours", type=int, default=10)
     parser.add_argument("--seeds", default="300-309", help="first and last seed")
     parser.add_argument("--only", default="", help="only the rows whose name contains this")
-    parser.add_argument("--page", type=Path, help="page whose table of this world is to be replaced")
+    parser.add_argument(
+        "--page", type=Path, help="page whose table of this world is to be replaced"
+    )
     options = parser.parse_args()
     found = rows(options.world, options.tours, seeds_from(options.seeds), options.only)
     print_rows(found, options.page, rf"\| {options.world}, \d+ drives")

@@ -32,41 +32,94 @@ TOOLS = (OURS, *PEERS)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds a cell has (default 60)")
-    parser.add_argument("--memory", type=int, default=4096, metavar="MIB", help="address space a cell has, in MiB (default 4096)")
-    parser.add_argument("--only", default="", metavar="PATTERN", help="instances whose name this regular expression is found in")
-    parser.add_argument("--tools", default="", metavar="PATTERN", help="tools whose name this regular expression is found in")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="random traces of each kind (default 1)")
     parser.add_argument(
-        "--out", type=Path, metavar="RESULTS.json", help="where to store what came of it (default benchmarks/results/DATE.json)"
+        "--limit", type=float, default=60, metavar="S", help="seconds a cell has (default 60)"
+    )
+    parser.add_argument(
+        "--memory",
+        type=int,
+        default=4096,
+        metavar="MIB",
+        help="address space a cell has, in MiB (default 4096)",
+    )
+    parser.add_argument(
+        "--only",
+        default="",
+        metavar="PATTERN",
+        help="instances whose name this regular expression is found in",
+    )
+    parser.add_argument(
+        "--tools",
+        default="",
+        metavar="PATTERN",
+        help="tools whose name this regular expression is found in",
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="random traces of each kind (default 1)"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="RESULTS.json",
+        help="where to store what came of it (default benchmarks/results/DATE.json)",
     )
     options = parser.parse_args()
     today = datetime.date.today().isoformat()
     out = options.out or FOLDER / "results" / f"{today}.json"
     out.parent.mkdir(parents=True, exist_ok=True)
-    results: dict[str, Any] = {"date": today, "limit": options.limit, "memory": options.memory, "seeds": options.seeds}
+    results: dict[str, Any] = {
+        "date": today,
+        "limit": options.limit,
+        "memory": options.memory,
+        "seeds": options.seeds,
+    }
     results |= {"machine": machine(), "packages": packages(), "cells": []}
     for instance in SUITE.values():
         for tool in TOOLS:
             if re.search(options.only, instance.name) and re.search(options.tools, tool):
                 for seed in range(options.seeds if instance.seeded else 1):
                     cell = run(tool, instance, seed, options.limit, options.memory)
-                    print(f"{instance.name:24} {seed:3} {tool:14} {cell['status']:14} {cell.get('seconds', 0):8.2f} s", file=sys.stderr)
+                    print(
+                        f"{instance.name:24} {seed:3} {tool:14} {cell['status']:14} {cell.get('seconds', 0):8.2f} s",
+                        file=sys.stderr,
+                    )
                     results["cells"].append(cell)
                     store(results, out)
     print(f"{times(results)}\n\n{grounding(results)}")
     sys.exit("\n".join(contradictions(results)) or None)
 
 
-def run(tool: str, instance: Instance, seed: int, limit: float, memory: int, clock: str = "wall") -> dict[str, Any]:
+def run(
+    tool: str, instance: Instance, seed: int, limit: float, memory: int, clock: str = "wall"
+) -> dict[str, Any]:
     """What comes of a tool on a trace: status, seconds by this clock, CPU seconds, peak MiB, states, and whether they are proven to be fewest."""
-    cell = {"instance": instance.name, "theory": "causal" if instance.causal else "full", "tool": tool, "seed": seed}
+    cell = {
+        "instance": instance.name,
+        "theory": "causal" if instance.causal else "full",
+        "tool": tool,
+        "seed": seed,
+    }
     if tool in PEERS and not instance.causal:
         return {**cell, "status": "not applicable", "reason": "it knows no places and paths"}
     if tool in PEERS and not PEERS[tool].installed:
-        return {**cell, "status": "not installed", "reason": f"{PEERS[tool].packages[0]} is not installed"}
-    command = [sys.executable, str(FOLDER / "cell.py"), tool, instance.name, str(seed), str(limit), str(memory), clock]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        return {
+            **cell,
+            "status": "not installed",
+            "reason": f"{PEERS[tool].packages[0]} is not installed",
+        }
+    command = [
+        sys.executable,
+        str(FOLDER / "cell.py"),
+        tool,
+        instance.name,
+        str(seed),
+        str(limit),
+        str(memory),
+        clock,
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
         assert process.stdout
         said = [json.loads(line) for line in process.stdout]
         _, status, usage = os.wait4(process.pid, 0)
@@ -76,7 +129,11 @@ def run(tool: str, instance: Instance, seed: int, limit: float, memory: int, clo
     if len(said) == 2:
         return {**cell, **said[1]}
     peak = usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
-    spent = {"seconds": limit, "cpu": round(usage.ru_utime + usage.ru_stime - start.get("cpu", 0), 5), "memory": peak}
+    spent = {
+        "seconds": limit,
+        "cpu": round(usage.ru_utime + usage.ru_stime - start.get("cpu", 0), 5),
+        "memory": peak,
+    }
     if process.returncode in (-signal.SIGALRM, -signal.SIGPROF) and start:
         return {**cell, "status": "timeout", "reason": "", **spent}
     return {**cell, "status": "error", "reason": f"ended with code {process.returncode}"}
@@ -84,8 +141,14 @@ def run(tool: str, instance: Instance, seed: int, limit: float, memory: int, clo
 
 def store(results: dict[str, Any], path: Path) -> None:
     """Write the results as JSON, a cell a line."""
-    head, cells = {k: v for k, v in results.items() if k != "cells"}, ",\n".join(json.dumps(cell) for cell in results["cells"])
-    path.write_text(json.dumps({**head, "cells": []}, indent=1).removesuffix("[]\n}") + f"[\n{cells}\n]}}\n", encoding="utf-8")
+    head, cells = (
+        {k: v for k, v in results.items() if k != "cells"},
+        ",\n".join(json.dumps(cell) for cell in results["cells"]),
+    )
+    path.write_text(
+        json.dumps({**head, "cells": []}, indent=1).removesuffix("[]\n}") + f"[\n{cells}\n]}}\n",
+        encoding="utf-8",
+    )
 
 
 def machine() -> dict[str, Any]:
@@ -104,7 +167,9 @@ def machine() -> dict[str, Any]:
 def packages() -> dict[str, str]:
     """The versions of what is measured."""
     found = {}
-    for name in dict.fromkeys([OURS, "clingo", *(package for peer in PEERS.values() for package in peer.packages)]):
+    for name in dict.fromkeys(
+        [OURS, "clingo", *(package for peer in PEERS.values() for package in peer.packages)]
+    ):
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
     return found

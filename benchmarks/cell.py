@@ -47,7 +47,9 @@ def main() -> None:
     now, timer = time.perf_counter, signal.ITIMER_REAL
     if clock == ["cpu"]:
         now, timer = cpu_seconds, signal.ITIMER_PROF
-        vars(limits)["time"] = SimpleNamespace(perf_counter=cpu_seconds)  # the clock that a search looks at
+        vars(limits)["time"] = SimpleNamespace(
+            perf_counter=cpu_seconds
+        )  # the clock that a search looks at
     instance, limit, space = INSTANCES[name], float(seconds), int(memory)
     end_after(AROUND)
     for module in PEERS[tool].modules if tool in PEERS else ():
@@ -65,7 +67,14 @@ def main() -> None:
             if tool.startswith(OURS):
                 end_after(limit * (1 + MARGIN) + 1, timer)
                 speedups = all_but(tool.removeprefix(OURS).removeprefix(WITHOUT))
-                search = Search(trace, theory, time_limit=limit, memory_limit=int(SHARE * space), max_maps=1, speedups=speedups)
+                search = Search(
+                    trace,
+                    theory,
+                    time_limit=limit,
+                    memory_limit=int(SHARE * space),
+                    max_maps=1,
+                    speedups=speedups,
+                )
                 answer = search.solution(tuple(search))
             else:
                 end_after(limit, timer)
@@ -74,7 +83,10 @@ def main() -> None:
         say(status="not applicable", reason=str(error))
         return
     except Exception as error:  # whatever a program raises is what came of it
-        outcome = {"status": "memory" if _of_memory(error) else "error", "reason": f"{type(error).__name__}: {error}"[:200]}
+        outcome = {
+            "status": "memory" if _of_memory(error) else "error",
+            "reason": f"{type(error).__name__}: {error}"[:200],
+        }
     spent = {"seconds": now() - began, "cpu": cpu_seconds() - cpu, "memory": peak_memory()}
     end_after(0, timer)
     end_after(AROUND)
@@ -91,8 +103,14 @@ def main() -> None:
 
 def of_solution(solution: Solution, trace: Trace, theory: Theory) -> dict[str, Any]:
     """What came of our solver: a map that the checker finds right, the bound, and where the time went."""
-    wrong = [violation.message for ssh_map in solution.maps for violation in check(trace, ssh_map, theory)]
-    stopped = {"time limit": "timeout", "memory limit": "memory"}.get(str(solution.stopped), "error")
+    wrong = [
+        violation.message
+        for ssh_map in solution.maps
+        for violation in check(trace, ssh_map, theory)
+    ]
+    stopped = {"time limit": "timeout", "memory limit": "memory"}.get(
+        str(solution.stopped), "error"
+    )
     proven = solution.status is Status.OPTIMAL
     return {
         "status": "wrong" if wrong else "ok" if proven else stopped,
@@ -126,7 +144,10 @@ def all_but(names: str) -> Speedups:
 
 def cpu_seconds() -> float:
     """What the processors worked for this process, all its threads, and the processes that it waited for."""
-    return sum(used.ru_utime + used.ru_stime for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
+    return sum(
+        used.ru_utime + used.ru_stime
+        for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
 
 
 def end_after(seconds: float, timer: int = signal.ITIMER_REAL) -> None:
@@ -139,7 +160,9 @@ def say(**record: Any) -> None:
 
 
 def _of_memory(error: Exception) -> bool:
-    return isinstance(error, MemoryError) or any(sign in str(error).lower() for sign in ("out of memory", "bad_alloc"))
+    return isinstance(error, MemoryError) or any(
+        sign in str(error).lower() for sign in ("out of memory", "bad_alloc")
+    )
 
 
 if __name__ == "__main__":

@@ -17,7 +17,9 @@ AT_ONCE = 48  # steps that are still quickly solved without prefixes
 
 
 def circuits(steps: int) -> Trace:
-    return Trace.from_steps([f"v{i % 4}" for i in range(steps)], [("right", "travel")[i % 2] for i in range(steps - 1)])
+    return Trace.from_steps(
+        [f"v{i % 4}" for i in range(steps)], [("right", "travel")[i % 2] for i in range(steps - 1)]
+    )
 
 
 def median(trace: Trace, theory: Theory, prefixes: bool = True) -> float:
@@ -31,15 +33,23 @@ def median(trace: Trace, theory: Theory, prefixes: bool = True) -> float:
 
 
 def main() -> None:
-    print(f"{'theory':16} {'images':>7} {'prefix':>7} {'s':>8} {'x 2 circuits':>13} {'at once, s':>11}")
-    for name, theory in (("causal", Theory.causal()), ("topological", Theory.topological()), ("circumscriptive", Theory.circumscriptive())):
+    print(
+        f"{'theory':16} {'images':>7} {'prefix':>7} {'s':>8} {'x 2 circuits':>13} {'at once, s':>11}"
+    )
+    for name, theory in (
+        ("causal", Theory.causal()),
+        ("topological", Theory.topological()),
+        ("circumscriptive", Theory.circumscriptive()),
+    ):
         base = 0.0
         for steps in (16, 48, 400, 4_000, 40_000):
             trace = circuits(steps)
             seconds = median(trace, theory)
             base = base or seconds
             whole = f"{median(trace, theory, prefixes=False):.3f}" if steps <= AT_ONCE else "–"
-            print(f"{name:16} {steps:7} {solve(trace, theory).prefix:7} {seconds:8.3f} {seconds / base:13.1f} {whole:>11}")
+            print(
+                f"{name:16} {steps:7} {solve(trace, theory).prefix:7} {seconds:8.3f} {seconds / base:13.1f} {whole:>11}"
+            )
 
 
 if __name__ == "__main__":

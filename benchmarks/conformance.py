@@ -29,8 +29,15 @@ def cases() -> list[tuple[Trace, Theory]]:
     import test_tables as tables
 
     small = [tuple(row.values[:2]) for row in tables.test_small_traces.pytestmark[0].args[1]]
-    round_about = [(tables.rectangle(actions), theory) for theory, *_ in tables.NOTCHED for actions in tables.LENGTHS]
-    return [(tables.cornered(trace) if theory.star == "frame" else trace, theory) for trace, theory in small + round_about]
+    round_about = [
+        (tables.rectangle(actions), theory)
+        for theory, *_ in tables.NOTCHED
+        for actions in tables.LENGTHS
+    ]
+    return [
+        (tables.cornered(trace) if theory.star == "frame" else trace, theory)
+        for trace, theory in small + round_about
+    ]
 
 
 def milliseconds(trace: Trace, theory: Theory) -> float:
@@ -54,7 +61,13 @@ def main(other: str | None = None) -> None:
     checkouts = [str(ROOT), *([other] if other else [])]
     command = [sys.executable, str(Path(__file__).resolve()), "--answer"]
     children = [
-        subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            command,
+            env={**os.environ, "PYTHONPATH": path},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         for path in checkouts
     ]
     rows: list[list[float]] = []
@@ -71,10 +84,14 @@ def main(other: str | None = None) -> None:
     for child in children:
         child.communicate()
     for path, times in zip(checkouts, zip(*rows, strict=True), strict=True):
-        print(f"{len(times)} traces, {path}: median {statistics.median(times):.1f} ms, most {max(times):.1f} ms")
+        print(
+            f"{len(times)} traces, {path}: median {statistics.median(times):.1f} ms, most {max(times):.1f} ms"
+        )
     if other:
         deciles = statistics.quantiles((here / there for here, there in rows), n=10)
-        print(f"ratio of each trace: median {deciles[4]:.2f}, for eight of ten {deciles[0]:.2f} to {deciles[-1]:.2f}")
+        print(
+            f"ratio of each trace: median {deciles[4]:.2f}, for eight of ten {deciles[0]:.2f} to {deciles[-1]:.2f}"
+        )
 
 
 if __name__ == "__main__":

@@ -30,7 +30,12 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation.paper.claims import VIEWS_ALONE, notched, one_to_one, true_dstates
-from ssh_abduction.learning.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning
+from ssh_abduction.learning.learner import (
+    AmbiguousMapWarning,
+    BootstrapLearner,
+    LearnerError,
+    RunnerUpWarning,
+)
 from ssh_abduction.solver.search import solve
 
 WORLD = World.named("notched-rectangle")
@@ -74,7 +79,10 @@ def room(times: float) -> World:
     walls = WORLD.segments.copy()
     walls[walls > 0] *= times
     x, y = 4 * times - 0.6, 2 * times - 0.6
-    dstates = tuple(replace(s, pose=(x if s.pose[0] > 2 else 0.6, y if s.pose[1] > 1 else 0.6, s.pose[2])) for s in WORLD.dstates)
+    dstates = tuple(
+        replace(s, pose=(x if s.pose[0] > 2 else 0.6, y if s.pose[1] > 1 else 0.6, s.pose[2]))
+        for s in WORLD.dstates
+    )
     return replace(WORLD, segments=walls, start=(x, y, 0.0), dstates=dstates)
 
 
@@ -84,7 +92,9 @@ def corner(side: float) -> World:
     return replace(WORLD, segments=np.hstack([points, np.roll(points, -1, axis=0)]))
 
 
-def spoilt(images: NDArray[np.float64], kind: str, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def spoilt(
+    images: NDArray[np.float64], kind: str, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """The images, some of which show somebody else, and which ones."""
     images, which = images.copy(), rng.choice(len(images), count, replace=False)
     for i in which:
@@ -92,7 +102,9 @@ def spoilt(images: NDArray[np.float64], kind: str, count: int, rng: np.random.Ge
             images[i] = rng.uniform(0.1, 8, images.shape[1])
         else:
             first, last, far = (70, 110, 0.4) if kind == "person in front" else (5, 40, 0.35)
-            images[i, first:last] = np.minimum(images[i, first:last], far + rng.normal(0, 0.01, last - first))
+            images[i, first:last] = np.minimum(
+                images[i, first:last], far + rng.normal(0, 0.01, last - first)
+            )
     return images, which
 
 
@@ -104,7 +116,12 @@ def driven(case: Case, tours: int, seed: int) -> tuple[Trace, NDArray[np.intp]]:
     if case.single:
         images = laser.scan(case.world, np.array([step.truth["pose"] for step in trace.steps]), rng)
     images, bad = spoilt(images, *case.bad, rng)
-    return replace(trace, steps=tuple(replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True))), bad
+    return replace(
+        trace,
+        steps=tuple(
+            replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)
+        ),
+    ), bad
 
 
 @dataclass(frozen=True)
@@ -121,19 +138,35 @@ def found(trace: Trace, by: str) -> Found:
     truth = true_dstates(trace)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(by=by, random_state=0), time_limit=SECONDS)
+        learner = BootstrapLearner(
+            VIEWS_ALONE, ViewClusterer(by=by, random_state=0), time_limit=SECONDS
+        )
         try:
             learner.fit(trace)
         except (LearnerError, PerceptionError):
             return Found(learner.clusterer_.k_, False, False, True)
     said = [w for w in caught if issubclass(w.category, DOUBTS)]
     right = one_to_one(learner.labels_, truth)
-    told = next((re.search(r"\((?:image) ([\d, ]+)", str(w.message)) for w in said if "like those of no view" in str(w.message)), None)
+    told = next(
+        (
+            re.search(r"\((?:image) ([\d, ]+)", str(w.message))
+            for w in said
+            if "like those of no view" in str(w.message)
+        ),
+        None,
+    )
     doubtful = [int(i) for i in told.group(1).strip(", ").split(", ")] if told else []
-    return Found(learner.clusterer_.k_, right, right or _mended(trace, learner.views_.copy(), truth, doubtful), bool(said))
+    return Found(
+        learner.clusterer_.k_,
+        right,
+        right or _mended(trace, learner.views_.copy(), truth, doubtful),
+        bool(said),
+    )
 
 
-def _mended(trace: Trace, views: NDArray[np.intp], truth: NDArray[np.str_], doubtful: list[int]) -> bool:
+def _mended(
+    trace: Trace, views: NDArray[np.intp], truth: NDArray[np.str_], doubtful: list[int]
+) -> bool:
     sure = np.setdiff1d(np.arange(len(views)), doubtful)
     for i in doubtful:
         alike = views[sure[truth[sure] == truth[i]]]
@@ -151,9 +184,15 @@ def rows(seeds: list[int], tours: int) -> Iterator[str]:
         cells = []
         for name, results in by.items():
             ks = sorted({r.k for r in results})
-            cells += [str(ks[0]) if len(ks) == 1 else f"{ks[0]}–{ks[-1]}", str(sum(r.right for r in results))]
+            cells += [
+                str(ks[0]) if len(ks) == 1 else f"{ks[0]}–{ks[-1]}",
+                str(sum(r.right for r in results)),
+            ]
             if name == "M":
-                cells += [str(sum(not r.right and not r.said for r in results)), str(sum(r.right and r.said for r in results))]
+                cells += [
+                    str(sum(not r.right and not r.said for r in results)),
+                    str(sum(r.right and r.said for r in results)),
+                ]
         yield f"| {case.name} | {' | '.join(cells)} | {sum(r.mended for r in by['trimmed'])} |"
 
 
@@ -167,10 +206,19 @@ def tolerances(seeds: list[int], tours: int) -> Iterator[str]:
         spreads, ks = [], []
         for seed in seeds:
             trace = simulate(WORLD, tours, seed, tolerance=tolerance)
-            truth, at = true_dstates(trace), np.array([step.truth["pose"][:2] for step in trace.steps])
-            off = np.concatenate([at[truth == name] - at[truth == name].mean(axis=0) for name in set(truth)])
+            truth, at = (
+                true_dstates(trace),
+                np.array([step.truth["pose"][:2] for step in trace.steps]),
+            )
+            off = np.concatenate(
+                [at[truth == name] - at[truth == name].mean(axis=0) for name in set(truth)]
+            )
             spreads.append(1000 * float(np.sqrt((off**2).sum(axis=1).mean())))
-            ks.append(ViewClusterer(k_max=10, random_state=0).fit(ReciprocalTransformer().fit_transform(images_of(trace))).k_)
+            ks.append(
+                ViewClusterer(k_max=10, random_state=0)
+                .fit(ReciprocalTransformer().fit_transform(images_of(trace)))
+                .k_
+            )
         yield f"| x {times:g} | {np.mean(spreads):.1f} | {', '.join(map(str, ks))} |"
 
 
@@ -179,7 +227,11 @@ def main() -> None:
     parser.add_argument("--seeds", default="200-204", help="first and last seed")
     parser.add_argument("--tours", type=int, default=10)
     parser.add_argument("--page", type=Path, help="page whose table is to be replaced")
-    parser.add_argument("--tolerances", action="store_true", help="print the spread of poses by the tolerance of hill-climbing instead")
+    parser.add_argument(
+        "--tolerances",
+        action="store_true",
+        help="print the spread of poses by the tolerance of hill-climbing instead",
+    )
     options = parser.parse_args()
     seeds = seeds_from(options.seeds)
     if options.tolerances:

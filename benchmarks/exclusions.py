@@ -21,7 +21,11 @@ def far(walk: Walk, apart: int) -> list[tuple[int, int]]:
     """The pairs of steps at cells that are more than so many cells apart, counted along and across."""
     cells = [(state[0], state[1]) for state in walk.truth if isinstance(state, tuple)]
     pairs = combinations(range(len(cells)), 2)
-    return [(i, j) for i, j in pairs if abs(cells[i][0] - cells[j][0]) + abs(cells[i][1] - cells[j][1]) > apart]
+    return [
+        (i, j)
+        for i, j in pairs
+        if abs(cells[i][0] - cells[j][0]) + abs(cells[i][1] - cells[j][1]) > apart
+    ]
 
 
 def timed(walk: Walk, theory: Theory, limit: float) -> tuple[float, Solution]:
@@ -33,15 +37,27 @@ def timed(walk: Walk, theory: Theory, limit: float) -> tuple[float, Solution]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--cells", type=int, default=6, metavar="N", help="mazes of N x N cells (default 6)")
-    parser.add_argument("--steps", type=int, default=400, metavar="N", help="actions of the robot (default 400)")
     parser.add_argument(
-        "--apart", type=int, default=3, metavar="N", help="cells that an excluded pair is apart, at least one more (default 3)"
+        "--cells", type=int, default=6, metavar="N", help="mazes of N x N cells (default 6)"
+    )
+    parser.add_argument(
+        "--steps", type=int, default=400, metavar="N", help="actions of the robot (default 400)"
+    )
+    parser.add_argument(
+        "--apart",
+        type=int,
+        default=3,
+        metavar="N",
+        help="cells that an excluded pair is apart, at least one more (default 3)",
     )
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="mazes (default 5)")
-    parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)")
+    parser.add_argument(
+        "--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)"
+    )
     options = parser.parse_args()
-    print("| seed | excluded pairs | without: dstates, s | with: dstates, s | truth | without / with |\n|---|---|---|---|---|---|")
+    print(
+        "| seed | excluded pairs | without: dstates, s | with: dstates, s | truth | without / with |\n|---|---|---|---|---|---|"
+    )
     ratios = []
     for seed in range(options.seeds):
         walk = maze(options.cells, options.cells, steps=options.steps, seed=seed, stars=True)
@@ -49,8 +65,14 @@ def main() -> None:
         plain, without = timed(walk, Theory.topological(), options.limit)
         excluding, found = timed(walk, Theory.topological().replace(elsewhere=pairs), options.limit)
         ratios.append(plain / excluding)
-        cells = [f"{s.cost.dstates if s.cost else '–'} ({s.status.value}), {t:.2f}" for s, t in ((without, plain), (found, excluding))]
-        print(f"| {seed} | {len(pairs):,} | {cells[0]} | {cells[1]} | {len(set(walk.truth))} | {plain / excluding:.2f} |", flush=True)
+        cells = [
+            f"{s.cost.dstates if s.cost else '–'} ({s.status.value}), {t:.2f}"
+            for s, t in ((without, plain), (found, excluding))
+        ]
+        print(
+            f"| {seed} | {len(pairs):,} | {cells[0]} | {cells[1]} | {len(set(walk.truth))} | {plain / excluding:.2f} |",
+            flush=True,
+        )
     print(f"\nmedian: {statistics.median(ratios):.2f}")
 
 

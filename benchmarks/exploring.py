@@ -83,7 +83,11 @@ class Maze:
     def ends(self, state: tuple[int, int, int]) -> dict[Action, tuple[int, int, int]]:
         x, y, heading = state
         found = {MOVES[name]: (x, y, (heading + turn) % 4) for name, turn in TURNS.items()}
-        return found | ({MOVES["travel"]: (*ahead(state, 0), heading)} if (state[:2], ahead(state, 0)) in self._doors else {})
+        return found | (
+            {MOVES["travel"]: (*ahead(state, 0), heading)}
+            if (state[:2], ahead(state, 0)) in self._doors
+            else {}
+        )
 
     def place(self, state: tuple[int, int, int]) -> Hashable:
         return state[:2]
@@ -93,7 +97,9 @@ class Maze:
         state = self.start
         while True:
             yield from [MOVES["right"]] * 4
-            turn = next(turn for turn in (1, 0, 3, 2) if (state[:2], ahead(state, turn)) in self._doors)
+            turn = next(
+                turn for turn in (1, 0, 3, 2) if (state[:2], ahead(state, turn)) in self._doors
+            )
             yield from [move for name, move in MOVES.items() if TURNS.get(name) == turn]
             yield MOVES["travel"]
             state = (*ahead(state, turn), (state[2] + turn) % 4)
@@ -123,7 +129,9 @@ class Building:
         state, passed, came_by = self.start, dict[int, int](), -1
         while True:
             gateways = self._floor.plan.gateways[state.room]
-            choices = [k for k, g in enumerate(gateways) if g.door != came_by] or [*range(len(gateways))]
+            choices = [k for k, g in enumerate(gateways) if g.door != came_by] or [
+                *range(len(gateways))
+            ]
             goal = min(choices, key=lambda k: (passed.get(gateways[k].door, 0), k))
             came_by = gateways[goal].door
             for action, after in self._floor.way_through(state, goal):
@@ -156,7 +164,9 @@ class Driven:
     def trace(self, actions: int) -> Trace:
         """The trace of the first actions."""
         seen = [self.world.sight(state) for state in self.truth[: actions + 1]]
-        return Trace.from_steps([step.view for step in seen], self.done[:actions], stars=[step.star for step in seen])  # type: ignore[arg-type, misc]
+        return Trace.from_steps(
+            [step.view for step in seen], self.done[:actions], stars=[step.star for step in seen]
+        )  # type: ignore[arg-type, misc]
 
 
 def states_of(world: World) -> dict[Any, dict[Action, Any]]:
@@ -173,16 +183,24 @@ def states_of(world: World) -> dict[Any, dict[Action, Any]]:
 
 def everything(ends: dict[Any, dict[Action, Any]]) -> set[Any]:
     """What has to be seen and done: all dstates, and all travels."""
-    return {*ends} | {(state, action.name) for state in ends for action in ends[state] if action.kind == "travel"}
+    return {*ends} | {
+        (state, action.name) for state in ends for action in ends[state] if action.kind == "travel"
+    }
 
 
 def shortest(world: World) -> int:
     """How many actions it takes at least to visit all dstates and do all travels, for a driver who knows the world."""
     ends = states_of(world)
     number = {state: n for n, state in enumerate(ends)}
-    moves = [Move(number[state], action, number[there], "known") for state in ends for action, there in ends[state].items()]
+    moves = [
+        Move(number[state], action, number[there], "known")
+        for state in ends
+        for action, there in ends[state].items()
+    ]
     travels = {k for k, move in enumerate(moves) if move.action.kind == "travel"}
-    times = shortest_flow(moves, number[world.start], travels, set(number.values()), rounds=1000, patience=600)
+    times = shortest_flow(
+        moves, number[world.start], travels, set(number.values()), rounds=1000, patience=600
+    )
     assert times is not None
     return sum(times)
 
@@ -204,7 +222,11 @@ def has_map(robot: Driven, actions: int, limit: float) -> bool:
     truth = tuple(robot.truth[: actions + 1])
     known = Known("", trace, truth, tuple(map(robot.world.place, truth)))
     solution = solve(trace, robot.world.theory, time_limit=limit, max_maps=20)
-    return bool(solution.maps) and all(is_true(m, known) for m in solution.maps) and (solution.complete or share_all(solution))
+    return (
+        bool(solution.maps)
+        and all(is_true(m, known) for m in solution.maps)
+        and (solution.complete or share_all(solution))
+    )
 
 
 def steps_to_map(robot: Driven, limit: float) -> int | None:
@@ -223,7 +245,14 @@ def steps_to_map(robot: Driven, limit: float) -> int | None:
     return high
 
 
-def explorer(world: World, seed: int, most: int, limit: float, seconds: float = float("inf"), judged: bool = False) -> Record:
+def explorer(
+    world: World,
+    seed: int,
+    most: int,
+    limit: float,
+    seconds: float = float("inf"),
+    judged: bool = False,
+) -> Record:
     """Until it says that it ends; until so many seconds of processor time are spent; or, if it is judged as it drives, until it has the map."""
     robot, missing = Driven(world), everything(states_of(world))
     found = Explorer(robot, world.theory, margin=world.margin, time_limit=limit)
@@ -231,7 +260,10 @@ def explorer(world: World, seed: int, most: int, limit: float, seconds: float = 
     goes_on = True
     while goes_on and len(robot.done) < most and time.process_time() - began < seconds:
         goes_on = found.step()
-        missing -= {*robot.truth[-2:]} | {(state, action.name) for state, action in zip(robot.truth[-2:], robot.done[-1:], strict=False)}
+        missing -= {*robot.truth[-2:]} | {
+            (state, action.name)
+            for state, action in zip(robot.truth[-2:], robot.done[-1:], strict=False)
+        }
         if judged and not missing and has_map(robot, len(robot.done), 10 * limit):
             break
     spent = {"driven": len(robot.done), "seconds": round(time.process_time() - began, 1)}
@@ -239,7 +271,12 @@ def explorer(world: World, seed: int, most: int, limit: float, seconds: float = 
     if goes_on:
         return {"steps": steps, **spent}
     ending = found.result.ending
-    told = {"stopped": len(robot.done), "ending": ending, "done": ending == "done", "true": has_map(robot, len(robot.done), 10 * limit)}
+    told = {
+        "stopped": len(robot.done),
+        "ending": ending,
+        "done": ending == "done",
+        "true": has_map(robot, len(robot.done), 10 * limit),
+    }
     return {"steps": steps, **told, **spent}
 
 
@@ -249,7 +286,9 @@ def random_walk(world: World, seed: int, most: int, limit: float) -> Record:
 
 
 def rule(world: World, seed: int, most: int, limit: float) -> Record:
-    return walked(Driven(world), (action for action, _ in zip(world.rule(), range(most), strict=False)), limit)
+    return walked(
+        Driven(world), (action for action, _ in zip(world.rule(), range(most), strict=False)), limit
+    )
 
 
 def walked(robot: Driven, actions: Iterator[Action], limit: float) -> Record:
@@ -263,7 +302,11 @@ def walked(robot: Driven, actions: Iterator[Action], limit: float) -> Record:
         after = 0 if missing - {robot.truth[-1]} else after + 1
         if after > len(robot.done) / 2:
             break
-    return {"steps": steps_to_map(robot, limit), "driven": len(robot.done), "seconds": round(time.perf_counter() - began, 1)}
+    return {
+        "steps": steps_to_map(robot, limit),
+        "driven": len(robot.done),
+        "seconds": round(time.perf_counter() - began, 1),
+    }
 
 
 def learnt(world: World, seed: int, most: int, limit: float) -> Record:
@@ -272,7 +315,10 @@ def learnt(world: World, seed: int, most: int, limit: float) -> Record:
 
     ends, chance = states_of(world), random.getstate()
     letters = sorted({action.name for leads in ends.values() for action in leads})
-    by_name = {state: {action.name: there for action, there in leads.items()} for state, leads in ends.items()}
+    by_name = {
+        state: {action.name: there for action, there in leads.items()}
+        for state, leads in ends.items()
+    }
     shows = {state: f"{(seen := world.sight(state)).view} {seen.star}" for state in ends}
 
     class Driving(SUL):  # type: ignore[misc]
@@ -326,40 +372,67 @@ def learnt(world: World, seed: int, most: int, limit: float) -> Record:
         steps = None
     finally:
         random.setstate(chance)
-    return {"steps": steps, "driven": driving.driven, "seconds": round(time.perf_counter() - began, 1)}
+    return {
+        "steps": steps,
+        "driven": driving.driven,
+        "seconds": round(time.perf_counter() - began, 1),
+    }
 
 
 class TooLongError(Exception):
     """So many steps were done that the run is given up."""
 
 
-RUN: dict[str, Callable[..., Record]] = {"explorer": explorer, "random": random_walk, "rule": rule, "hW": learnt}
+RUN: dict[str, Callable[..., Record]] = {
+    "explorer": explorer,
+    "random": random_walk,
+    "rule": rule,
+    "hW": learnt,
+}
 
 
 def worlds(options: argparse.Namespace) -> Iterator[tuple[World, int]]:
     if options.family == "mazes":
-        yield from ((Maze(options.cells, seed), seed) for seed in range(options.first, options.first + options.seeds))
+        yield from (
+            (Maze(options.cells, seed), seed)
+            for seed in range(options.first, options.first + options.seeds)
+        )
         return
     for file in sorted(options.folder.glob("*.xml"), key=lambda file: file.stem.lower()):
         if not options.only or any(name in file.stem for name in options.only.split(",")):
-            yield from ((Building(file), seed) for seed in range(options.first, options.first + options.seeds))
+            yield from (
+                (Building(file), seed)
+                for seed in range(options.first, options.first + options.seeds)
+            )
 
 
 def table(records: Sequence[Record]) -> str:
     """A row for each world, and the medians: steps until the robot has the map, and when the explorer stops. Where it was not driven so long, nothing is said of that."""
     names = [*dict.fromkeys(record["world"] for record in records)]
     by = {(record["world"], record["strategy"]): record for record in records}
-    lines = ["| world | dstates | shortest | explorer | random | rule | hW | explorer / best other | it stops | then |", "|---" * 10 + "|"]
-    columns: dict[str, list[float]] = {name: [] for name in (*STRATEGIES, "shortest", "stopped", "ratio")}
+    lines = [
+        "| world | dstates | shortest | explorer | random | rule | hW | explorer / best other | it stops | then |",
+        "|---" * 10 + "|",
+    ]
+    columns: dict[str, list[float]] = {
+        name: [] for name in (*STRATEGIES, "shortest", "stopped", "ratio")
+    }
     ends: list[str] = []
     for name in names:
         row = {strategy: by.get((name, strategy), {}) for strategy in STRATEGIES}
-        steps = {strategy: float("inf") if said.get("steps") is None else said["steps"] for strategy, said in row.items()}
+        steps = {
+            strategy: float("inf") if said.get("steps") is None else said["steps"]
+            for strategy, said in row.items()
+        }
         best = min(steps[strategy] for strategy in STRATEGIES[1:])
         for strategy in STRATEGIES:
             columns[strategy].append(steps[strategy])
         columns["ratio"].append(
-            min(steps["explorer"] / best, 99) if best < float("inf") else 0.0 if steps["explorer"] < float("inf") else 1.0
+            min(steps["explorer"] / best, 99)
+            if best < float("inf")
+            else 0.0
+            if steps["explorer"] < float("inf")
+            else 1.0
         )
         some = next(record for record in records if record["world"] == name)
         columns["shortest"].append(some["shortest"])
@@ -370,8 +443,13 @@ def table(records: Sequence[Record]) -> str:
         ratio = f"{columns['ratio'][-1]:.2f}" if columns["ratio"][-1] < 99 else ""
         told = " | ".join(_told(steps[s], row[s]) for s in STRATEGIES)
         ending = f"{said['stopped']} | {ends[-1]}" if "stopped" in said else " | "
-        lines.append(f"| {name} | {some['dstates']} | {some['shortest']} | {told} | {ratio} | {ending} |")
-    medians = {name: _number(statistics.median(values)) if values else "" for name, values in columns.items()}
+        lines.append(
+            f"| {name} | {some['dstates']} | {some['shortest']} | {told} | {ratio} | {ending} |"
+        )
+    medians = {
+        name: _number(statistics.median(values)) if values else ""
+        for name, values in columns.items()
+    }
     lines.append(
         f"| median of {len(names)} | | {medians['shortest']} | {' | '.join(medians[s] for s in STRATEGIES)} | {statistics.median(columns['ratio']):.2f} | "
         f"{medians['stopped']} | {'; '.join(f'{ends.count(end)} {end}' for end in dict.fromkeys(ends))} |"
@@ -380,7 +458,13 @@ def table(records: Sequence[Record]) -> str:
 
 
 def _told(steps: float, said: Record) -> str:
-    return _number(steps) if steps < float("inf") else f"not in {said['driven']:,}" if "driven" in said else ""
+    return (
+        _number(steps)
+        if steps < float("inf")
+        else f"not in {said['driven']:,}"
+        if "driven" in said
+        else ""
+    )
 
 
 def _number(steps: float) -> str:
@@ -395,32 +479,47 @@ def plot(records: Sequence[Record], file: Path) -> None:
     import matplotlib.pyplot as plt
 
     families = [*dict.fromkeys(record["family"] for record in records)]
-    figure, axes = plt.subplots(1, len(families), figsize=(4.2 * len(families), 3.6), sharey=True, squeeze=False)
+    figure, axes = plt.subplots(
+        1, len(families), figsize=(4.2 * len(families), 3.6), sharey=True, squeeze=False
+    )
     for axis, family in zip(axes[0], families, strict=True):
         some = [record for record in records if record["family"] == family]
         runs = [*dict.fromkeys(record["world"] for record in some)]
         for world in runs:
-            steps = {record["strategy"]: record["steps"] for record in some if record["world"] == world}
+            steps = {
+                record["strategy"]: record["steps"] for record in some if record["world"] == world
+            }
             at = [(i, steps[s]) for i, s in enumerate(STRATEGIES) if steps.get(s)]
             if not at:
                 continue
             axis.plot(*zip(*at, strict=True), color="0.8", linewidth=0.7, zorder=1)
             axis.scatter(*zip(*at, strict=True), s=14, color="#0072B2", zorder=2)
         for i, strategy in enumerate(STRATEGIES):
-            values = [record["steps"] or float("inf") for record in some if record["strategy"] == strategy]
+            values = [
+                record["steps"] or float("inf") for record in some if record["strategy"] == strategy
+            ]
             middle = statistics.median(values) if values else float("inf")
             if middle < float("inf"):
-                axis.plot([i - 0.3, i + 0.3], [middle, middle], color="#D55E00", linewidth=2, zorder=3)
+                axis.plot(
+                    [i - 0.3, i + 0.3], [middle, middle], color="#D55E00", linewidth=2, zorder=3
+                )
             missing = sum(value == float("inf") for value in values)
             if missing:
                 axis.annotate(
-                    f"{missing} of {len(values)}\nnever", (i, 1.0), xycoords=("data", "axes fraction"), ha="center", va="top", fontsize=7
+                    f"{missing} of {len(values)}\nnever",
+                    (i, 1.0),
+                    xycoords=("data", "axes fraction"),
+                    ha="center",
+                    va="top",
+                    fontsize=7,
                 )
         axis.set_xticks(range(len(STRATEGIES)), STRATEGIES)
         axis.set_title(f"{family} ({len(runs)})", fontsize=10)
         axis.set_xlim(-0.5, len(STRATEGIES) - 0.5)
         axis.set_yscale("log")
-        axis.set_ylim(top=max(record["steps"] or 1 for record in records) * 3)  # what never had the map is written above the dots
+        axis.set_ylim(
+            top=max(record["steps"] or 1 for record in records) * 3
+        )  # what never had the map is written above the dots
         axis.grid(axis="y", color="0.9")
     axes[0][0].set_ylabel("steps until the map is unique and true")
     figure.tight_layout()
@@ -430,28 +529,80 @@ def plot(records: Sequence[Record], file: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--family", choices=("mazes", "plans"), default="mazes")
-    parser.add_argument("--cells", type=int, default=3, metavar="N", help="mazes of N x N cells (default 3)")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="worlds, or runs of each plan (default 1)")
-    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)")
-    parser.add_argument("--folder", type=Path, default=ROOT.parent / "shared" / "data" / "plans", metavar="FOLDER", help="of the plans")
-    parser.add_argument("--only", default="", metavar="NAMES", help="plans whose names have one of these parts; commas between")
-    parser.add_argument("--strategies", default=",".join(STRATEGIES), metavar="NAMES", help="which to run; commas between")
-    parser.add_argument("--most", type=int, default=20_000, metavar="N", help="give up after so many steps (default 20000); explorer 2000")
-    parser.add_argument("--limit", type=float, default=3.0, metavar="S", help="seconds for a solve, about (default 3)")
     parser.add_argument(
-        "--seconds", type=float, default=float("inf"), metavar="S", help="of processor time for a run of the explorer (default: no limit)"
+        "--cells", type=int, default=3, metavar="N", help="mazes of N x N cells (default 3)"
     )
-    parser.add_argument("--judged", action="store_true", help="end a run of the explorer once it has the true map, before it says so")
     parser.add_argument(
-        "--out", type=Path, metavar="RESULTS.jsonl", help="where to store what came of each run; what is there is not run again"
+        "--seeds", type=int, default=1, metavar="N", help="worlds, or runs of each plan (default 1)"
     )
-    parser.add_argument("--table", type=Path, metavar="RESULTS.jsonl", help="print a table of stored results instead")
+    parser.add_argument(
+        "--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)"
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        default=ROOT.parent / "shared" / "data" / "plans",
+        metavar="FOLDER",
+        help="of the plans",
+    )
+    parser.add_argument(
+        "--only",
+        default="",
+        metavar="NAMES",
+        help="plans whose names have one of these parts; commas between",
+    )
+    parser.add_argument(
+        "--strategies",
+        default=",".join(STRATEGIES),
+        metavar="NAMES",
+        help="which to run; commas between",
+    )
+    parser.add_argument(
+        "--most",
+        type=int,
+        default=20_000,
+        metavar="N",
+        help="give up after so many steps (default 20000); explorer 2000",
+    )
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=3.0,
+        metavar="S",
+        help="seconds for a solve, about (default 3)",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=float("inf"),
+        metavar="S",
+        help="of processor time for a run of the explorer (default: no limit)",
+    )
+    parser.add_argument(
+        "--judged",
+        action="store_true",
+        help="end a run of the explorer once it has the true map, before it says so",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="RESULTS.jsonl",
+        help="where to store what came of each run; what is there is not run again",
+    )
+    parser.add_argument(
+        "--table",
+        type=Path,
+        metavar="RESULTS.jsonl",
+        help="print a table of stored results instead",
+    )
     parser.add_argument("--plot", type=Path, metavar="PNG", help="with --table, draw them, too")
     options = parser.parse_args()
     if options.table:
         records = [json.loads(line) for line in options.table.read_text().splitlines()]
         for family in dict.fromkeys(record["family"] for record in records):
-            print(f"\n{family}\n\n{table([record for record in records if record['family'] == family])}")
+            print(
+                f"\n{family}\n\n{table([record for record in records if record['family'] == family])}"
+            )
         if options.plot:
             plot(records, options.plot)
         return
@@ -464,7 +615,11 @@ def main() -> None:
             if (world.name, strategy) in known:
                 continue
             most = min(options.most, 2000) if strategy == "explorer" else options.most
-            told = {"seconds": options.seconds, "judged": options.judged} if strategy == "explorer" else {}
+            told = (
+                {"seconds": options.seconds, "judged": options.judged}
+                if strategy == "explorer"
+                else {}
+            )
             said = RUN[strategy](world, seed, most, options.limit, **told)
             record = {
                 "family": family,

@@ -25,7 +25,9 @@ from ssh_abduction.data import Odometry
 PRICE = 1.5  # What a fault of any kind costs, in dstates.
 MARGIN = 5  # No fault is at one of so many first or last steps: it could not be noticed there.
 RARE = 4  # A dstate that is visited so many times, or less often, may be noise.
-NOISE = Odometry(along=0.05, across=0.005, heading=0.002)  # Of the mazes with displacements: as in truth.py.
+NOISE = Odometry(
+    along=0.05, across=0.005, heading=0.002
+)  # Of the mazes with displacements: as in truth.py.
 
 Faults = frozenset[tuple[int, str]]  # step and kind
 
@@ -71,11 +73,21 @@ class Explanation:
     def of(cls, trace: Trace, labels: Sequence[Hashable]) -> Explanation:
         """The causal map of these labels: dstates show what is seen there most often, and actions lead where they lead most often."""
         shows, leads = _read_off(trace, labels)
-        misread = {(t, "misread") for t, (s, view) in enumerate(zip(labels, trace.views, strict=True)) if shows[s] != view}
-        slipped = {
-            (t, "slipped") for t, ((s, x), a) in enumerate(zip(pairwise(labels), trace.actions, strict=True)) if leads[s, a.name] != x
+        misread = {
+            (t, "misread")
+            for t, (s, view) in enumerate(zip(labels, trace.views, strict=True))
+            if shows[s] != view
         }
-        return cls(tuple(labels), frozenset(misread | slipped), 10 * len(shows) + round(10 * PRICE) * len(misread | slipped))
+        slipped = {
+            (t, "slipped")
+            for t, ((s, x), a) in enumerate(zip(pairwise(labels), trace.actions, strict=True))
+            if leads[s, a.name] != x
+        }
+        return cls(
+            tuple(labels),
+            frozenset(misread | slipped),
+            10 * len(shows) + round(10 * PRICE) * len(misread | slipped),
+        )
 
     def is_true(self, case: Case) -> bool:
         return is_true(self.labels, self.faults, case)
@@ -84,17 +96,23 @@ class Explanation:
 def is_true(labels: Sequence[Hashable], faults: Faults, case: Case) -> bool:
     """Whether these labels are the true ones up to renaming, at all steps but those with a wrong view, and these faults the true ones."""
     kept = [t for t in range(len(labels)) if t not in case.wrong]
-    return faults == case.faults and partition([labels[t] for t in kept]) == partition([case.walk.truth[t] for t in kept])
+    return faults == case.faults and partition([labels[t] for t in kept]) == partition(
+        [case.walk.truth[t] for t in kept]
+    )
 
 
-def _read_off(trace: Trace, labels: Sequence[Hashable]) -> tuple[dict[Hashable, object], dict[tuple[Hashable, str], Hashable]]:
+def _read_off(
+    trace: Trace, labels: Sequence[Hashable]
+) -> tuple[dict[Hashable, object], dict[tuple[Hashable, str], Hashable]]:
     views: defaultdict[Hashable, Counter[object]] = defaultdict(Counter)
     ends: defaultdict[tuple[Hashable, str], Counter[Hashable]] = defaultdict(Counter)
     for s, view in zip(labels, trace.views, strict=True):
         views[s][view] += 1
     for (s, x), a in zip(pairwise(labels), trace.actions, strict=True):
         ends[s, a.name][x] += 1
-    return {s: n.most_common(1)[0][0] for s, n in views.items()}, {key: n.most_common(1)[0][0] for key, n in ends.items()}
+    return {s: n.most_common(1)[0][0] for s, n in views.items()}, {
+        key: n.most_common(1)[0][0] for key, n in ends.items()
+    }
 
 
 def refined(trace: Trace, labels: Sequence[Hashable]) -> Explanation:
@@ -106,21 +124,29 @@ def refined(trace: Trace, labels: Sequence[Hashable]) -> Explanation:
         shows, leads = _read_off(trace, best.labels)
         rare = [s for s, visits in Counter(best.labels).items() if visits <= RARE]
         tried = (
-            Explanation.of(trace, _laid_over(trace, {s: v for s, v in shows.items() if s != out}, leads))
+            Explanation.of(
+                trace, _laid_over(trace, {s: v for s, v in shows.items() if s != out}, leads)
+            )
             for out in [None, *rare]
             if len(shows) > 1
         )
-        better = next((explanation for explanation in tried if explanation.tenths < best.tenths), None)
+        better = next(
+            (explanation for explanation in tried if explanation.tenths < best.tenths), None
+        )
         if better is None:
             return best
         best = better
 
 
-def _laid_over(trace: Trace, shows: dict[Hashable, object], leads: dict[tuple[Hashable, str], Hashable]) -> list[Hashable]:
+def _laid_over(
+    trace: Trace, shows: dict[Hashable, object], leads: dict[tuple[Hashable, str], Hashable]
+) -> list[Hashable]:
     """The labels with the fewest faults that a map gives to the steps of a trace (Viterbi 1967)."""
     names = list(shows)
     number = {s: i for i, s in enumerate(names)}
-    seen = {view: np.array([PRICE * (shows[s] != view) for s in names]) for view in set(trace.views)}
+    seen = {
+        view: np.array([PRICE * (shows[s] != view) for s in names]) for view in set(trace.views)
+    }
     moves = {a: np.full((len(names), len(names)), PRICE) for a in {a.name for a in trace.actions}}
     for (s, a), x in leads.items():
         if s in number and x in number:
@@ -152,10 +178,16 @@ def machine(seed: int, *, jumps: bool) -> Case:
     chance = random.Random(f"size {seed}")
     states = chance.randint(5, 12)
     views, faults = chance.randint(4, min(9, states)), chance.randint(1, 2)
-    return sized(seed, states, views, 200, jumps=faults) if jumps else sized(seed, states, views, 200, wrong=faults)
+    return (
+        sized(seed, states, views, 200, jumps=faults)
+        if jumps
+        else sized(seed, states, views, 200, wrong=faults)
+    )
 
 
-def sized(seed: int, states: int, views: int, steps: int, *, wrong: int = 0, jumps: int = 0) -> Case:
+def sized(
+    seed: int, states: int, views: int, steps: int, *, wrong: int = 0, jumps: int = 0
+) -> Case:
     return Case(*faulty_machine(states, views, steps=steps, seed=seed, wrong=wrong, jumps=jumps))
 
 
@@ -171,7 +203,9 @@ def rectangle_of_five(seed: int, *, steps: int, wrong: int = 0, jumps: int = 0) 
     for t in range(steps):
         truth.append((truth[-1] + 1 + (chance.choice((2, 6)) if t in jumped else 0)) % 8)
     views = ["v4" if s == 4 else f"v{s % 4}" for s in truth]
-    trace = Trace.from_steps(views, [("right", "travel")[t % 2] for t in range(steps)], name=f"rectangle, seed {seed}")
+    trace = Trace.from_steps(
+        views, [("right", "travel")[t % 2] for t in range(steps)], name=f"rectangle, seed {seed}"
+    )
     return replace(misread(Walk(trace, tuple(truth)), wrong, seed), jumps=jumped)
 
 
@@ -209,7 +243,13 @@ def large_maze(seed: int, share: float) -> Case:
     walk = maze(6, 6, steps=400, seed=seed, stars=True, follow=True, odometry=NOISE)
     faults = round(share * 400)
     case = misread(walk, faults - faults // 2, seed)
-    misseen = tuple(sorted(chance.sample([t for t in range(MARGIN, 400 - MARGIN) if t not in case.wrong], faults // 2)))
+    misseen = tuple(
+        sorted(
+            chance.sample(
+                [t for t in range(MARGIN, 400 - MARGIN) if t not in case.wrong], faults // 2
+            )
+        )
+    )
     return replace(case, walk=star_turned(case.walk, misseen, chance), misseen=misseen)
 
 
@@ -219,14 +259,28 @@ TOPOLOGICAL = Theory.topological().replace(misread=PRICE, slipped=PRICE)
 FAMILIES = {
     "machines 5–12, 1 or 2 wrong views": Family(partial(machine, jumps=False), CAUSAL),
     "machines 5–12, 1 or 2 jumps": Family(partial(machine, jumps=True), CAUSAL),
-    "rectangle n=400, 4 wrong views": Family(partial(rectangle_of_five, steps=400, wrong=4), CAUSAL),
+    "rectangle n=400, 4 wrong views": Family(
+        partial(rectangle_of_five, steps=400, wrong=4), CAUSAL
+    ),
     "rectangle n=400, 4 jumps": Family(partial(rectangle_of_five, steps=400, jumps=4), CAUSAL),
-    "rectangle n=4000, 40 wrong views": Family(partial(rectangle_of_five, steps=4000, wrong=40), CAUSAL),
+    "rectangle n=4000, 40 wrong views": Family(
+        partial(rectangle_of_five, steps=4000, wrong=40), CAUSAL
+    ),
     "rectangle n=4000, 40 jumps": Family(partial(rectangle_of_five, steps=4000, jumps=40), CAUSAL),
-    "machines 20/10 n=400, 4 wrong views": Family(partial(sized, states=20, views=10, steps=400, wrong=4), CAUSAL),
-    "machines 30/10 n=800, 8 wrong views": Family(partial(sized, states=30, views=10, steps=800, wrong=8), CAUSAL),
-    "mazes 3x3 n=600, 6 wrong views": Family(lambda seed: misread(maze(3, 3, steps=600, seed=seed), 6, seed), CAUSAL),
+    "machines 20/10 n=400, 4 wrong views": Family(
+        partial(sized, states=20, views=10, steps=400, wrong=4), CAUSAL
+    ),
+    "machines 30/10 n=800, 8 wrong views": Family(
+        partial(sized, states=30, views=10, steps=800, wrong=8), CAUSAL
+    ),
+    "mazes 3x3 n=600, 6 wrong views": Family(
+        lambda seed: misread(maze(3, 3, steps=600, seed=seed), 6, seed), CAUSAL
+    ),
     "Taylor Hall, 3 mixed faults": Family(tour_of_taylor_hall, TOPOLOGICAL, optional=True),
-    "mazes 6x6 with stars and displacements, 1 % faults": Family(partial(large_maze, share=0.01), TOPOLOGICAL, optional=True),
-    "mazes 6x6 with stars and displacements, 5 % faults": Family(partial(large_maze, share=0.05), TOPOLOGICAL, optional=True),
+    "mazes 6x6 with stars and displacements, 1 % faults": Family(
+        partial(large_maze, share=0.01), TOPOLOGICAL, optional=True
+    ),
+    "mazes 6x6 with stars and displacements, 5 % faults": Family(
+        partial(large_maze, share=0.05), TOPOLOGICAL, optional=True
+    ),
 }

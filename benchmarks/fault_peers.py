@@ -83,11 +83,19 @@ def maxsat(case: Case, seconds: float) -> Explanation:
         formula.extend([[-literal] for literal in excuse], weights=[1] * len(excuse))
     for t, action in enumerate(a.name for a in trace.actions):
         excuse = [int(names.id(("jumped", t)))] if case.jumps else []
-        formula.extend([[-at(t, s), -leads(s, action, x), at(t + 1, x), *excuse] for s in states for x in states])
+        formula.extend(
+            [
+                [-at(t, s), -leads(s, action, x), at(t + 1, x), *excuse]
+                for s in states
+                for x in states
+            ]
+        )
         formula.extend([[-literal] for literal in excuse], weights=[1] * len(excuse))
     with RC2(formula, solver="g4", adapt=True, exhaust=True, minz=True) as solver:
         model = set(solver.compute() or ())
-    return Explanation.of(trace, [next(s for s in states if at(t, s) in model) for t in range(len(trace))])
+    return Explanation.of(
+        trace, [next(s for s in states if at(t, s) in model) for t in range(len(trace))]
+    )
 
 
 def merged(case: Case, seconds: float) -> Explanation:
@@ -99,17 +107,28 @@ def merged(case: Case, seconds: float) -> Explanation:
     """
     from aalpy.learning_algs import run_GSM
     from aalpy.learning_algs.general_passive.DataHandler import CountDataHandler
-    from aalpy.learning_algs.general_passive.ScoreFunctionsGSM import SimpleScoreCalculation, lower_threshold
+    from aalpy.learning_algs.general_passive.ScoreFunctionsGSM import (
+        SimpleScoreCalculation,
+        lower_threshold,
+    )
 
     def noise(node: Any) -> int:
-        return sum(sum(counts.values()) - max(counts.values()) for counts in node.data.transition_count.values())
+        return sum(
+            sum(counts.values()) - max(counts.values())
+            for counts in node.data.transition_count.values()
+        )
 
     def score(part: dict[Any, Any]) -> Any:
         new = set(part.values())
-        return lower_threshold(len(part) - len(new) - NOISY * (sum(map(noise, new)) - sum(map(noise, part))), LEAST)
+        return lower_threshold(
+            len(part) - len(new) - NOISY * (sum(map(noise, new)) - sum(map(noise, part))), LEAST
+        )
 
     trace = case.walk.trace
-    walk = [trace.views[0], *((action.name, view) for action, view in zip(trace.actions, trace.views[1:], strict=True))]
+    walk = [
+        trace.views[0],
+        *((action.name, view) for action, view in zip(trace.actions, trace.views[1:], strict=True)),
+    ]
     node: Any = run_GSM(
         [walk],
         transition_behavior="stochastic",
@@ -150,7 +169,10 @@ class Clones:
     def __init__(self, trace: Trace, clones: int) -> None:
         views = {view: i for i, view in enumerate(dict.fromkeys(trace.views))}
         actions = {name: i for i, name in enumerate(dict.fromkeys(a.name for a in trace.actions))}
-        self.clones, self.shape = clones, (max(len(actions), 1), len(views), len(views), clones, clones)
+        self.clones, self.shape = (
+            clones,
+            (max(len(actions), 1), len(views), len(views), clones, clones),
+        )
         self.seen = [views[view] for view in trace.views]
         self.links = [actions[a.name] for a in trace.actions], self.seen[:-1], self.seen[1:]
 

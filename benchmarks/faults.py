@@ -64,22 +64,56 @@ Record = dict[str, Any]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--only", default="", metavar="PATTERN", help="families whose name this regular expression is found in")
-    parser.add_argument("--solvers", default="", metavar="PATTERN", help="solvers whose name this regular expression is found in")
-    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="cases of each family (default 20)")
-    parser.add_argument("--first", type=int, default=500, metavar="SEED", help="the first seed (default 500)")
-    parser.add_argument("--limit", type=float, default=60, metavar="S", help="CPU seconds a cell has (default 60)")
-    parser.add_argument("--memory", type=int, default=4096, metavar="MIB", help="address space a cell has, in MiB (default 4096)")
-    parser.add_argument("--out", type=Path, metavar="RESULTS.jsonl", help="where to store what came of it")
-    parser.add_argument("--show", type=Path, metavar="RESULTS.jsonl", help="print the table of stored runs")
+    parser.add_argument(
+        "--only",
+        default="",
+        metavar="PATTERN",
+        help="families whose name this regular expression is found in",
+    )
+    parser.add_argument(
+        "--solvers",
+        default="",
+        metavar="PATTERN",
+        help="solvers whose name this regular expression is found in",
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=20, metavar="N", help="cases of each family (default 20)"
+    )
+    parser.add_argument(
+        "--first", type=int, default=500, metavar="SEED", help="the first seed (default 500)"
+    )
+    parser.add_argument(
+        "--limit", type=float, default=60, metavar="S", help="CPU seconds a cell has (default 60)"
+    )
+    parser.add_argument(
+        "--memory",
+        type=int,
+        default=4096,
+        metavar="MIB",
+        help="address space a cell has, in MiB (default 4096)",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="RESULTS.jsonl", help="where to store what came of it"
+    )
+    parser.add_argument(
+        "--show", type=Path, metavar="RESULTS.jsonl", help="print the table of stored runs"
+    )
     options = parser.parse_args()
     stored = options.show or options.out
-    records: list[Record] = [json.loads(line) for line in stored.read_text().splitlines()] if stored and stored.exists() else []
+    records: list[Record] = (
+        [json.loads(line) for line in stored.read_text().splitlines()]
+        if stored and stored.exists()
+        else []
+    )
     if not options.show:
         done = {(record["family"], record["solver"], record["seed"]) for record in records}
         for name, family in FAMILIES.items():
             for solver in SOLVERS:
-                wanted = re.search(options.only, name) and re.search(options.solvers, solver) and (options.only or not family.optional)
+                wanted = (
+                    re.search(options.only, name)
+                    and re.search(options.solvers, solver)
+                    and (options.only or not family.optional)
+                )
                 for seed in range(options.first, options.first + options.seeds) if wanted else ():
                     if (name, solver, seed) not in done:
                         record = measured(name, solver, seed, options.limit, options.memory)
@@ -112,7 +146,12 @@ def measured(name: str, solver: str, seed: int, limit: float, memory: int) -> Re
     except EOFError:  # it has ended
         pass
     process.join()
-    return {**record, "status": "timeout" if process.exitcode in (-signal.SIGPROF, -signal.SIGKILL) else "error", "cpu": limit, **answer}
+    return {
+        **record,
+        "status": "timeout" if process.exitcode in (-signal.SIGPROF, -signal.SIGKILL) else "error",
+        "cpu": limit,
+        **answer,
+    }
 
 
 def work(sender: Connection, name: str, solver: str, seed: int, limit: float, memory: int) -> None:
@@ -120,7 +159,9 @@ def work(sender: Connection, name: str, solver: str, seed: int, limit: float, me
     for module in PEERS[solver].modules if solver in PEERS else ():
         importlib.import_module(module)
     case = FAMILIES[name].make(seed)
-    sender.send({"faults": len(case.faults), "true_states": case.states, "true_tenths": true_tenths(case)})
+    sender.send(
+        {"faults": len(case.faults), "true_states": case.states, "true_tenths": true_tenths(case)}
+    )
     resource.setrlimit(resource.RLIMIT_AS, (memory * 2**20, -1))
     began = cpu_seconds()
     try:
@@ -128,11 +169,17 @@ def work(sender: Connection, name: str, solver: str, seed: int, limit: float, me
             end_after(limit, signal.ITIMER_PROF)
             explanation = PEERS[solver].explain(case, limit)
             spent = round(cpu_seconds() - began, 3)
-            sender.send({"status": "ok", "cpu": spent, **judged(case, [explanation], PEERS[solver].proves)})
+            sender.send(
+                {"status": "ok", "cpu": spent, **judged(case, [explanation], PEERS[solver].proves)}
+            )
         else:
-            vars(limits)["time"] = SimpleNamespace(perf_counter=cpu_seconds)  # the clock that a search looks at
+            vars(limits)["time"] = SimpleNamespace(
+                perf_counter=cpu_seconds
+            )  # the clock that a search looks at
             end_after(limit + MARGIN, signal.ITIMER_PROF)
-            search(sender, case, theory_for(case, FAMILIES[name].theory, told=solver == TOLD), limit)
+            search(
+                sender, case, theory_for(case, FAMILIES[name].theory, told=solver == TOLD), limit
+            )
     except Exception as error:  # whatever a program raises is what came of it
         sender.send({"status": "error", "reason": f"{type(error).__name__}: {error}"[:200]})
 
@@ -147,7 +194,13 @@ def search(sender: Connection, case: Case, theory: Theory, limit: float) -> None
             proven_at = cpu_seconds() - began
             end_after(LISTING, signal.ITIMER_PROF)
             explanations = [explained(ours.best, progress.cost.tenths)]
-            sender.send({"status": "ok", "cpu": round(proven_at, 3), **judged(case, explanations, proven=True)})
+            sender.send(
+                {
+                    "status": "ok",
+                    "cpu": round(proven_at, 3),
+                    **judged(case, explanations, proven=True),
+                }
+            )
 
     ours = Search(case.walk.trace, theory, time_limit=limit, on_progress=on_progress)
     maps = tuple(ours)
@@ -158,12 +211,18 @@ def search(sender: Connection, case: Case, theory: Theory, limit: float) -> None
 
 
 def explained(ssh_map: SSHMap, tenths: int) -> Explanation:
-    return Explanation(ssh_map.labels, frozenset((fault.step, fault.kind) for fault in ssh_map.faults), tenths)
+    return Explanation(
+        ssh_map.labels, frozenset((fault.step, fault.kind) for fault in ssh_map.faults), tenths
+    )
 
 
 def theory_for(case: Case, theory: Theory, *, told: bool) -> Theory:
     """The theory without the kinds of faults that are not there, where that is told."""
-    return theory.replace(misread=PRICE if case.wrong else 0.0, slipped=PRICE if case.jumps else 0.0) if told else theory
+    return (
+        theory.replace(misread=PRICE if case.wrong else 0.0, slipped=PRICE if case.jumps else 0.0)
+        if told
+        else theory
+    )
 
 
 def judged(case: Case, explanations: Sequence[Explanation], proven: bool) -> Record:
@@ -216,7 +275,10 @@ def table(records: Iterable[Record]) -> str:
         rows.setdefault((record["family"], record["solver"]), []).append(record)
     order = sorted(rows, key=lambda key: (list(FAMILIES).index(key[0]), SOLVERS.index(key[1])))
     lines = [f"| {' | '.join(COLUMNS)} |", "|---" * len(COLUMNS) + "|"]
-    return "\n".join(lines + [f"| {key[0]} | {key[1]} | {' | '.join(cells(key[1], rows[key]))} |" for key in order])
+    return "\n".join(
+        lines
+        + [f"| {key[0]} | {key[1]} | {' | '.join(cells(key[1], rows[key]))} |" for key in order]
+    )
 
 
 def cells(solver: str, records: Sequence[Record]) -> list[str]:

@@ -35,21 +35,44 @@ def cases(seed: int) -> list[tuple[str, nx.Graph, int, float, set[object]]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="tours of each world (default 3)")
-    parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)")
+    parser.add_argument(
+        "--seeds", type=int, default=3, metavar="N", help="tours of each world (default 3)"
+    )
+    parser.add_argument(
+        "--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)"
+    )
     options = parser.parse_args()
-    print("| world | steps | seed | status | dstates, places | truth | right maps | seconds |\n|---|---|---|---|---|---|---|---|")
+    print(
+        "| world | steps | seed | status | dstates, places | truth | right maps | seconds |\n|---|---|---|---|---|---|---|---|"
+    )
     for seed in range(options.seeds):
         for name, graph, steps, noise, landmarks in cases(seed):
             start = next(iter(graph))
-            tour = planar.drive(graph, start, next(iter(graph[start])), steps, random.Random(seed), noise=noise, landmarks=landmarks)
+            tour = planar.drive(
+                graph,
+                start,
+                next(iter(graph[start])),
+                steps,
+                random.Random(seed),
+                noise=noise,
+                landmarks=landmarks,
+            )
             began = time.process_time()
             solution = solve(tour.trace, time_limit=options.limit, max_maps=50)
             seconds = time.process_time() - began
             found = f"{solution.cost.dstates}, {solution.cost.places}" if solution.cost else "–"
             right = sum(ssh_map.labels == tour.labels for ssh_map in solution.maps)
             truth = f"{len(set(tour.labels))}, {tour.places}"
-            cells = [name, steps, seed, solution.status.value, found, truth, f"{right} of {len(solution.maps)}", f"{seconds:.1f}"]
+            cells = [
+                name,
+                steps,
+                seed,
+                solution.status.value,
+                found,
+                truth,
+                f"{right} of {len(solution.maps)}",
+                f"{seconds:.1f}",
+            ]
             print(f"| {' | '.join(map(str, cells))} |", flush=True)
 
 

@@ -47,7 +47,9 @@ def timed() -> Iterator[list[float]]:
             inside[0], began = True, time.thread_time()
             try:
                 found = function(*arguments, **named)
-                return list(found) if hasattr(found, "__next__") else found  # a generator works when it is asked
+                return (
+                    list(found) if hasattr(found, "__next__") else found
+                )  # a generator works when it is asked
             finally:
                 spent[0] += time.thread_time() - began
                 inside[0] = False
@@ -71,7 +73,9 @@ def measured(trace: Trace, theory: Theory, limit: float) -> tuple[float, float, 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--cells", type=int, nargs="+", default=[4, 6], metavar="N")
-    parser.add_argument("--steps", type=int, nargs="+", default=[40, 150], metavar="N", help="for each of --cells")
+    parser.add_argument(
+        "--steps", type=int, nargs="+", default=[40, 150], metavar="N", help="for each of --cells"
+    )
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=200)
     parser.add_argument("--limit", type=float, default=60)
@@ -79,15 +83,32 @@ def main() -> None:
     options = parser.parse_args()
     theory = Theory(star="none") if options.views else Theory.topological()
     # What is loaded once is no cost of a trace.
-    measured(maze(2, 2, steps=8, seed=0, stars=True, follow=True, odometry=Odometry(**NOISE)).trace, theory, options.limit)
+    measured(
+        maze(2, 2, steps=8, seed=0, stars=True, follow=True, odometry=Odometry(**NOISE)).trace,
+        theory,
+        options.limit,
+    )
     print(
         f"| mazes, {'views' if options.views else 'stars'} | proven with, without | CPU s with, without (median) | without / with (median of ratios) | share of geometry: median, most |\n|---|---|---|---|---|"
     )
     for cells, steps in zip(options.cells, options.steps, strict=True):
         rows = []
         for seed in range(options.first, options.first + options.seeds):
-            trace = maze(cells, cells, steps=steps, seed=seed, stars=True, follow=True, odometry=Odometry(**NOISE)).trace
-            rows.append((measured(trace, theory, options.limit), measured(trace, theory.replace(displacement="none"), options.limit)))
+            trace = maze(
+                cells,
+                cells,
+                steps=steps,
+                seed=seed,
+                stars=True,
+                follow=True,
+                odometry=Odometry(**NOISE),
+            ).trace
+            rows.append(
+                (
+                    measured(trace, theory, options.limit),
+                    measured(trace, theory.replace(displacement="none"), options.limit),
+                )
+            )
         used, plain = zip(*rows, strict=True)
         shares = [inside / seconds for seconds, inside, _ in used]
         print(

@@ -61,7 +61,11 @@ class BeamModel:
         nearer = np.maximum(e, STEP)
         # Gaussian noise makes no range below 0, so the Gaussian is cut off there.
         scale = np.exp(log_ndtr(e / self.sigma))
-        bell = np.exp(-(((z - e) / self.sigma) ** 2) / 2) / (self.sigma * math.sqrt(2 * math.pi)) / scale
+        bell = (
+            np.exp(-(((z - e) / self.sigma) ** 2) / 2)
+            / (self.sigma * math.sqrt(2 * math.pi))
+            / scale
+        )
         decay = self.rate * np.exp(-self.rate * z) / -np.expm1(-self.rate * nearer) * (z <= nearer)
         inside = self.hit * bell + self.short * decay + self.any / self.reach
         beyond = self.hit * ndtr((e - self.reach) / self.sigma) / scale + self.lost
@@ -89,10 +93,14 @@ class Grid:
     ranges: NDArray[np.uint16] = field(repr=False)
 
     @classmethod
-    def of(cls, world: World, resolution: float = 0.1, headings: int = 72, reach: float = 8.0) -> Grid:
+    def of(
+        cls, world: World, resolution: float = 0.1, headings: int = 72, reach: float = 8.0
+    ) -> Grid:
         """The grid of a world's walls; clutter counts where it stands in the world's file."""
         if headings % 72:
-            raise ValueError(f"headings: expected a multiple of 72, so that beams are in the directions of headings, got {headings}")
+            raise ValueError(
+                f"headings: expected a multiple of 72, so that beams are in the directions of headings, got {headings}"
+            )
         segments = np.vstack([world.segments, *(item.segments for item in world.clutter)])
         points = np.vstack([_along(s, resolution / 4) for s in segments])
         low = points.min(0) - 1.5 * resolution
@@ -103,13 +111,23 @@ class Grid:
         parts, _ = ndimage.label(~occupied)
         column, row = np.floor((np.array(world.start[:2]) - low) / resolution).astype(int)
         free = parts == parts[row, column]
-        return cls(resolution, headings, (float(low[0]), float(low[1])), occupied, free, _cast(occupied, free, resolution, headings, reach))
+        return cls(
+            resolution,
+            headings,
+            (float(low[0]), float(low[1])),
+            occupied,
+            free,
+            _cast(occupied, free, resolution, headings, reach),
+        )
 
     @cached_property
     def centres(self) -> Array:
         """The middles of the free cells, (free cells, 2), in metres."""
         rows, columns = np.nonzero(self.free)
-        return np.asarray((np.column_stack([columns, rows]) + 0.5) * self.resolution + np.array(self.origin), np.float64)
+        return np.asarray(
+            (np.column_stack([columns, rows]) + 0.5) * self.resolution + np.array(self.origin),
+            np.float64,
+        )
 
     @cached_property
     def number(self) -> NDArray[np.int32]:
@@ -123,11 +141,15 @@ class Grid:
         """The headings, in radians."""
         return np.asarray(np.arange(self.headings) * (math.tau / self.headings), np.float64)
 
-    def likelihoods(self, image: Array, model: BeamModel) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    def likelihoods(
+        self, image: Array, model: BeamModel
+    ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
         """For the beams used their directions against the heading, in headings, (b,); and log p(range | expected) for each expected range in units of STEP, (b, units)."""
         every = model.beams
         used = np.arange(every // 2, len(image), every)
-        offsets = np.rint((BEARINGS[used] - math.radians(0.5)) / (math.tau / self.headings)).astype(int)
+        offsets = np.rint((BEARINGS[used] - math.radians(0.5)) / (math.tau / self.headings)).astype(
+            int
+        )
         expected = np.linspace(0.0, model.reach, round(model.reach / STEP) + 1)
         return offsets, model.log_likelihood(image[used, None], expected).astype(np.float32)
 
@@ -139,7 +161,13 @@ def _along(segment: Array, step: float) -> Array:
     return np.asarray(start + np.linspace(0, 1, count)[:, None] * (end - start))
 
 
-def _cast(occupied: NDArray[np.bool_], free: NDArray[np.bool_], resolution: float, headings: int, reach: float) -> NDArray[np.uint16]:
+def _cast(
+    occupied: NDArray[np.bool_],
+    free: NDArray[np.bool_],
+    resolution: float,
+    headings: int,
+    reach: float,
+) -> NDArray[np.uint16]:
     """Walks from all free cells at once in each direction, in strides of half a cell, until a cell is occupied."""
     rows, columns = np.nonzero(free)
     ranges = np.full((len(rows), headings), round(reach / STEP), np.uint16)
@@ -148,8 +176,16 @@ def _cast(occupied: NDArray[np.bool_], free: NDArray[np.bool_], resolution: floa
         left = np.arange(len(rows))
         for stride in range(1, math.ceil(2 * reach / resolution)):
             way = stride / 2
-            row = np.floor(rows[left] + 0.5 + way * math.sin(angle)).astype(int).clip(0, occupied.shape[0] - 1)
-            column = np.floor(columns[left] + 0.5 + way * math.cos(angle)).astype(int).clip(0, occupied.shape[1] - 1)
+            row = (
+                np.floor(rows[left] + 0.5 + way * math.sin(angle))
+                .astype(int)
+                .clip(0, occupied.shape[0] - 1)
+            )
+            column = (
+                np.floor(columns[left] + 0.5 + way * math.cos(angle))
+                .astype(int)
+                .clip(0, occupied.shape[1] - 1)
+            )
             hit = occupied[row, column]
             ranges[left[hit], h] = round(way * resolution / STEP)
             left = left[~hit]
@@ -192,7 +228,9 @@ class Histogram:
     def __init__(self, grid: Grid, model: BeamModel | None = None, slipped: float = 0.01) -> None:
         self.grid, self.model, self.slipped = grid, model or BeamModel(), slipped
         self.anywhere = 1 / (float(grid.free.sum()) * grid.headings)
-        self.probability = np.where(grid.free, np.float32(self.anywhere), np.float32(0)) * np.ones((grid.headings, 1, 1), np.float32)
+        self.probability = np.where(grid.free, np.float32(self.anywhere), np.float32(0)) * np.ones(
+            (grid.headings, 1, 1), np.float32
+        )
 
     @property
     def bytes(self) -> int:
@@ -218,17 +256,25 @@ class Histogram:
             turn = np.array([[cos, -sin], [sin, cos]])
             x, y = turn @ (dx, dy) / size
             (xx, xy), (_, yy) = turn @ spread @ turn.T / size**2 + LEAST_BLUR**2 * np.eye(2)
-            kernel = np.exp(-1j * (kx * x + ky * y) - (xx * kx**2 + 2 * xy * kx * ky + yy * ky**2) / 2)
+            kernel = np.exp(
+                -1j * (kx * x + ky * y) - (xx * kx**2 + 2 * xy * kx * ky + yy * ky**2) / 2
+            )
             layer = fft.irfft2(fft.rfft2(self.probability[h].astype(float), shape) * kernel, shape)
             self.probability[h] = np.maximum(layer[:rows, :columns], 0)
         k = math.tau * fft.rfftfreq(grid.headings)
         variance = max(float(covariance[2][2]) / bin_**2, LEAST_BLUR**2)
         kernel = np.exp(-1j * k * (turned / bin_) - variance * k**2 / 2)
         spectrum = fft.rfft(self.probability, axis=0) * kernel[:, None, None].astype(np.complex64)
-        self.probability = np.maximum(fft.irfft(spectrum, grid.headings, axis=0), 0).astype(np.float32) * grid.free
+        self.probability = (
+            np.maximum(fft.irfft(spectrum, grid.headings, axis=0), 0).astype(np.float32) * grid.free
+        )
         total = float(self.probability.sum(dtype=float))
         self.probability *= np.float32((1 - self.slipped) / total if total > 0 else 0.0)
-        self.probability += np.where(grid.free, np.float32((self.slipped if total > 0 else 1.0) * self.anywhere), np.float32(0))
+        self.probability += np.where(
+            grid.free,
+            np.float32((self.slipped if total > 0 else 1.0) * self.anywhere),
+            np.float32(0),
+        )
 
     def seen(self, image: Array) -> None:
         grid = self.grid
@@ -242,7 +288,11 @@ class Histogram:
 
     def best(self) -> Pose:
         h, row, column = np.unravel_index(int(self.probability.argmax()), self.probability.shape)
-        x, y = np.array([column, row]) * self.grid.resolution + self.grid.resolution / 2 + np.array(self.grid.origin)
+        x, y = (
+            np.array([column, row]) * self.grid.resolution
+            + self.grid.resolution / 2
+            + np.array(self.grid.origin)
+        )
         return float(x), float(y), float(self.grid.angles[h])
 
     def mass(self, pose: Sequence[float], near: float, turned: float) -> float:
@@ -261,7 +311,9 @@ class Particles:
              the others, the belief is drawn anew from anywhere, by that image (sensor resetting, Lenser & Veloso 2000)
     """
 
-    BIN = np.array([0.5, 0.5, math.radians(10)])  # AMCL's bins of KLD sampling: metres, metres, radians
+    BIN = np.array(
+        [0.5, 0.5, math.radians(10)]
+    )  # AMCL's bins of KLD sampling: metres, metres, radians
 
     def __init__(
         self,
@@ -291,19 +343,26 @@ class Particles:
         """Poses from anywhere."""
         cells = self.grid.centres[self.rng.integers(len(self.grid.centres), size=count)]
         return np.column_stack(
-            [cells + self.rng.uniform(-0.5, 0.5, (count, 2)) * self.grid.resolution, self.rng.uniform(0, math.tau, count)]
+            [
+                cells + self.rng.uniform(-0.5, 0.5, (count, 2)) * self.grid.resolution,
+                self.rng.uniform(0, math.tau, count),
+            ]
         )
 
     def moved(self, displacement: Sequence[float], covariance: Array) -> None:
         self._resample()
-        dx, dy, turned = self.rng.multivariate_normal(displacement, covariance, size=len(self.poses), method="cholesky").T
+        dx, dy, turned = self.rng.multivariate_normal(
+            displacement, covariance, size=len(self.poses), method="cholesky"
+        ).T
         cos, sin = np.cos(self.poses[:, 2]), np.sin(self.poses[:, 2])
         self.poses += np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy, turned])
         self.poses[:, 2] %= math.tau
         self.fresh = math.ceil(self.slipped * self.most)
         if self.fresh:
             self.poses = np.vstack([self.poses, self._drawn(self.fresh)])
-            self.weights = np.append(self.weights * (1 - self.slipped), np.full(self.fresh, self.slipped / self.fresh))
+            self.weights = np.append(
+                self.weights * (1 - self.slipped), np.full(self.fresh, self.slipped / self.fresh)
+            )
 
     def seen(self, image: Array) -> None:
         if self._weigh(image):
@@ -316,7 +375,12 @@ class Particles:
         grid = self.grid
         offsets, logs = grid.likelihoods(image, self.model)
         columns, rows = np.floor((self.poses[:, :2] - grid.origin) / grid.resolution).astype(int).T
-        inside = (rows >= 0) & (columns >= 0) & (rows < grid.free.shape[0]) & (columns < grid.free.shape[1])
+        inside = (
+            (rows >= 0)
+            & (columns >= 0)
+            & (rows < grid.free.shape[0])
+            & (columns < grid.free.shape[1])
+        )
         cells = np.where(inside, grid.number[rows * inside, columns * inside], -1)
         h = np.rint(self.poses[:, 2] / (math.tau / grid.headings)).astype(int)
         weights = np.where(cells < 0, -np.inf, np.log(np.maximum(self.weights, 1e-300)))
@@ -331,7 +395,9 @@ class Particles:
     def _resample(self) -> None:
         """Draw as many particles as KLD sampling asks for, evenly along the weights (tables 4.4 and 8.4)."""
         bins = len(np.unique(self._bins(self.poses[np.unique(self._chosen(self.most))])))
-        self.poses = self.poses[self._chosen(min(self.most, max(self.least, _kld(bins, self.error))))]
+        self.poses = self.poses[
+            self._chosen(min(self.most, max(self.least, _kld(bins, self.error))))
+        ]
         self.weights = np.full(len(self.poses), 1 / len(self.poses))
 
     def _bins(self, poses: Array) -> NDArray[np.intp]:

@@ -40,7 +40,7 @@ from simulator.world import World
 from ssh_abduction import Localiser, Trace
 from ssh_abduction.evaluation.paper.claims import one_to_one
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.online.localize import LOCATED, Chances
+from ssh_abduction.online.localiser import LOCATED, Chances
 
 STEPS = 30  # of each of the two drives of a run
 EXPLORED = 2  # exploration tours
@@ -86,7 +86,9 @@ class Judged:
     def localised(self, start: int, stop: int) -> int | None:
         """Steps from `start` until the belief is sure and right, and stays so."""
         good = [r and s for r, s in zip(self.right, self.sure, strict=True)][start:stop]
-        return first([all(good[i : i + STAYS]) and i + STAYS <= len(good) for i in range(len(good))])
+        return first(
+            [all(good[i : i + STAYS]) and i + STAYS <= len(good) for i in range(len(good))]
+        )
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,10 @@ class Drive:
         steps = [step for part in parts for step in part.steps]
         noise = parts[0].odometry
         assert noise is not None
-        told = [step.displacement or parts[0].steps[1].displacement or (0.0, 0.0, 0.0) for step in steps[1:]]
+        told = [
+            step.displacement or parts[0].steps[1].displacement or (0.0, 0.0, 0.0)
+            for step in steps[1:]
+        ]
         return cls(
             spliced([part.steps for part in parts], images),
             [(displacement, np.array(noise.covariance(displacement))) for displacement in told],
@@ -129,10 +134,16 @@ class Learnt:
         learner = BootstrapLearner(None, ViewClusterer(random_state=0), time_limit=SECONDS)
         began = process_time()
         learner.fit(explored)
-        return cls(learner, [str(step.truth["dstate"]) for step in explored], process_time() - began)
+        return cls(
+            learner, [str(step.truth["dstate"]) for step in explored], process_time() - began
+        )
 
 
-BY_IMAGE, SOMEWHERE, BY_VIEW = "dstates by image", "dstates by image, never nowhere", "dstates by view"
+BY_IMAGE, SOMEWHERE, BY_VIEW = (
+    "dstates by image",
+    "dstates by image, never nowhere",
+    "dstates by view",
+)
 
 
 def by_dstates(drive: Drive, learnt: Learnt, method: str) -> Judged:
@@ -140,7 +151,9 @@ def by_dstates(drive: Drive, learnt: Learnt, method: str) -> Judged:
     images = method != BY_VIEW
     learner, named = learnt.learner, {}
     for x in range(len(learner.map_.dstates)):
-        here = Counter(name for name, label in zip(learnt.truth, learner.labels_, strict=True) if label == x)
+        here = Counter(
+            name for name, label in zip(learnt.truth, learner.labels_, strict=True) if label == x
+        )
         named[x] = here.most_common(1)[0][0] if here else None
     chances = Chances(unmapped=0.0) if method == SOMEWHERE else Chances()
     localiser = Localiser(learner.map_, learner.recogniser_ if images else None, chances=chances)
@@ -154,7 +167,10 @@ def by_dstates(drive: Drive, learnt: Learnt, method: str) -> Judged:
     following = process_time() - began
     return Judged(
         method,
-        tuple(b.dstate is not None and named[b.dstate] == at for b, at in zip(beliefs, drive.at, strict=True)),
+        tuple(
+            b.dstate is not None and named[b.dstate] == at
+            for b, at in zip(beliefs, drive.at, strict=True)
+        ),
         tuple(b.probability >= LOCATED for b in beliefs),
         len(pickle.dumps(localiser)) + centres,
         beliefs[0].probabilities.nbytes,
@@ -176,22 +192,40 @@ def by_poses(drive: Drive, belief: Filter, method: str, grid: Grid, making: floa
         off = math.hypot(best[0] - pose[0], best[1] - pose[1])
         right.append(off <= NEAR and abs(math.remainder(best[2] - pose[2], math.tau)) <= FACING)
         sure.append(belief.mass(best, NEAR, FACING) >= LOCATED)
-    return Judged(method, tuple(right), tuple(sure), grid.ranges.nbytes + grid.occupied.nbytes + grid.free.nbytes, most, making, following)
+    return Judged(
+        method,
+        tuple(right),
+        tuple(sure),
+        grid.ranges.nbytes + grid.occupied.nbytes + grid.free.nbytes,
+        most,
+        making,
+        following,
+    )
 
 
 def run(case: Case, seed: int) -> Iterator[Judged]:
     scene = case.scene(seed)
     drive = Drive.of(scene, case, seed)
     learnt = Learnt.of(scene, case, seed)
-    for method in (BY_IMAGE, SOMEWHERE, BY_VIEW) if case.change or case.people else (BY_IMAGE, BY_VIEW):
+    for method in (
+        (BY_IMAGE, SOMEWHERE, BY_VIEW) if case.change or case.people else (BY_IMAGE, BY_VIEW)
+    ):
         yield by_dstates(drive, learnt, method)
-    for method, resolution, headings, sigma in ((COARSE, 0.1, 72, 0.2), (FINE, 0.025, 144, 0.05))[: 1 + case.fine]:
+    for method, resolution, headings, sigma in ((COARSE, 0.1, 72, 0.2), (FINE, 0.025, 144, 0.05))[
+        : 1 + case.fine
+    ]:
         began = process_time()
         grid = Grid.of(scene.world, resolution, headings)
         making = process_time() - began
         model = BeamModel(sigma=sigma)
         yield by_poses(drive, Histogram(grid, model), method, grid, making)
-        yield by_poses(drive, Particles(grid, model, seed=seed), method.replace("grid", "particles, grid"), grid, making)
+        yield by_poses(
+            drive,
+            Particles(grid, model, seed=seed),
+            method.replace("grid", "particles, grid"),
+            grid,
+            making,
+        )
 
 
 PARTS: dict[str, list[Case]] = {
@@ -204,8 +238,18 @@ PARTS: dict[str, list[Case]] = {
         Case("ring, one side hallway missing", lambda _: ring(True)),
     ],
     "clutter": [
-        *(Case(f"Taylor Hall, {n} boxes added", lambda _: taylor_hall(), boxes(n)) for n in (10, 30)),
-        *(Case(f"Taylor Hall, somebody in front in {p:.0%} of images", lambda _: taylor_hall(), people=p) for p in (0.2, 0.5)),
+        *(
+            Case(f"Taylor Hall, {n} boxes added", lambda _: taylor_hall(), boxes(n))
+            for n in (10, 30)
+        ),
+        *(
+            Case(
+                f"Taylor Hall, somebody in front in {p:.0%} of images",
+                lambda _: taylor_hall(),
+                people=p,
+            )
+            for p in (0.2, 0.5)
+        ),
         Case("Taylor Hall, 30 boxes, somebody in 20%", lambda _: taylor_hall(), boxes(30), 0.2),
     ],
     "growing": [Case(f"maze, {n} x {n}", lambda seed, n=n: maze(n, seed)) for n in (2, 3, 4, 5)],  # type: ignore[misc]
@@ -240,7 +284,8 @@ def maps(parts: Sequence[str], seeds: range) -> None:
         learnt = [Learnt.of(case.scene(seed), case, seed) for seed in seeds]
         right = sum(one_to_one(one.learner.labels_, np.array(one.truth)) for one in learnt)
         sizes = [
-            spread([float(size) for size in some], "{:g}") for some in ([len(set(x.truth)) for x in learnt], [len(x.truth) for x in learnt])
+            spread([float(size) for size in some], "{:g}")
+            for some in ([len(set(x.truth)) for x in learnt], [len(x.truth) for x in learnt])
         ]
         print(f"| {case.name} | {' | '.join(sizes)} | {right} of {len(learnt)} |", flush=True)
 
@@ -249,7 +294,15 @@ def loaded(path: str) -> Saved:
     data = json.loads(Path(path).read_text())
     return {
         part: {
-            case: [[Judged(**{**judged, "right": tuple(judged["right"]), "sure": tuple(judged["sure"])}) for judged in one] for one in runs]
+            case: [
+                [
+                    Judged(
+                        **{**judged, "right": tuple(judged["right"]), "sure": tuple(judged["sure"])}
+                    )
+                    for judged in one
+                ]
+                for one in runs
+            ]
             for case, runs in cases.items()
         }
         for part, cases in data.items()
@@ -264,7 +317,10 @@ def show(case: str, runs: Sequence[Sequence[Judged]]) -> None:
 def cells(runs: Sequence[Judged]) -> list[str]:
     here = [judged.localised(0, STEPS) for judged in runs]
     there = [judged.localised(STEPS, 2 * STEPS) for judged in runs]
-    wrong = [np.mean([s and not r for r, s in zip(judged.right, judged.sure, strict=True)]) for judged in runs]
+    wrong = [
+        np.mean([s and not r for r, s in zip(judged.right, judged.sure, strict=True)])
+        for judged in runs
+    ]
     return [
         *(cell for steps in (here, there) for cell in (spread([s for s in steps if s is not None], "{:g}"), f"{sum(s is not None for s in steps)} of {len(steps)}")),
         spread([float(np.mean(judged.right)) for judged in runs], "{:.2f}"),
@@ -291,7 +347,10 @@ COLOURS = {
     COARSE: "#d55e00",
     COARSE.replace("grid", "particles, grid"): "#cc79a7",
 }
-LOCATING = (("aliasing", "six side hallways, all alike"), ("clutter", "Taylor Hall, 30 boxes added"))
+LOCATING = (
+    ("aliasing", "six side hallways, all alike"),
+    ("clutter", "Taylor Hall, 30 boxes added"),
+)
 
 
 def draw(path: str, found: Saved) -> None:
@@ -301,28 +360,56 @@ def draw(path: str, found: Saved) -> None:
     mpl.use("Agg")
     from matplotlib import pyplot
 
-    pyplot.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 110})
+    pyplot.rcParams.update(
+        {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 110}
+    )
     figure, (above, below) = pyplot.subplots(2, 2, figsize=(9, 6), layout="constrained")
     for axes, (part, name) in zip(above, LOCATING, strict=True):
         for same in zip(*found[part][name], strict=True):
-            located = np.mean([np.logical_and(judged.right, judged.sure) for judged in same], axis=0)
-            axes.plot(range(2 * STEPS), located, drawstyle="steps-mid", color=COLOURS[same[0].method], label=same[0].method)
+            located = np.mean(
+                [np.logical_and(judged.right, judged.sure) for judged in same], axis=0
+            )
+            axes.plot(
+                range(2 * STEPS),
+                located,
+                drawstyle="steps-mid",
+                color=COLOURS[same[0].method],
+                label=same[0].method,
+            )
         axes.axvline(STEPS - 0.5, color="#888888", linestyle=":")
         axes.text(STEPS, 1.04, "carried", color="#888888")
         axes.set(title=name, xlabel="step", ylabel="share of runs located", ylim=(0, 1.1))
     sizes = [int(name.split()[-1]) for name in found["growing"]]
     numbers: tuple[tuple[str, Callable[[Judged], float]], ...] = (
-        ("memory of map and belief, kB", lambda judged: (judged.map_bytes + judged.belief_bytes) / 1000),
+        (
+            "memory of map and belief, kB",
+            lambda judged: (judged.map_bytes + judged.belief_bytes) / 1000,
+        ),
         ("CPU time a step, ms", lambda judged: 1000 * judged.following / len(judged.right)),
     )
     for axes, (label, number) in zip(below, numbers, strict=True):
         methods = [list(zip(*runs, strict=True)) for runs in found["growing"].values()]
         for same in zip(*methods, strict=True):
             values = np.array([[number(judged) for judged in seeds] for seeds in same])
-            axes.plot(sizes, np.median(values, axis=1), "o-", color=COLOURS[same[0][0].method], markersize=4)
-            axes.fill_between(sizes, values.min(axis=1), values.max(axis=1), color=COLOURS[same[0][0].method], alpha=0.2, linewidth=0)
+            axes.plot(
+                sizes,
+                np.median(values, axis=1),
+                "o-",
+                color=COLOURS[same[0][0].method],
+                markersize=4,
+            )
+            axes.fill_between(
+                sizes,
+                values.min(axis=1),
+                values.max(axis=1),
+                color=COLOURS[same[0][0].method],
+                alpha=0.2,
+                linewidth=0,
+            )
         axes.set(xlabel="cells along a side of a maze", ylabel=label, yscale="log", xticks=sizes)
-    figure.legend(*above[1].get_legend_handles_labels(), frameon=False, loc="outside upper center", ncols=3)
+    figure.legend(
+        *above[1].get_legend_handles_labels(), frameon=False, loc="outside upper center", ncols=3
+    )
     figure.savefig(path)
     pyplot.close(figure)
 
@@ -332,7 +419,11 @@ def main() -> None:
     parser.add_argument("--part", choices=PARTS, action="append")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=600)
-    parser.add_argument("--maps", action="store_true", help="only say how many of the maps that are learnt are the true ones")
+    parser.add_argument(
+        "--maps",
+        action="store_true",
+        help="only say how many of the maps that are learnt are the true ones",
+    )
     parser.add_argument("--save", metavar="JSON")
     parser.add_argument("--from", dest="source", metavar="JSON", nargs="+")
     parser.add_argument("--plot", metavar="PNG")
@@ -355,7 +446,9 @@ def main() -> None:
         found = measured(parts, seeds, options.save)
     if options.plot:
         if set(found) != set(PARTS):
-            parser.error(f"--plot: expected {', '.join(PARTS)}, got {', '.join(found)} only; measure the others, too")
+            parser.error(
+                f"--plot: expected {', '.join(PARTS)}, got {', '.join(found)} only; measure the others, too"
+            )
         draw(options.plot, found)
 
 

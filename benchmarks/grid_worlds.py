@@ -21,7 +21,9 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Trace
 
-State = tuple[object, object, bool]  # a place, a street there, and whether the robot faces it or has it behind
+State = tuple[
+    object, object, bool
+]  # a place, a street there, and whether the robot faces it or has it behind
 # A robot that drives at random travels so often where it can; else it turns.
 TRAVELS = 2 / 3
 # So many times another draw is made where a drive fails, as with a box in the way.
@@ -48,10 +50,18 @@ class Scene:
     def explored(self, tours: int, seed: int) -> Trace:
         return simulate(self.at(*self.explore), tours, seed)
 
-    def driven(self, steps: int, seed: int, change: Callable[[World, np.random.Generator], World] | None = None) -> Trace:
+    def driven(
+        self,
+        steps: int,
+        seed: int,
+        change: Callable[[World, np.random.Generator], World] | None = None,
+    ) -> Trace:
         """A drive at random of so many steps from any dstate, in the world as it is or as it was changed. Raises SimulatorError where every draw fails."""
         for attempt in range(TRIES):
-            chance, rng = random.Random(1000 * seed + attempt), np.random.default_rng([seed, attempt])
+            chance, rng = (
+                random.Random(1000 * seed + attempt),
+                np.random.default_rng([seed, attempt]),
+            )
             here = first = chance.choice(sorted(self.moves))
             route: list[str] = []
             for _ in range(steps):
@@ -63,8 +73,12 @@ class Scene:
             world = self.at(first, tuple(route))
             try:
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", SimulatorWarning)  # A drive at random ends anywhere.
-                    return simulate(change(world, rng) if change else world, 1, int(rng.integers(2**31)))
+                    warnings.simplefilter(
+                        "ignore", SimulatorWarning
+                    )  # A drive at random ends anywhere.
+                    return simulate(
+                        change(world, rng) if change else world, 1, int(rng.integers(2**31))
+                    )
             except SimulatorError as error:
                 failure = error
         raise failure
@@ -78,19 +92,26 @@ def of_streets(graph: nx.Graph, start: Leg, reach: float, like: World | None = N
         world = World.load(path)
     ways = {leg: _way(graph, *leg) for edge in graph.edges for leg in (edge, _back(edge))}
     moves = _moves(ways)
-    names: dict[State, str] = {state: f"{state[0]} {'to' if state[2] else 'from'} {state[1]}" for state in moves}
+    names: dict[State, str] = {
+        state: f"{state[0]} {'to' if state[2] else 'from'} {state[1]}" for state in moves
+    }
     if like is not None:
         poses = {s.name: s.pose for s in world.dstates}
         names = {state: like.nearest(poses[name]).name for state, name in names.items()}  # type: ignore[union-attr]
         world = like
-    led = {names[a]: {action: names[b] for _, b, action in moves.edges(a, data="action")} for a in moves}
+    led = {
+        names[a]: {action: names[b] for _, b, action in moves.edges(a, data="action")}
+        for a in moves
+    }
     first = names[(*start, True)]
     return Scene(world, led, (first, tuple(_all_moves(led, first))))
 
 
 def _all_moves(moves: dict[str, dict[str, str]], start: str) -> list[str]:
     """Actions that try each action at each dstate, and lead back to the start: always on to the nearest one that is left."""
-    graph = nx.DiGraph([(a, b, {"action": action}) for a, ways in moves.items() for action, b in ways.items()])
+    graph = nx.DiGraph(
+        [(a, b, {"action": action}) for a, ways in moves.items() for action, b in ways.items()]
+    )
     left = {(a, action) for a, ways in moves.items() for action in ways}
     here, route = start, []
     while left or here != start:
@@ -113,13 +134,31 @@ def rectangle(depth: float) -> Scene:
     walls = world.segments.copy()
     walls[:, 1::2] = np.where(walls[:, 1::2] < 0, -depth, walls[:, 1::2])
     names = [s.name for s in world.dstates]
-    moves = {name: {action: names[(i + 1) % 8]} for i, (name, action) in enumerate(zip(names, world.route, strict=True))}
+    moves = {
+        name: {action: names[(i + 1) % 8]}
+        for i, (name, action) in enumerate(zip(names, world.route, strict=True))
+    }
     return Scene(replace(world, segments=walls), moves, (names[0], world.route))
 
 
 def taylor_hall() -> Scene:
-    at: dict[object, complex] = {"D1": -15j, "P1": 0j, "P2": 13 + 0j, "D2": 13 - 10j, "P3": 28 + 0j, "D3": 28 - 13j, "E": 40 + 0j}
-    streets: list[tuple[object, object]] = [("D1", "P1"), ("P1", "P2"), ("P2", "D2"), ("P2", "P3"), ("P3", "D3"), ("P3", "E")]
+    at: dict[object, complex] = {
+        "D1": -15j,
+        "P1": 0j,
+        "P2": 13 + 0j,
+        "D2": 13 - 10j,
+        "P3": 28 + 0j,
+        "D3": 28 - 13j,
+        "E": 40 + 0j,
+    }
+    streets: list[tuple[object, object]] = [
+        ("D1", "P1"),
+        ("P1", "P2"),
+        ("P2", "D2"),
+        ("P2", "P3"),
+        ("P3", "D3"),
+        ("P3", "E"),
+    ]
     return of_streets(planar.world(at, streets), ("D1", "P1"), 1.0, World.named("taylor-hall"))
 
 
@@ -128,7 +167,9 @@ def comb(halls: int) -> Scene:
     at: dict[object, complex] = {f"P{i}": 6.0 * i + 0j for i in range(halls)}
     at |= {f"D{i}": 6.0 * i - 6j for i in range(halls)}
     streets: list[tuple[object, object]] = [(f"P{i}", f"P{i + 1}") for i in range(halls - 1)]
-    return of_streets(planar.world(at, streets + [(f"P{i}", f"D{i}") for i in range(halls)]), ("P0", "P1"), 0.8)
+    return of_streets(
+        planar.world(at, streets + [(f"P{i}", f"D{i}") for i in range(halls)]), ("P0", "P1"), 0.8
+    )
 
 
 def ring(marked: bool) -> Scene:
@@ -138,7 +179,11 @@ def ring(marked: bool) -> Scene:
     streets: list[tuple[object, object]] = []
     for k, z in enumerate(corners):
         way = (corners[(k + 1) % 4] - z) / 18
-        names = [f"C{k}", *(f"P{k}{i}" for i in (1, 2) if not (marked and (k, i) == (0, 2))), f"C{(k + 1) % 4}"]
+        names = [
+            f"C{k}",
+            *(f"P{k}{i}" for i in (1, 2) if not (marked and (k, i) == (0, 2))),
+            f"C{(k + 1) % 4}",
+        ]
         for i in (1, 2):
             if f"P{k}{i}" in names:
                 at |= {f"P{k}{i}": z + 6 * i * way, f"D{k}{i}": z + 6 * i * way - 5j * way}
@@ -151,8 +196,14 @@ def maze(size: int, seed: int, cell: float = 5.0) -> Scene:
     """A maze of so many cells by as many: a random spanning tree of a grid, and each further street by a chance of a tenth. A cell that a street goes straight through is no place."""
     chance = random.Random(seed)
     grid = nx.grid_2d_graph(size, size)
-    graph = nx.Graph(nx.minimum_spanning_tree(nx.Graph([(a, b, {"weight": chance.random()}) for a, b in sorted(grid.edges)])).edges)
-    graph.add_edges_from(edge for edge in sorted(grid.edges) if not graph.has_edge(*edge) and chance.random() < 0.1)
+    graph = nx.Graph(
+        nx.minimum_spanning_tree(
+            nx.Graph([(a, b, {"weight": chance.random()}) for a, b in sorted(grid.edges)])
+        ).edges
+    )
+    graph.add_edges_from(
+        edge for edge in sorted(grid.edges) if not graph.has_edge(*edge) and chance.random() < 0.1
+    )
     for place in sorted(graph):
         beside = sorted(graph[place])
         if len(beside) == 2 and (beside[0][0] == beside[1][0] or beside[0][1] == beside[1][1]):
@@ -176,7 +227,14 @@ def boxes(count: int) -> Callable[[World, np.random.Generator], World]:
             half = rng.uniform(0.15, 0.4) * way
             across = 0.3 * np.array([-way[1], way[0]])
             middle = start + rng.uniform(0, lengths[wall]) * way
-            corners = np.array([middle - half - across, middle + half - across, middle + half + across, middle - half + across])
+            corners = np.array(
+                [
+                    middle - half - across,
+                    middle + half - across,
+                    middle + half + across,
+                    middle - half + across,
+                ]
+            )
             found.append(np.hstack([corners, np.roll(corners, -1, axis=0)]))
         return replace(world, segments=np.vstack(found))
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perception.reciprocal import ReciprocalTransformer
-from perception.recognition import PlaceRecognizer
+from perception.recognition import PlaceRecogniser
 from perception.views import ViewClusterer
 from simulator.laser import Laser
 from simulator.tours import simulate
@@ -33,7 +33,9 @@ def ranges(kind: str, count: int, seed: int = 0) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
     if kind == "dstates":
         ideal = np.array([s.pose for s in WORLD.dstates])
-        poses = ideal[np.arange(count) % len(ideal)] + rng.normal(0, [0.005, 0.005, 0.005], (count, 3))
+        poses = ideal[np.arange(count) % len(ideal)] + rng.normal(
+            0, [0.005, 0.005, 0.005], (count, 3)
+        )
     else:
         poses = rng.uniform([0.3, 0.3, -np.pi], [3.7, 1.7, np.pi], (count, 3))
     return Laser().scan(WORLD, poses, rng)
@@ -45,10 +47,16 @@ def simulated(world: str) -> None:
     poses = np.repeat([s.pose for s in room.dstates], 20_000 // len(room.dstates), axis=0)
     began = time.perf_counter()
     Laser().scan(room, poses, rng)
-    print(f"{world:18} {len(poses) / (time.perf_counter() - began):9,.0f} images a second, all poses at once", flush=True)
+    print(
+        f"{world:18} {len(poses) / (time.perf_counter() - began):9,.0f} images a second, all poses at once",
+        flush=True,
+    )
     began = time.perf_counter()
     steps = len(simulate(room, tours=5))
-    print(f"{world:18} {steps / (time.perf_counter() - began):9,.0f} dstates a second, driving", flush=True)
+    print(
+        f"{world:18} {steps / (time.perf_counter() - began):9,.0f} dstates a second, driving",
+        flush=True,
+    )
 
 
 def search(kind: str, count: int) -> None:
@@ -58,13 +66,16 @@ def search(kind: str, count: int) -> None:
     views = ViewClusterer(k_max=MOST_VIEWS, random_state=0).fit(images)
     seconds = time.perf_counter() - began
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
-    print(f"{kind:9} {count:7,} images, k = 2 … {MOST_VIEWS}: {seconds:7.1f} s, peak {peak:6.0f} MB, k = {views.k_}", flush=True)
+    print(
+        f"{kind:9} {count:7,} images, k = 2 … {MOST_VIEWS}: {seconds:7.1f} s, peak {peak:6.0f} MB, k = {views.k_}",
+        flush=True,
+    )
 
 
 def queries(kind: str, count: int) -> None:
     """Ask for the nearest of `count` images, and print a line of the table."""
     images = ReciprocalTransformer().fit_transform(ranges(kind, count + 2_000))
-    recogniser = PlaceRecognizer().fit(images[:count], np.arange(count) % 8)
+    recogniser = PlaceRecogniser().fit(images[:count], np.arange(count) % 8)
     began = time.perf_counter()
     recogniser.predict(images[count:])
     seconds = time.perf_counter() - began

@@ -33,20 +33,40 @@ class Walk:
     truth: tuple[object, ...]
 
 
-def displaced(trace: Trace, poses: Sequence[Pose], odometry: Odometry, seed: int, *, scale: float = 0.0, bend: float = 0.0) -> Trace:
+def displaced(
+    trace: Trace,
+    poses: Sequence[Pose],
+    odometry: Odometry,
+    seed: int,
+    *,
+    scale: float = 0.0,
+    bend: float = 0.0,
+) -> Trace:
     """A trace with the displacements between the true poses of its steps, as an odometry reports them; see simulator.motion.reported."""
     rng = np.random.default_rng(seed)
-    moved = [reported(between(a, b), odometry, rng, scale=scale, bend=bend) for a, b in pairwise(poses)]
-    steps = (replace(step, displacement=displacement) for step, displacement in zip(trace.steps, [None, *moved], strict=True))
+    moved = [
+        reported(between(a, b), odometry, rng, scale=scale, bend=bend) for a, b in pairwise(poses)
+    ]
+    steps = (
+        replace(step, displacement=displacement)
+        for step, displacement in zip(trace.steps, [None, *moved], strict=True)
+    )
     return replace(trace, steps=tuple(steps), odometry=odometry)
 
 
 Cell = tuple[int, int]
 
 
-def doors_of(width: int, height: int, chance: random.Random, loops: float = 0.1) -> set[tuple[Cell, Cell]]:
+def doors_of(
+    width: int, height: int, chance: random.Random, loops: float = 0.1
+) -> set[tuple[Cell, Cell]]:
     """The corridors of a maze, from cell to cell, each in both directions: a random spanning tree of the grid, and each further wall open by chance."""
-    walls = [((x, y), (x + dx, y + dy)) for x in range(width) for y in range(height) for dx, dy in ((1, 0), (0, 1))]
+    walls = [
+        ((x, y), (x + dx, y + dy))
+        for x in range(width)
+        for y in range(height)
+        for dx, dy in ((1, 0), (0, 1))
+    ]
     walls = [(a, b) for a, b in walls if b[0] < width and b[1] < height]
     chance.shuffle(walls)
     root = {(x, y): (x, y) for x in range(width) for y in range(height)}
@@ -108,7 +128,9 @@ def maze(
             break
         ahead_open, right_open, _, left_open = seen[-1]
         if not follow:
-            action = chance.choice(["travel", "travel", "right", "left"] if ahead_open else ["right", "left", "around"])
+            action = chance.choice(
+                ["travel", "travel", "right", "left"] if ahead_open else ["right", "left", "around"]
+            )
         elif ahead_open:
             action = chance.choice(["travel"] * 4 + ["right", "left"])
         else:
@@ -119,7 +141,9 @@ def maze(
             heading = (heading + TURNS[action]) % 4
         done.append(action)
     views = ["".join(map(str, openings)) for openings in seen]
-    trace = Trace.from_steps(views, done, stars=seen if stars else None, name=f"maze {width} x {height}, seed {seed}")
+    trace = Trace.from_steps(
+        views, done, stars=seen if stars else None, name=f"maze {width} x {height}, seed {seed}"
+    )
     if odometry is not None:
         trace = displaced(trace, poses, odometry, seed, scale=scale, bend=bend)
     return Walk(trace, tuple(truth))
@@ -140,11 +164,23 @@ def moore(states: int, views: int, *, steps: int, seed: int, actions: int = 2) -
         state = follow[state][action]
         done.append({"name": f"a{action}"})
         truth.append(state)
-    return Walk(Trace.from_steps([f"v{shown[s]}" for s in truth], done, name=f"moore {states}/{views}, seed {seed}"), tuple(truth))
+    return Walk(
+        Trace.from_steps(
+            [f"v{shown[s]}" for s in truth], done, name=f"moore {states}/{views}, seed {seed}"
+        ),
+        tuple(truth),
+    )
 
 
 def faulty_machine(
-    states: int, views: int, *, steps: int, seed: int, wrong: int = 0, jumps: int = 0, actions: int = 3
+    states: int,
+    views: int,
+    *,
+    steps: int,
+    seed: int,
+    wrong: int = 0,
+    jumps: int = 0,
+    actions: int = 3,
 ) -> tuple[Walk, tuple[int, ...], tuple[int, ...]]:
     """A random walk in a random Moore machine, at whose steps some views are wrong; and some actions end anywhere else, and what follows goes on from there.
 
@@ -152,7 +188,9 @@ def faulty_machine(
     """
     walk = moore(states, views, steps=steps, seed=seed, actions=actions)
     chance = random.Random(f"faults {seed}")
-    links = {(s, a.name): x for (s, x), a in zip(pairwise(walk.truth), walk.trace.actions, strict=True)}
+    links = {
+        (s, a.name): x for (s, x), a in zip(pairwise(walk.truth), walk.trace.actions, strict=True)
+    }
     shown = dict(zip(walk.truth, walk.trace.views, strict=True))
     jumped = sorted(chance.sample(range(5, steps - 5), jumps))
     truth = [walk.truth[0]]
@@ -165,23 +203,36 @@ def faulty_machine(
     seen = [shown[s] for s in truth]
     misread = sorted(chance.sample(range(5, steps - 5), wrong))
     for t in misread:
-        seen[t] = chance.choice([view for view in sorted(set(shown.values()), key=str) if view != seen[t]])
-    trace = Trace.from_steps(seen, list(walk.trace.actions), name=f"{walk.trace.name}, {wrong} wrong, {jumps} jumps")
+        seen[t] = chance.choice(
+            [view for view in sorted(set(shown.values()), key=str) if view != seen[t]]
+        )
+    trace = Trace.from_steps(
+        seen, list(walk.trace.actions), name=f"{walk.trace.name}, {wrong} wrong, {jumps} jumps"
+    )
     return Walk(trace, tuple(truth)), tuple(misread), tuple(jumped)
 
 
 def rectangle(circuits: int) -> Walk:
     """The notched rectangle of Kuipers & Beeson (2002), so many times round: eight states, four views."""
     steps = 8 * circuits
-    trace = Trace.from_steps([f"v{i % 4}" for i in range(steps + 1)], [("right", "travel")[i % 2] for i in range(steps)])
+    trace = Trace.from_steps(
+        [f"v{i % 4}" for i in range(steps + 1)], [("right", "travel")[i % 2] for i in range(steps)]
+    )
     return Walk(trace, tuple(i % 8 for i in range(steps + 1)))
 
 
 def circuits(width: int, height: int, *, rounds: int, seed: int, views: int = 4) -> Walk:
     """So many times round a block: along each side from place to place, and right at the corners. What is seen is drawn evenly for each state."""
     chance = random.Random(seed)
-    once = [action for side in (width, height, width, height) for action in ["travel"] * side + ["right"]]
+    once = [
+        action
+        for side in (width, height, width, height)
+        for action in ["travel"] * side + ["right"]
+    ]
     shown = [f"v{chance.randrange(views)}" for _ in once]
     steps = rounds * len(once)
-    trace = Trace.from_steps([shown[i % len(once)] for i in range(steps + 1)], [once[i % len(once)] for i in range(steps)])
+    trace = Trace.from_steps(
+        [shown[i % len(once)] for i in range(steps + 1)],
+        [once[i % len(once)] for i in range(steps)],
+    )
     return Walk(trace, tuple(i % len(once) for i in range(steps + 1)))

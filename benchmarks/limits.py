@@ -26,7 +26,10 @@ from instances import maze, moore, rectangle
 
 from ssh_abduction import Trace
 
-TIME, MEMORY = (1.2, 1.0), (1.2, 200.0)  # times the limit, and seconds or MiB beyond that, that are promised
+TIME, MEMORY = (
+    (1.2, 1.0),
+    (1.2, 200.0),
+)  # times the limit, and seconds or MiB beyond that, that are promised
 PYTHON = """
 import json, sys
 from ssh_abduction import Trace, solve
@@ -53,8 +56,14 @@ FAMILIES: dict[str, tuple[str, Callable[[int, int], Trace]]] = {
     "rectangle, causal": ("causal", lambda steps, _: rectangle(max(steps // 8, 3)).trace),
     "like ACES": ("topological", lambda steps, seed: aces(max(steps // 23, 1), seed)),
     "maze": ("topological", lambda steps, seed: maze(6, 6, steps=steps, seed=seed).trace),
-    "maze with stars": ("topological", lambda steps, seed: maze(6, 6, steps=steps, seed=seed, stars=True).trace),
-    "random machine, causal": ("causal", lambda steps, seed: moore(60, 4, steps=steps, seed=seed).trace),
+    "maze with stars": (
+        "topological",
+        lambda steps, seed: maze(6, 6, steps=steps, seed=seed, stars=True).trace,
+    ),
+    "random machine, causal": (
+        "causal",
+        lambda steps, seed: moore(60, 4, steps=steps, seed=seed).trace,
+    ),
 }
 
 
@@ -69,7 +78,9 @@ def flawed(trace: Trace, flaws: int, chance: random.Random) -> Trace:
             other = chance.choice([step for step in steps if step.view != steps[t].view])
             steps[t] = replace(steps[t], view=other.view, star=other.star)
         elif flaw == "action":
-            steps[t] = replace(steps[t], action=chance.choice([step.action for step in steps if step.action]))
+            steps[t] = replace(
+                steps[t], action=chance.choice([step.action for step in steps if step.action])
+            )
         elif flaw == "dropped":
             del steps[t]
         else:
@@ -89,9 +100,29 @@ class Case:
     def command(self, path: Path, *, python: bool) -> list[str]:
         """What is run."""
         if python:
-            return [sys.executable, "-c", PYTHON, str(path), FAMILIES[self.family][0], str(self.seconds), str(self.mebibytes or 0)]
-        limits = [f"--time-limit={self.seconds}", *([f"--memory-limit={self.mebibytes}"] if self.mebibytes else [])]
-        return [sys.executable, "-m", "ssh_abduction", "solve", str(path), "--json", f"--theory={FAMILIES[self.family][0]}", *limits]
+            return [
+                sys.executable,
+                "-c",
+                PYTHON,
+                str(path),
+                FAMILIES[self.family][0],
+                str(self.seconds),
+                str(self.mebibytes or 0),
+            ]
+        limits = [
+            f"--time-limit={self.seconds}",
+            *([f"--memory-limit={self.mebibytes}"] if self.mebibytes else []),
+        ]
+        return [
+            sys.executable,
+            "-m",
+            "ssh_abduction",
+            "solve",
+            str(path),
+            "--json",
+            f"--theory={FAMILIES[self.family][0]}",
+            *limits,
+        ]
 
 
 @dataclass(frozen=True)
@@ -109,15 +140,23 @@ class Outcome:
     status: str
 
 
-def cases(count: int, seed: int, longest: int = 2000, seconds: Sequence[float] = (0.5, 1, 2, 5, 10)) -> Iterator[Case]:
+def cases(
+    count: int, seed: int, longest: int = 2000, seconds: Sequence[float] = (0.5, 1, 2, 5, 10)
+) -> Iterator[Case]:
     """So many cases, the families by turns."""
     chance = random.Random(seed)
     families = list(FAMILIES)
     for number in range(count):
         family = families[number % len(families)]
         steps = round(20 * (longest / 20) ** chance.random())
-        trace = flawed(FAMILIES[family][1](steps, chance.randrange(1000)), chance.choice([0, 1, 1, 1, 3]), chance)
-        yield Case(family, trace, chance.choice(seconds), chance.choice([None, None, 300, 600, 1500]))
+        trace = flawed(
+            FAMILIES[family][1](steps, chance.randrange(1000)),
+            chance.choice([0, 1, 1, 1, 3]),
+            chance,
+        )
+        yield Case(
+            family, trace, chance.choice(seconds), chance.choice([None, None, 300, 600, 1500])
+        )
 
 
 def outcome(case: Case, folder: Path, *, python: bool = False) -> Outcome:
@@ -127,7 +166,10 @@ def outcome(case: Case, folder: Path, *, python: bool = False) -> Outcome:
     command = case.command(path, python=python)
     promised = TIME[0] * case.seconds + TIME[1]
     began = time.monotonic()
-    with output.open("wb") as written, subprocess.Popen(command, stdout=written, stderr=subprocess.PIPE) as process:
+    with (
+        output.open("wb") as written,
+        subprocess.Popen(command, stdout=written, stderr=subprocess.PIPE) as process,
+    ):
         ended, peak = False, 0.0
         while not ended:
             peak = max(peak, _peak(process.pid))
@@ -171,8 +213,17 @@ def table(outcomes: Sequence[Outcome]) -> str:
         if not of_family:
             continue
         counts = [sum(found.status == status for found in of_family) for status in CODES]
-        worst = max(found.seconds for found in of_family), max(found.mebibytes for found in of_family)
-        cells = [family, len(of_family), *counts, len(of_family) - sum(counts), *(f"{share:.0%}" for share in worst)]
+        worst = (
+            max(found.seconds for found in of_family),
+            max(found.mebibytes for found in of_family),
+        )
+        cells = [
+            family,
+            len(of_family),
+            *counts,
+            len(of_family) - sum(counts),
+            *(f"{share:.0%}" for share in worst),
+        ]
         rows.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(rows)
 
@@ -182,7 +233,9 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--longest", type=int, default=2000, help="steps of the longest traces")
-    parser.add_argument("--python", action="store_true", help="by the Python interface rather than the command line")
+    parser.add_argument(
+        "--python", action="store_true", help="by the Python interface rather than the command line"
+    )
     options = parser.parse_args()
     outcomes = []
     with tempfile.TemporaryDirectory() as folder:
@@ -193,7 +246,9 @@ def main() -> None:
             told = f"{case.family}, {len(case.trace)} steps, {limits}: {found.status}, {found.seconds:.0%} of the time, {found.mebibytes:.0%} of the memory"
             print(told, file=sys.stderr, flush=True)
             if max(found.seconds, found.mebibytes) > 1:
-                case.trace.save(Path(tempfile.gettempdir()) / f"over-{options.seed}-{len(outcomes)}.jsonl")
+                case.trace.save(
+                    Path(tempfile.gettempdir()) / f"over-{options.seed}-{len(outcomes)}.jsonl"
+                )
     print(table(outcomes))
 
 

@@ -36,7 +36,7 @@ from ssh_abduction.data import Step
 from ssh_abduction.data.maps import DState
 from ssh_abduction.evaluation.paper.figures import draw_beliefs
 from ssh_abduction.online import Belief
-from ssh_abduction.online.localize import Verdict
+from ssh_abduction.online.localiser import Verdict
 
 FAMILIES: dict[str, Callable[[int], Walk]] = {
     "machines of 20 states, 6 views": lambda seed: moore(20, 6, steps=1000, seed=seed),
@@ -62,8 +62,12 @@ def true_map(walk: Walk) -> SSHMap:
     number: dict[object, int] = {}
     labels = tuple(number.setdefault(x, len(number)) for x in walk.truth)
     views = {label: step.view for label, step in zip(labels, walk.trace, strict=True)}
-    links = {(x, a.name, y) for x, a, y in zip(labels, walk.trace.actions, labels[1:], strict=False)}
-    return SSHMap(labels, tuple(DState(i, views[i] or "") for i in range(len(number))), tuple(sorted(links)))
+    links = {
+        (x, a.name, y) for x, a, y in zip(labels, walk.trace.actions, labels[1:], strict=False)
+    }
+    return SSHMap(
+        labels, tuple(DState(i, views[i] or "") for i in range(len(number))), tuple(sorted(links))
+    )
 
 
 class Robot:
@@ -101,7 +105,10 @@ def kidnapped(ssh_map: SSHMap, seed: int, misread: float) -> Drive:
             robot.at = robot.anywhere()
         at.append(robot.at)
     views = [ssh_map.dstates[x].view for x in at]
-    views = [chance.choice([v for v in names if v != view]) if chance.random() < misread else view for view in views]
+    views = [
+        chance.choice([v for v in names if v != view]) if chance.random() < misread else view
+        for view in views
+    ]
     return Drive(Trace.from_steps(views, actions), tuple(at))
 
 
@@ -115,7 +122,11 @@ def elsewhere(ssh_map: SSHMap, other: SSHMap, seed: int, new: float) -> Drive:
         away = LEFT <= step < BACK
         actions.append((stranger if away else robot).act())
         at.append(None if away else robot.at)
-        views.append(f"new {stranger.at}" if away and stranger.at in unseen else (stranger if away else robot).view)
+        views.append(
+            f"new {stranger.at}"
+            if away and stranger.at in unseen
+            else (stranger if away else robot).view
+        )
     return Drive(Trace.from_steps(views, actions), tuple(at))  # type: ignore[arg-type]
 
 
@@ -159,7 +170,10 @@ def part_kidnapped(seeds: range) -> None:
                 right += sum(b.dstate == x for b, x in zip(beliefs, drive.at, strict=True))
                 steps += len(beliefs)
                 sure += sum(b.verdict is Verdict.LOCATED for b in beliefs)
-                wrong += sum(b.verdict is Verdict.LOCATED and b.dstate != x for b, x in zip(beliefs, drive.at, strict=True))
+                wrong += sum(
+                    b.verdict is Verdict.LOCATED and b.dstate != x
+                    for b, x in zip(beliefs, drive.at, strict=True)
+                )
                 vain += sum(
                     b.collapsed and step.view == ssh_map.dstates[x or 0].view
                     for b, step, x in zip(beliefs[:KIDNAPPED], drive.trace, drive.at, strict=False)
@@ -172,7 +186,9 @@ def part_kidnapped(seeds: range) -> None:
 
 
 def part_nowhere(seeds: range) -> None:
-    print("| map | new views there | nowhere after | said so there | said so at home | found after | found |")
+    print(
+        "| map | new views there | nowhere after | said so there | said so at home | found after | found |"
+    )
     print("|---|---|---|---|---|---|---|")
     for name, make in FAMILIES.items():
         maps = [(true_map(make(seed)), true_map(make(1000 + seed))) for seed in seeds]
@@ -188,7 +204,14 @@ def part_nowhere(seeds: range) -> None:
                 there += sum(nowhere[LEFT:BACK])
                 home += sum(nowhere[:LEFT])
                 at_home += LEFT
-                if (again := first([located(b, x) for b, x in zip(beliefs[BACK:], drive.at[BACK:], strict=True)])) is not None:
+                if (
+                    again := first(
+                        [
+                            located(b, x)
+                            for b, x in zip(beliefs[BACK:], drive.at[BACK:], strict=True)
+                        ]
+                    )
+                ) is not None:
                     found.append(again)
             print(
                 f"| {name} | {new:.0%} | {median(said)} | {share(there, (BACK - LEFT) * len(maps))} | {share(home, at_home)} | {median(found)} | {len(found)} of {len(maps)} |",
@@ -207,7 +230,10 @@ def part_images(seeds: range) -> None:
         "other building is nowhere: one image | localiser | own images are nowhere |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
-    for name, foreign in (("notched-rectangle", "taylor-hall"), ("taylor-hall", "notched-rectangle")):
+    for name, foreign in (
+        ("notched-rectangle", "taylor-hall"),
+        ("taylor-hall", "notched-rectangle"),
+    ):
         for tours in (3, 10):
             right: dict[str, list[bool]] = {}
             found = []
@@ -219,11 +245,21 @@ def part_images(seeds: range) -> None:
                 own = simulate(World.named(name), tours=3, seed=1000 + seed)
                 more = simulate(World.named(name), tours=2, seed=2000 + seed)
                 other = simulate(World.named(foreign), tours=1, seed=3000 + seed)
-                skipped = len(more) // 3  # so the robot is carried from its start to where it is after a third of the tours
-                images = np.concatenate([images_of(own), images_of(more)[skipped:], images_of(other)])
-                at = [number.get(step.truth["dstate"]) for step in (*own.steps, *more.steps[skipped:])] + [None] * len(other)
+                skipped = (
+                    len(more) // 3
+                )  # so the robot is carried from its start to where it is after a third of the tours
+                images = np.concatenate(
+                    [images_of(own), images_of(more)[skipped:], images_of(other)]
+                )
+                at = [
+                    number.get(step.truth["dstate"]) for step in (*own.steps, *more.steps[skipped:])
+                ] + [None] * len(other)
                 front = in_front(images[: len(own)], np.random.default_rng(seed))
-                beliefs = list(Localiser(ssh_map, known).beliefs(spliced([own.steps, more.steps[skipped:], other.steps], images)))
+                beliefs = list(
+                    Localiser(ssh_map, known).beliefs(
+                        spliced([own.steps, more.steps[skipped:], other.steps], images)
+                    )
+                )
                 nearest, alone = known.predict(images), ImageLikelihood.of(known).labels(images)
                 for i in range(len(own)):
                     which = " in front" if front[i] else ""
@@ -239,25 +275,39 @@ def part_images(seeds: range) -> None:
                     found.append(again)
             shares = [
                 f"{np.mean(right[kind]):.3f}"
-                for kind in ("nearest", "belief", "nearest in front", "belief in front", "alone", "nowhere", "own")
+                for kind in (
+                    "nearest",
+                    "belief",
+                    "nearest in front",
+                    "belief in front",
+                    "alone",
+                    "nowhere",
+                    "own",
+                )
             ]
             cells = [*shares[:4], median(found), f"{len(found)} of {len(seeds)}", *shares[4:]]
             print(f"| {name} | {tours} | {' | '.join(cells)} |", flush=True)
 
 
-def in_front(images: NDArray[np.float64], rng: np.random.Generator, share: float = 0.05) -> NDArray[np.bool_]:
+def in_front(
+    images: NDArray[np.float64], rng: np.random.Generator, share: float = 0.05
+) -> NDArray[np.bool_]:
     """Puts somebody in front of the laser in this share of the images, from 0.4 to 0.8 m away, over a sixth of the beams. Returns in which."""
     front = rng.random(len(images)) < share
     width = images.shape[1] // 6
     for image in (images[i] for i in np.flatnonzero(front)):
         begin = rng.integers(0, len(image) - width)
-        image[begin : begin + width] = np.minimum(image[begin : begin + width], rng.uniform(0.4, 0.8))
+        image[begin : begin + width] = np.minimum(
+            image[begin : begin + width], rng.uniform(0.4, 0.8)
+        )
     return front
 
 
 def spliced(drives: Sequence[Sequence[Step]], images: NDArray[np.float64]) -> Trace:
     """One drive after the other, with these images. The robot is carried from one to the next, and takes that for its first travel."""
-    carried = next(step.action for step in drives[0] if step.action and step.action.kind == "travel")
+    carried = next(
+        step.action for step in drives[0] if step.action and step.action.kind == "travel"
+    )
     actions = [step.action or carried for drive in drives for step in drive][:-1]
     steps = zip(images, [*actions, None], strict=True)
     return Trace(tuple(Step(image=tuple(image.tolist()), action=action) for image, action in steps))
@@ -268,8 +318,12 @@ def part_speed(seeds: range) -> None:
     print("|---|---|---|---|---|---|")
     for dstates, views in ((100, 10), (1_000, 10), (10_000, 10), (10_000, 1_000), (10_000, 10_000)):
         chance = random.Random(seeds[0])
-        links = tuple((x, action, chance.randrange(dstates)) for x in range(dstates) for action in "abc")
-        ssh_map = SSHMap((0,), tuple(DState(i, f"v{chance.randrange(views)}") for i in range(dstates)), links)
+        links = tuple(
+            (x, action, chance.randrange(dstates)) for x in range(dstates) for action in "abc"
+        )
+        ssh_map = SSHMap(
+            (0,), tuple(DState(i, f"v{chance.randrange(views)}") for i in range(dstates)), links
+        )
         robot = Robot(ssh_map, chance)
         seen, actions = [robot.view], []
         for _ in range(STEPS - 1):
@@ -282,10 +336,18 @@ def part_speed(seeds: range) -> None:
         for belief in localiser.beliefs(trace):
             _ = belief.entropy, belief.verdict, belief.dstate
         seconds = time.process_time() - made
-        print(f"| {dstates:,} | {views:,} | {STEPS:,} | {seconds:.2f} | {STEPS / seconds:,.0f} | {made - began:.2f} |", flush=True)
+        print(
+            f"| {dstates:,} | {views:,} | {STEPS:,} | {seconds:.2f} | {STEPS / seconds:,.0f} | {made - began:.2f} |",
+            flush=True,
+        )
 
 
-PARTS = {"kidnapped": part_kidnapped, "nowhere": part_nowhere, "images": part_images, "speed": part_speed}
+PARTS = {
+    "kidnapped": part_kidnapped,
+    "nowhere": part_nowhere,
+    "images": part_images,
+    "speed": part_speed,
+}
 
 
 def main() -> None:
@@ -297,7 +359,12 @@ def main() -> None:
     options = parser.parse_args()
     if options.plot:
         make = FAMILIES["mazes 5 x 5"]
-        drive = elsewhere(true_map(make(options.first)), true_map(make(1000 + options.first)), options.first, 1 / 3)
+        drive = elsewhere(
+            true_map(make(options.first)),
+            true_map(make(1000 + options.first)),
+            options.first,
+            1 / 3,
+        )
         beliefs = Localiser(true_map(make(options.first))).beliefs(drive.trace)
         draw_beliefs(options.plot, [belief.to_dict() for belief in beliefs])
         return

@@ -32,7 +32,11 @@ from ssh_abduction.data.maps import maps_of, read_json
 
 OURS = "ssh-abduction"
 # By name the poses at which scans are laid into the grid, and whether doors are nodes.
-SKELETONS = {"skeleton": ("corrected", False), "skeleton with doors": ("corrected", True), "skeleton, odometry": ("odometry", False)}
+SKELETONS = {
+    "skeleton": ("corrected", False),
+    "skeleton with doors": ("corrected", True),
+    "skeleton, odometry": ("odometry", False),
+}
 METHODS = (OURS, *SKELETONS)
 HEAD = (
     "| log | mapper | places | events | events: precision, recall | passes noticed | accuracy | edges: precision, recall | pairs: joined, returns | pairs: precision, recall | CPU s |",
@@ -60,7 +64,19 @@ def driven(plans: Path, seeds: int, runs: Path) -> Iterator[Path]:
     for plan, seed in product(sorted(plans.glob("*.xml")), range(1, seeds + 1)):
         log = runs / f"{plan.stem.removesuffix('_updated')}-{seed}.log"
         if not log.exists():
-            command = [sys.executable, "-m", "ssh_abduction", "simulate", str(plan), "--as", "carmen", "--seed", str(seed), "-o", str(log)]
+            command = [
+                sys.executable,
+                "-m",
+                "ssh_abduction",
+                "simulate",
+                str(plan),
+                "--as",
+                "carmen",
+                "--seed",
+                str(seed),
+                "-o",
+                str(log),
+            ]
             subprocess.run(command, check=True, capture_output=True)
         yield log
 
@@ -76,10 +92,25 @@ def by_map(log: Path, runs: Path) -> Events:
     """The events and the first map of `ssh-abduction map`, which is run unless its folder is there. Raises OSError and ValueError where there is no map."""
     folder = runs / name_of(log)
     if not (folder / "maps.json").exists():
-        command = [sys.executable, "-m", "ssh_abduction", "-q", "map", str(log), "-o", str(folder), "--no-ladder"]
-        done = subprocess.run(command, check=False, capture_output=True)  # which does not end with 0 where a map is not proven
+        command = [
+            sys.executable,
+            "-m",
+            "ssh_abduction",
+            "-q",
+            "map",
+            str(log),
+            "-o",
+            str(folder),
+            "--no-ladder",
+        ]
+        done = subprocess.run(
+            command, check=False, capture_output=True
+        )  # which does not end with 0 where a map is not proven
         if not (folder / "maps.json").exists():
-            raise ValueError(done.stderr.decode(errors="replace").strip().rpartition("\n")[2] or f"map ended with {done.returncode}")
+            raise ValueError(
+                done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+                or f"map ended with {done.returncode}"
+            )
     maps = maps_of(read_json(folder / "maps.json"), str(folder / "maps.json"))
     if not maps:
         raise ValueError("no map")
@@ -97,7 +128,9 @@ def row_of(log: Path, method: str, truth: Truth, runs: Path) -> dict[str, Any]:
         if method == OURS and trace.exists():  # events may be right where no map of them was found
             events = Events.of(Trace.load(trace))
             told = judged(replace(events, places=tuple(range(len(events.places)))), truth).to_dict()
-            failed |= {name: told[name] for name in ("events", "event_precision", "event_recall", "passes")}
+            failed |= {
+                name: told[name] for name in ("events", "event_precision", "event_recall", "passes")
+            }
         return failed
     return row | {"seconds": process_time() - began, **judged(events, truth).to_dict()}
 
@@ -122,8 +155,15 @@ def lines_of(row: dict[str, Any]) -> Iterator[str]:
         shown(row["event_precision"], row["event_recall"]),
         f"{noticed} of {come}",
     ]
-    cells += [shown(row["accuracy"]), shown(row["edge_precision"], row["edge_recall"]), f"{pairs['joined']}, {pairs['returns']}"]
-    cells += [shown(pairs["precision"], pairs["recall"]), "–" if row["method"] == OURS else f"{row['seconds']:.1f}"]
+    cells += [
+        shown(row["accuracy"]),
+        shown(row["edge_precision"], row["edge_recall"]),
+        f"{pairs['joined']}, {pairs['returns']}",
+    ]
+    cells += [
+        shown(pairs["precision"], pairs["recall"]),
+        "–" if row["method"] == OURS else f"{row['seconds']:.1f}",
+    ]
     yield "| " + " | ".join(map(str, cells)) + " |"
     if (pairs := row.get("relations")) is not None:
         yield f"| by relations | {row['method']} | | | | | | | {pairs['joined']}, {pairs['returns']} | {shown(pairs['precision'], pairs['recall'])} | |"
@@ -138,9 +178,17 @@ def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
     def median(name: str) -> float | None:
         return statistics.median([row[name] for row in done if row[name] is not None] or [0])
 
-    joined, right, returns = (sum(row["poses"][name] for row in done) for name in ("joined", "right", "returns"))
+    joined, right, returns = (
+        sum(row["poses"][name] for row in done) for name in ("joined", "right", "returns")
+    )
     come, noticed = (sum(row["passes"][k] for row in done) for k in (0, 1))
-    cells = [method, len(rows), len(done), sum(row["isomorphic"] for row in done), sum(row["places_right"] for row in done)]
+    cells = [
+        method,
+        len(rows),
+        len(done),
+        sum(row["isomorphic"] for row in done),
+        sum(row["places_right"] for row in done),
+    ]
     cells += [
         shown(statistics.mean(row["event_recall"] for row in done)),
         f"{noticed} of {come}",
@@ -161,7 +209,9 @@ def draw(path: Path, logs: Sequence[Path], runs: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, panels = plt.subplots(2, math.ceil(len(logs) / 2), figsize=(5.5 * math.ceil(len(logs) / 2), 11), squeeze=False)
+    figure, panels = plt.subplots(
+        2, math.ceil(len(logs) / 2), figsize=(5.5 * math.ceil(len(logs) / 2), 11), squeeze=False
+    )
     for axes in panels.flat:
         axes.axis("off")
     for axes, log in zip(panels.flat, logs, strict=False):
@@ -174,8 +224,13 @@ def draw(path: Path, logs: Sequence[Path], runs: Path) -> None:
         except (OSError, ValueError) as error:
             print(f"{name_of(log)}: {error}", file=sys.stderr)
             continue
-        at = np.array([poses[scan] for scan in events.scans] if events.poses is None else events.poses)[:, :2]
-        middle = {place: at[[i for i, other in enumerate(events.places) if other == place]].mean(axis=0) for place in events.places}
+        at = np.array(
+            [poses[scan] for scan in events.scans] if events.poses is None else events.poses
+        )[:, :2]
+        middle = {
+            place: at[[i for i, other in enumerate(events.places) if other == place]].mean(axis=0)
+            for place in events.places
+        }
         for here, there in pairwise(events.places):
             axes.plot(*np.array([middle[here], middle[there]]).T, color="tab:orange", linewidth=1.5)
         for place, (x, y) in zip(events.places, at, strict=True):
@@ -198,9 +253,19 @@ def draw(path: Path, logs: Sequence[Path], runs: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("logs", nargs="*", type=Path, metavar="LOG")
-    parser.add_argument("--plans", type=Path, metavar="FOLDER", help="floor plans (.xml) to simulate drives in")
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="drives through each plan (default: 5)")
-    parser.add_argument("--out", type=Path, required=True, metavar="JSONL", help="file of rows, to which new ones are added")
+    parser.add_argument(
+        "--plans", type=Path, metavar="FOLDER", help="floor plans (.xml) to simulate drives in"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=5, metavar="N", help="drives through each plan (default: 5)"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="JSONL",
+        help="file of rows, to which new ones are added",
+    )
     parser.add_argument(
         "--runs",
         type=Path,
@@ -208,13 +273,29 @@ def main() -> None:
         metavar="FOLDER",
         help="where map writes a folder for each log, or has written it (default: runs)",
     )
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS, help="which mappers (default: all)")
-    parser.add_argument("--figure", type=Path, help="draw the logs that are given, their skeletons and maps, into this file")
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        choices=METHODS,
+        default=METHODS,
+        help="which mappers (default: all)",
+    )
+    parser.add_argument(
+        "--figure",
+        type=Path,
+        help="draw the logs that are given, their skeletons and maps, into this file",
+    )
     parser.add_argument("--page", type=Path, help="write the tables into this page, too")
     options = parser.parse_args()
-    rows = [json.loads(line) for line in options.out.read_text().splitlines()] if options.out.exists() else []
+    rows = (
+        [json.loads(line) for line in options.out.read_text().splitlines()]
+        if options.out.exists()
+        else []
+    )
     known = {(row["log"], row["method"]) for row in rows}
-    for log in chain(options.logs, driven(options.plans, options.seeds, options.runs) if options.plans else ()):
+    for log in chain(
+        options.logs, driven(options.plans, options.seeds, options.runs) if options.plans else ()
+    ):
         wanted = [method for method in options.methods if (name_of(log), method) not in known]
         truth = truth_of(log, sidecar(log)) if wanted else None
         for method in wanted:
@@ -224,13 +305,22 @@ def main() -> None:
                 print(json.dumps(rows[-1]), file=file)
     if options.figure:
         draw(options.figure, options.logs, options.runs)
-    real = sorted((row for row in rows if not row["simulated"]), key=lambda row: (row["log"], METHODS.index(row["method"])))
-    print_rows([*HEAD, *(line for row in real for line in lines_of(row))], options.page, r"\| log \| mapper")
+    real = sorted(
+        (row for row in rows if not row["simulated"]),
+        key=lambda row: (row["log"], METHODS.index(row["method"])),
+    )
+    print_rows(
+        [*HEAD, *(line for row in real for line in lines_of(row))],
+        options.page,
+        r"\| log \| mapper",
+    )
     simulated = [row for row in rows if row["simulated"]]
     if simulated:
         by_method = [[row for row in simulated if row["method"] == method] for method in METHODS]
         print_rows(
-            [*SIMULATED, *(simulated_line(rows[0]["method"], rows) for rows in by_method if rows)], options.page, r"\| mapper \| logs"
+            [*SIMULATED, *(simulated_line(rows[0]["method"], rows) for rows in by_method if rows)],
+            options.page,
+            r"\| mapper \| logs",
         )
 
 

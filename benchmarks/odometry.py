@@ -34,8 +34,14 @@ def fixed_points(trace: Trace) -> list[Pose]:
         positions[step.truth["place"]].append(step.truth["pose"][:2])
         headings[step.truth["dstate"]].append(step.truth["pose"][2])
     middle = {place: np.mean(found, axis=0) for place, found in positions.items()}
-    ahead = {dstate: math.atan2(np.mean(np.sin(found)), np.mean(np.cos(found))) for dstate, found in headings.items()}
-    return [(*map(float, middle[step.truth["place"]]), ahead[step.truth["dstate"]]) for step in trace.steps]
+    ahead = {
+        dstate: math.atan2(np.mean(np.sin(found)), np.mean(np.cos(found)))
+        for dstate, found in headings.items()
+    }
+    return [
+        (*map(float, middle[step.truth["place"]]), ahead[step.truth["dstate"]])
+        for step in trace.steps
+    ]
 
 
 def errors(trace: Trace, poses: Sequence[Pose], kind: str) -> list[NDArray[np.float64]]:
@@ -52,20 +58,39 @@ def errors(trace: Trace, poses: Sequence[Pose], kind: str) -> list[NDArray[np.fl
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--seeds", type=int, default=4, metavar="N", help="drives through each world (default 4)")
-    parser.add_argument("--tours", type=int, default=10, metavar="N", help="tours of each drive (default 10)")
-    parser.add_argument("--worlds", nargs="+", default=["notched-rectangle", "taylor-hall"], metavar="NAME", help="which worlds")
+    parser.add_argument(
+        "--seeds", type=int, default=4, metavar="N", help="drives through each world (default 4)"
+    )
+    parser.add_argument(
+        "--tours", type=int, default=10, metavar="N", help="tours of each drive (default 10)"
+    )
+    parser.add_argument(
+        "--worlds",
+        nargs="+",
+        default=["notched-rectangle", "taylor-hall"],
+        metavar="NAME",
+        help="which worlds",
+    )
     options = parser.parse_args()
     print(
         "| world | action | against | displacements | mean: ahead, left, heading | mean square: ahead, left, heading |\n|---|---|---|---|---|---|"
     )
     for world in options.worlds:
-        traces = [simulate(World.named(world), options.tours, seed) for seed in range(options.seeds)]
+        traces = [
+            simulate(World.named(world), options.tours, seed) for seed in range(options.seeds)
+        ]
         for kind in ("travel", "turn"):
             for name, poses in (("true poses", true_poses), ("fixed points", fixed_points)):
-                found = np.array([error for trace in traces for error in errors(trace, poses(trace), kind)])
-                mean, square = (", ".join(f"{v:.2f}" for v in values) for values in (found.mean(0), (found**2).mean(0)))
-                print(f"| {world} | {kind} | {name} | {len(found)} | {mean} | {square} |", flush=True)
+                found = np.array(
+                    [error for trace in traces for error in errors(trace, poses(trace), kind)]
+                )
+                mean, square = (
+                    ", ".join(f"{v:.2f}" for v in values)
+                    for values in (found.mean(0), (found**2).mean(0))
+                )
+                print(
+                    f"| {world} | {kind} | {name} | {len(found)} | {mean} | {square} |", flush=True
+                )
 
 
 if __name__ == "__main__":

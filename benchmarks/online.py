@@ -25,7 +25,16 @@ from ssh_abduction.solver import Status
 CHECKPOINTS = (10, 20, 30, 40, 60, 100, 300, 1000, 4000)
 ANEW = 20.0  # seconds
 NOISE = {
-    "tight": Odometry(along=0.05, across=0.005, heading=0.002, turning=0.0, position=0.0, angle=0.0, scale=0.0, bend=0.0),
+    "tight": Odometry(
+        along=0.05,
+        across=0.005,
+        heading=0.002,
+        turning=0.0,
+        position=0.0,
+        angle=0.0,
+        scale=0.0,
+        bend=0.0,
+    ),
     "usual": Odometry(),
 }
 
@@ -45,10 +54,19 @@ def main() -> None:
     parser.add_argument("--anew", type=float, default=ANEW)
     options = parser.parse_args()
     odometry = NOISE.get(options.odometry)
-    walk = maze(options.size, options.size, steps=options.steps, seed=options.seed, stars=True, odometry=odometry)
+    walk = maze(
+        options.size,
+        options.size,
+        steps=options.steps,
+        seed=options.seed,
+        stars=True,
+        odometry=odometry,
+    )
     trace = walk.trace
     first, *rest = trace.steps
-    mapper = OnlineMapper(first.view or "", star=first.star, odometry=odometry, time_limit=options.limit)
+    mapper = OnlineMapper(
+        first.view or "", star=first.star, odometry=odometry, time_limit=options.limit
+    )
     number: dict[object, int] = {}
     truth = tuple(number.setdefault(state, len(number)) for state in walk.truth)
     seconds: list[float] = []
@@ -60,7 +78,9 @@ def main() -> None:
     for action, step in zip(trace.actions, rest, strict=True):
         time.sleep(options.drive)
         began = time.perf_counter()
-        solution = mapper.observe(action, step.view or "", star=step.star, displacement=step.displacement)
+        solution = mapper.observe(
+            action, step.view or "", star=step.star, displacement=step.displacement
+        )
         seconds.append(time.perf_counter() - began)
         optimal += solution.status is Status.OPTIMAL
         complete += solution.complete
@@ -68,7 +88,11 @@ def main() -> None:
         visited = len(set(walk.truth[: solution.steps]))
         sizes.append(solution.cost.dstates / visited if solution.cost else 0.0)
         if solution.steps in CHECKPOINTS:
-            anew = solve(trace.prefix(solution.steps), time_limit=options.anew).seconds.total if options.anew else 0.0
+            anew = (
+                solve(trace.prefix(solution.steps), time_limit=options.anew).seconds.total
+                if options.anew
+                else 0.0
+            )
             dstates = solution.cost.dstates if solution.cost else 0
             print(
                 f"{solution.steps:6} {solution.status.value:10} {dstates:8} {solution.bound.dstates or 0:6} {visited:8} {solution.count:5} "

@@ -38,14 +38,19 @@ from perception.appearance import PanoramaTransformer
 from perception.errors import ImageWarning, PerceptionError
 from perception.images import images_of
 from perception.quality import uncertainty_coefficient
-from perception.recognition import PlaceRecognizer
+from perception.recognition import PlaceRecogniser
 from perception.views import ViewClusterer
 from simulator.panorama import Camera, Paint
 from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation.paper.claims import VIEWS_ALONE, one_to_one, true_dstates
-from ssh_abduction.learning.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning
+from ssh_abduction.learning.learner import (
+    AmbiguousMapWarning,
+    BootstrapLearner,
+    LearnerError,
+    RunnerUpWarning,
+)
 
 Pixels = NDArray[np.float64]
 SECONDS, MOST_VIEWS = 2.0, 24
@@ -61,8 +66,19 @@ def world(name: str) -> World:
     if name != "maze":
         return World.named(name.lower().replace(" ", "-"))
     graph = nx.Graph()
-    graph.add_nodes_from(((x, y), {"at": complex(5 * x, 5 * y)}) for x in range(3) for y in range(2))
-    graph.add_edges_from([((0, 0), (1, 0)), ((1, 0), (2, 0)), ((2, 0), (2, 1)), ((2, 1), (1, 1)), ((1, 1), (1, 0)), ((0, 1), (1, 1))])
+    graph.add_nodes_from(
+        ((x, y), {"at": complex(5 * x, 5 * y)}) for x in range(3) for y in range(2)
+    )
+    graph.add_edges_from(
+        [
+            ((0, 0), (1, 0)),
+            ((1, 0), (2, 0)),
+            ((2, 0), (2, 1)),
+            ((2, 1), (1, 1)),
+            ((1, 1), (1, 0)),
+            ((0, 1), (1, 1)),
+        ]
+    )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "maze.json"
         path.write_text(json.dumps(streets.drawn(graph, 0.8, ((0, 0), (1, 0)), name="maze")))
@@ -79,7 +95,10 @@ def of_each_image(pixels: Pixels) -> Pixels:
 def gradients(pixels: Pixels) -> Pixels:
     """Histograms of oriented gradients (Dalal and Triggs 2005) of grey panoramas: of 8 directions, in cells of 6 x 12 pixels, each normalised."""
     grey = pixels.reshape(-1, 24, 180, 3).mean(axis=3)
-    up, along = np.gradient(grey, axis=1), (np.roll(grey, -1, axis=2) - np.roll(grey, 1, axis=2)) / 2
+    up, along = (
+        np.gradient(grey, axis=1),
+        (np.roll(grey, -1, axis=2) - np.roll(grey, 1, axis=2)) / 2,
+    )
     strength, direction = np.hypot(along, up), np.arctan2(up, along) / np.pi * 4 % 8
     low, share = np.floor(direction).astype(int) % 8, direction % 1
     histograms = sum(
@@ -169,28 +188,42 @@ def drives(name: str, light: str, texture: str, seed: int) -> tuple[Trace, Trace
     """A drive to learn from, and one to be asked for."""
     camera = Camera(paint=Paint(seed, TEXTURES[texture]))
     first, second = (replace(camera, hours=hours) for hours in LIGHTS[light])
-    return simulate(world(name), TOURS[name], seed, camera=first), simulate(world(name), 1, 10_000 + seed, camera=second)
+    return simulate(world(name), TOURS[name], seed, camera=first), simulate(
+        world(name), 1, 10_000 + seed, camera=second
+    )
 
 
 def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
     truth, asked_truth = true_dstates(learnt), true_dstates(asked)
     made = Rotated(FEATURES[features])
     learner = BootstrapLearner(
-        VIEWS_ALONE, ViewClusterer(k_max=MOST_VIEWS, clusterer=CLUSTERERS[clusterer], random_state=0), time_limit=SECONDS, features=made
+        VIEWS_ALONE,
+        ViewClusterer(k_max=MOST_VIEWS, clusterer=CLUSTERERS[clusterer], random_state=0),
+        time_limit=SECONDS,
+        features=made,
     )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with suppress(LearnerError, PerceptionError):
             learner.fit(learnt)
     said = not hasattr(learner, "labels_") or any(issubclass(w.category, DOUBTS) for w in caught)
-    doubted = any(w.category is ImageWarning or "give another map" in str(w.message) for w in caught)
+    doubted = any(
+        w.category is ImageWarning or "give another map" in str(w.message) for w in caught
+    )
     views, first = learner.views_, learner.features_.transform(images_of(learnt))
     second = learner.features_.transform(images_of(asked))
     mapped = by_map = 0.0
     if hasattr(learner, "labels_"):
         mapped = one_to_one(learner.labels_, truth)
         names = named(learner.labels_, truth)
-        by_map = float(np.mean([names.get(label) == name for label, name in zip(learner.predict(asked), asked_truth, strict=True)]))
+        by_map = float(
+            np.mean(
+                [
+                    names.get(label) == name
+                    for label, name in zip(learner.predict(asked), asked_truth, strict=True)
+                ]
+            )
+        )
     return Found(
         k=learner.clusterer_.k_,
         quality=learner.clusterer_.quality_[learner.clusterer_.k_],
@@ -199,7 +232,9 @@ def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
         right=bool(mapped),
         said=said,
         doubted=doubted,
-        recognised=float(np.mean(PlaceRecognizer().fit(first, truth).predict(second) == asked_truth)),
+        recognised=float(
+            np.mean(PlaceRecogniser().fit(first, truth).predict(second) == asked_truth)
+        ),
         by_map=by_map,
     )
 
@@ -207,8 +242,13 @@ def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
 def named(labels: NDArray[np.intp], truth: NDArray[Any]) -> dict[int, str]:
     """The true dstate of each label, one to one, so that most labels are right."""
     of_label, of_name = np.unique(labels), np.unique(truth)
-    counts = np.array([[np.sum((labels == label) & (truth == name)) for name in of_name] for label in of_label])
-    return {int(of_label[i]): str(of_name[j]) for i, j in zip(*linear_sum_assignment(-counts), strict=True)}
+    counts = np.array(
+        [[np.sum((labels == label) & (truth == name)) for name in of_name] for label in of_label]
+    )
+    return {
+        int(of_label[i]): str(of_name[j])
+        for i, j in zip(*linear_sum_assignment(-counts), strict=True)
+    }
 
 
 def measured(job: tuple[str, str, str, int], pairs: list[tuple[str, str]]) -> list[Found]:
@@ -243,22 +283,38 @@ HEAD = "k by M | M | U | views by dstates | map right | wrong, and nothing said 
 def tables(seeds: list[int], workers: int) -> Iterator[tuple[str, str]]:
     """The names of tables, and their lines: features in all worlds, then clusterings over a day."""
     by_k_means = [(features, "k-means") for features in FEATURES]
-    others = [("PanoramaTransformer", clusterer) for clusterer in CLUSTERERS if clusterer != "k-means"]
-    others += [("raw pixels", clusterer) for clusterer in ("agglomerative, average", "HDBSCAN, 3 or more")]
+    others = [
+        ("PanoramaTransformer", clusterer) for clusterer in CLUSTERERS if clusterer != "k-means"
+    ]
+    others += [
+        ("raw pixels", clusterer) for clusterer in ("agglomerative, average", "HDBSCAN, 3 or more")
+    ]
     rows: dict[tuple[str, str], list[Found]] = {}
-    yield "features", f"| world | light | textures | features | {HEAD} |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+    yield (
+        "features",
+        f"| world | light | textures | features | {HEAD} |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+    )
     with ProcessPoolExecutor(workers) as pool:
-        for group in [(name, light, texture) for name in TOURS for light in LIGHTS for texture in TEXTURES]:
+        for group in [
+            (name, light, texture) for name in TOURS for light in LIGHTS for texture in TEXTURES
+        ]:
             pairs = by_k_means + (others if group[1] == "a day" else [])
-            results = list(pool.map(partial(measured, pairs=pairs), [(*group, seed) for seed in seeds]))
+            results = list(
+                pool.map(partial(measured, pairs=pairs), [(*group, seed) for seed in seeds])
+            )
             for i, pair in enumerate(pairs):
                 of_pair = [result[i] for result in results]
                 if group[1] == "a day":
                     rows.setdefault(pair, []).extend(of_pair)
                 if pair in by_k_means:
                     yield "features", f"| {' | '.join(group)} | {pair[0]} | {cells(of_pair)} |"
-    yield "clusterings", f"| features | clustering | {HEAD} |\n|---|---|---|---|---|---|---|---|---|---|---|"
-    for pair in sorted(rows, key=lambda pair: (list(FEATURES).index(pair[0]), list(CLUSTERERS).index(pair[1]))):
+    yield (
+        "clusterings",
+        f"| features | clustering | {HEAD} |\n|---|---|---|---|---|---|---|---|---|---|---|",
+    )
+    for pair in sorted(
+        rows, key=lambda pair: (list(FEATURES).index(pair[0]), list(CLUSTERERS).index(pair[1]))
+    ):
         if pair[0] in ("raw pixels", "PanoramaTransformer"):
             yield "clusterings", f"| {' | '.join(pair)} | {cells(rows[pair])} |"
 
@@ -283,7 +339,10 @@ def figure(path: Path, seed: int = 1) -> None:
     ]
     _, axes = plt.subplots(4, 2, figsize=(9, 3.6))
     for ax, (title, place, pose, repeated, hour) in zip(axes.flat, shots, strict=True):
-        ax.imshow(Camera(paint=Paint(seed, repeated)).shot(place, pose, rng, hour), interpolation="nearest")
+        ax.imshow(
+            Camera(paint=Paint(seed, repeated)).shot(place, pose, rng, hour),
+            interpolation="nearest",
+        )
         ax.set_title(title, fontsize=7, pad=2)
         ax.axis("off")
     plt.tight_layout(pad=0.4)

@@ -70,12 +70,18 @@ class Words:
 
     def __init__(self, trace: Trace) -> None:
         self.views = list(dict.fromkeys(trace.views))
-        self.actions = {name: str(i) for i, name in enumerate(dict.fromkeys(a.name for a in trace.actions))}
+        self.actions = {
+            name: str(i) for i, name in enumerate(dict.fromkeys(a.name for a in trace.actions))
+        }
         bits = max(1, (len(self.views) - 1).bit_length())
         self.questions = [str(len(self.actions) + i) for i in range(bits - 1)]
         self._numbers = [self.views.index(view) for view in trace.views]
         self._done = [self.actions[a.name] for a in trace.actions]
-        self.all_done_by = max(self._done.index(letter) for letter in self.actions.values()) + 2 if self._done else 1
+        self.all_done_by = (
+            max(self._done.index(letter) for letter in self.actions.values()) + 2
+            if self._done
+            else 1
+        )
 
     def __len__(self) -> int:
         """How many steps the trace has."""
@@ -88,11 +94,18 @@ class Words:
         for i, letter in enumerate(self.questions, 1):
             yield [*done, letter], bool(number >> i & 1)
 
-    def machine(self, start: Any, follow: Callable[[Any, str], Any], accepts: Callable[[Any], bool]) -> Machine:
+    def machine(
+        self, start: Any, follow: Callable[[Any, str], Any], accepts: Callable[[Any], bool]
+    ) -> Machine:
         """The Moore machine that a DFA over these letters is."""
 
         def shows(state: Any) -> Any:
-            number = sum(accepts(s) << i for i, s in enumerate([state, *(follow(state, letter) for letter in self.questions)]))
+            number = sum(
+                accepts(s) << i
+                for i, s in enumerate(
+                    [state, *(follow(state, letter) for letter in self.questions)]
+                )
+            )
             return self.views[number] if number < len(self.views) else None
 
         return Machine(start, lambda state, action: follow(state, self.actions[action]), shows)
@@ -102,7 +115,10 @@ def plain(trace: Trace) -> Machine:
     """plain.lp in clingo, with more and more states, from as many as there are views: the first machine is the smallest."""
     import clingo
 
-    views, actions = list(dict.fromkeys(trace.views)), list(dict.fromkeys(a.name for a in trace.actions))
+    views, actions = (
+        list(dict.fromkeys(trace.views)),
+        list(dict.fromkeys(a.name for a in trace.actions)),
+    )
     facts = [f"view({t},{views.index(view)})." for t, view in enumerate(trace.views)]
     facts += [f"act({t},{actions.index(action.name)})." for t, action in enumerate(trace.actions)]
     for k in count(len(views)):
@@ -112,7 +128,10 @@ def plain(trace: Trace) -> Machine:
         control.ground()
         with control.solve(yield_=True) as handle:
             if model := handle.model():
-                found = [(atom.name, [x.number for x in atom.arguments]) for atom in model.symbols(shown=True)]
+                found = [
+                    (atom.name, [x.number for x in atom.arguments])
+                    for atom in model.symbols(shown=True)
+                ]
                 break
     shows = {s: views[v] for name, (s, v, *_) in found if name == "shows"}
     leads = {(args[0], actions[args[1]]): args[2] for name, args in found if name == "leads"}
@@ -139,7 +158,11 @@ def dfainductor(trace: Trace) -> Machine:
             pass
 
         def _written(self, steps: Iterator[int] | range) -> list[str]:
-            return [f"{accepted:d} {len(word)} {' '.join(word)}" for t in steps for word, accepted in words.at(t)]
+            return [
+                f"{accepted:d} {len(word)} {' '.join(word)}"
+                for t in steps
+                for word, accepted in words.at(t)
+            ]
 
         def get_init_examples(self) -> list[str]:
             return self._written(range(min(len(words), max(100, words.all_done_by))))
@@ -161,11 +184,23 @@ def dfainductor(trace: Trace) -> Machine:
         _counter_examples_size = _init_examples_size
 
     def moore(dfa: DFA) -> Machine:
-        return words.machine(dfa.get_start(), lambda state, letter: state.get_child(letter), lambda state: state.is_accepting())
+        return words.machine(
+            dfa.get_start(),
+            lambda state, letter: state.get_child(letter),
+            lambda state: state.is_accepting(),
+        )
 
     examples = Examples()
     apta = APTA(examples.get_init_examples())
-    search = LSUS(apta, InconsistencyGraph(apta, is_empty=True), "cadical153", "BFS", "lin-abs", examples, "none")
+    search = LSUS(
+        apta,
+        InconsistencyGraph(apta, is_empty=True),
+        "cadical153",
+        "BFS",
+        "lin-abs",
+        examples,
+        "none",
+    )
     return moore(search.search(len(words.views), len(words)))
 
 
@@ -179,7 +214,9 @@ def z3gi(trace: Trace) -> Machine:
     from z3gi.sample import Sample
 
     words = Words(trace)
-    sys.setrecursionlimit(max(sys.getrecursionlimit(), 10 * len(words)))  # it reads a word letter by letter, each in a call of its own
+    sys.setrecursionlimit(
+        max(sys.getrecursionlimit(), 10 * len(words))
+    )  # it reads a word letter by letter, each in a call of its own
     encoder = expressive.Encoder(quantifiers=False)
     sample = Sample(encoder)
     for t in range(len(words)):
@@ -203,28 +240,47 @@ def rpni(trace: Trace) -> Machine:
     from aalpy.learning_algs import run_RPNI
 
     done = tuple(action.name for action in trace.actions)
-    return _of_aalpy(run_RPNI([(done[:t], view) for t, view in enumerate(trace.views)], "moore", print_info=False))
+    return _of_aalpy(
+        run_RPNI(
+            [(done[:t], view) for t, view in enumerate(trace.views)], "moore", print_info=False
+        )
+    )
 
 
 def gsm(trace: Trace) -> Machine:
     """AALpy's general state merging, by evidence: the merge that joins most comes first. The machine explains the trace, but need not be the smallest."""
     from aalpy.learning_algs import run_GSM
     from aalpy.learning_algs.general_passive.GsmNode import GsmNode
-    from aalpy.learning_algs.general_passive.ScoreFunctionsGSM import EDSM_score, SimpleScoreCalculation
+    from aalpy.learning_algs.general_passive.ScoreFunctionsGSM import (
+        EDSM_score,
+        SimpleScoreCalculation,
+    )
 
-    walk = [trace.views[0], *((action.name, view) for action, view in zip(trace.actions, trace.views[1:], strict=True))]
+    walk = [
+        trace.views[0],
+        *((action.name, view) for action, view in zip(trace.actions, trace.views[1:], strict=True)),
+    ]
     score = SimpleScoreCalculation(GsmNode.deterministic_compatible, EDSM_score())
     with warnings.catch_warnings(action="ignore"):  # that not all actions were tried in all states
         return _of_aalpy(run_GSM([walk], score_calc=score, data_format="io_traces"))
 
 
 def _of_aalpy(machine: Any) -> Machine:
-    return Machine(machine.initial_state, lambda state, action: state.transitions[action], lambda state: state.output)
+    return Machine(
+        machine.initial_state,
+        lambda state, action: state.transitions[action],
+        lambda state: state.output,
+    )
 
 
 PEERS = {
     "plain.lp": Peer(plain, ("clingo",), ("clingo",), proves=True),
-    "dfainductor": Peer(dfainductor, ("dfainductor.algorithms.searchers",), ("dfainductor", "python-sat"), proves=True),
+    "dfainductor": Peer(
+        dfainductor,
+        ("dfainductor.algorithms.searchers",),
+        ("dfainductor", "python-sat"),
+        proves=True,
+    ),
     "z3gi": Peer(z3gi, ("z3gi.sample",), ("z3gi", "z3-solver"), proves=True),
     "RPNI": Peer(rpni, ("aalpy.learning_algs",), ("aalpy",), proves=False),
     "GSM": Peer(gsm, ("aalpy.learning_algs",), ("aalpy",), proves=False),

@@ -47,32 +47,43 @@ def world(at: dict[object, complex], streets: list[tuple[object, object]]) -> nx
 
 def triangle() -> nx.Graph:
     """Three places with corners of 60 degrees."""
-    return world({k: cmath.rect(1, math.radians(120 * k)) for k in range(3)}, [(0, 1), (1, 2), (2, 0)])
+    return world(
+        {k: cmath.rect(1, math.radians(120 * k)) for k in range(3)}, [(0, 1), (1, 2), (2, 0)]
+    )
 
 
 def hexagon() -> nx.Graph:
     """Six places with bends of 120 degrees."""
-    return world({k: cmath.rect(1, math.radians(60 * k)) for k in range(6)}, [(k, (k + 1) % 6) for k in range(6)])
+    return world(
+        {k: cmath.rect(1, math.radians(60 * k)) for k in range(6)},
+        [(k, (k + 1) % 6) for k in range(6)],
+    )
 
 
 def honeycomb(rows: int, columns: int) -> nx.Graph:
     """Junctions of three streets, 120 degrees from each other."""
     graph = nx.hexagonal_lattice_graph(rows, columns)
-    nx.set_node_attributes(graph, {node: complex(*pos) for node, pos in graph.nodes(data="pos")}, "at")
+    nx.set_node_attributes(
+        graph, {node: complex(*pos) for node, pos in graph.nodes(data="pos")}, "at"
+    )
     return graph
 
 
 def triangles(rows: int, columns: int) -> nx.Graph:
     """A lattice of triangles: junctions of up to six streets, 60 degrees from each other."""
     graph = nx.triangular_lattice_graph(rows, columns)
-    nx.set_node_attributes(graph, {node: complex(*pos) for node, pos in graph.nodes(data="pos")}, "at")
+    nx.set_node_attributes(
+        graph, {node: complex(*pos) for node, pos in graph.nodes(data="pos")}, "at"
+    )
     return graph
 
 
 def wheel(spokes: int) -> nx.Graph:
     """A hub with so many spokes, and a ring road around it."""
     rim = {k: cmath.rect(1, 2 * math.pi * k / spokes) for k in range(spokes)}
-    return world({"hub": 0j, **rim}, [("hub", k) for k in rim] + [(k, (k + 1) % spokes) for k in rim])
+    return world(
+        {"hub": 0j, **rim}, [("hub", k) for k in rim] + [(k, (k + 1) % spokes) for k in rim]
+    )
 
 
 def junction(*directions: float) -> nx.Graph:
@@ -87,7 +98,11 @@ def scattered(places: int, rng: random.Random) -> nx.Graph:
 
     while True:
         points = [complex(rng.random(), rng.random()) for _ in range(places)]
-        edges = {frozenset(map(int, (s[i], s[i - 1]))) for s in Delaunay([(z.real, z.imag) for z in points]).simplices for i in range(3)}
+        edges = {
+            frozenset(map(int, (s[i], s[i - 1])))
+            for s in Delaunay([(z.real, z.imag) for z in points]).simplices
+            for i in range(3)
+        }
         graph: nx.Graph = nx.Graph()
         graph.add_nodes_from((k, {"at": z}) for k, z in enumerate(points))
         for a, b in rng.sample(sorted(map(sorted, edges)), len(edges)):
@@ -118,7 +133,13 @@ def _direction(graph: nx.Graph, here: object, there: object) -> float:
 def _aligned(graph: nx.Graph, place: object, facing: float) -> float:
     """The direction of a robot that has come to a place, and turns to the street that goes straight on, if there is one."""
     return next(
-        (way for there in graph[place] if abs(((way := _direction(graph, place, there)) - facing + 180) % 360 - 180) <= STRAIGHT), facing
+        (
+            way
+            for there in graph[place]
+            if abs(((way := _direction(graph, place, there)) - facing + 180) % 360 - 180)
+            <= STRAIGHT
+        ),
+        facing,
     )
 
 
@@ -151,9 +172,18 @@ def drive(
         for bearing in bearings:
             off = bearing + rng.uniform(-noise, noise)
             hidden = unseen and 100 < bearing < 260
-            seen.append({"bearing": round(off, 2) % 360, "open": None} if hidden else round(off, 2) % 360)
+            seen.append(
+                {"bearing": round(off, 2) % 360, "open": None} if hidden else round(off, 2) % 360
+            )
         stars.append(seen)
-        views.append(" ".join([*map(str, sorted(round(b / 10) % 36 for b in bearings)), *([f"at {here}"] if here in landmarks else [])]))
+        views.append(
+            " ".join(
+                [
+                    *map(str, sorted(round(b / 10) % 36 for b in bearings)),
+                    *([f"at {here}"] if here in landmarks else []),
+                ]
+            )
+        )
         truth.append((here, round(facing / 5) % 72))
 
     look()
@@ -180,7 +210,11 @@ def drive(
             beside = [b for b in others if STRAIGHT < b < 360 - STRAIGHT]
             order = beside if side == "right" else beside[::-1]
             number = 1 + min(range(len(order)), key=lambda k: abs(order[k] - turn))
-            actions.append(Action.of({"name": f"{side} {number}", "kind": "turn", "turn": side, "gateway": number}))
+            actions.append(
+                Action.of(
+                    {"name": f"{side} {number}", "kind": "turn", "turn": side, "gateway": number}
+                )
+            )
         facing = _direction(graph, here, ahead)
         look()
     return Tour(Trace.from_steps(views, actions, stars=stars), tuple(truth))

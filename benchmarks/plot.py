@@ -64,19 +64,45 @@ def draw(results: dict[str, Any], picture: Path) -> None:
         for pattern, line in families.values():
             for level, (tool, (colour, marker, _)) in enumerate(STYLES.items(), 1):
                 points = sorted(curve(results, pattern, tool, size))
-                heights = [seconds if seconds < math.inf else limit * STEP_UP**level for _, seconds in points]
-                axis.plot([x for x, _ in points], heights, line, color=colour, alpha=0.6, linewidth=1.2)
+                heights = [
+                    seconds if seconds < math.inf else limit * STEP_UP**level
+                    for _, seconds in points
+                ]
+                axis.plot(
+                    [x for x, _ in points], heights, line, color=colour, alpha=0.6, linewidth=1.2
+                )
                 for (x, seconds), y in zip(points, heights, strict=True):
-                    axis.plot(x, y, marker, color=colour, markersize=6, fillstyle="full" if seconds < math.inf else "none")
+                    axis.plot(
+                        x,
+                        y,
+                        marker,
+                        color=colour,
+                        markersize=6,
+                        fillstyle="full" if seconds < math.inf else "none",
+                    )
         axis.axhspan(limit, top, color="0.93", zorder=0)
-        axis.text(0.01, 0.985, f"not solved in {limit:g} s", transform=axis.transAxes, va="top", fontsize=9, color="0.35")
+        axis.text(
+            0.01,
+            0.985,
+            f"not solved in {limit:g} s",
+            transform=axis.transAxes,
+            va="top",
+            fontsize=9,
+            color="0.35",
+        )
         axis.set(xscale="log", yscale="log", xlabel=label, ylim=(None, top))
         axis.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
         axis.grid(alpha=0.3)
-        kinds = [Line2D([], [], color="0.3", linestyle=line, label=name) for name, (_, line) in families.items()]
+        kinds = [
+            Line2D([], [], color="0.3", linestyle=line, label=name)
+            for name, (_, line) in families.items()
+        ]
         axis.legend(handles=kinds, loc="lower right", fontsize=9)
     axes[0].set_ylabel("seconds")
-    tools = [Line2D([], [], color=colour, marker=marker, linestyle="", label=name) for colour, marker, name in STYLES.values()]
+    tools = [
+        Line2D([], [], color=colour, marker=marker, linestyle="", label=name)
+        for colour, marker, name in STYLES.values()
+    ]
     figure.legend(handles=tools, loc="outside upper center", ncols=len(tools), frameon=False)
     figure.savefig(picture, dpi=110, metadata={"Software": None})
     plt.close(figure)
@@ -91,7 +117,12 @@ def curve(results: dict[str, Any], pattern: str, tool: str, size: str) -> list[t
             proven = [cell["dstates"] for cell in cells if cell.get("proven")]
             states = proven or [cell["true_dstates"] for cell in cells if cell.get("true_dstates")]
             images = [cell["images"] for cell in cells if cell.get("images")]
-            points.append((statistics.median(images if size == "images" else states), median_seconds(by_tool[tool])))
+            points.append(
+                (
+                    statistics.median(images if size == "images" else states),
+                    median_seconds(by_tool[tool]),
+                )
+            )
     return points
 
 

@@ -59,14 +59,21 @@ QUICK_MAZE, MAZE, CORRIDORS, MACHINE, MACHINE_16 = (
     "moore 20/2 n=800",
     "moore 16/2 n=1600",
 )
-BLOCK, SMALL_BLOCK, LARGE_BLOCK = "circuits 60x40, 4 rounds", "full circuits 5x3, 50 rounds", "full circuits 6x4, 20 rounds"
+BLOCK, SMALL_BLOCK, LARGE_BLOCK = (
+    "circuits 60x40, 4 rounds",
+    "full circuits 5x3, 50 rounds",
+    "full circuits 6x4, 20 rounds",
+)
 STARS, STAR_CORRIDORS, FEW_SEEN, TAYLOR = (
     "full maze 4x4 n=800",
     "full maze 5x5 n=600, corridors followed",
     "full maze 8x8 n=150",
     "full taylor-hall",
 )
-BARE_CORRIDORS, PATTERNS = "full maze 4x4 n=40, corridors followed, no stars", "full maze 3x3 n=60, stars as patterns"
+BARE_CORRIDORS, PATTERNS = (
+    "full maze 4x4 n=40, corridors followed, no stars",
+    "full maze 3x3 n=60, stars as patterns",
+)
 LONG = ("maze 4x4 n=10000", "maze 5x5 n=10000, corridors followed", "moore 16/2 n=10000")
 
 
@@ -99,7 +106,12 @@ TRIALS = (
     *_timed("prefixes", SMALL_BLOCK, BLOCK, TAYLOR),
     *_timed("path_names", SMALL_BLOCK, LARGE_BLOCK, BARE_CORRIDORS, PATTERNS),
     *_timed("framing", BARE.name, limit=2 * LIMIT),
-    *_ended("framing", "full maze 4x4 n=800, no stars", "full maze 5x5 n=1600, no stars", limit=2 * LIMIT),
+    *_ended(
+        "framing",
+        "full maze 4x4 n=800, no stars",
+        "full maze 5x5 n=1600, no stars",
+        limit=2 * LIMIT,
+    ),
     *_timed("annealed", QUICK_MAZE),
     *_ended("annealed", "maze 6x6 n=1600", "full maze 10x10 n=400", limit=2 * LIMIT),
     *_ended("annealed", "maze 6x6 n=10000", limit=LONGER),
@@ -111,7 +123,9 @@ TRIALS = (
     *_ended("processes", "full maze 10x10 n=400", clock="wall"),
 )
 # What can be run: a speed-up that went keeps its trials above, which say what its row of the page is of.
-SWITCHES = tuple(dict.fromkeys(trial.switch for trial in TRIALS if trial.switch in (*SPEEDUPS, "following")))
+SWITCHES = tuple(
+    dict.fromkeys(trial.switch for trial in TRIALS if trial.switch in (*SPEEDUPS, "following"))
+)
 
 
 def ratio(measure: str, limit: float, base: dict[str, Any], without: dict[str, Any]) -> float:
@@ -119,7 +133,9 @@ def ratio(measure: str, limit: float, base: dict[str, Any], without: dict[str, A
     if measure == "dstates":
         here, there = (cell.get("dstates") or math.inf for cell in (base, without))
         return 1.0 if here == there else there / here
-    here, there = (min(cell["seconds"], limit) if cell["status"] == "ok" else limit for cell in (base, without))
+    here, there = (
+        min(cell["seconds"], limit) if cell["status"] == "ok" else limit for cell in (base, without)
+    )
     return there / here
 
 
@@ -127,12 +143,16 @@ def ratios(results: dict[str, Any]) -> dict[str, dict[Trial, list[float]]]:
     """The ratios of each trial, one a seed, by switch."""
     pairs: dict[tuple[Trial, int], dict[bool, dict[str, Any]]] = {}
     for cell in results["cells"]:
-        trial = Trial(cell["switch"], cell["instance"], cell["measure"], cell["limit"], cell["clock"])
+        trial = Trial(
+            cell["switch"], cell["instance"], cell["measure"], cell["limit"], cell["clock"]
+        )
         pairs.setdefault((trial, cell["seed"]), {})[cell["tool"] == OURS] = cell
     found: dict[str, dict[Trial, list[float]]] = {}
     for (trial, _), pair in pairs.items():
         if len(pair) == 2:
-            found.setdefault(trial.switch, {}).setdefault(trial, []).append(ratio(trial.measure, trial.limit, pair[True], pair[False]))
+            found.setdefault(trial.switch, {}).setdefault(trial, []).append(
+                ratio(trial.measure, trial.limit, pair[True], pair[False])
+            )
     return found
 
 
@@ -145,28 +165,57 @@ def verdict(of_switch: Collection[list[float]]) -> str:
 
 def table(results: dict[str, Any]) -> str:
     """Markdown: a row for each switch."""
-    rows = ["| speed-up | without it, as a ratio to with it: the median over the seeds (least to most) | verdict |", "| -- | -- | -- |"]
+    rows = [
+        "| speed-up | without it, as a ratio to with it: the median over the seeds (least to most) | verdict |",
+        "| -- | -- | -- |",
+    ]
     for switch, trials in ratios(results).items():
-        of_seeds = {trial: "" if len(found) == results["seeds"] else f", {len(found)} seeds" for trial, found in trials.items()}
-        cells = [f"{trial.family}{_meant(trial)}{of_seeds[trial]}: {_spread(found)}" for trial, found in trials.items()]
+        of_seeds = {
+            trial: "" if len(found) == results["seeds"] else f", {len(found)} seeds"
+            for trial, found in trials.items()
+        }
+        cells = [
+            f"{trial.family}{_meant(trial)}{of_seeds[trial]}: {_spread(found)}"
+            for trial, found in trials.items()
+        ]
         rows.append(f"| {switch} | {'<br>'.join(cells)} | {verdict(trials.values())} |")
-    rows += [f"| {switch} |  | not measured yet |" for switch in SWITCHES if switch not in ratios(results)]
+    rows += [
+        f"| {switch} |  | not measured yet |"
+        for switch in SWITCHES
+        if switch not in ratios(results)
+    ]
     return "\n".join(rows)
 
 
 def _meant(trial: Trial) -> str:
     """What is compared, where that is not CPU seconds."""
-    return f", dstates after {trial.limit:g} s" if trial.measure == "dstates" else ", wall-clock" if trial.clock == "wall" else ""
+    return (
+        f", dstates after {trial.limit:g} s"
+        if trial.measure == "dstates"
+        else ", wall-clock"
+        if trial.clock == "wall"
+        else ""
+    )
 
 
 def _spread(found: list[float]) -> str:
-    shown = [f"{number:.2f}" if number < math.inf else "∞" for number in (statistics.median(found), min(found), max(found))]
-    return f"**{shown[0]}** ({shown[1]} to {shown[2]})" if statistics.median(found) >= GAIN else f"{shown[0]} ({shown[1]} to {shown[2]})"
+    shown = [
+        f"{number:.2f}" if number < math.inf else "∞"
+        for number in (statistics.median(found), min(found), max(found))
+    ]
+    return (
+        f"**{shown[0]}** ({shown[1]} to {shown[2]})"
+        if statistics.median(found) >= GAIN
+        else f"{shown[0]} ({shown[1]} to {shown[2]})"
+    )
 
 
 def page(results: dict[str, Any], stored: Path) -> str:
     """What docs/pruning.md says."""
-    on, versions = results["machine"], ", ".join(f"{package} {number}" for package, number in results["packages"].items())
+    on, versions = (
+        results["machine"],
+        ", ".join(f"{package} {number}" for package, number in results["packages"].items()),
+    )
     limits = sorted({cell["limit"] for cell in results["cells"]})
     return f"""# Which speed-ups earn their lines
 
@@ -190,15 +239,26 @@ From [`{stored.relative_to(ROOT).as_posix()}`](../{stored.relative_to(ROOT).as_p
 
 def measure(results: dict[str, Any], trials: Iterable[Trial], seeds: int, out: Path) -> None:
     """Run what is not stored yet."""
-    done = {(c["switch"], c["instance"], c["measure"], c["limit"], c["seed"], c["tool"]) for c in results["cells"]}
+    done = {
+        (c["switch"], c["instance"], c["measure"], c["limit"], c["seed"], c["tool"])
+        for c in results["cells"]
+    }
     for trial in trials:
         for seed in range(seeds):
             tools = [OURS, f"{OURS}{WITHOUT}{trial.switch}"]
             for tool in tools if seed % 2 else tools[::-1]:
                 if (trial.switch, trial.family, trial.measure, trial.limit, seed, tool) not in done:
-                    cell = run(tool, INSTANCES[trial.family], seed, trial.limit, MEMORY, trial.clock)
+                    cell = run(
+                        tool, INSTANCES[trial.family], seed, trial.limit, MEMORY, trial.clock
+                    )
                     results["cells"].append(
-                        {**cell, "switch": trial.switch, "measure": trial.measure, "limit": trial.limit, "clock": trial.clock}
+                        {
+                            **cell,
+                            "switch": trial.switch,
+                            "measure": trial.measure,
+                            "limit": trial.limit,
+                            "clock": trial.clock,
+                        }
                     )
                     store(results, out)
                     came = f"{cell['status']:8} {cell.get('seconds', 0):6.2f} s {cell.get('dstates')} dstates"
@@ -207,14 +267,39 @@ def measure(results: dict[str, Any], trials: Iterable[Trial], seeds: int, out: P
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--only", default=",".join(SWITCHES), metavar="SWITCHES", help="speed-ups, commas between (default all)")
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="traces of each family (default 5)")
-    parser.add_argument("--resume", action="store_true", help="keep what is stored, and run only what is not")
-    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "pruning.json", metavar="RESULTS.json")
-    parser.add_argument("--page", type=Path, metavar="PAGE.md", help="write the page with the table there")
+    parser.add_argument(
+        "--only",
+        default=",".join(SWITCHES),
+        metavar="SWITCHES",
+        help="speed-ups, commas between (default all)",
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=5, metavar="N", help="traces of each family (default 5)"
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="keep what is stored, and run only what is not"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=ROOT / "benchmarks" / "results" / "pruning.json",
+        metavar="RESULTS.json",
+    )
+    parser.add_argument(
+        "--page", type=Path, metavar="PAGE.md", help="write the page with the table there"
+    )
     options = parser.parse_args()
-    results: dict[str, Any] = {"date": datetime.date.today().isoformat(), "limit": LIMIT, "memory": MEMORY, "seeds": options.seeds}
-    results |= {"machine": machine(), "packages": {k: v for k, v in packages().items() if k in (OURS, "clingo")}, "cells": []}
+    results: dict[str, Any] = {
+        "date": datetime.date.today().isoformat(),
+        "limit": LIMIT,
+        "memory": MEMORY,
+        "seeds": options.seeds,
+    }
+    results |= {
+        "machine": machine(),
+        "packages": {k: v for k, v in packages().items() if k in (OURS, "clingo")},
+        "cells": [],
+    }
     out = options.out.resolve()
     if options.resume and out.exists():
         results["cells"] = json.loads(out.read_text(encoding="utf-8"))["cells"]

@@ -19,7 +19,11 @@ from table import times
 
 ROOT = Path(__file__).parent.parent
 PROJECT = "https://github.com/ssh-abduction/ssh-abduction/blob/main"  # links of the README are absolute, as it is shown on PyPI, too
-PAGES = {"few": ROOT / "README.md", "peers": ROOT / "docs" / "performance.md", "ablation": ROOT / "docs" / "performance.md"}
+PAGES = {
+    "few": ROOT / "README.md",
+    "peers": ROOT / "docs" / "performance.md",
+    "ablation": ROOT / "docs" / "performance.md",
+}
 
 # The rows of the README: one that some peers prove sooner, one that nobody proves, and one that only we prove.
 FEW = ("rectangle n=400", "moore 50/2 n=3200", "maze 4x4 n=1600")
@@ -27,13 +31,22 @@ FEW = ("rectangle n=400", "moore 50/2 n=3200", "maze 4x4 n=1600")
 
 def block(name: str, results: dict[str, Any], path: Path) -> str:
     """What stands between the markers of a table: the table, what it was measured on, and where it is stored."""
-    machine, versions = results["machine"], ", ".join(f"{package} {number}" for package, number in results["packages"].items())
+    machine, versions = (
+        results["machine"],
+        ", ".join(f"{package} {number}" for package, number in results["packages"].items()),
+    )
     measured = f"{results['date']}, {machine['cpu']}, {machine['cores']} cores"
     limits = f"{results['limit']:g} s and {results['memory']:,} MiB a cell"
     if name == "few":
-        shown = times({**results, "cells": [cell for cell in results["cells"] if cell["instance"] in FEW]})
+        shown = times(
+            {**results, "cells": [cell for cell in results["cells"] if cell["instance"] in FEW]}
+        )
         return f"{_narrow(shown)}\n\n{measured}; {limits}. From [this run]({PROJECT}/{path.relative_to(ROOT).as_posix()}).\n"
-    seeds = "one trace of each kind" if results["seeds"] == 1 else f"medians over {results['seeds']} traces of each random kind"
+    seeds = (
+        "one trace of each kind"
+        if results["seeds"] == 1
+        else f"medians over {results['seeds']} traces of each random kind"
+    )
     source = os.path.relpath(path, PAGES[name].parent).replace(os.sep, "/")
     return (
         f"{_narrow(times(results))}\n\n"
@@ -48,7 +61,9 @@ def _narrow(table: str) -> str:
 
 def rewritten(page: str, name: str, results: dict[str, Any], path: Path) -> str:
     """The page with the named table of these results."""
-    marked = re.compile(rf"(<!-- bench:begin {name} -->\n).*?(<!-- bench:end {name} -->)", re.DOTALL)
+    marked = re.compile(
+        rf"(<!-- bench:begin {name} -->\n).*?(<!-- bench:end {name} -->)", re.DOTALL
+    )
     return marked.sub(lambda found: found[1] + block(name, results, path) + found[2], page)
 
 
@@ -57,7 +72,9 @@ def main() -> None:
     results = json.loads(path.read_text(encoding="utf-8"))
     for name in sys.argv[2:] or ["few", "peers"]:
         page = PAGES[name]
-        page.write_text(rewritten(page.read_text(encoding="utf-8"), name, results, path), encoding="utf-8")
+        page.write_text(
+            rewritten(page.read_text(encoding="utf-8"), name, results, path), encoding="utf-8"
+        )
 
 
 if __name__ == "__main__":

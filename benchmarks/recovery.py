@@ -22,7 +22,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fault_cases import CAUSAL, MARGIN, TOPOLOGICAL, Case, is_true, rectangle_of_five, sized, star_turned
+from fault_cases import (
+    CAUSAL,
+    MARGIN,
+    TOPOLOGICAL,
+    Case,
+    is_true,
+    rectangle_of_five,
+    sized,
+    star_turned,
+)
 from instances import Walk
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace
@@ -61,7 +70,12 @@ def corridor(seed: int, steps: int = 30) -> Case:
     actions = ["travel", "travel", "travel", "around"] * 2
     truth = [t % 8 for t in range(steps + 1)]
     views = ["abbacbbc"[s] for s in truth]
-    trace = Trace.from_steps(views, [actions[s] for s in truth[:-1]], stars=[openings[s] for s in truth], name=f"corridor, seed {seed}")
+    trace = Trace.from_steps(
+        views,
+        [actions[s] for s in truth[:-1]],
+        stars=[openings[s] for s in truth],
+        name=f"corridor, seed {seed}",
+    )
     wrong = chance.randrange(MARGIN, steps - MARGIN)
     return Case(star_turned(Walk(trace, tuple(truth)), [wrong], chance), misseen=(wrong,))
 
@@ -72,31 +86,63 @@ FAMILIES: dict[str, tuple[Callable[[int], Case], Theory]] = {
     "machine, a jump": (partial(machine, jumps=1), CAUSAL),
     "rectangle of 5 views, a wrong view": (partial(rectangle_of_five, steps=200, wrong=1), CAUSAL),
     "rectangle of 5 views, a jump": (partial(rectangle_of_five, steps=200, jumps=1), CAUSAL),
-    "rectangle of 5 views, a wrong view, slipped 3": (partial(rectangle_of_five, steps=200, wrong=1), DEARER),
-    "rectangle of 5 views, a jump, slipped 3": (partial(rectangle_of_five, steps=200, jumps=1), DEARER),
+    "rectangle of 5 views, a wrong view, slipped 3": (
+        partial(rectangle_of_five, steps=200, wrong=1),
+        DEARER,
+    ),
+    "rectangle of 5 views, a jump, slipped 3": (
+        partial(rectangle_of_five, steps=200, jumps=1),
+        DEARER,
+    ),
     "corridor with stars, a wrong star": (corridor, TOPOLOGICAL.replace(slipped=0)),
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--only", default="", metavar="PATTERN", help="families whose name this regular expression is found in")
-    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="runs of each family (default 20)")
-    parser.add_argument("--first", type=int, default=800, metavar="SEED", help="the first seed (default 800)")
-    parser.add_argument("--limit", type=float, default=0.5, metavar="S", help="seconds a step may take (default 0.5)")
-    parser.add_argument("--drive", type=float, default=0.05, metavar="S", help="seconds the robot drives between two steps (default 0.05)")
-    parser.add_argument("--out", type=Path, metavar="RESULTS.jsonl", help="where to store what came of each run")
+    parser.add_argument(
+        "--only",
+        default="",
+        metavar="PATTERN",
+        help="families whose name this regular expression is found in",
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=20, metavar="N", help="runs of each family (default 20)"
+    )
+    parser.add_argument(
+        "--first", type=int, default=800, metavar="SEED", help="the first seed (default 800)"
+    )
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=0.5,
+        metavar="S",
+        help="seconds a step may take (default 0.5)",
+    )
+    parser.add_argument(
+        "--drive",
+        type=float,
+        default=0.05,
+        metavar="S",
+        help="seconds the robot drives between two steps (default 0.05)",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="RESULTS.jsonl", help="where to store what came of each run"
+    )
     options = parser.parse_args()
     print(f"| {' | '.join(('trace', *COLUMNS))} |\n{'|---' * (len(COLUMNS) + 1)}|")
     for name, (make, theory) in FAMILIES.items():
         if re.search(options.only, name):
             records = [
-                run(make(seed), theory, options.limit, options.drive, seed) for seed in range(options.first, options.first + options.seeds)
+                run(make(seed), theory, options.limit, options.drive, seed)
+                for seed in range(options.first, options.first + options.seeds)
             ]
             print(f"| {name} | {' | '.join(cells(records))} |", flush=True)
             if options.out:
                 with options.out.open("a") as file:
-                    file.writelines(json.dumps({"family": name, **record}) + "\n" for record in records)
+                    file.writelines(
+                        json.dumps({"family": name, **record}) + "\n" for record in records
+                    )
 
 
 def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int = 0) -> Record:
@@ -115,7 +161,11 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
         milliseconds.append(1000 * (time.process_time() - began))
         if t == shown - 1:
             certain_before = mapper.standing.certain
-        if t >= shown and noticed is None and any(said.startswith(f"step {t}:") for said in mapper.standing.broke):
+        if (
+            t >= shown
+            and noticed is None
+            and any(said.startswith(f"step {t}:") for said in mapper.standing.broke)
+        ):
             noticed = t
         if noticed is not None and again is None and mapper.standing.certain:
             again, right_again = t, is_right(case, mapper.theory, solution.maps[0])
@@ -129,8 +179,12 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
         "right_again": right_again,
         "certain_in_the_end": mapper.standing.certain,
         "right": bool(solution.maps) and is_right(case, mapper.theory, solution.maps[0]),
-        "found": [is_true(m.labels, frozenset((fault.step, fault.kind) for fault in m.faults), case) for m in solution.maps],
-        "dearer": cost is not None and Cost.of(true_map(case, mapper.theory, len(trace))).tenths > cost.tenths,
+        "found": [
+            is_true(m.labels, frozenset((fault.step, fault.kind) for fault in m.faults), case)
+            for m in solution.maps
+        ],
+        "dearer": cost is not None
+        and Cost.of(true_map(case, mapper.theory, len(trace))).tenths > cost.tenths,
         "searches": mapper.searches,
         "milliseconds": [round(spent, 3) for spent in milliseconds],
     }
@@ -139,7 +193,10 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
 def is_right(case: Case, theory: Theory, ssh_map: SSHMap) -> bool:
     """Whether a map of the first steps predicts from there what the true one does."""
     truth = true_map(case, theory, len(ssh_map.labels))
-    return Rival.of(ssh_map, case.walk.trace, theory).future() == Rival.of(truth, case.walk.trace, theory).future()
+    return (
+        Rival.of(ssh_map, case.walk.trace, theory).future()
+        == Rival.of(truth, case.walk.trace, theory).future()
+    )
 
 
 def true_map(case: Case, theory: Theory, steps: int) -> SSHMap:
@@ -151,9 +208,12 @@ def true_map(case: Case, theory: Theory, steps: int) -> SSHMap:
 
 def cells(records: Sequence[Record]) -> list[str]:
     """What the table says of the runs of a family."""
-    sure, others = ([r for r in records if r["certain_before"] is before] for before in (True, False))
+    sure, others = (
+        [r for r in records if r["certain_before"] is before] for before in (True, False)
+    )
     noticed, again, others_again = (
-        [r[key] for r in some if r[key] is not None] for some, key in ((records, "noticed"), (sure, "again"), (others, "again"))
+        [r[key] for r in some if r[key] is not None]
+        for some, key in ((records, "noticed"), (sure, "again"), (others, "again"))
     )
     spent = [ms for record in records for ms in record["milliseconds"]]
     return [

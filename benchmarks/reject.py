@@ -38,7 +38,9 @@ def walks(cells: int, steps: int, seed: int) -> Iterator[Walk]:
     scale, bend = rng.normal(0.0, MODEL.scale), rng.normal(0.0, MODEL.bend)
     white = replace(MODEL, scale=0.0, bend=0.0)
     yield maze(cells, cells, steps=steps, seed=seed, follow=True, odometry=white)
-    yield maze(cells, cells, steps=steps, seed=seed, follow=True, odometry=MODEL, scale=scale, bend=bend)
+    yield maze(
+        cells, cells, steps=steps, seed=seed, follow=True, odometry=MODEL, scale=scale, bend=bend
+    )
 
 
 def is_refused(walk: Walk, reject: float) -> bool:
@@ -48,10 +50,18 @@ def is_refused(walk: Walk, reject: float) -> bool:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--routes", type=int, default=1000, metavar="N", help="routes (default 1000)")
-    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)")
-    parser.add_argument("--cells", type=int, default=4, metavar="N", help="mazes of N x N cells (default 4)")
-    parser.add_argument("--steps", type=int, default=40, metavar="N", help="actions of the robot (default 40)")
+    parser.add_argument(
+        "--routes", type=int, default=1000, metavar="N", help="routes (default 1000)"
+    )
+    parser.add_argument(
+        "--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)"
+    )
+    parser.add_argument(
+        "--cells", type=int, default=4, metavar="N", help="mazes of N x N cells (default 4)"
+    )
+    parser.add_argument(
+        "--steps", type=int, default=40, metavar="N", help="actions of the robot (default 40)"
+    )
     options = parser.parse_args()
     refused = np.zeros((len(REJECTS), 2), dtype=int)
     for seed in range(options.first, options.first + options.routes):

@@ -27,7 +27,9 @@ from simulator.motion import moved
 
 Array = NDArray[np.float64]
 CELL = 0.1  # metres a side
-FARTHEST = 12.0  # Beams are laid into the grid so far: beyond that they diverge, and leave cells out.
+FARTHEST = (
+    12.0  # Beams are laid into the grid so far: beyond that they diverge, and leave cells out.
+)
 WALL = 0.2  # The share of the beams at a cell that have to end there for a wall.
 LEAST = 2  # So many beams have to have passed a cell that is free.
 RADIUS = 0.25  # of the robot
@@ -63,7 +65,9 @@ def poses_of(log: RobotLog, kind: str) -> list[Pose]:
         return [scan.odometry for scan in log.scans]
     poses = [scan.corrected for scan in log.scans if scan.corrected is not None]
     if len(poses) < len(log):
-        raise ValueError(f"{log.source}: expected corrected poses, got {len(poses)} for {len(log)} scans; take --poses odometry")
+        raise ValueError(
+            f"{log.source}: expected corrected poses, got {len(poses)} for {len(log)} scans; take --poses odometry"
+        )
     return poses
 
 
@@ -71,7 +75,11 @@ def grid_of(log: RobotLog, poses: Sequence[Pose]) -> Grid:
     """An occupancy grid of all scans at these poses."""
     along = np.arange(0, FARTHEST, CELL / 2)
     low = np.floor((np.min([pose[:2] for pose in poses], axis=0) - FARTHEST) / CELL).astype(int) - 2
-    columns, rows = np.ceil((np.max([pose[:2] for pose in poses], axis=0) + FARTHEST) / CELL).astype(int) + 2 - low
+    columns, rows = (
+        np.ceil((np.max([pose[:2] for pose in poses], axis=0) + FARTHEST) / CELL).astype(int)
+        + 2
+        - low
+    )
     wall, clear = np.zeros(rows * columns), np.zeros(rows * columns)
 
     def number(points: Array) -> NDArray[np.int_]:
@@ -94,7 +102,9 @@ def grid_of(log: RobotLog, poses: Sequence[Pose]) -> Grid:
     cells = cells.reshape(rows, columns)
     used = [np.flatnonzero(~np.isnan(cells).all(axis=axis)) for axis in (1, 0)]
     (bottom, top), (left, right) = ((found[0] - 1, found[-1] + 2) for found in used)
-    return Grid(cells[bottom:top, left:right], (float(low[0] + left) * CELL, float(low[1] + bottom) * CELL))
+    return Grid(
+        cells[bottom:top, left:right], (float(low[0] + left) * CELL, float(low[1] + bottom) * CELL)
+    )
 
 
 def free_space(grid: Grid, poses: Sequence[Pose]) -> tuple[NDArray[np.bool_], Array]:
@@ -136,7 +146,11 @@ class Skeleton:
         last = -1  # the scan at which the robot was last within reach of the last node
         for scan in np.flatnonzero(within):
             number = int(nearest[scan])
-            if passed and passed[-1][1] == number and distance[last : scan + 1, number].max() <= 2 * reach[number]:
+            if (
+                passed
+                and passed[-1][1] == number
+                and distance[last : scan + 1, number].max() <= 2 * reach[number]
+            ):
                 if distance[scan, number] < distance[passed[-1][0], number]:
                     passed[-1] = (int(scan), number)
             else:
@@ -171,10 +185,16 @@ def _pixels(thin: NDArray[np.bool_]) -> nx.Graph:
     cells = {(int(r), int(c)) for r, c in np.argwhere(thin)}
     graph.add_nodes_from(cells)
     for r, c in cells:
-        graph.add_edges_from(((r, c), other) for other in ((r + 1, c), (r, c + 1)) if other in cells)
+        graph.add_edges_from(
+            ((r, c), other) for other in ((r + 1, c), (r, c + 1)) if other in cells
+        )
     for r, c in cells:
         for side in (-1, 1):
-            if (r + 1, c + side) in cells and (r + 1, c) not in cells and (r, c + side) not in cells:
+            if (
+                (r + 1, c + side) in cells
+                and (r + 1, c) not in cells
+                and (r, c + side) not in cells
+            ):
                 graph.add_edge((r, c), (r + 1, c + side))
     return graph
 
@@ -182,7 +202,11 @@ def _pixels(thin: NDArray[np.bool_]) -> nx.Graph:
 def _chains(pixels: nx.Graph) -> nx.MultiGraph:
     """Junctions and ends of a graph of cells, joined by the chains of cells between them. A ring without a junction has one at one of its cells."""
     ends = [cell for cell, degree in pixels.degree if degree != 2]
-    ends += [min(ring) for ring in nx.connected_components(pixels) if all(pixels.degree(cell) == 2 for cell in ring)]
+    ends += [
+        min(ring)
+        for ring in nx.connected_components(pixels)
+        if all(pixels.degree(cell) == 2 for cell in ring)
+    ]
     graph = nx.MultiGraph()
     graph.add_nodes_from(ends)
     known = set(ends)
@@ -197,7 +221,12 @@ def _chains(pixels: nx.Graph) -> nx.MultiGraph:
 
 
 def _join(graph: nx.MultiGraph, cells: Sequence[tuple[int, int]]) -> None:
-    graph.add_edge(cells[0], cells[-1], cells=list(cells), metres=CELL * sum(math.dist(a, b) for a, b in pairwise(cells)))
+    graph.add_edge(
+        cells[0],
+        cells[-1],
+        cells=list(cells),
+        metres=CELL * sum(math.dist(a, b) for a, b in pairwise(cells)),
+    )
 
 
 def _prune(graph: nx.MultiGraph) -> None:
@@ -265,8 +294,14 @@ def _with_doors(graph: nx.MultiGraph, clear: Array) -> nx.MultiGraph:
         cut = [0]
         for k in range(1, len(cells) - 1):
             before, after = width[max(0, k - within) : k], width[k + 1 : k + 1 + within]
-            narrow = width[k] <= DOOR and width[k] < before.min() + CELL / 10 and width[k] <= after.min()
-            if narrow and width[k] * WIDER <= min(before.max(), after.max()) and (k - cut[-1] > within / 2 or cut[-1] == 0):
+            narrow = (
+                width[k] <= DOOR and width[k] < before.min() + CELL / 10 and width[k] <= after.min()
+            )
+            if (
+                narrow
+                and width[k] * WIDER <= min(before.max(), after.max())
+                and (k - cut[-1] > within / 2 or cut[-1] == 0)
+            ):
                 cut.append(k)
                 opened.add_node(cells[k], cell=cells[k], clear=float(width[k]), door=True)
         for start, end in pairwise([*cut, len(cells) - 1]):
@@ -278,15 +313,32 @@ def lay(axes: Any, skeleton: Skeleton, poses: Sequence[Pose]) -> None:
     """Draw the grid, the way of the robot and the graph; nodes that it passed are filled."""
     grid = skeleton.grid
     rows, columns = grid.cells.shape
-    shown = np.where(np.isnan(grid.cells), 0.8, np.where(skeleton.free, 1.0, np.where(grid.cells == 1.0, 0.94, 0.0)))
+    shown = np.where(
+        np.isnan(grid.cells),
+        0.8,
+        np.where(skeleton.free, 1.0, np.where(grid.cells == 1.0, 0.94, 0.0)),
+    )
     x, y = grid.origin
-    axes.imshow(shown, cmap="gray", vmin=0, vmax=1, origin="lower", extent=(x, x + columns * CELL, y, y + rows * CELL))
+    axes.imshow(
+        shown,
+        cmap="gray",
+        vmin=0,
+        vmax=1,
+        origin="lower",
+        extent=(x, x + columns * CELL, y, y + rows * CELL),
+    )
     axes.plot(*np.array(poses)[:, :2].T, color="0.45", linewidth=0.8)
     for *_, data in skeleton.graph.edges(data=True):
         axes.plot(*data["way"].T, color="tab:blue", linewidth=1)
     passed = {node for _, node in skeleton.events(poses)}
     for node, data in skeleton.graph.nodes(data=True):
-        axes.plot(*data["at"], "s", color="tab:blue", markerfacecolor="tab:blue" if node in passed else "white", markersize=4)
+        axes.plot(
+            *data["at"],
+            "s",
+            color="tab:blue",
+            markerfacecolor="tab:blue" if node in passed else "white",
+            markersize=4,
+        )
     axes.set_aspect("equal")
 
 

@@ -33,18 +33,25 @@ Leg = tuple[object, object]  # a place, and the next one along a street
 STRAIGHT = 20.0  # degrees: two streets that are at most so far from one line are one path
 
 
-def drawn(graph: nx.Graph, reach: float, start: Leg, route: list[str] | None = None, name: str = "streets") -> dict[str, Any]:
+def drawn(
+    graph: nx.Graph, reach: float, start: Leg, route: list[str] | None = None, name: str = "streets"
+) -> dict[str, Any]:
     """The world, as its file has it: streets are 2 `reach` wide, and end `reach` behind a dead end.
 
     start  the place where the robot starts, and the one that it faces
     route  None for one along all streets, both ways
     """
-    ways = {(a, b): _way(graph, a, b) for a, b in graph.edges} | {(b, a): _way(graph, b, a) for a, b in graph.edges}
+    ways = {(a, b): _way(graph, a, b) for a, b in graph.edges} | {
+        (b, a): _way(graph, b, a) for a, b in graph.edges
+    }
     return {
         "format": "ssh-world",
         "version": 1,
         "name": name,
-        "polygons": [[[round(z.real, 4), round(z.imag, 4)] for z in polygon] for polygon in _polygons(graph, ways, reach)],
+        "polygons": [
+            [[round(z.real, 4), round(z.imag, 4)] for z in polygon]
+            for polygon in _polygons(graph, ways, reach)
+        ],
         "reach": reach,
         "start": _pose(graph, start[0], ways[start]),
         "route": round_trip(graph, start) if route is None else route,
@@ -74,11 +81,19 @@ def _polygons(graph: nx.Graph, ways: dict[Leg, complex], reach: float) -> list[l
             here, there = leg
             at: complex = graph.nodes[there]["at"]
             back = ways[there, here]
-            others = sorted(graph[there], key=lambda other: cmath.phase(ways[there, other] / back / cmath.rect(1, 1e-9)) % math.tau)
+            others = sorted(
+                graph[there],
+                key=lambda other: (
+                    cmath.phase(ways[there, other] / back / cmath.rect(1, 1e-9)) % math.tau
+                ),
+            )
             onward = others[0]
             way = ways[there, onward]
             if onward == here:
-                polygon += [at - reach * back + reach * 1j * back, at - reach * back - reach * 1j * back]
+                polygon += [
+                    at - reach * back + reach * 1j * back,
+                    at - reach * back - reach * 1j * back,
+                ]
             else:  # the corner between the street that we came by, and the next one counter-clockwise of it
                 a, b = reach * 1j * back, -reach * 1j * way
                 turn = (back.conjugate() * way).imag
@@ -140,14 +155,20 @@ def _straight_on(ways: dict[Leg, complex], leg: Leg) -> list[Leg]:
 def _opposite(ways: dict[Leg, complex], leg: Leg) -> Leg | None:
     """The leg that leaves a place opposite to another one."""
     for other, way in ways.items():
-        if other[0] == leg[0] and other != leg and abs(math.degrees(cmath.phase(-way / ways[leg]))) <= STRAIGHT:
+        if (
+            other[0] == leg[0]
+            and other != leg
+            and abs(math.degrees(cmath.phase(-way / ways[leg]))) <= STRAIGHT
+        ):
             return other
     return None
 
 
 def round_trip(graph: nx.Graph, start: Leg) -> list[str]:
     """Actions that lead along all streets, both ways, and back to the start: always on to the nearest way that is left."""
-    moves = _moves({(a, b): _way(graph, a, b) for edge in graph.edges for a, b in (edge, edge[::-1])})
+    moves = _moves(
+        {(a, b): _way(graph, a, b) for edge in graph.edges for a, b in (edge, edge[::-1])}
+    )
     here = first = (*start, True)
     left = {leg for leg in moves if leg[2]}
     route: list[str] = []
@@ -161,7 +182,9 @@ def round_trip(graph: nx.Graph, start: Leg) -> list[str]:
         if left:
             route.append("travel")
             left.discard(here)
-            here = next(b for _, b, action in moves.edges(here, data="action") if action == "travel")
+            here = next(
+                b for _, b, action in moves.edges(here, data="action") if action == "travel"
+            )
     return route
 
 
@@ -182,10 +205,14 @@ def _moves(ways: dict[Leg, complex]) -> nx.DiGraph:
             if beside := [other for other in streets if STRAIGHT < order(other) < 180 - STRAIGHT]:
                 moves.add_edge(state, min(beside, key=order), action=side)
         if others:
-            moves.add_edge(state, min(others, key=lambda other: abs(clockwise(other) - 180)), action="around")
+            moves.add_edge(
+                state, min(others, key=lambda other: abs(clockwise(other) - 180)), action="around"
+            )
         if ahead:
             on = _opposite(ways, (there, here))
-            moves.add_edge(state, (there, here, False) if on is None else (*on, True), action="travel")
+            moves.add_edge(
+                state, (there, here, False) if on is None else (*on, True), action="travel"
+            )
     return moves
 
 
@@ -241,9 +268,19 @@ def _worlds(reach: float) -> Iterator[World]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="drives through each world (default 20)")
-    parser.add_argument("--tours", type=int, default=2, metavar="N", help="tours of each drive (default 2)")
-    parser.add_argument("--reach", type=float, default=0.8, metavar="M", help="half the width of the streets that are drawn (default 0.8)")
+    parser.add_argument(
+        "--seeds", type=int, default=20, metavar="N", help="drives through each world (default 20)"
+    )
+    parser.add_argument(
+        "--tours", type=int, default=2, metavar="N", help="tours of each drive (default 2)"
+    )
+    parser.add_argument(
+        "--reach",
+        type=float,
+        default=0.8,
+        metavar="M",
+        help="half the width of the streets that are drawn (default 0.8)",
+    )
     options = parser.parse_args()
     print(
         "| world | steps | driven | dstates and places right | and paths | the only minimal map | seconds: simulate, solve |\n|---|---|---|---|---|---|---|"
@@ -258,7 +295,11 @@ def main() -> None:
             except SimulatorError:
                 continue
             simulated = process_time()
-            views = ViewClusterer(random_state=0).fit(ReciprocalTransformer().fit_transform(images_of(run))).labels_
+            views = (
+                ViewClusterer(random_state=0)
+                .fit(ReciprocalTransformer().fit_transform(images_of(run)))
+                .labels_
+            )
             trace = run.with_views(views.tolist())
             clustered = process_time()
             solution = solve(trace, max_maps=None, time_limit=60)
@@ -267,10 +308,16 @@ def main() -> None:
             places += bool(found and all(m.dstates_right and m.places_right for m in found.maps))
             paths += bool(found and found.rank)
             alone += bool(found and found.rank and solution.complete and len(solution.maps) == 1)
-            simulating, solving = simulating + simulated - began, solving + process_time() - clustered
+            simulating, solving = (
+                simulating + simulated - began,
+                solving + process_time() - clustered,
+            )
         seconds = f"{simulating / max(driven, 1):.1f}, {solving / max(driven, 1):.1f}"
         steps = options.tours * len(world.route)
-        print(f"| {world.name} | {steps} | {driven} of {options.seeds} | {places} | {paths} | {alone} | {seconds} |", flush=True)
+        print(
+            f"| {world.name} | {steps} | {driven} of {options.seeds} | {places} | {paths} | {alone} | {seconds} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -55,8 +55,14 @@ def _taylor_hall(seed: int) -> Walk:
     from simulator.world import World
 
     trace = simulate(World.named("taylor-hall"), tours=10, seed=seed)
-    views = ViewClusterer(k_max=24, random_state=seed).fit(ReciprocalTransformer().fit_transform(images_of(trace))).labels_
-    steps = Trace.from_steps(views.tolist(), trace.actions, stars=[step.star for step in trace], name=trace.name)
+    views = (
+        ViewClusterer(k_max=24, random_state=seed)
+        .fit(ReciprocalTransformer().fit_transform(images_of(trace)))
+        .labels_
+    )
+    steps = Trace.from_steps(
+        views.tolist(), trace.actions, stars=[step.star for step in trace], name=trace.name
+    )
     return Walk(steps, tuple(step.truth["dstate"] for step in trace if step.truth))
 
 
@@ -65,18 +71,26 @@ def _circuits(rounds: int) -> Callable[[int], Walk]:
 
 
 def _moore(states: int, views: int, steps: int) -> Instance:
-    return Instance(f"moore {states}/{views} n={steps}", lambda seed: moore(states, views, steps=steps, seed=seed))
+    return Instance(
+        f"moore {states}/{views} n={steps}",
+        lambda seed: moore(states, views, steps=steps, seed=seed),
+    )
 
 
 def _maze(side: int, steps: int, *, full: bool = False) -> Instance:
     walk = partial(maze, side, side, steps=steps, stars=full)
-    return Instance(f"{'full ' if full else ''}maze {side}x{side} n={steps}", lambda seed: walk(seed=seed))
+    return Instance(
+        f"{'full ' if full else ''}maze {side}x{side} n={steps}", lambda seed: walk(seed=seed)
+    )
 
 
 SUITE = {
     instance.name: instance
     for instance in (
-        *(Instance(f"rectangle n={8 * n}", _circuits(n), seeded=False) for n in (50, 500, 5_000, 50_000)),
+        *(
+            Instance(f"rectangle n={8 * n}", _circuits(n), seeded=False)
+            for n in (50, 500, 5_000, 50_000)
+        ),
         *(_moore(8, 2, steps) for steps in (800, 3200, 12_800)),
         *(_moore(states, 2, 800) for states in (12, 20)),
         _moore(30, 10, 200),
@@ -93,14 +107,20 @@ SUITE = {
         Instance("full aces3", lambda _: aces3(), seeded=False),
     )
 }
-SMALL = _maze(2, 60, full=True)  # what the full theory's plain encoding can still do: for ablation.py
+SMALL = _maze(
+    2, 60, full=True
+)  # what the full theory's plain encoding can still do: for ablation.py
 # Where a map with frames is sought:
-BARE = Instance("full maze 3x3 n=400, loops, no stars", lambda seed: maze(3, 3, steps=400, seed=seed, loops=0.5))
+BARE = Instance(
+    "full maze 3x3 n=400, loops, no stars", lambda seed: maze(3, 3, steps=400, seed=seed, loops=0.5)
+)
 
 
 def _block(width: int, height: int, rounds: int, *, views: int, full: bool = False) -> Instance:
     name = f"{'full ' if full else ''}circuits {width}x{height}, {rounds} rounds"
-    return Instance(name, lambda seed: circuits(width, height, rounds=rounds, seed=seed, views=views))
+    return Instance(
+        name, lambda seed: circuits(width, height, rounds=rounds, seed=seed, views=views)
+    )
 
 
 def _drive(name: str, side: int, steps: int, star: str = "auto", **kind: Any) -> Instance:

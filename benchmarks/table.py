@@ -30,12 +30,32 @@ def times(results: dict[str, Any]) -> str:
     rows = []
     for name, by_tool in instances(results).items():
         ours = by_tool.get(OURS, [])
-        images = next((cell["images"] for cells in by_tool.values() for cell in cells if cell.get("images")), 0)
-        here = [_time(ours, results["limit"]) + _mark(ours, reasons), _memory(ours)] if ours else ["–", "–"]
+        images = next(
+            (cell["images"] for cells in by_tool.values() for cell in cells if cell.get("images")),
+            0,
+        )
+        here = (
+            [_time(ours, results["limit"]) + _mark(ours, reasons), _memory(ours)]
+            if ours
+            else ["–", "–"]
+        )
         peers = [_peer(by_tool.get(tool, []), ours, results["limit"], reasons) for tool in tools]
-        rows.append([name, f"{images:,}", dstates([cell for cells in by_tool.values() for cell in cells]), *here, *peers])
+        rows.append(
+            [
+                name,
+                f"{images:,}",
+                dstates([cell for cells in by_tool.values() for cell in cells]),
+                *here,
+                *peers,
+            ]
+        )
     notes = [f"{mark} {reason}" for mark, reason in zip(MARKS, reasons, strict=False)]
-    return "\n".join([_markdown(["instance", "steps", "dstates", "time", "MB", *tools], rows), *(["", "; ".join(notes)] if notes else [])])
+    return "\n".join(
+        [
+            _markdown(["instance", "steps", "dstates", "time", "MB", *tools], rows),
+            *(["", "; ".join(notes)] if notes else []),
+        ]
+    )
 
 
 def grounding(results: dict[str, Any]) -> str:
@@ -45,21 +65,47 @@ def grounding(results: dict[str, Any]) -> str:
         cells = [cell for cell in by_tool.get(OURS, []) if cell.get("rules") is not None]
         if cells:
             rules, atoms, ground, solve, seconds, prefix = (
-                statistics.median(cell[key] for cell in cells) for key in ("rules", "atoms", "ground", "solve", "seconds", "prefix")
+                statistics.median(cell[key] for cell in cells)
+                for key in ("rules", "atoms", "ground", "solve", "seconds", "prefix")
             )
             counts = [f"{count:,.0f}" for count in (prefix, rules, atoms)]
-            rows.append([name, *counts, *(f"{s:.3f}" for s in (ground, solve, seconds)), f"{solve / seconds:.0%}"])
-    return _markdown(["instance", "steps given", "rules", "atoms", "ground, s", "solve, s", "in all, s", "solving"], rows)
+            rows.append(
+                [
+                    name,
+                    *counts,
+                    *(f"{s:.3f}" for s in (ground, solve, seconds)),
+                    f"{solve / seconds:.0%}",
+                ]
+            )
+    return _markdown(
+        [
+            "instance",
+            "steps given",
+            "rules",
+            "atoms",
+            "ground, s",
+            "solve, s",
+            "in all, s",
+            "solving",
+        ],
+        rows,
+    )
 
 
 def contradictions(results: dict[str, Any]) -> list[str]:
     """Where an answer is wrong: it fails its check, or one tool found fewer states than another proved possible."""
-    found = [f"{c['instance']}, seed {c['seed']}: {c['tool']}: {c['reason']}" for c in results["cells"] if c["status"] == "wrong"]
+    found = [
+        f"{c['instance']}, seed {c['seed']}: {c['tool']}: {c['reason']}"
+        for c in results["cells"]
+        if c["status"] == "wrong"
+    ]
     for name, by_tool in instances(results).items():
         for low, high in permutations([cell for cells in by_tool.values() for cell in cells], 2):
             proven = low["dstates"] if low.get("proven") else low.get("bound") or 0
             if high["seed"] == low["seed"] and (high.get("dstates") or math.inf) < proven:
-                found += [f"{name}, seed {low['seed']}: {low['tool']} proved {proven} states, {high['tool']} found {high['dstates']}"]
+                found += [
+                    f"{name}, seed {low['seed']}: {low['tool']} proved {proven} states, {high['tool']} found {high['dstates']}"
+                ]
     return found
 
 
@@ -73,7 +119,9 @@ def instances(results: dict[str, Any]) -> dict[str, dict[str, list[dict[str, Any
 
 def median_seconds(cells: Cells) -> float:
     """Seconds, the median over the seeds; infinite where that seed was not solved within the limit."""
-    return statistics.median(cell["seconds"] if cell["status"] == "ok" else math.inf for cell in cells)
+    return statistics.median(
+        cell["seconds"] if cell["status"] == "ok" else math.inf for cell in cells
+    )
 
 
 def dstates(cells: Cells) -> str:
@@ -82,10 +130,20 @@ def dstates(cells: Cells) -> str:
     if known:
         return f"{statistics.median(known.values()):,g}"
     seeds = {cell["seed"] for cell in cells}
-    bounds = [max(counts) for seed in seeds if (counts := [c["bound"] for c in cells if c["seed"] == seed and c.get("bound")])]
-    found = [min(counts) for seed in seeds if (counts := [c["dstates"] for c in cells if c["seed"] == seed and c.get("dstates")])]
+    bounds = [
+        max(counts)
+        for seed in seeds
+        if (counts := [c["bound"] for c in cells if c["seed"] == seed and c.get("bound")])
+    ]
+    found = [
+        min(counts)
+        for seed in seeds
+        if (counts := [c["dstates"] for c in cells if c["seed"] == seed and c.get("dstates")])
+    ]
     low, high = (f"{statistics.median(counts):,g}" if counts else "" for counts in (bounds, found))
-    return f"{low} – {high}" if low and high else f"≥ {low}" if low else f"≤ {high}" if high else "–"
+    return (
+        f"{low} – {high}" if low and high else f"≥ {low}" if low else f"≤ {high}" if high else "–"
+    )
 
 
 def _peer(cells: Cells, ours: Cells, limit: float, reasons: list[str]) -> str:
@@ -94,19 +152,32 @@ def _peer(cells: Cells, ours: Cells, limit: float, reasons: list[str]) -> str:
         return "–" + _mark(cells, reasons)
     there, here = median_seconds(cells), median_seconds(ours) if ours else math.inf
     sign = "<" if here == math.inf else ">" if there == math.inf else ""
-    known = min(there, here) < math.inf and all(cell["status"] in ("ok", "timeout") for cell in (*cells, *ours))
+    known = min(there, here) < math.inf and all(
+        cell["status"] in ("ok", "timeout") for cell in (*cells, *ours)
+    )
     ratio = f"{sign}×{_figures(min(there, limit) / min(here, limit))}" if known else ""
     unproven = [cell["dstates"] for cell in cells if cell["status"] == "ok" and not cell["proven"]]
     states = f"{statistics.median(unproven):,g} states" if unproven else ""
-    return ", ".join(filter(None, (_time(cells, limit) + _mark(cells, reasons), f"{_memory(cells)} MB", ratio, states)))
+    return ", ".join(
+        filter(
+            None,
+            (_time(cells, limit) + _mark(cells, reasons), f"{_memory(cells)} MB", ratio, states),
+        )
+    )
 
 
 def _time(cells: Cells, limit: float) -> str:
     """The median over the seeds, or why there is none."""
     seconds = median_seconds(cells)
     failed = {cell["status"] for cell in cells} - {"ok", "timeout"}
-    text = _duration(seconds) if seconds < math.inf else " / ".join(sorted(failed)) or f"> {limit:g} s"
-    return text + (f" ({sum(cell['status'] == 'ok' for cell in cells)} of {len(cells)})" if len(cells) > 1 else "")
+    text = (
+        _duration(seconds) if seconds < math.inf else " / ".join(sorted(failed)) or f"> {limit:g} s"
+    )
+    return text + (
+        f" ({sum(cell['status'] == 'ok' for cell in cells)} of {len(cells)})"
+        if len(cells) > 1
+        else ""
+    )
 
 
 def _memory(cells: Cells) -> str:
@@ -116,7 +187,9 @@ def _memory(cells: Cells) -> str:
 
 def _mark(cells: Cells, reasons: list[str]) -> str:
     """The mark of a note that says why there is no answer; the note is added where it is new."""
-    reason = next((cell["reason"] for cell in cells if cell.get("reason")), "").removesuffix(": ")  # an error may say nothing
+    reason = next((cell["reason"] for cell in cells if cell.get("reason")), "").removesuffix(
+        ": "
+    )  # an error may say nothing
     if reason and reason not in reasons:
         reasons.append(reason)
     return MARKS[reasons.index(reason) % len(MARKS)] if reason else ""
@@ -128,14 +201,26 @@ def _duration(seconds: float) -> str:
 
 def _figures(number: float) -> str:
     """Two significant figures; whole numbers from ten on."""
-    return f"{number:,.0f}" if number >= 9.95 else f"{number:.1f}" if number >= 0.995 else f"{number:.2g}"
+    return (
+        f"{number:,.0f}"
+        if number >= 9.95
+        else f"{number:.1f}"
+        if number >= 0.995
+        else f"{number:.2g}"
+    )
 
 
 def _markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [header, *rows]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
     rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
-    aligned = [[line[0].ljust(widths[0]), *(text.rjust(w) for text, w in zip(line[1:], widths[1:], strict=True))] for line in lines]
+    aligned = [
+        [
+            line[0].ljust(widths[0]),
+            *(text.rjust(w) for text, w in zip(line[1:], widths[1:], strict=True)),
+        ]
+        for line in lines
+    ]
     return "\n".join("| " + " | ".join(line) + " |" for line in (aligned[0], rule, *aligned[1:]))
 
 

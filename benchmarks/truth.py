@@ -50,7 +50,10 @@ NOISE = {
 }
 # The layout of the ACES3 route: three columns and three rows of places, by their x and y in metres.
 COLUMNS, ROWS = (-20.0, -1.0, 22.5), (-0.5, -19.0, -39.0)
-ACES3 = {name: (COLUMNS[i % 3], ROWS[i // 3]) for i, name in enumerate(("NW", "N", "NE", "W", "C", "E", "SW", "S", "SE"))}
+ACES3 = {
+    name: (COLUMNS[i % 3], ROWS[i // 3])
+    for i, name in enumerate(("NW", "N", "NE", "W", "C", "E", "SW", "S", "SE"))
+}
 COMPASS = {"E": 0.0, "N": math.pi / 2, "W": math.pi, "S": -math.pi / 2}
 
 
@@ -82,16 +85,29 @@ def partition(names: Sequence[Hashable]) -> tuple[int, ...]:
 def is_true(ssh_map: SSHMap, known: Known) -> bool:
     """Whether the labels of a map are the true dstates, and the places of its labels, if it has any, the true places, both up to renaming."""
     places = [ssh_map.dstates[label].place for label in ssh_map.labels]
-    return partition(ssh_map.labels) == partition(known.dstates) and (not ssh_map.places or partition(places) == partition(known.places))
+    return partition(ssh_map.labels) == partition(known.dstates) and (
+        not ssh_map.places or partition(places) == partition(known.places)
+    )
 
 
 def mazes(cells: int, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
     for seed in seeds:
         walk = maze(
-            cells, cells, steps=steps, seed=seed, stars=True, follow=True, odometry=noise.odometry, scale=noise.scale, bend=noise.bend
+            cells,
+            cells,
+            steps=steps,
+            seed=seed,
+            stars=True,
+            follow=True,
+            odometry=noise.odometry,
+            scale=noise.scale,
+            bend=noise.bend,
         )
         yield Known(
-            f"maze {cells} x {cells}, {seed}", walk.trace, walk.truth, tuple(state[:2] for state in walk.truth if isinstance(state, tuple))
+            f"maze {cells} x {cells}, {seed}",
+            walk.trace,
+            walk.truth,
+            tuple(state[:2] for state in walk.truth if isinstance(state, tuple)),
         )
 
 
@@ -116,7 +132,9 @@ def taylor_hall(tours: int, seeds: Sequence[int], noise: Noise) -> Iterator[Know
     """Tours of Taylor Hall, with the robot's own odometry. Each is simulated in a process of its own, whose memory does not count."""
     for seed in seeds:
         with ProcessPoolExecutor(1, get_context("spawn")) as process:
-            trace = process.submit(drive, tours, seed, Body(scale=noise.scale, bend=noise.bend)).result()
+            trace = process.submit(
+                drive, tours, seed, Body(scale=noise.scale, bend=noise.bend)
+            ).result()
         yield told(f"Taylor Hall, {seed}", trace)
 
 
@@ -130,12 +148,18 @@ def drive(tours: int, seed: int, body: Body) -> Trace:
 
     trace = simulate(World.named("taylor-hall"), tours, seed, body=body)
     clusterer = ViewClusterer(k_max=24, random_state=seed)
-    return trace.with_views(clusterer.fit(ReciprocalTransformer().fit_transform(images_of(trace))).labels_.tolist())
+    return trace.with_views(
+        clusterer.fit(ReciprocalTransformer().fit_transform(images_of(trace))).labels_.tolist()
+    )
 
 
 def told(name: str, trace: Trace) -> Known:
     """A trace whose steps tell their true dstate and place."""
-    return Known(name, trace, *(tuple(step.truth[kind] for step in trace.steps) for kind in ("dstate", "place")))
+    return Known(
+        name,
+        trace,
+        *(tuple(step.truth[kind] for step in trace.steps) for kind in ("dstate", "place")),
+    )
 
 
 def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
@@ -145,7 +169,11 @@ def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
     seconds = time.perf_counter() - began
     right = [is_true(ssh_map, known) for ssh_map in solution.maps]
     all_true = bool(right) and all(right) and (solution.complete or share_all(solution))
-    cost = f"{solution.cost.dstates}, {solution.cost.places}, {solution.cost.paths}" if solution.cost else "–"
+    cost = (
+        f"{solution.cost.dstates}, {solution.cost.places}, {solution.cost.paths}"
+        if solution.cost
+        else "–"
+    )
     truth = f"{len(set(known.dstates))}, {len(set(known.places))}"
     more = "" if solution.complete else " or more, all alike" if all_true else " or more"
     listed = f"{sum(right)} of {len(right)}{more}"
@@ -161,7 +189,12 @@ def share_all(solution: Solution) -> bool:
     if solution.status is not Status.OPTIMAL:
         return False
     shared = solution.backbone
-    return shared is not None and shared.proven and not shared.dstates.sometimes and not (shared.places and shared.places.sometimes)
+    return (
+        shared is not None
+        and shared.proven
+        and not shared.dstates.sometimes
+        and not (shared.places and shared.places.sometimes)
+    )
 
 
 def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
@@ -182,28 +215,75 @@ def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
 
 def arguments() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--family", choices=("mazes", "plans", "aces3", "taylor-hall"), required=True)
-    parser.add_argument("--seeds", type=int, metavar="N", help="traces; of each plan (default 10; plans 1, taylor-hall 20)")
-    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)")
-    parser.add_argument("--cells", type=int, default=4, metavar="N", help="mazes of N x N cells (default 4)")
-    parser.add_argument("--steps", type=int, metavar="N", help="actions of the robot (default: mazes 40, plans 100)")
-    parser.add_argument("--tours", type=int, default=10, metavar="N", help="tours of Taylor Hall (default 10)")
-    parser.add_argument("--folder", type=Path, default=ROOT.parent / "shared" / "data" / "plans", metavar="FOLDER", help="of the plans")
-    parser.add_argument("--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)")
+    parser.add_argument(
+        "--family", choices=("mazes", "plans", "aces3", "taylor-hall"), required=True
+    )
+    parser.add_argument(
+        "--seeds",
+        type=int,
+        metavar="N",
+        help="traces; of each plan (default 10; plans 1, taylor-hall 20)",
+    )
+    parser.add_argument(
+        "--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)"
+    )
+    parser.add_argument(
+        "--cells", type=int, default=4, metavar="N", help="mazes of N x N cells (default 4)"
+    )
+    parser.add_argument(
+        "--steps", type=int, metavar="N", help="actions of the robot (default: mazes 40, plans 100)"
+    )
+    parser.add_argument(
+        "--tours", type=int, default=10, metavar="N", help="tours of Taylor Hall (default 10)"
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        default=ROOT.parent / "shared" / "data" / "plans",
+        metavar="FOLDER",
+        help="of the plans",
+    )
+    parser.add_argument(
+        "--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)"
+    )
     parser.add_argument("--stars", action="store_true", help="the solver is told of stars, too")
-    parser.add_argument("--causal", action="store_true", help="the causal theory: dstates alone have to be true")
+    parser.add_argument(
+        "--causal", action="store_true", help="the causal theory: dstates alone have to be true"
+    )
     for name in ("displacement", "boundary", "prefer"):
         parser.add_argument(f"--{name}", metavar="CHOICE", help=f"of the theory's field {name}")
     for name in NUMBERS:
-        parser.add_argument(f"--{name}", type=float, default=NOISE[name], metavar="X", help=f"of Odometry (default {NOISE[name]})")
-    parser.add_argument("--scale-error", type=float, default=0.0, metavar="SHARE", help="all ways are reported longer by this (default 0)")
-    parser.add_argument("--bend-error", type=float, default=0.0, metavar="DEGREES", help="drift of the heading in each metre (default 0)")
+        parser.add_argument(
+            f"--{name}",
+            type=float,
+            default=NOISE[name],
+            metavar="X",
+            help=f"of Odometry (default {NOISE[name]})",
+        )
+    parser.add_argument(
+        "--scale-error",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="all ways are reported longer by this (default 0)",
+    )
+    parser.add_argument(
+        "--bend-error",
+        type=float,
+        default=0.0,
+        metavar="DEGREES",
+        help="drift of the heading in each metre (default 0)",
+    )
     return parser
 
 
 def chosen(options: argparse.Namespace) -> Iterator[Known]:
     """The traces that are asked for."""
-    noise = Noise(Odometry(**{name: getattr(options, name) for name in NUMBERS}), options.scale_error, math.radians(options.bend_error))
+    noise = Noise(
+        Odometry(**{name: getattr(options, name) for name in NUMBERS}),
+        options.scale_error,
+        math.radians(options.bend_error),
+    )
 
     def seeds(count: int) -> range:
         return range(options.first, options.first + (options.seeds or count))
@@ -222,11 +302,17 @@ def chosen(options: argparse.Namespace) -> Iterator[Known]:
 
 def main() -> None:
     options = arguments().parse_args()
-    choices = {name: value for name in ("displacement", "boundary", "prefer") if (value := getattr(options, name))}
+    choices = {
+        name: value
+        for name in ("displacement", "boundary", "prefer")
+        if (value := getattr(options, name))
+    }
     if options.causal:
         theory = Theory.causal().replace(**choices, **({"star": "alike"} if options.stars else {}))
     else:
-        theory = Theory.topological().replace(**choices, **({} if options.stars else {"star": "none"}))
+        theory = Theory.topological().replace(
+            **choices, **({} if options.stars else {"star": "none"})
+        )
     print(f"\n{report(chosen(options), theory, options.limit)}")
 
 

@@ -25,7 +25,14 @@ from skeleton import poses_of
 from perception.readers.logs import read_log
 from ssh_abduction import SSHMap, Trace
 from ssh_abduction.data import Action, DState, Step
-from ssh_abduction.evaluation import Evaluation, Relations, VisitsEvaluation, evaluate, evaluate_visits, told_poses
+from ssh_abduction.evaluation import (
+    Evaluation,
+    Relations,
+    VisitsEvaluation,
+    evaluate,
+    evaluate_visits,
+    told_poses,
+)
 from ssh_abduction.evaluation.visits import NEAR
 
 Array = NDArray[np.float64]
@@ -77,10 +84,16 @@ class Truth:
     @staticmethod
     def of_aces(poses: Array) -> Truth:
         """The 15 visits of ACES3. Raises ValueError where the corrected poses do not pass the places in the order that the log is known for."""
-        places = {name: (x, y) for y, names in zip(ACES_ROWS, ACES_NAMES, strict=True) for x, name in zip(ACES_COLUMNS, names, strict=True)}
+        places = {
+            name: (x, y)
+            for y, names in zip(ACES_ROWS, ACES_NAMES, strict=True)
+            for x, name in zip(ACES_COLUMNS, names, strict=True)
+        }
         visits = visits_of(places, poses)
         if (route := [visit.place for visit in visits]) != ACES_ROUTE:
-            raise ValueError(f"expected the route {' '.join(ACES_ROUTE)}, got {' '.join(route)}; give the corrected poses of ACES3")
+            raise ValueError(
+                f"expected the route {' '.join(ACES_ROUTE)}, got {' '.join(route)}; give the corrected poses of ACES3"
+            )
         return Truth(poses, visits, grid=True)
 
     @staticmethod
@@ -90,8 +103,16 @@ class Truth:
         poses = np.array(told["poses"])
         doors = {name: door["at"] for name, door in told.get("doors", {}).items()}
         if doors:
-            return Truth(poses, doorways=doorways_of(told["crossings"], poses), doors=doors, rooms=tuple(told["scans"]))
-        return Truth(poses, tuple(Visit(visit["place"], visit["first"], visit["last"]) for visit in told["visits"]))
+            return Truth(
+                poses,
+                doorways=doorways_of(told["crossings"], poses),
+                doors=doors,
+                rooms=tuple(told["scans"]),
+            )
+        return Truth(
+            poses,
+            tuple(Visit(visit["place"], visit["first"], visit["last"]) for visit in told["visits"]),
+        )
 
     def matched(self, scans: Sequence[int]) -> list[int | None]:
         """For each event the visit that it is at; of several events at one visit, the one nearest to its middle. None where it is at none."""
@@ -105,7 +126,10 @@ class Truth:
 
     def names(self, scans: Sequence[int], poses: Array | None = None) -> list[str]:
         """The true place at which each of these scans was taken, or which it shows at this pose: that of the visit; else a door; else one that is named after the room, with others near it."""
-        named: list[str | None] = [next((v.place for v in self.visits if v.first <= scan <= v.last), None) for scan in scans]
+        named: list[str | None] = [
+            next((v.place for v in self.visits if v.first <= scan <= v.last), None)
+            for scan in scans
+        ]
         at = (self.poses[np.asarray(scans, dtype=int)] if poses is None else poses)[:, :2]
         for i, (x, y) in enumerate(at):
             if named[i] is None and self.doors:
@@ -114,14 +138,22 @@ class Truth:
         rooms = [self.rooms[scan] if self.rooms else None for scan in scans]
         for room in dict.fromkeys(rooms):
             here = [i for i in range(len(scans)) if rooms[i] == room and named[i] is None]
-            groups = fcluster(linkage(at[here], "average"), APART, "distance") if len(here) > 1 else np.ones(len(here), int)
-            numbers = {group: number for number, group in enumerate(dict.fromkeys(groups.tolist()), 1)}
+            groups = (
+                fcluster(linkage(at[here], "average"), APART, "distance")
+                if len(here) > 1
+                else np.ones(len(here), int)
+            )
+            numbers = {
+                group: number for number, group in enumerate(dict.fromkeys(groups.tolist()), 1)
+            }
             for i, group in zip(here, groups.tolist(), strict=True):
                 named[i] = f"{room or 'elsewhere'} {numbers[group]}"
         return [name or "" for name in named]
 
 
-def visits_of(places: Mapping[str, Sequence[float]], poses: Array, reach: float = REACH) -> tuple[Visit, ...]:
+def visits_of(
+    places: Mapping[str, Sequence[float]], poses: Array, reach: float = REACH
+) -> tuple[Visit, ...]:
     """The stays within reach of places, (x, y) by name, of a robot that was at these poses. Between two stays at one place the robot comes to another."""
     visits: list[Visit] = []
     for scan, (x, y, _) in enumerate(poses.tolist()):
@@ -138,7 +170,10 @@ def doorways_of(crossings: Sequence[Mapping[str, Any]], poses: Array) -> tuple[V
     found: list[Visit] = []
     for crossing in crossings:
         at = way[min(crossing["scan"], len(way) - 1)]
-        first, last = int(np.searchsorted(way, at - DOOR)), int(np.searchsorted(way, at + DOOR, side="right")) - 1
+        first, last = (
+            int(np.searchsorted(way, at - DOOR)),
+            int(np.searchsorted(way, at + DOOR, side="right")) - 1,
+        )
         if found and found[-1].place == crossing["door"]:
             first = found.pop().first
         found.append(Visit(crossing["door"], first, last))
@@ -162,11 +197,15 @@ class Events:
     def of(trace: Trace, ssh_map: SSHMap | None = None) -> Events:
         """The visits of a trace that was made of a log, and where a map has them."""
         starts = [t for t in range(len(trace)) if t == 0 or trace.actions[t - 1].kind != "turn"]
-        places = [None if ssh_map is None else ssh_map.dstates[ssh_map.labels[t]].place for t in starts]
+        places = [
+            None if ssh_map is None else ssh_map.dstates[ssh_map.labels[t]].place for t in starts
+        ]
         told = told_poses(trace)
         poses = [pose for t in starts if (pose := told[t]) is not None]
         return Events(
-            tuple(int(trace.steps[t].extra["scan"]) for t in starts), tuple(places), np.array(poses) if len(poses) == len(starts) else None
+            tuple(int(trace.steps[t].extra["scan"]) for t in starts),
+            tuple(places),
+            np.array(poses) if len(poses) == len(starts) else None,
         )
 
 
@@ -210,7 +249,11 @@ class Figures:
     @property
     def isomorphic(self) -> bool:
         """Whether its places are what was visited: they are told apart rightly, and each event is a true visit and the other way round, as far as true visits are known."""
-        return bool(self.named.maps[0].places_right) and self.precision in (None, 1.0) and self.recall in (None, 1.0)
+        return (
+            bool(self.named.maps[0].places_right)
+            and self.precision in (None, 1.0)
+            and self.recall in (None, 1.0)
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The figures under short names, None where they cannot be said."""
@@ -240,7 +283,9 @@ class Figures:
 def judged(events: Events, truth: Truth) -> Figures:
     """How right these events are."""
     hits = sum(visit is not None for visit in truth.matched(events.scans))
-    noticed = sum(any(door.first <= scan <= door.last for scan in events.scans) for door in truth.doorways)
+    noticed = sum(
+        any(door.first <= scan <= door.last for scan in events.scans) for door in truth.doorways
+    )
     names = truth.names(events.scans, events.poses)
     poses = truth.poses[list(events.scans)] if events.poses is None else events.poses
     numbers = {place: i for i, place in enumerate(dict.fromkeys(events.places))}
@@ -255,12 +300,18 @@ def judged(events: Events, truth: Truth) -> Figures:
     ]
     trace = Trace((*(replace(step, action=Action.of("travel")) for step in steps[:-1]), steps[-1]))
     dstates = tuple(DState(i, "v", i, None, None) for i in range(len(numbers)))
-    ssh_map = SSHMap(tuple(numbers[place] for place in events.places), dstates, (), tuple(range(len(numbers))))
+    ssh_map = SSHMap(
+        tuple(numbers[place] for place in events.places), dstates, (), tuple(range(len(numbers)))
+    )
     return Figures(
         nodes=len(numbers),
         events=len(names),
         precision=hits / len(names) if truth.visits else None,
-        recall=hits / len(truth.visits) if truth.visits else noticed / len(truth.doorways) if truth.doorways else None,
+        recall=hits / len(truth.visits)
+        if truth.visits
+        else noticed / len(truth.doorways)
+        if truth.doorways
+        else None,
         passes=passes(events, truth),
         named=evaluate([ssh_map], trace),
         posed=evaluate_visits([ssh_map], trace),
@@ -272,7 +323,15 @@ def with_names(trace: Trace, truth: Truth) -> Trace:
     """The trace with the true place of each step as its truth; in ACES3 with its heading, path and direction, too, where the step has a pose."""
     told = told_poses(trace)
     scans = [int(step.extra["scan"]) for step in trace.steps]
-    names = truth.names(scans, np.array([truth.poses[scan] if pose is None else pose for scan, pose in zip(scans, told, strict=True)]))
+    names = truth.names(
+        scans,
+        np.array(
+            [
+                truth.poses[scan] if pose is None else pose
+                for scan, pose in zip(scans, told, strict=True)
+            ]
+        ),
+    )
     known = {visit.place for visit in truth.visits}
     steps = []
     for step, name, pose in zip(trace.steps, names, told, strict=True):
@@ -282,7 +341,9 @@ def with_names(trace: Trace, truth: Truth) -> Trace:
             says |= {"pose": list(pose), "heading": "ENWS"[quarter]}
             if truth.grid and name in known:
                 row = next(i for i, names in enumerate(ACES_NAMES) if name in names)
-                along = f"row {row}" if quarter % 2 == 0 else f"column {ACES_NAMES[row].index(name)}"
+                along = (
+                    f"row {row}" if quarter % 2 == 0 else f"column {ACES_NAMES[row].index(name)}"
+                )
                 says |= {"path": along, "direction": 1 if quarter < 2 else -1}
         steps.append(replace(step, truth=says))
     return replace(trace, steps=tuple(steps))
@@ -300,7 +361,9 @@ def main() -> None:
     events = Events.of(trace)
     matched = truth.matched(events.scans)
     poses = truth.poses[list(events.scans)] if events.poses is None else events.poses
-    for scan, (x, y, heading), name, visit in zip(events.scans, poses, truth.names(events.scans, poses), matched, strict=True):
+    for scan, (x, y, heading), name, visit in zip(
+        events.scans, poses, truth.names(events.scans, poses), matched, strict=True
+    ):
         print(
             f"scan {scan:4}  ({x:6.1f}, {y:6.1f}, {math.degrees(heading):4.0f})  {name}{'' if visit is not None or not truth.visits else '  no visit'}"
         )
@@ -311,8 +374,12 @@ def main() -> None:
             f"{len(matched)} events, precision {figures.precision:.2f}, recall {figures.recall:.2f}; missed: {' '.join(missed) or 'none'}"
         )
     if truth.doorways:
-        print(f"{len(matched)} events; an event or more at {figures.recall:.0%} of {len(truth.doorways)} doors driven through")
-    print("came back {} times to where an event is, and noticed it {} times".format(*figures.passes))
+        print(
+            f"{len(matched)} events; an event or more at {figures.recall:.0%} of {len(truth.doorways)} doors driven through"
+        )
+    print(
+        "came back {} times to where an event is, and noticed it {} times".format(*figures.passes)
+    )
     if options.output:
         with_names(trace, truth).save(options.output)
 
@@ -326,7 +393,11 @@ def truth_of(log: Path, truth: Path | None = None) -> Truth:
     if log.name.startswith("aces"):
         return Truth.of_aces(poses)
     relations = log.with_suffix(".relations")
-    return Truth(poses, times=tuple(scan.time for scan in read.scans), relations=Relations.load(relations) if relations.exists() else None)
+    return Truth(
+        poses,
+        times=tuple(scan.time for scan in read.scans),
+        relations=Relations.load(relations) if relations.exists() else None,
+    )
 
 
 if __name__ == "__main__":

@@ -18,10 +18,23 @@ class Run(clingo.Application):
         for file in files:
             control.load(file)
         control.ground([("base", [])])
-        last = max((atom.symbol.arguments[0].number for atom in control.symbolic_atoms.by_signature("view", 2)), default=-1)
+        last = max(
+            (
+                atom.symbol.arguments[0].number
+                for atom in control.symbolic_atoms.by_signature("view", 2)
+            ),
+            default=-1,
+        )
         if last < 0:
-            sys.exit("run.py: expected facts view(T,V), got none; write them with ssh-abduction facts")
-        control.ground([*(("step", [clingo.Number(t)]) for t in range(last + 1)), ("check", [clingo.Number(last)])])
+            sys.exit(
+                "run.py: expected facts view(T,V), got none; write them with ssh-abduction facts"
+            )
+        control.ground(
+            [
+                *(("step", [clingo.Number(t)]) for t in range(last + 1)),
+                ("check", [clingo.Number(last)]),
+            ]
+        )
         control.assign_external(clingo.Function("query", [clingo.Number(last)]), True)
         control.assign_external(clingo.Function("run_by_steps"), True)
         control.solve()

@@ -49,16 +49,28 @@ THEORIES = {
 def main() -> None:
     parser = argparse.ArgumentParser(description="Map many drives under many theories.")
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--worlds", nargs="+", required=True, help="worlds that ship, world files, or floor plans")
+    parser.add_argument(
+        "--worlds", nargs="+", required=True, help="worlds that ship, world files, or floor plans"
+    )
     parser.add_argument("--seeds", type=int, default=5, help="so many drives through each")
     parser.add_argument("--theories", nargs="+", choices=THEORIES, default=list(THEORIES))
-    parser.add_argument("--time-limit", default="30", help="seconds for the maps of a log (default: 30)")
-    parser.add_argument("--scheduler", help="address of a Dask scheduler; without it, one process a core")
+    parser.add_argument(
+        "--time-limit", default="30", help="seconds for the maps of a log (default: 30)"
+    )
+    parser.add_argument(
+        "--scheduler", help="address of a Dask scheduler; without it, one process a core"
+    )
     options = parser.parse_args()
     names = [Path(world).name.partition(".")[0] for world in options.worlds]
     if len(set(names)) < len(names):
-        parser.error("--worlds: expected worlds with different names, as logs and folders are named after them")
-    tours = [drive(world, seed, options.folder) for world in options.worlds for seed in range(options.seeds)]
+        parser.error(
+            "--worlds: expected worlds with different names, as logs and folders are named after them"
+        )
+    tours = [
+        drive(world, seed, options.folder)
+        for world in options.worlds
+        for seed in range(options.seeds)
+    ]
     logs = [log for log in tours if log.exists()]
     if not logs:
         parser.exit(1, "no drive was made, as said above\n")
@@ -66,14 +78,32 @@ def main() -> None:
     rows = []
     for theory in options.theories:
         runs = options.folder / theory.replace(", ", "-").replace(" ", "-")
-        folder = runs if len(logs) > 1 else runs / logs[0].stem  # a log that stands alone has the folder that is named
-        code = shell(["map", *map(str, logs), "-o", str(folder), "--time-limit", options.time_limit, *where, *THEORIES[theory], "-q"])
+        folder = (
+            runs if len(logs) > 1 else runs / logs[0].stem
+        )  # a log that stands alone has the folder that is named
+        code = shell(
+            [
+                "map",
+                *map(str, logs),
+                "-o",
+                str(folder),
+                "--time-limit",
+                options.time_limit,
+                *where,
+                *THEORIES[theory],
+                "-q",
+            ]
+        )
         if code == INTERRUPTED:
             parser.exit(code, "stopped; the same command goes on from here\n")
         rows += [row for log in logs for row in rows_of(theory, runs / log.stem)]
     text = "".join(json.dumps(row) + "\n" for row in rows)
     (options.folder / "rows.jsonl").write_text(text, encoding="utf-8")
-    failed = f"; {len(tours) - len(logs)} of {len(tours)} drives were not made" if len(logs) < len(tours) else ""
+    failed = (
+        f"; {len(tours) - len(logs)} of {len(tours)} drives were not made"
+        if len(logs) < len(tours)
+        else ""
+    )
     print(f"{len(rows)} solves in {options.folder / 'rows.jsonl'}{failed}")
     print("\n".join(table(rows)))
 
@@ -92,7 +122,11 @@ def rows_of(theory: str, run: Path) -> list[Row]:
     if not (run / "run.json").exists():
         return [{"log": run.name, "theory": theory, "rung": None, "status": "error"}]
     told = json.loads((run / "run.json").read_text(encoding="utf-8"))
-    whole = {"name": "maps", **{name: told[name] for name in ("status", "complete", "count", "cost")}, "pairs": pairs_of(run)}
+    whole = {
+        "name": "maps",
+        **{name: told[name] for name in ("status", "complete", "count", "cost")},
+        "pairs": pairs_of(run),
+    }
     return [
         {
             "log": run.name,
@@ -109,7 +143,9 @@ def pairs_of(run: Path) -> dict[str, int] | None:
     """Of the pairs of visits of a run: how many its first map has at one place, how many of these are, and how many are in truth. None where it has no map."""
     maps = Solution.load(run / "maps.json").maps[:1]
     places = evaluate_visits(maps, Trace.load(run / "trace.jsonl")).maps[0].places if maps else None
-    return {name: getattr(places, name) for name in ("joined", "right", "returns")} if places else None
+    return (
+        {name: getattr(places, name) for name in ("joined", "right", "returns")} if places else None
+    )
 
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
@@ -117,14 +153,20 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
     yield f"{'theory':<22}{'rung':<14}{'drives':>7}{'mapped':>8}{'unique':>8}{'places':>8}{'precision':>11}{'recall':>8}"
     theories = [*dict.fromkeys(row["theory"] for row in rows)]
     for theory, rung in sorted(
-        {(row["theory"], row["rung"]) for row in rows}, key=lambda pair: (theories.index(pair[0]), RUNGS.index(pair[1]))
+        {(row["theory"], row["rung"]) for row in rows},
+        key=lambda pair: (theories.index(pair[0]), RUNGS.index(pair[1])),
     ):
         some = [row for row in rows if (row["theory"], row["rung"]) == (theory, rung)]
         costs = [row["cost"] for row in some if row.get("cost")]
-        unique = sum(row.get("status") == "optimal" and row.get("complete") and row.get("count") == 1 for row in some)
+        unique = sum(
+            row.get("status") == "optimal" and row.get("complete") and row.get("count") == 1
+            for row in some
+        )
         places = f"{median(cost['places'] for cost in costs):g}" if costs else ""
         pairs = [row["pairs"] for row in some if row.get("pairs")]
-        joined, right, returns = (sum(found[name] for found in pairs) for name in ("joined", "right", "returns"))
+        joined, right, returns = (
+            sum(found[name] for found in pairs) for name in ("joined", "right", "returns")
+        )
         precision, recall = (f"{right / n:.2f}" if n else "" for n in (joined, returns))
         yield f"{theory!s:<22}{rung or 'error':<14}{len(some):>7}{len(costs):>8}{unique:>8}{places:>8}{precision:>11}{recall:>8}"
 

@@ -41,16 +41,22 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
     Raises PerceptionError for settings that are out of range or do not fit the images, and ValueError for images that are no finite (n, d) table of values of 0 or more.
     """
 
-    def __init__(self, shape: Shape | None = None, patch: tuple[int, int] = (3, 4), floor: float = 5.0) -> None:
+    def __init__(
+        self, shape: Shape | None = None, patch: tuple[int, int] = (3, 4), floor: float = 5.0
+    ) -> None:
         self.shape, self.patch, self.floor = shape, patch, floor
 
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
         """Learn the shape, and nothing else."""
         images = _bright(validate_data(self, equal_length(X), dtype=np.float64))
-        self.shape_ = (1, images.shape[1], 1) if self.shape is None else _numbers("shape", self.shape, 3)
+        self.shape_ = (
+            (1, images.shape[1], 1) if self.shape is None else _numbers("shape", self.shape, 3)
+        )
         _numbers("patch", self.patch, 2)
         if not is_finite(self.floor) or self.floor < 0:
-            raise PerceptionError(f"floor: expected a number of 0 or more, got {brief(self.floor)}; change it")
+            raise PerceptionError(
+                f"floor: expected a number of 0 or more, got {brief(self.floor)}; change it"
+            )
         if np.prod(self.shape_) != images.shape[1]:
             rows, columns, colours = self.shape_
             raise PerceptionError(
@@ -65,7 +71,9 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
         patches = images.reshape(-1, *self.shape_)
         for axis, pixels in ((1, self.patch[0]), (2, self.patch[1])):
             begins = np.arange(0, patches.shape[axis], pixels)
-            size = np.diff([*begins, patches.shape[axis]]).reshape([-1 if i == axis else 1 for i in range(4)])
+            size = np.diff([*begins, patches.shape[axis]]).reshape(
+                [-1 if i == axis else 1 for i in range(4)]
+            )
             patches = np.add.reduceat(patches, begins, axis=axis) / size
         logs = np.log(np.maximum(patches + self.floor, np.finfo(float).tiny))
         right, down = np.roll(logs, -1, axis=2) - logs, np.diff(logs, axis=1)
@@ -98,7 +106,11 @@ def _bright(images: Any) -> NDArray[np.float64]:
 
 
 def _numbers(name: str, given: Any, count: int) -> tuple[int, ...]:
-    if not isinstance(given, list | tuple) or len(given) != count or not all(is_whole(number) and number >= 1 for number in given):
+    if (
+        not isinstance(given, list | tuple)
+        or len(given) != count
+        or not all(is_whole(number) and number >= 1 for number in given)
+    ):
         raise PerceptionError(
             f"{name}: expected {count} whole numbers of at least 1, got {brief(given)}; give rows and columns of pixels first"
         )

@@ -46,7 +46,9 @@ def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
     inside = images[of != NOISE]
     distances = cdist(inside, _centres(inside, number, len(views)))
     here, size = np.arange(len(inside)), counts[number]
-    own = distances[here, number] * size / np.maximum(size - 1, 1)  # the centre without the image itself
+    own = (
+        distances[here, number] * size / np.maximum(size - 1, 1)
+    )  # the centre without the image itself
     distances[here, number] = np.inf
     next_ = distances.min(axis=1)
     own[size == 1] = next_[size == 1]
@@ -67,7 +69,9 @@ def nearest_views(X: ArrayLike, labels: ArrayLike) -> NDArray[np.intp]:
         return of
     views, number = np.unique(of[~noise], return_inverse=True)
     found = of.copy()
-    found[noise] = views[cdist(images[noise], _centres(images[~noise], number, len(views))).argmin(axis=1)]
+    found[noise] = views[
+        cdist(images[noise], _centres(images[~noise], number, len(views))).argmin(axis=1)
+    ]
     return found
 
 
@@ -84,17 +88,27 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
     rare = size <= (max(RARE * usual, FEW) if usual >= SEEN else 0)
     doubtful = np.flatnonzero((of == NOISE) | rare | ((certain < SURE) & (size > 1)))
     if len(doubtful):
-        named = ", ".join(map(str, doubtful[:NAMED].tolist())) + (", …" if len(doubtful) > NAMED else "")
+        named = ", ".join(map(str, doubtful[:NAMED].tolist())) + (
+            ", …" if len(doubtful) > NAMED else ""
+        )
         text = f"{len(doubtful)} of {len(of)} images are like those of no view, or of a view that was hardly ever seen (image {named})"
         warnings.warn(
-            f"{text}: their views may be wrong, and the map with them; look whether something stood before the laser", ImageWarning, 2
+            f"{text}: their views may be wrong, and the map with them; look whether something stood before the laser",
+            ImageWarning,
+            2,
         )
     if quality < 1:
         text = f"views overlap (M is {quality:.2f}, below 1): some images of two views are nearer to each other than some of one view"
-        warnings.warn(f"{text}; log images where the robot stands still, at places that it comes back to", ImageWarning, 2)
+        warnings.warn(
+            f"{text}; log images where the robot stands still, at places that it comes back to",
+            ImageWarning,
+            2,
+        )
 
 
-def _centres(images: NDArray[np.float64], number: NDArray[np.intp], views: int) -> NDArray[np.float64]:
+def _centres(
+    images: NDArray[np.float64], number: NDArray[np.intp], views: int
+) -> NDArray[np.float64]:
     """The mean image of each view, (k, d)."""
     return np.array([images[number == view].mean(axis=0) for view in range(views)])
 
@@ -103,5 +117,7 @@ def _checked(X: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64], NDAr
     images: Any = check_array(equal_length(X), dtype=np.float64)
     of = np.asarray(labels)
     if of.shape != (len(images),) or not np.issubdtype(of.dtype, np.integer):
-        raise PerceptionError(f"labels: expected {len(images)} whole numbers, one an image, got an array of shape {of.shape}")
+        raise PerceptionError(
+            f"labels: expected {len(images)} whole numbers, one an image, got an array of shape {of.shape}"
+        )
     return images, of.astype(np.intp)

@@ -51,7 +51,9 @@ class TellingFeatures:
         return {"margin": self.margin, "permutation": self.permutation, "linear": self.linear}
 
 
-def telling_features(X: ArrayLike, labels: ArrayLike, a: Any, b: Any, random_state: int = 0) -> TellingFeatures:
+def telling_features(
+    X: ArrayLike, labels: ArrayLike, a: Any, b: Any, random_state: int = 0
+) -> TellingFeatures:
     """Which features tell the dstates `a` and `b` apart.
 
     X       (n, d) images, as the recogniser compares them: reciprocals of ranges
@@ -62,19 +64,30 @@ def telling_features(X: ArrayLike, labels: ArrayLike, a: Any, b: Any, random_sta
     images = check_array(equal_length(X), dtype=np.float64)
     of = np.asarray(labels)
     if of.shape != (len(images),):
-        raise PerceptionError(f"labels: expected {len(images)}, one an image, got an array of shape {of.shape}")
+        raise PerceptionError(
+            f"labels: expected {len(images)}, one an image, got an array of shape {of.shape}"
+        )
     if a == b:
-        raise PerceptionError(f"dstates: expected two different ones, got {a!r} twice; name another one")
+        raise PerceptionError(
+            f"dstates: expected two different ones, got {a!r} twice; name another one"
+        )
     for name in (a, b):
         if np.count_nonzero(of == name) < 2:
             seen = np.count_nonzero(of == name)
-            raise PerceptionError(f"dstates: expected at least two images of {name!r}, got {seen}; log more, or name another one")
+            raise PerceptionError(
+                f"dstates: expected at least two images of {name!r}, got {seen}; log more, or name another one"
+            )
     images, second = images[(of == a) | (of == b)], of[(of == a) | (of == b)] == b
     hit, miss = _neighbours(images, second)
     margin = (np.abs(images - images[miss]) - np.abs(images - images[hit])).mean(axis=0)
-    far = np.linalg.norm(images - images[miss], axis=1) - np.linalg.norm(images - images[hit], axis=1)
+    far = np.linalg.norm(images - images[miss], axis=1) - np.linalg.norm(
+        images - images[hit], axis=1
+    )
     return TellingFeatures(
-        _shares(margin), _shares(_permuted(images, second, random_state)), _shares(_linear(images, second)), float(np.mean(far > 0))
+        _shares(margin),
+        _shares(_permuted(images, second, random_state)),
+        _shares(_linear(images, second)),
+        float(np.mean(far > 0)),
     )
 
 
@@ -82,19 +95,26 @@ def strongest(shares: ArrayLike, most: float = 0.5) -> str:
     """The features that have the largest shares, and together `most` of all, as stretches: "3–14, 80"."""
     weights = np.asarray(shares)
     order = np.argsort(-weights, kind="stable")
-    chosen = np.sort(order[: int(np.searchsorted(np.cumsum(weights[order]), most * weights.sum())) + 1])
+    chosen = np.sort(
+        order[: int(np.searchsorted(np.cumsum(weights[order]), most * weights.sum())) + 1]
+    )
     if not weights.any():
         return "–"
     parts = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
     return ", ".join(str(part[0]) if len(part) == 1 else f"{part[0]}–{part[-1]}" for part in parts)
 
 
-def _neighbours(images: Floats, second: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _neighbours(
+    images: Floats, second: NDArray[np.bool_]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """For each image the nearest other one of its dstate, and the nearest one of the other dstate."""
     distances = cdist(images, images)
     np.fill_diagonal(distances, np.inf)
     same = second[:, None] == second
-    hits, misses = np.where(same, distances, np.inf).argmin(axis=1), np.where(same, np.inf, distances).argmin(axis=1)
+    hits, misses = (
+        np.where(same, distances, np.inf).argmin(axis=1),
+        np.where(same, np.inf, distances).argmin(axis=1),
+    )
     return hits.astype(np.intp), misses.astype(np.intp)
 
 
@@ -104,7 +124,14 @@ def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
     known, asked = order[::2], order[1::2]
     model = KNeighborsClassifier(1, algorithm="brute").fit(images[known], second[known])
     return np.asarray(
-        permutation_importance(model, images[asked], second[asked], scoring=_margin, n_repeats=SHUFFLED, random_state=seed).importances_mean
+        permutation_importance(
+            model,
+            images[asked],
+            second[asked],
+            scoring=_margin,
+            n_repeats=SHUFFLED,
+            random_state=seed,
+        ).importances_mean
     )
 
 
@@ -115,7 +142,12 @@ def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
     """
     distances = cdist(images, model._fit_X, "sqeuclidean")
     same = second[:, None] == model.classes_[model._y]
-    return float((np.where(same, np.inf, distances).min(axis=1) - np.where(same, distances, np.inf).min(axis=1)).mean())
+    return float(
+        (
+            np.where(same, np.inf, distances).min(axis=1)
+            - np.where(same, distances, np.inf).min(axis=1)
+        ).mean()
+    )
 
 
 def _linear(images: Floats, second: NDArray[np.bool_]) -> Floats:

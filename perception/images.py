@@ -23,15 +23,21 @@ def images_of(trace: Trace) -> NDArray[np.float64]:
     """
     for i, step in enumerate(trace.steps):
         if step.image is None:
-            raise PerceptionError(f"{trace.at(i)}: image: expected one, got none; log an image at each step")
+            raise PerceptionError(
+                f"{trace.at(i)}: image: expected one, got none; log an image at each step"
+            )
     held = images_held(trace)
     lengths = [len(image) for image in held]  # type: ignore[arg-type]  # as each step has one
     if not lengths[0]:
-        raise PerceptionError(f"{trace.at(0)}: image: expected at least one range, got none; log what the robot saw")
+        raise PerceptionError(
+            f"{trace.at(0)}: image: expected at least one range, got none; log what the robot saw"
+        )
     for i, beams in enumerate(lengths):
         if beams != lengths[0]:
             mend = "give every image the same number of beams"
-            raise PerceptionError(f"{trace.at(i)}: image: expected {lengths[0]} ranges, as the first has, got {beams}; {mend}")
+            raise PerceptionError(
+                f"{trace.at(i)}: image: expected {lengths[0]} ranges, as the first has, got {beams}; {mend}"
+            )
     return np.array(held, dtype=float)
 
 
@@ -44,22 +50,38 @@ def images_held(trace: Trace) -> list[NDArray[np.float64] | None]:
     rows: list[NDArray[np.float64] | None] = []
     for i, image in enumerate(held):
         if isinstance(image, int) and image >= len(table):
-            raise PerceptionError(f"{trace.at(i)}: image: expected an index below {len(table)}, got {image}; {trace.images} has no more")
-        rows.append(None if image is None else table[image] if isinstance(image, int) else np.array(image, dtype=float))
+            raise PerceptionError(
+                f"{trace.at(i)}: image: expected an index below {len(table)}, got {image}; {trace.images} has no more"
+            )
+        rows.append(
+            None
+            if image is None
+            else table[image]
+            if isinstance(image, int)
+            else np.array(image, dtype=float)
+        )
     return rows
 
 
 def _sidecar(trace: Trace) -> NDArray[np.float64]:
     """The table in the sidecar file of a trace."""
     if trace.images is None:
-        raise PerceptionError(f"{trace.at(0)}: image: expected the header to name a file of images for the indices, got none; add images")
+        raise PerceptionError(
+            f"{trace.at(0)}: image: expected the header to name a file of images for the indices, got none; add images"
+        )
     path = Path(trace.source or ".").parent / trace.images
     try:
         with path.open("rb") as file:  # numpy leaves a damaged file open
             _affordable(file)
             data = np.load(file, allow_pickle=False)
-            table = data if isinstance(data, np.ndarray) else data["images" if "images" in data else data.files[0]]
-            floats = np.issubdtype(table.dtype, np.integer) or np.issubdtype(table.dtype, np.floating)
+            table = (
+                data
+                if isinstance(data, np.ndarray)
+                else data["images" if "images" in data else data.files[0]]
+            )
+            floats = np.issubdtype(table.dtype, np.integer) or np.issubdtype(
+                table.dtype, np.floating
+            )
             shape = table.shape
     except OSError as error:
         raise PerceptionError(
@@ -69,9 +91,13 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
         raise
     except Exception as error:  # each part of a damaged archive fails in its own way: zlib.error, MemoryError, AttributeError, …
         why = f"{type(error).__name__}: {error}"
-        raise PerceptionError(f"{path}: expected a .npy or .npz file of images, got something else ({why}); write it again") from None
+        raise PerceptionError(
+            f"{path}: expected a .npy or .npz file of images, got something else ({why}); write it again"
+        ) from None
     if len(shape) != 2 or not floats:
-        raise PerceptionError(f"{path}: expected a table of images x ranges, got {table.dtype} of shape {shape}; store one image a row")
+        raise PerceptionError(
+            f"{path}: expected a table of images x ranges, got {table.dtype} of shape {shape}; store one image a row"
+        )
     return table.astype(float)
 
 
@@ -81,5 +107,7 @@ def _affordable(file: BinaryIO) -> None:
         with zipfile.ZipFile(file) as archive:
             unpacked = sum(part.file_size for part in archive.infolist())
         if unpacked > LARGEST:
-            raise PerceptionError(f"images: expected at most {LARGEST} bytes once unpacked, got {unpacked}; write fewer images a file")
+            raise PerceptionError(
+                f"images: expected at most {LARGEST} bytes once unpacked, got {unpacked}; write fewer images a file"
+            )
     file.seek(0)

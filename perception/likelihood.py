@@ -1,7 +1,7 @@
 """How probable an image is at each place that a recogniser knows, and how probable it is at none of them.
 
->>> from perception.recognition import PlaceRecognizer
->>> known = PlaceRecognizer().fit([[1.0, 4.0], [1.2, 4.0], [3.0, 3.0], [3.0, 3.1]], ["corner", "corner", "hall", "hall"])
+>>> from perception.recognition import PlaceRecogniser
+>>> known = PlaceRecogniser().fit([[1.0, 4.0], [1.2, 4.0], [3.0, 3.0], [3.0, 3.1]], ["corner", "corner", "hall", "hall"])
 >>> likelihood = ImageLikelihood.of(known)
 >>> likelihood.labels([[1.1, 4.0], [3.0, 3.2], [9.0, 0.0]])
 ['corner', 'hall', None]
@@ -31,7 +31,7 @@ from sklearn.exceptions import NotFittedError
 from sklearn.pipeline import Pipeline
 
 from perception.errors import PerceptionError, equal_length
-from perception.recognition import PlaceRecognizer
+from perception.recognition import PlaceRecogniser
 from ssh_abduction.data.errors import brief
 
 # The spread of a place's images is at least this share of the spread of all images: images without any noise, such as those of a test, are not infinitely certain.
@@ -46,7 +46,7 @@ UNMAPPED = 0.1
 class ImageLikelihood:
     """What a recogniser's distances say of images.
 
-    recogniser  the fitted estimator: a PlaceRecognizer, or a pipeline that ends with one
+    recogniser  the fitted estimator: a PlaceRecogniser, or a pipeline that ends with one
     classes     its places, (c,)
     within      mean squared distance from an image to the nearest other one of its place
     spread      mean squared distance from an image to the mean of all images
@@ -65,9 +65,9 @@ class ImageLikelihood:
     def of(cls, recogniser: Any) -> ImageLikelihood:
         """Measure the distances within a recogniser's memory. Raises PerceptionError where it is of another kind, or saw no place twice."""
         nearest = _nearest(recogniser)
-        if not isinstance(nearest, PlaceRecognizer):
+        if not isinstance(nearest, PlaceRecogniser):
             raise PerceptionError(
-                f"recogniser: expected a PlaceRecognizer, or a pipeline that ends with one, got a {type(nearest).__name__}; make one with recogniser()"
+                f"recogniser: expected a PlaceRecogniser, or a pipeline that ends with one, got a {type(nearest).__name__}; make one with recogniser()"
             )
         try:
             images, labels = nearest.remembered()
@@ -81,7 +81,9 @@ class ImageLikelihood:
             raise PerceptionError(
                 "recogniser: expected one that remembers images of finite numbers, got NaN, infinity, or numbers too large to square; train it again"
             )
-        squares = np.concatenate([_to_nearest_other(images[labels == label]) for label in np.unique(labels)])
+        squares = np.concatenate(
+            [_to_nearest_other(images[labels == label]) for label in np.unique(labels)]
+        )
         if not len(squares):
             raise PerceptionError(
                 "recogniser: expected two images of some place, to learn how images of one place differ, got one of each; train it on a longer trace"
@@ -103,7 +105,9 @@ class ImageLikelihood:
         features = self._features(images)
         for some in np.array_split(features, max(1, math.ceil(len(features) / AT_ONCE))):
             known, novel = self._of_features(some)
-            nowhere = logsumexp(np.column_stack([known, novel]), axis=1) - np.log(known.shape[1] + 1)
+            nowhere = logsumexp(np.column_stack([known, novel]), axis=1) - np.log(
+                known.shape[1] + 1
+            )
             yield from np.exp(known - nowhere[:, None])
 
     def labels(self, images: ArrayLike, unmapped: float = UNMAPPED) -> list[Any]:
@@ -133,8 +137,15 @@ class ImageLikelihood:
                 f"images: expected {beams} ranges each, as the recogniser learnt, got a table of shape {table.shape}; take its own images"
             )
         try:
-            features = np.asarray(self.recogniser[:-1].transform(table) if isinstance(self.recogniser, Pipeline) else table, np.float64)
-        except Exception as error:  # each part of a model that was damaged in its file fails in its own way
+            features = np.asarray(
+                self.recogniser[:-1].transform(table)
+                if isinstance(self.recogniser, Pipeline)
+                else table,
+                np.float64,
+            )
+        except (
+            Exception
+        ) as error:  # each part of a model that was damaged in its file fails in its own way
             raise PerceptionError(
                 f"recogniser: expected one that reads images, got {type(error).__name__}: {error}; train it again"
             ) from None
@@ -144,13 +155,17 @@ class ImageLikelihood:
             )
         return features
 
-    def _of_features(self, features: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _of_features(
+        self, features: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         known = self._log_density(_nearest(self.recogniser).distances(features) ** 2, self.within)
         return known, self._log_density(np.sum((features - self.centre) ** 2, axis=1), self.spread)
 
     def _log_density(self, squares: NDArray[np.float64], mean: float) -> NDArray[np.float64]:
         """Log density of an isotropic Gaussian in `dimensions` dimensions whose squared distances from its centre have this mean."""
-        return np.asarray(-0.5 * self.dimensions * (np.log(2 * np.pi * mean / self.dimensions) + squares / mean))
+        return np.asarray(
+            -0.5 * self.dimensions * (np.log(2 * np.pi * mean / self.dimensions) + squares / mean)
+        )
 
 
 def _nearest(recogniser: Any) -> Any:

@@ -104,7 +104,9 @@ def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None =
     return between / within if within > 0 else math.inf
 
 
-def trimmed_quality(X: ArrayLike, labels: ArrayLike, trim: float = 0.5, distances: Floats | None = None) -> float:
+def trimmed_quality(
+    X: ArrayLike, labels: ArrayLike, trim: float = 0.5, distances: Floats | None = None
+) -> float:
     """M with quantiles in the place of its extremes, so that one lost beam or one strange image does not decide. Larger is better.
 
     In M, the smallest distance between clusters and the largest within one are each that of a single pair of images. Here two clusters are as far from each
@@ -120,7 +122,11 @@ def trimmed_quality(X: ArrayLike, labels: ArrayLike, trim: float = 0.5, distance
     Returns a number in [0, inf]: NaN for one cluster, infinite where no cluster has a width. Raises PerceptionError for labels of another length, and for
     another trim.
     """
-    if not (isinstance(trim, int | float | np.number) and not isinstance(trim, bool) and 0 <= trim <= 0.5):
+    if not (
+        isinstance(trim, int | float | np.number)
+        and not isinstance(trim, bool)
+        and 0 <= trim <= 0.5
+    ):
         raise PerceptionError(f"trim: expected a share from 0 to 0.5, got {trim!r}")
     images = check_array(equal_length(X), dtype=np.float64)
     clusters = _numbered(labels, len(images))
@@ -134,8 +140,14 @@ def trimmed_quality(X: ArrayLike, labels: ArrayLike, trim: float = 0.5, distance
         return 0.0  # the sample shows no gap
     usual = float(np.median([len(m) for m in members]))
     wide = [m for m in members if len(m) > (FEW if usual >= SEEN else 1)]
-    widths = [np.quantile(distances[np.ix_(m, m)][np.triu_indices(len(m), 1)], 1 - trim) for m in wide]
-    gaps = [np.quantile(distances[np.ix_(m, other)], trim) for i, m in enumerate(members) for other in members[:i]]
+    widths = [
+        np.quantile(distances[np.ix_(m, m)][np.triu_indices(len(m), 1)], 1 - trim) for m in wide
+    ]
+    gaps = [
+        np.quantile(distances[np.ix_(m, other)], trim)
+        for i, m in enumerate(members)
+        for other in members[:i]
+    ]
     between, within = float(min(gaps)), float(max(widths, default=0.0))
     return 0.0 if between == 0 else between / within if within > 0 else math.inf
 
@@ -176,7 +188,10 @@ def spanning_tree(X: ArrayLike) -> SpanningTree:
         squares, picks = cells.shortest_leaving(components)
         order = np.argsort(squares, kind="stable")
         added = [c for c in order.tolist() if forest.merge(int(picks[c, 0]), int(picks[c, 1]))]
-        edges, lengths = np.concatenate([edges, picks[added]]), np.concatenate([lengths, np.sqrt(squares[added])])
+        edges, lengths = (
+            np.concatenate([edges, picks[added]]),
+            np.concatenate([lengths, np.sqrt(squares[added])]),
+        )
         links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
         components = connected_components(links, directed=False)[1].astype(np.intp)
     order = np.argsort(lengths, kind="stable")
@@ -220,9 +235,16 @@ class _Cells:
         self.slices = [slice(a, b) for a, b in zip(self.starts[:-1], self.starts[1:], strict=True)]
         self.reach = np.array([math.sqrt(self.norms[s].max()) for s in self.slices])
         centres = np.array([self.images[s].mean(axis=0) for s in self.slices])
-        radii = np.array([math.sqrt(_squares(self.images[s] - c).max()) for s, c in zip(self.slices, centres, strict=True)])
+        radii = np.array(
+            [
+                math.sqrt(_squares(self.images[s] - c).max())
+                for s, c in zip(self.slices, centres, strict=True)
+            ]
+        )
         self.first, self.second = np.triu_indices(len(parts))
-        apart = np.concatenate([np.sqrt(_squares(centres[i:] - centres[i])) for i in range(len(parts))])
+        apart = np.concatenate(
+            [np.sqrt(_squares(centres[i:] - centres[i])) for i in range(len(parts))]
+        )
         gap = apart - radii[self.first] - radii[self.second] - 1e-12 * (apart + self.reach.max())
         gap[self.first == self.second] = 0
         self.bounds = np.maximum(gap, 0) ** 2
@@ -236,9 +258,14 @@ class _Cells:
         ):  # products are so small here that threads would wait for each other longer than they work
             while len(pairs):
                 limits = np.maximum.reduceat(search.best[search.components], self.starts[:-1])
-                pairs = pairs[self.bounds[pairs] < np.maximum(limits[self.first[pairs]], limits[self.second[pairs]])]
+                pairs = pairs[
+                    self.bounds[pairs]
+                    < np.maximum(limits[self.first[pairs]], limits[self.second[pairs]])
+                ]
                 for p in pairs[:BATCH].tolist():
-                    self.bounds[p] = max(self.bounds[p], self._compare(self.first[p], self.second[p], search))
+                    self.bounds[p] = max(
+                        self.bounds[p], self._compare(self.first[p], self.second[p], search)
+                    )
                 pairs = pairs[BATCH:]
         return search.best, self.order[search.ends]
 
@@ -341,10 +368,15 @@ def _wider(images: Floats, best: float) -> float:
             if float(upper.max()) + slack <= (best / scale) ** 2:
                 continue
             i, j = np.unravel_index(upper.argmax(), upper.shape)
-            best = max(best, math.sqrt(_squares(centred[kept[[a + i]]] - centred[kept[[b + j]]])[0]))
+            best = max(
+                best, math.sqrt(_squares(centred[kept[[a + i]]] - centred[kept[[b + j]]])[0])
+            )
             near, far = np.nonzero(upper > (best / scale) ** 2 - slack)
             for k in range(0, len(near), GATHERED):
-                pairs = centred[kept[a + near[k : k + GATHERED]]] - centred[kept[b + far[k : k + GATHERED]]]
+                pairs = (
+                    centred[kept[a + near[k : k + GATHERED]]]
+                    - centred[kept[b + far[k : k + GATHERED]]]
+                )
                 best = max(best, math.sqrt(_squares(pairs).max()))
     return best
 

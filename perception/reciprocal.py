@@ -34,14 +34,18 @@ class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimato
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
         """Learn the number of beams, and nothing else."""
         if not is_finite(self.floor) or self.floor <= 0:
-            raise PerceptionError(f"floor: expected a positive number of metres, got {self.floor!r}")
+            raise PerceptionError(
+                f"floor: expected a positive number of metres, got {self.floor!r}"
+            )
         validate_data(self, equal_length(X), dtype=np.float64, ensure_all_finite=False)
         return self
 
     def transform(self, X: ArrayLike) -> NDArray[np.float64]:
         """The reciprocals, (n, d), in 1/m, within [0, 1 / floor]."""
         check_is_fitted(self)
-        ranges = validate_data(self, equal_length(X), dtype=np.float64, ensure_all_finite=False, reset=False)
+        ranges = validate_data(
+            self, equal_length(X), dtype=np.float64, ensure_all_finite=False, reset=False
+        )
         infinite, missing, without = np.isposinf(ranges), np.isnan(ranges), ranges <= 0
         counts = [int(np.count_nonzero(part)) for part in (infinite, missing, without)]
         if any(counts):

@@ -26,7 +26,7 @@ from perception.reciprocal import ReciprocalTransformer
 from ssh_abduction.data.errors import brief
 
 
-class PlaceRecognizer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     """The label of the nearest image, or the commonest among the `n_neighbors` nearest (Euclidean distance).
 
     Attributes: classes_, (c,); neighbours_, the fitted KNeighborsClassifier. Raises PerceptionError for a number of neighbours that is
@@ -40,8 +40,14 @@ class PlaceRecognizer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """Remember images, (n, d), and their labels, (n,)."""
         images, labels = validate_data(self, equal_length(X), y, dtype=np.float64)
         number = self.n_neighbors
-        if not isinstance(number, int | np.integer) or isinstance(number, bool) or not 1 <= number <= len(images):
-            raise PerceptionError(f"n_neighbors: expected a whole number from 1 to the {len(images)} images, got {number!r}")
+        if (
+            not isinstance(number, int | np.integer)
+            or isinstance(number, bool)
+            or not 1 <= number <= len(images)
+        ):
+            raise PerceptionError(
+                f"n_neighbors: expected a whole number from 1 to the {len(images)} images, got {number!r}"
+            )
         with warnings.catch_warnings():  # scikit-learn takes labels for numbers to regress on where many of them occur once or twice
             warnings.filterwarnings("ignore", "The number of unique classes")
             check_classification_targets(labels)
@@ -69,13 +75,13 @@ class PlaceRecognizer(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         held = self._neighbours()
         return np.asarray(held._fit_X), np.asarray(self.classes_)[np.asarray(held._y)]
 
-    def learnt_again(self) -> PlaceRecognizer:
+    def learnt_again(self) -> PlaceRecogniser:
         """A recogniser that learns from scratch the images and labels that this one remembers, and so answers the same.
 
         scikit-learn's compiled search trusts its tables, and tables that were damaged in a file can end the whole process. What is learnt
         again has been checked again. Raises PerceptionError, ValueError or another error of numpy's where the tables are not sound.
         """
-        return PlaceRecognizer(self.n_neighbors).fit(*self.remembered())
+        return PlaceRecogniser(self.n_neighbors).fit(*self.remembered())
 
     def _neighbours(self) -> Any:
         check_is_fitted(self)
@@ -91,15 +97,21 @@ def recogniser(floor: float = 0.05, n_neighbors: int = 1, features: Any = None) 
     floor     of the reciprocals of ranges in metres, which are the features where no others are given
     features  a transformer of scikit-learn's kind for other images, such as a PanoramaTransformer. It is cloned
     """
-    made = ("reciprocal", ReciprocalTransformer(floor)) if features is None else ("features", cloned("features", features, "transform"))
-    return Pipeline([made, ("nearest", PlaceRecognizer(n_neighbors))])
+    made = (
+        ("reciprocal", ReciprocalTransformer(floor))
+        if features is None
+        else ("features", cloned("features", features, "transform"))
+    )
+    return Pipeline([made, ("nearest", PlaceRecogniser(n_neighbors))])
 
 
 def cloned(name: str, estimator: Any, *methods: str) -> Any:
     """A clone of an estimator of scikit-learn's kind, which has `fit` and these methods. Raises PerceptionError for anything else."""
     wanted = ("fit", "get_params", *methods)
     if isinstance(estimator, type) or not all(hasattr(estimator, method) for method in wanted):
-        raise PerceptionError(f"{name}: expected an estimator with {', '.join(wanted)}, got {brief(estimator)}; make one of scikit-learn's")
+        raise PerceptionError(
+            f"{name}: expected an estimator with {', '.join(wanted)}, got {brief(estimator)}; make one of scikit-learn's"
+        )
     return clone(estimator)
 
 
@@ -140,11 +152,15 @@ def learning_curve(
     """
     estimator = recogniser() if estimator is None else estimator
     images, labels = np.asarray(equal_length(X)), np.asarray(y)
-    clone(estimator).fit(images, labels)  # so that warnings and errors about the images come once, and not for each fold
+    clone(estimator).fit(
+        images, labels
+    )  # so that warnings and errors about the images come once, and not for each fold
     wanted = tuple(int(size) for size in sizes)
     for size in wanted:
         if not 1 <= size <= len(images):
-            raise PerceptionError(f"sizes: expected numbers from 1 to the {len(images)} images, got {size}")
+            raise PerceptionError(
+                f"sizes: expected numbers from 1 to the {len(images)} images, got {size}"
+            )
     fold, untested = _deal(labels, folds, random_state)
     rates = np.zeros((len(wanted), folds))
     with warnings.catch_warnings():
@@ -154,12 +170,19 @@ def learning_curve(
             for s, size in enumerate(wanted):
                 train = np.flatnonzero(~test[:size])
                 if len(train):
-                    rates[s, f] = np.mean(clone(estimator).fit(images[train], labels[train]).predict(images[test]) == labels[test])
-    mean, lowest, highest = (tuple(part.tolist()) for part in (rates.mean(axis=1), rates.min(axis=1), rates.max(axis=1)))
+                    rates[s, f] = np.mean(
+                        clone(estimator).fit(images[train], labels[train]).predict(images[test])
+                        == labels[test]
+                    )
+    mean, lowest, highest = (
+        tuple(part.tolist()) for part in (rates.mean(axis=1), rates.min(axis=1), rates.max(axis=1))
+    )
     return LearningCurve(wanted, mean, lowest, highest, folds, untested)
 
 
-def _deal(labels: NDArray[Any], folds: int, random_state: Any) -> tuple[NDArray[np.intp], tuple[Any, ...]]:
+def _deal(
+    labels: NDArray[Any], folds: int, random_state: Any
+) -> tuple[NDArray[np.intp], tuple[Any, ...]]:
     """The fold of each image, -1 for those never tested, and the classes that are never tested.
 
     Images are dealt round like cards, one class after the other. So the sizes of folds differ by at most one image, in all and within each class.
@@ -171,7 +194,12 @@ def _deal(labels: NDArray[Any], folds: int, random_state: Any) -> tuple[NDArray[
     cards = shuffled[np.argsort(of[shuffled], kind="stable")]
     cards = cards[counts[of[cards]] > 1]
     if len(cards) < folds:
-        raise PerceptionError(f"folds: expected at most {len(cards)}, the images of places seen more than once, got {folds}")
+        raise PerceptionError(
+            f"folds: expected at most {len(cards)}, the images of places seen more than once, got {folds}"
+        )
     fold = np.full(len(labels), -1, np.intp)
     fold[cards] = np.arange(len(cards)) % folds
     return fold, tuple(classes[counts == 1].tolist())
+
+
+PlaceRecognizer = PlaceRecogniser  # its name of version 0.1.0, which files of recognisers hold

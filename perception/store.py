@@ -24,14 +24,18 @@ from perception.appearance import PanoramaTransformer
 from perception.errors import PerceptionError
 from perception.likelihood import ImageLikelihood
 from perception.reciprocal import ReciprocalTransformer
-from perception.recognition import PlaceRecognizer
+from perception.recognition import PlaceRecogniser
 from perception.views import ViewClusterer
 from ssh_abduction.data.errors import brief, is_whole
 from ssh_abduction.data.files import write_file
 
 FORMAT, VERSION = "ssh-recogniser", 1
-OURS = tuple(
-    f"{kind.__module__}.{kind.__qualname__}" for kind in (PlaceRecognizer, PanoramaTransformer, ReciprocalTransformer, ViewClusterer)
+OURS = (
+    *(
+        f"{kind.__module__}.{kind.__qualname__}"
+        for kind in (PlaceRecogniser, PanoramaTransformer, ReciprocalTransformer, ViewClusterer)
+    ),
+    "perception.recognition.PlaceRecognizer",  # in files of version 0.1.0
 )
 # Bytes that a file may have once it is unpacked: a small archive may claim to hold more than the memory.
 LARGEST = 4 * 2**30
@@ -76,9 +80,13 @@ class Stored:
         except PerceptionError:
             raise
         except Exception as error:  # each part of a damaged model fails in its own way
-            raise PerceptionError(f"recogniser: expected one that answers, got {type(error).__name__}: {error}; train it again") from None
+            raise PerceptionError(
+                f"recogniser: expected one that answers, got {type(error).__name__}: {error}; train it again"
+            ) from None
         if not sound:
-            raise PerceptionError(f"recogniser: expected whole numbers as labels, got {found.dtype} of shape {found.shape}; train it again")
+            raise PerceptionError(
+                f"recogniser: expected whole numbers as labels, got {found.dtype} of shape {found.shape}; train it again"
+            )
         return labels
 
 
@@ -88,16 +96,32 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     Raises PerceptionError where `load` would refuse it, or the file cannot be written.
     """
     classes = np.asarray(getattr(model, "classes_", ())).tolist()
-    versions = {name: version(name) for name in ("numpy", "scikit-learn", "skops", "ssh-abduction")} | {"python": platform.python_version()}
-    data = skops.io.dumps({"format": FORMAT, "version": VERSION, "model": model, "classes": classes, "versions": versions})
+    versions = {
+        name: version(name) for name in ("numpy", "scikit-learn", "skops", "ssh-abduction")
+    } | {"python": platform.python_version()}
+    data = skops.io.dumps(
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "model": model,
+            "classes": classes,
+            "versions": versions,
+        }
+    )
     if foreign := _foreign(data=data):
-        raise PerceptionError(f"{path}: expected a model of types that can be read back, got {', '.join(foreign)}")
+        raise PerceptionError(
+            f"{path}: expected a model of types that can be read back, got {', '.join(foreign)}"
+        )
     try:
         write_file(path, data)
     except OSError as error:
-        raise PerceptionError(f"{path}: cannot write the recogniser: {error.strerror or error}; check the folder") from None
+        raise PerceptionError(
+            f"{path}: cannot write the recogniser: {error.strerror or error}; check the folder"
+        ) from None
     except ValueError as error:
-        raise PerceptionError(f"{brief(str(path))}: cannot write the recogniser: {error}; name a file") from None
+        raise PerceptionError(
+            f"{brief(str(path))}: cannot write the recogniser: {error}; name a file"
+        ) from None
 
 
 def load(path: str | os.PathLike[str]) -> Stored:
@@ -106,7 +130,9 @@ def load(path: str | os.PathLike[str]) -> Stored:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(part.file_size for part in archive.infolist())
         if unpacked > LARGEST:
-            raise PerceptionError(f"{path}: expected at most {LARGEST} bytes once unpacked, got {unpacked}")
+            raise PerceptionError(
+                f"{path}: expected at most {LARGEST} bytes once unpacked, got {unpacked}"
+            )
         if foreign := _foreign(file=path):
             raise PerceptionError(
                 f"{path}: expected scikit-learn's and this package's types only, got {', '.join(foreign)}; do not trust it"
@@ -115,28 +141,42 @@ def load(path: str | os.PathLike[str]) -> Stored:
     except PerceptionError:
         raise
     except OSError as error:
-        raise PerceptionError(f"{path}: expected a readable recogniser: {error.strerror or error}; check the path") from None
+        raise PerceptionError(
+            f"{path}: expected a readable recogniser: {error.strerror or error}; check the path"
+        ) from None
     except Exception as error:  # each part of a damaged archive fails in its own way
         raise PerceptionError(
             f"{path}: expected a .skops file that train or save wrote, got something else ({type(error).__name__})"
         ) from error
-    if not isinstance(held, dict) or not isinstance(held.get("format"), str) or held["format"] != FORMAT:
-        raise PerceptionError(f"{path}: expected a file of format {FORMAT}, got another object; write it with train or save")
+    if (
+        not isinstance(held, dict)
+        or not isinstance(held.get("format"), str)
+        or held["format"] != FORMAT
+    ):
+        raise PerceptionError(
+            f"{path}: expected a file of format {FORMAT}, got another object; write it with train or save"
+        )
     version = held.get("version")
     if not is_whole(version) or version != VERSION:
-        raise PerceptionError(f"{path}: expected version {VERSION}, got {_kind(version)}; use the program that wrote it")
+        raise PerceptionError(
+            f"{path}: expected version {VERSION}, got {_kind(version)}; use the program that wrote it"
+        )
     for part, kind in (("model", BaseEstimator), ("classes", list), ("versions", dict)):
         if not isinstance(held.get(part), kind):
-            raise PerceptionError(f"{path}: {part}: expected a {kind.__name__}, got {_kind(held.get(part))}; save the recogniser again")
+            raise PerceptionError(
+                f"{path}: {part}: expected a {kind.__name__}, got {_kind(held.get(part))}; save the recogniser again"
+            )
     try:
         return Stored(_learnt_again(held["model"]), tuple(held["classes"]), held["versions"])
     except Exception as error:  # each part of a damaged model fails in its own way
-        raise PerceptionError(f"{path}: model: expected a fitted one, got {type(error).__name__}: {error}; train it again") from None
+        raise PerceptionError(
+            f"{path}: model: expected a fitted one, got {type(error).__name__}: {error}; train it again"
+        ) from None
 
 
 def _learnt_again(model: Any) -> Any:
     """The model, in which each recogniser of places has learnt its images again, so that no damaged table reaches compiled code."""
-    if isinstance(model, PlaceRecognizer):
+    if isinstance(model, PlaceRecogniser):
         return model.learnt_again()
     if isinstance(model, Pipeline):
         return Pipeline([(name, _learnt_again(step)) for name, step in model.steps])
@@ -145,7 +185,9 @@ def _learnt_again(model: Any) -> Any:
 
 def _kind(value: object) -> str:
     """A value as an error message shows it. Of objects only the type is shown, as to make a text of one that was tampered with may itself raise."""
-    return brief(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+    return (
+        brief(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+    )
 
 
 def _foreign(**source: Any) -> list[str]:

@@ -124,7 +124,9 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         if (images[inside] == images[inside][0]).all():
             inside[:] = True
         self._fit_all(images[inside])
-        self.labels_by_k_: dict[int, NDArray[np.intp]] = {k: _among(inside, labels) for k, labels in self.labels_by_k_.items()}
+        self.labels_by_k_: dict[int, NDArray[np.intp]] = {
+            k: _among(inside, labels) for k, labels in self.labels_by_k_.items()
+        }
         self.labels_ = self.labels_by_k_[self.k_]
         self.confidence_, self.inside_ = confidence(images, self.labels_), images[inside]
         return self
@@ -152,7 +154,9 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         images = validate_data(self, equal_length(X), dtype=np.float64, reset=False)
         if self.clusterer_ is None:
             return np.zeros(len(images), np.intp)
-        views = np.asarray((self.clusterer_ if self.nearest_ is None else self.nearest_).predict(images), np.intp)
+        views = np.asarray(
+            (self.clusterer_ if self.nearest_ is None else self.nearest_).predict(images), np.intp
+        )
         if self.isolated is not None and self.reach_ > 0:
             views[_to_neighbour(images, self.inside_, 0) > self.reach_] = NOISE
         return views
@@ -160,7 +164,11 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     def score(self, X: ArrayLike, y: Any = None) -> float:
         """M of the views of images, (n, d), as `predict` gives them; larger is better. NaN where they have one view."""
         views, images = self.predict(X), np.asarray(X, float)
-        return cluster_quality(images[views != NOISE], views[views != NOISE]) if (views != NOISE).any() else math.nan
+        return (
+            cluster_quality(images[views != NOISE], views[views != NOISE])
+            if (views != NOISE).any()
+            else math.nan
+        )
 
     @property
     def runner_up_labels_(self) -> NDArray[np.intp] | None:
@@ -173,8 +181,14 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         inside = labels != NOISE
         self.k_ = len(set(labels[inside].tolist()))
         self.runner_up_: int | None = None
-        self.quality_ = {self.k_: cluster_quality(images[inside], labels[inside]) if inside.any() else math.nan}
-        self.trimmed_ = {self.k_: trimmed_quality(images[inside], labels[inside], self.trim) if inside.any() else math.nan}
+        self.quality_ = {
+            self.k_: cluster_quality(images[inside], labels[inside]) if inside.any() else math.nan
+        }
+        self.trimmed_ = {
+            self.k_: trimmed_quality(images[inside], labels[inside], self.trim)
+            if inside.any()
+            else math.nan
+        }
         self.labels_by_k_ = {self.k_: labels}
 
     def _search(self, images: NDArray[np.float64], seed: int) -> Any:
@@ -194,7 +208,11 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             fitted[k], self.labels_by_k_[k] = tried, labels
             self.quality_[k] = cluster_quality(images, labels, tree)
             self.trimmed_[k] = trimmed_quality(images[chosen], labels[chosen], self.trim, distances)
-        self.k_ = _smallest_good(self.trimmed_) if self.by == "trimmed" else max(self.quality_, key=self.quality_.__getitem__)
+        self.k_ = (
+            _smallest_good(self.trimmed_)
+            if self.by == "trimmed"
+            else max(self.quality_, key=self.quality_.__getitem__)
+        )
         self.runner_up_ = self._doubted()
         return fitted[self.k_]
 
@@ -214,7 +232,11 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         settings = chosen.get_params()
         if k is not None:
             chosen.set_params(**{str(_size(chosen)): k})
-        if "random_state" in settings and settings["random_state"] is None and self.random_state is not None:
+        if (
+            "random_state" in settings
+            and settings["random_state"] is None
+            and self.random_state is not None
+        ):
             chosen.set_params(random_state=seed)
         return chosen.fit(images)
 
@@ -227,15 +249,25 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 sample = np.random.default_rng(seed).choice(len(images), MANY, replace=False)
                 with warnings.catch_warnings():  # if the sample has fewer different images than views, all images may still have enough
                     warnings.simplefilter("ignore", ConvergenceWarning)
-                    start = KMeans(k, n_init=self.n_init, max_iter=ROUNDS, random_state=seed).fit(images[sample]).cluster_centers_
-                return KMeans(k, init=start, n_init=1, max_iter=ROUNDS, random_state=seed).fit(images)
+                    start = (
+                        KMeans(k, n_init=self.n_init, max_iter=ROUNDS, random_state=seed)
+                        .fit(images[sample])
+                        .cluster_centers_
+                    )
+                return KMeans(k, init=start, n_init=1, max_iter=ROUNDS, random_state=seed).fit(
+                    images
+                )
             return KMeans(k, n_init=self.n_init, random_state=seed).fit(images)
 
     def _keep(self, best: Any, images: NDArray[np.float64]) -> Self:
         self.clusterer_ = best
         self.labels_ = _labels(best, images)
         self.confidence_ = confidence(images, self.labels_)
-        self.nearest_ = None if hasattr(best, "predict") else KNeighborsClassifier(1, algorithm="brute").fit(images, self.labels_)
+        self.nearest_ = (
+            None
+            if hasattr(best, "predict")
+            else KNeighborsClassifier(1, algorithm="brute").fit(images, self.labels_)
+        )
         if hasattr(best, "cluster_centers_"):
             self.cluster_centers_ = best.cluster_centers_
         elif hasattr(self, "cluster_centers_"):
@@ -243,10 +275,18 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def _one_view(self, images: NDArray[np.float64]) -> Self:
-        warnings.warn(f"all {len(images)} images are equal: they are taken as one view", ImageWarning, stacklevel=3)
+        warnings.warn(
+            f"all {len(images)} images are equal: they are taken as one view",
+            ImageWarning,
+            stacklevel=3,
+        )
         self.clusterer_ = self.nearest_ = None
         self.labels_, self.k_, self.runner_up_ = np.zeros(len(images), np.intp), 1, None
-        self.quality_, self.trimmed_, self.labels_by_k_ = {1: math.nan}, {1: math.nan}, {1: self.labels_}
+        self.quality_, self.trimmed_, self.labels_by_k_ = (
+            {1: math.nan},
+            {1: math.nan},
+            {1: self.labels_},
+        )
         self.cluster_centers_, self.confidence_ = images[:1].copy(), np.ones(len(images))
         return self
 
@@ -256,29 +296,53 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             if value is None and name in ("k", "k_max"):
                 continue
             if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-                raise PerceptionError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+                raise PerceptionError(
+                    f"{name}: expected a whole number of at least {least}, got {value!r}"
+                )
         if self.n_init > MOST_STARTS:
-            raise PerceptionError(f"n_init: expected at most {MOST_STARTS} starts, got {brief(self.n_init)}; a few dozen are many")
-        if self.random_state is not None and not isinstance(self.random_state, np.random.RandomState):
+            raise PerceptionError(
+                f"n_init: expected at most {MOST_STARTS} starts, got {brief(self.n_init)}; a few dozen are many"
+            )
+        if self.random_state is not None and not isinstance(
+            self.random_state, np.random.RandomState
+        ):
             a_whole_number(
-                "random_state", self.random_state, PerceptionError, 0, 2**32 - 1, what="a seed", mend="give a seed, a RandomState or None"
+                "random_state",
+                self.random_state,
+                PerceptionError,
+                0,
+                2**32 - 1,
+                what="a seed",
+                mend="give a seed, a RandomState or None",
             )
         if not isinstance(self.by, str) or self.by not in ("M", "trimmed"):
             raise PerceptionError(f'by: expected "M" or "trimmed", got {self.by!r}')
         if self.isolated is not None and not (is_finite(self.isolated) and self.isolated > 1):
-            raise PerceptionError(f"isolated: expected a number of more than 1, or None, got {self.isolated!r}")
+            raise PerceptionError(
+                f"isolated: expected a number of more than 1, or None, got {self.isolated!r}"
+            )
         if self.k is None and self.k_max is not None and self.k_max < self.k_min:
-            raise PerceptionError(f"k_max: expected at least k_min = {self.k_min}, got {self.k_max}")
-        if self.clusterer is not None and not (hasattr(self.clusterer, "fit") and hasattr(self.clusterer, "get_params")):
-            raise PerceptionError(f"clusterer: expected a scikit-learn clusterer, such as DBSCAN(), got {self.clusterer!r}")
+            raise PerceptionError(
+                f"k_max: expected at least k_min = {self.k_min}, got {self.k_max}"
+            )
+        if self.clusterer is not None and not (
+            hasattr(self.clusterer, "fit") and hasattr(self.clusterer, "get_params")
+        ):
+            raise PerceptionError(
+                f"clusterer: expected a scikit-learn clusterer, such as DBSCAN(), got {self.clusterer!r}"
+            )
         if self.k is not None and self.clusterer is not None and _size(self.clusterer) is None:
-            raise PerceptionError(f"k: {type(self.clusterer).__name__} finds the number of clusters itself; leave k out")
+            raise PerceptionError(
+                f"k: {type(self.clusterer).__name__} finds the number of clusters itself; leave k out"
+            )
 
     def _affordable(self, k: int, images: NDArray[np.float64], distinct: int | None = None) -> None:
         """Raise where there are fewer different images than views."""
         found = len(np.unique(images, axis=0)) if distinct is None else distinct
         if found < k:
-            raise PerceptionError(f"k: expected at most {found}, as there are {found} different images among {len(images)}, got {k}")
+            raise PerceptionError(
+                f"k: expected at most {found}, as there are {found} different images among {len(images)}, got {k}"
+            )
 
 
 def as_view_clusterer(clusterer: Any) -> ViewClusterer:
@@ -291,13 +355,17 @@ def as_view_clusterer(clusterer: Any) -> ViewClusterer:
     return checked if size is None else checked.set_params(k=clusterer.get_params()[size])
 
 
-def _to_neighbour(images: NDArray[np.float64], among: NDArray[np.float64], itself: int) -> NDArray[np.float64]:
+def _to_neighbour(
+    images: NDArray[np.float64], among: NDArray[np.float64], itself: int
+) -> NDArray[np.float64]:
     """How far each image is from its third nearest neighbour among others, (n,); from the last one, where there are fewer.
 
     itself  1 where each image is among these, too, else 0
     """
     number = min(NEIGHBOURS + itself, len(among))
-    distances, _ = NearestNeighbors(n_neighbors=number, algorithm="brute").fit(among).kneighbors(images)
+    distances, _ = (
+        NearestNeighbors(n_neighbors=number, algorithm="brute").fit(among).kneighbors(images)
+    )
     return np.asarray(distances[:, -1])
 
 
@@ -318,9 +386,13 @@ def _size(clusterer: Any) -> str | None:
     settings = clusterer.get_params()
     if settings.get("n_clusters") is not None:
         return "n_clusters"
-    return "n_components" if isinstance(clusterer, GaussianMixture | BayesianGaussianMixture) else None
+    return (
+        "n_components" if isinstance(clusterer, GaussianMixture | BayesianGaussianMixture) else None
+    )
 
 
 def _labels(fitted: Any, images: NDArray[np.float64]) -> NDArray[np.intp]:
     """The cluster of each image that was fitted, (n,). Mixtures predict it."""
-    return np.asarray(fitted.labels_ if hasattr(fitted, "labels_") else fitted.predict(images), np.intp)
+    return np.asarray(
+        fitted.labels_ if hasattr(fitted, "labels_") else fitted.predict(images), np.intp
+    )

@@ -42,12 +42,16 @@ class Opening:
         """Points, (n, 2), along the wall and across it, metres from the middle."""
         cos, sin = math.cos(self.along), math.sin(self.along)
         off = points - np.array(self.middle)
-        return np.column_stack([cos * off[:, 0] + sin * off[:, 1], cos * off[:, 1] - sin * off[:, 0]])
+        return np.column_stack(
+            [cos * off[:, 0] + sin * off[:, 1], cos * off[:, 1] - sin * off[:, 0]]
+        )
 
     def point(self, along: float, across: float) -> tuple[float, float]:
         """The point that is so far along the wall from the middle, and across it to the left."""
         cos, sin = math.cos(self.along), math.sin(self.along)
-        return self.middle[0] + cos * along - sin * across, self.middle[1] + sin * along + cos * across
+        return self.middle[0] + cos * along - sin * across, self.middle[
+            1
+        ] + sin * along + cos * across
 
     @property
     def threshold(self) -> Array:
@@ -102,12 +106,19 @@ def _opening(plan: Plan, door: Door) -> Opening:
     width = min(DOOR, high - low) if high > low else DOOR
     shift = float(np.clip(0.0, low + width / 2, high - width / 2)) if high > low else 0.0
     across = [_across(flat, wall, shift) for wall in walls]
-    return Opening(flat.point(shift, (across[0] + across[1]) / 2), flat.along, width, abs(across[0] - across[1]))
+    return Opening(
+        flat.point(shift, (across[0] + across[1]) / 2),
+        flat.along,
+        width,
+        abs(across[0] - across[1]),
+    )
 
 
 def _span(flat: Opening, walls: Array) -> tuple[float, float]:
     """From where to where a room has a wall along a door, metres from the door: an outline may have corners within a straight wall."""
-    ends = np.stack([flat.frame(walls[:, :2]), flat.frame(walls[:, 2:])], axis=1)  # (n, 2 ends, along and across)
+    ends = np.stack(
+        [flat.frame(walls[:, :2]), flat.frame(walls[:, 2:])], axis=1
+    )  # (n, 2 ends, along and across)
     way = ends[:, 1] - ends[:, 0]
     level = (np.abs(ends[:, :, 1]) < DEPTH).all(1) & (np.abs(way[:, 1]) < np.abs(way[:, 0]))
     stretches: list[tuple[float, float]] = []
@@ -143,8 +154,12 @@ def _cut(walls: Array, opening: Opening) -> Array:
         one, other = (-half - starts) / way, (half - starts) / way
     still = way == 0
     inside = np.abs(starts) <= half
-    enter = np.where(still, np.where(inside, -np.inf, np.inf), np.minimum(one, other)).max(1).clip(0, 1)
-    leave = np.where(still, np.where(inside, np.inf, -np.inf), np.maximum(one, other)).min(1).clip(0, 1)
+    enter = (
+        np.where(still, np.where(inside, -np.inf, np.inf), np.minimum(one, other)).max(1).clip(0, 1)
+    )
+    leave = (
+        np.where(still, np.where(inside, np.inf, -np.inf), np.maximum(one, other)).min(1).clip(0, 1)
+    )
     hit = enter < leave
     way = walls[:, 2:] - walls[:, :2]
     before = np.hstack([walls[:, :2], walls[:, :2] + enter[:, None] * way])[hit & (enter > 0)]
@@ -157,4 +172,6 @@ def _jambs(opening: Opening) -> Array:
     if opening.depth < 0.02:
         return np.empty((0, 4))
     half, deep = opening.width / 2, opening.depth / 2
-    return np.array([[*opening.point(side, -deep), *opening.point(side, deep)] for side in (-half, half)])
+    return np.array(
+        [[*opening.point(side, -deep), *opening.point(side, deep)] for side in (-half, half)]
+    )

@@ -78,7 +78,9 @@ class Driver:
         self.robot.move(forward, turn)
         x, y, _ = self.robot.pose
         if not self.world.holds(x, y):
-            raise SimulatorError(f"{self.world.name}: the robot left the world at ({x:.2f}, {y:.2f}); close the gap in the walls")
+            raise SimulatorError(
+                f"{self.world.name}: the robot left the world at ({x:.2f}, {y:.2f}); close the gap in the walls"
+            )
         if forward and self.world.clearance(x, y) < self.robot.body.radius:
             raise SimulatorError(
                 f"{self.world.name}: the robot hit a wall at ({x:.2f}, {y:.2f}); give it {self.robot.body.radius} m of room"
@@ -113,7 +115,9 @@ def travel(driver: Driver) -> None:
                 )
             return
         if done > LONGEST_TRAVEL:
-            raise SimulatorError(f"{driver.world.name}: travel: expected a distinctive place within {LONGEST_TRAVEL:.0f} m, got none")
+            raise SimulatorError(
+                f"{driver.world.name}: travel: expected a distinctive place within {LONGEST_TRAVEL:.0f} m, got none"
+            )
         stride = STRIDE if to_go is None else min(STRIDE, max(0.5 * to_go, 0.01))
         driver.go(stride, _steer(seen, reach, stride))
         if driver.on_travel is not None:
@@ -137,7 +141,13 @@ def climb(driver: Driver, turned: bool = False) -> None:
         seen = driver.see(STILL)
         to_go, offset = seen.to_go(reach), seen.offset(reach)
         aside = abs(offset) if offset is not None else 0.0
-        if aside > tolerance.aside and to_go is not None and abs(to_go) < 0.1 and not turned and attempt < TRIES // 2:
+        if (
+            aside > tolerance.aside
+            and to_go is not None
+            and abs(to_go) < 0.1
+            and not turned
+            and attempt < TRIES // 2
+        ):
             _come_again(driver)
             continue
         if abs(seen.tilt) > tolerance.straight:

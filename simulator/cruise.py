@@ -36,7 +36,9 @@ def follow(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
     space  what is known of the walls; obstacles that are seen are marked in it
     Raises SimulatorError where an obstacle closes the way, or the robot hits a wall.
     """
-    numbers = np.arange(len(way))  # which point of the way that was given each point of the way stands for
+    numbers = np.arange(
+        len(way)
+    )  # which point of the way that was given each point of the way stands for
     watch = replace(driver.laser, reach=WATCH)
     at = waited = 0
     while at < len(way) - 1:
@@ -46,7 +48,9 @@ def follow(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
         before, at = at, _come_to(way, at, driver)
         waited = 0 if at > before else waited + 1
         if waited > PATIENCE:
-            raise _error(driver, "a way on", f"none that the robot can drive within {PATIENCE} motions")
+            raise _error(
+                driver, "a way on", f"none that the robot can drive within {PATIENCE} motions"
+            )
         yield int(numbers[at])
 
 
@@ -65,14 +69,26 @@ def _stride(driver: Driver, way: Array, aim: float) -> None:
     if abs(turn) > SHARP:
         driver.go(0.0, math.copysign(min(abs(turn), BEND), turn))
     else:
-        driver.go(min(STRIDE, max(math.dist(goal, (x, y)), CELL / 2)), math.copysign(min(0.5 * abs(turn), BEND), turn))
+        driver.go(
+            min(STRIDE, max(math.dist(goal, (x, y)), CELL / 2)),
+            math.copysign(min(0.5 * abs(turn), BEND), turn),
+        )
 
 
-def _around_obstacles(driver: Driver, space: FreeSpace, image: Array, way: Array, numbers: Cells, at: int) -> tuple[Array, Cells]:
+def _around_obstacles(
+    driver: Driver, space: FreeSpace, image: Array, way: Array, numbers: Cells, at: int
+) -> tuple[Array, Cells]:
     """The way, planned anew where the laser shows something new in it."""
     seen = _obstacles(driver, space, image)
     ahead = slice(at, at + round(WATCH / CELL))
-    if not len(seen) or not (blocked := np.flatnonzero(_apart(space.middles(way[ahead]), space.middles(seen)) < space.least)).size:
+    if (
+        not len(seen)
+        or not (
+            blocked := np.flatnonzero(
+                _apart(space.middles(way[ahead]), space.middles(seen)) < space.least
+            )
+        ).size
+    ):
         return way, numbers
     here = driver.robot.pose[:2]
     farther = way[at : at + round(2 * WATCH / CELL)]
@@ -107,4 +123,6 @@ def _apart(points: Array, others: Array) -> Array:
 
 def _error(driver: Driver, expected: str, got: str) -> SimulatorError:
     x, y, _ = driver.robot.pose
-    return SimulatorError(f"{driver.world.name}: drive at ({x:.2f}, {y:.2f}): expected {expected}, got {got}; make room there")
+    return SimulatorError(
+        f"{driver.world.name}: drive at ({x:.2f}, {y:.2f}): expected {expected}, got {got}; make room there"
+    )

@@ -57,7 +57,9 @@ class Drive:
     def __len__(self) -> int:
         return len(self.ranges)
 
-    def judged(self, places: Mapping[str, Sequence[float]], scans: Sequence[str | None], **more: object) -> Drive:
+    def judged(
+        self, places: Mapping[str, Sequence[float]], scans: Sequence[str | None], **more: object
+    ) -> Drive:
         """This drive with the truth that a map of it is judged by: where the places are, in metres, and at which of them each scan was taken."""
         visits: list[dict[str, Any]] = []
         for number, place in enumerate(scans):
@@ -102,7 +104,9 @@ class Recorder:
 
     def __post_init__(self) -> None:
         if not is_finite(self.every) or self.every < CLOSEST:
-            raise SimulatorError(f"every: expected metres, {CLOSEST} or more, got {brief(self.every)}; a scan each {EVERY} m is usual")
+            raise SimulatorError(
+                f"every: expected metres, {CLOSEST} or more, got {brief(self.every)}; a scan each {EVERY} m is usual"
+            )
 
     @property
     def taken(self) -> int:
@@ -119,17 +123,28 @@ class Recorder:
         way = math.hypot(dx, dy)
         parts = max(math.ceil(FINE * max(way / self.every, abs(turned) / self.turn)), 1)
         for part in range(1, parts):
-            self._add(world, moved(start, (dx * part / parts, dy * part / parts, turned * part / parts)), way / parts, abs(turned) / parts)
+            self._add(
+                world,
+                moved(start, (dx * part / parts, dy * part / parts, turned * part / parts)),
+                way / parts,
+                abs(turned) / parts,
+            )
         self._add(world, pose, way / parts, abs(turned) / parts)
 
     def _add(self, world: World, pose: Pose, way: float, turned: float) -> None:
         self.metres += way
-        self._seconds.append((self._seconds[-1] if self._seconds else 0.0) + way / SPEED + turned / SPIN)
+        self._seconds.append(
+            (self._seconds[-1] if self._seconds else 0.0) + way / SPEED + turned / SPIN
+        )
         self._way, self._turned = self._way + way, self._turned + turned
         self.poses.append(pose)
         if not self.scans or self.scans[-1][0] is not world:
             self.scans.append((world, []))
-        if len(self.poses) == 1 or self._way >= self.every - TINY or self._turned >= self.turn - TINY:
+        if (
+            len(self.poses) == 1
+            or self._way >= self.every - TINY
+            or self._turned >= self.turn - TINY
+        ):
             self.scans[-1][1].append(len(self.poses) - 1)
             self._way = self._turned = 0.0
 
@@ -140,7 +155,9 @@ class Recorder:
         sight, wheels = (np.random.default_rng([seed, k]) for k in (2, 3))
         poses = np.array(self.poses)
         numbers = [number for _, part in self.scans for number in part]
-        ranges = np.vstack([laser.scan(world, poses[part], sight) for world, part in self.scans if part])
+        ranges = np.vstack(
+            [laser.scan(world, poses[part], sight) for world, part in self.scans if part]
+        )
         return Drive(
             name=name,
             ranges=np.where(ranges < laser.reach, ranges, np.inf),

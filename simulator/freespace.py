@@ -81,7 +81,9 @@ class FreeSpace:
         cells = np.zeros_like(self.occupied)
         for x1, y1, x2, y2 in segments:
             count = 2 + math.ceil(math.hypot(x2 - x1, y2 - y1) / (CELL / 2))
-            rows, columns = self.cells(np.column_stack([np.linspace(x1, x2, count), np.linspace(y1, y2, count)]))
+            rows, columns = self.cells(
+                np.column_stack([np.linspace(x1, x2, count), np.linspace(y1, y2, count)])
+            )
             cells[rows, columns] = True
         return cells
 
@@ -92,14 +94,18 @@ class FreeSpace:
 
     def middles(self, points: Array) -> Array:
         """The middles of the cells in which points are, (n, 2)."""
-        found: Array = (np.column_stack(self.cells(points)[::-1]) + 0.5) * CELL + np.array(self.corner)
+        found: Array = (np.column_stack(self.cells(points)[::-1]) + 0.5) * CELL + np.array(
+            self.corner
+        )
         return found
 
     def part(self, points: Array, closed: Mask | None = None) -> Part:
         """The part of the space around points, (n, 2), in which some cells are closed besides the occupied ones."""
         rows, columns = self.cells(np.vstack([points.min(0) - MARGIN, points.max(0) + MARGIN]))
         window = slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1)
-        occupied = self.occupied[window] if closed is None else self.occupied[window] | closed[window]
+        occupied = (
+            self.occupied[window] if closed is None else self.occupied[window] | closed[window]
+        )
         corner = self.corner[0] + CELL * int(columns[0]), self.corner[1] + CELL * int(rows[0])
         return Part(corner, _clearance(occupied), self.least)
 
@@ -122,7 +128,9 @@ class Part:
         It is short, and keeps ROOM off the walls where there is room.
         """
         (row, other_row), (column, other_column) = self._cells(np.array([start, goal]))
-        cells = _shortest(self.clearance, self.least, (int(row), int(column)), (int(other_row), int(other_column)))
+        cells = _shortest(
+            self.clearance, self.least, (int(row), int(column)), (int(other_row), int(other_column))
+        )
         if cells is None:
             return None
         way = self._middles(cells)
@@ -159,7 +167,9 @@ class Part:
 
     def _cells(self, points: Array) -> tuple[Cells, Cells]:
         columns, rows = np.floor((points - np.array(self.corner)) / CELL + 1e-6).astype(np.intp).T
-        return rows.clip(0, self.clearance.shape[0] - 1), columns.clip(0, self.clearance.shape[1] - 1)
+        return rows.clip(0, self.clearance.shape[0] - 1), columns.clip(
+            0, self.clearance.shape[1] - 1
+        )
 
     def _middles(self, cells: Cells) -> Array:
         middles: Array = (cells[:, ::-1] + 0.5) * CELL + np.array(self.corner)
@@ -168,11 +178,15 @@ class Part:
 
 def _clearance(occupied: Mask) -> Array:
     """For each cell the metres to the nearest occupied one; what is outside is occupied."""
-    clearance: Array = distance_transform_edt(np.pad(~occupied, 1, constant_values=False))[1:-1, 1:-1] * CELL
+    clearance: Array = (
+        distance_transform_edt(np.pad(~occupied, 1, constant_values=False))[1:-1, 1:-1] * CELL
+    )
     return clearance
 
 
-def _shortest(clearance: Array, least: float, start: tuple[int, int], goal: tuple[int, int]) -> Cells | None:
+def _shortest(
+    clearance: Array, least: float, start: tuple[int, int], goal: tuple[int, int]
+) -> Cells | None:
     """The cells of the cheapest way, (n, 2) rows and columns, through cells that are at least so far off the walls.
 
     Around start and goal, where a robot may have come nearer to something than it would plan to, all cells are free that are not beside an occupied one.
@@ -180,7 +194,10 @@ def _shortest(clearance: Array, least: float, start: tuple[int, int], goal: tupl
     rows, columns = clearance.shape
     free = clearance >= least
     for row, column in (start, goal):
-        beside = slice(max(row - LEEWAY, 0), row + LEEWAY + 1), slice(max(column - LEEWAY, 0), column + LEEWAY + 1)
+        beside = (
+            slice(max(row - LEEWAY, 0), row + LEEWAY + 1),
+            slice(max(column - LEEWAY, 0), column + LEEWAY + 1),
+        )
         free[beside] |= clearance[beside] > 1.5 * CELL
         free[row, column] = True
     price = 1 + (NARROW - 1) * (1 - np.minimum(clearance / ROOM, 1.0)) ** 2
@@ -196,9 +213,12 @@ def _shortest(clearance: Array, least: float, start: tuple[int, int], goal: tupl
         others.append(numbers[there][open_])
         costs.append((math.hypot(down, right) * (price[here] + price[there]) / 2)[open_])
     graph = coo_array(
-        (np.concatenate(costs), (np.concatenate(ends), np.concatenate(others))), shape=(rows * columns, rows * columns)
+        (np.concatenate(costs), (np.concatenate(ends), np.concatenate(others))),
+        shape=(rows * columns, rows * columns),
     ).tocsr()
-    _, before = dijkstra(graph, directed=False, indices=int(numbers[start]), return_predecessors=True)
+    _, before = dijkstra(
+        graph, directed=False, indices=int(numbers[start]), return_predecessors=True
+    )
     cell = int(numbers[goal])
     path = [cell]
     while cell != int(numbers[start]):

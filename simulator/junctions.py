@@ -16,7 +16,18 @@ import numpy as np
 from simulator.control import LONGEST_TRAVEL, STILL, STRIDE, TRIES, Driver
 from simulator.errors import SimulatorError
 from simulator.laser import BEARINGS
-from simulator.surroundings import STRAIGHT, Array, Panorama, Place, Street, apart, compass, points_of, streets_of, walls_of
+from simulator.surroundings import (
+    STRAIGHT,
+    Array,
+    Panorama,
+    Place,
+    Street,
+    apart,
+    compass,
+    points_of,
+    streets_of,
+    walls_of,
+)
 from ssh_abduction.data.trace import Action
 
 # Radians that the robot turns between two images.
@@ -27,7 +38,10 @@ SIDES = {"left": 1, "right": -1}
 ACTIONS = {
     "travel": Action.of("travel"),
     "around": Action.of("around"),
-    **{side: Action.of({"name": side, "kind": "turn", "turn": side, "gateway": 1}) for side in SIDES},
+    **{
+        side: Action.of({"name": side, "kind": "turn", "turn": side, "gateway": 1})
+        for side in SIDES
+    },
 }
 
 
@@ -52,7 +66,12 @@ class Pilot:
     def begin(self) -> None:
         """Climb to the dstate that is nearest to where the robot stands. Raises SimulatorError where that is no place."""
         if not self._climb():
-            raise self._error("start", "a place, where streets meet or end", "a street that goes straight on", "move the start")
+            raise self._error(
+                "start",
+                "a place, where streets meet or end",
+                "a street that goes straight on",
+                "move the start",
+            )
 
     def act(self, action: str) -> None:
         """Do an action of a route. Raises SimulatorError where it cannot be done."""
@@ -63,12 +82,20 @@ class Pilot:
         else:
             turn = self.here.place.beside(self.here.heading, SIDES[action])
             if turn is None:
-                raise self._error(action, f"a street to the {action}", "none before straight behind", "take around, or another turn")
+                raise self._error(
+                    action,
+                    f"a street to the {action}",
+                    "none before straight behind",
+                    "take around, or another turn",
+                )
             self._face(self.here.heading + turn)
 
     def star(self) -> tuple[float, ...]:
         """The bearings of the gateways, in degrees clockwise from straight ahead."""
-        bearings = (round(math.degrees(self.here.heading - street.bearing) % 360, 1) % 360 for street in self.here.place.streets)
+        bearings = (
+            round(math.degrees(self.here.heading - street.bearing) % 360, 1) % 360
+            for street in self.here.place.streets
+        )
         return tuple(sorted(bearings))
 
     def _travel(self) -> None:
@@ -106,7 +133,9 @@ class Pilot:
                     opened = robot.driven
             streets = streets_of(walls_of(points, beams), points, reach, 0.0)
             course_off = course - robot.odometry[2]
-            street = min(streets, key=lambda street: apart(street.bearing, course_off), default=None)
+            street = min(
+                streets, key=lambda street: apart(street.bearing, course_off), default=None
+            )
             if street is not None and apart(street.bearing, course_off) <= STRAIGHT:
                 course = robot.odometry[2] + street.bearing
                 self.driver.go(STRIDE, _steer(street))
@@ -114,7 +143,9 @@ class Pilot:
                 self.driver.go(STRIDE)
             if self.driver.on_travel is not None:
                 self.driver.on_travel(self.driver)
-        raise self._error("travel", f"a place within {LONGEST_TRAVEL:.0f} m", "none", "close the street")
+        raise self._error(
+            "travel", f"a place within {LONGEST_TRAVEL:.0f} m", "none", "close the street"
+        )
 
     def _straight(self, way: float) -> None:
         """Drive straight ahead, or back."""
@@ -130,7 +161,12 @@ class Pilot:
             self.here = self._look_around()
             place = self.here.place
             if not place.streets:
-                raise self._error("place", f"a street, about {2 * self.reach:g} m wide", "none", "give another reach")
+                raise self._error(
+                    "place",
+                    f"a street, about {2 * self.reach:g} m wide",
+                    "none",
+                    "give another reach",
+                )
             if place.fixed is None or abs(place.fixed) <= self.driver.tolerance.close:
                 break
             self._go(place.fixed)
@@ -161,7 +197,9 @@ class Pilot:
                 return
             strides = math.ceil(abs(turn) / TURN)
             turned = sum(self._turn(turn / strides) for _ in range(strides))
-            self.here.heading = compass(self.here.ranges, self.driver.look(STILL), self.here.heading + turned, turned)
+            self.here.heading = compass(
+                self.here.ranges, self.driver.look(STILL), self.here.heading + turned, turned
+            )
 
     def _turn(self, turn: float) -> float:
         """Turn once, and say how far by odometry."""
@@ -171,12 +209,16 @@ class Pilot:
 
     def _error(self, what: str, expected: str, got: str, mend: str) -> SimulatorError:
         x, y, _ = self.driver.robot.pose
-        return SimulatorError(f"{self.driver.world.name}: {what} at ({x:.2f}, {y:.2f}): expected {expected}, got {got}; {mend}")
+        return SimulatorError(
+            f"{self.driver.world.name}: {what} at ({x:.2f}, {y:.2f}): expected {expected}, got {got}; {mend}"
+        )
 
 
 def _is_open(image: Array, side: int, reach: float) -> bool:
     """Whether the wall at a side (1 left, -1 right) has ended: between 75 and 90 degrees what is there is farther off than a wall of the street."""
-    beams = image[-15:] * np.sin(BEARINGS[-15:]) if side > 0 else image[:15] * np.sin(-BEARINGS[:15])
+    beams = (
+        image[-15:] * np.sin(BEARINGS[-15:]) if side > 0 else image[:15] * np.sin(-BEARINGS[:15])
+    )
     return bool(np.median(beams) > OPEN * reach)
 
 

@@ -11,7 +11,9 @@ from simulator.world import World
 
 Array = NDArray[np.float64]
 BEAMS = 180
-BEARINGS: Array = np.radians(np.arange(BEAMS) - 89.5)  # radians, counter-clockwise from straight ahead
+BEARINGS: Array = np.radians(
+    np.arange(BEAMS) - 89.5
+)  # radians, counter-clockwise from straight ahead
 # At most this many intersections of beams and walls are computed at once, unless a single image takes more: an array of them has 32 MB.
 _BLOCK = 4_000_000
 
@@ -33,7 +35,9 @@ class Laser:
         """Ranges without noise, (m, 180) metres, from m poses (x, y, heading). One call for many poses is faster than many calls."""
         poses = np.atleast_2d(poses)
         rows = max(1, _BLOCK // (BEAMS * len(world.segments)))
-        return np.vstack([self._cast(world.segments, poses[i : i + rows]) for i in range(0, len(poses), rows)])
+        return np.vstack(
+            [self._cast(world.segments, poses[i : i + rows]) for i in range(0, len(poses), rows)]
+        )
 
     def scan(self, world: World, poses: Array, rng: np.random.Generator) -> Array:
         """Ranges as the scanner reports them, (m, 180) metres."""
@@ -45,7 +49,9 @@ class Laser:
     def _cast(self, segments: Array, poses: Array) -> Array:
         """The distance from each pose to the nearest wall along each beam, (m, 180) metres."""
         near = _near(segments, poses, self.reach)
-        nearest: Array = np.minimum(meetings(near, poses, BEARINGS).min(axis=2, initial=np.inf), self.reach)
+        nearest: Array = np.minimum(
+            meetings(near, poses, BEARINGS).min(axis=2, initial=np.inf), self.reach
+        )
         return nearest
 
 
@@ -53,7 +59,9 @@ def _near(segments: Array, poses: Array, reach: float) -> Array:
     """The walls that a laser may see from poses: those whose boxes are at most `reach` off the box of the poses."""
     low, high = poses[:, :2].min(0) - reach, poses[:, :2].max(0) + reach
     ends, others = segments[:, :2], segments[:, 2:]
-    near: Array = segments[(np.minimum(ends, others) <= high).all(1) & (np.maximum(ends, others) >= low).all(1)]
+    near: Array = segments[
+        (np.minimum(ends, others) <= high).all(1) & (np.maximum(ends, others) >= low).all(1)
+    ]
     return near
 
 

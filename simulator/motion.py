@@ -22,7 +22,12 @@ DIGITS = 5
 
 
 def reported(
-    displacement: Displacement, odometry: Odometry, rng: np.random.Generator, *, scale: float = 0.0, bend: float = 0.0
+    displacement: Displacement,
+    odometry: Odometry,
+    rng: np.random.Generator,
+    *,
+    scale: float = 0.0,
+    bend: float = 0.0,
 ) -> Displacement:
     """What odometry reports of a displacement: noise is drawn from the covariance, and added to what the errors that repeat make of it.
 
@@ -31,7 +36,10 @@ def reported(
     """
     dx, dy, turned = displacement
     drift = bend * math.hypot(dx, dy)
-    cos, sin = (1 + scale) * math.cos(drift / 2), (1 + scale) * math.sin(drift / 2)  # on the average the way is half of the drift off
+    cos, sin = (
+        (1 + scale) * math.cos(drift / 2),
+        (1 + scale) * math.sin(drift / 2),
+    )  # on the average the way is half of the drift off
     noise = np.linalg.cholesky(np.array(odometry.covariance(displacement))) @ rng.normal(size=3)
     x, y, heading = np.array([cos * dx - sin * dy, sin * dx + cos * dy, turned + drift]) + noise
     return round(float(x), DIGITS), round(float(y), DIGITS), round(float(heading), DIGITS)

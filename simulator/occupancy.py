@@ -41,7 +41,10 @@ FIELDS = {"image", "resolution", "origin", "negate", "occupied_thresh", "free_th
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 # How YAML 1.1 writes truth values, in small letters, and the whole numbers that map_server wants.
-TRUTHS = {**dict.fromkeys(("1", "true", "yes", "on", "y"), True), **dict.fromkeys(("0", "false", "no", "off", "n"), False)}
+TRUTHS = {
+    **dict.fromkeys(("1", "true", "yes", "on", "y"), True),
+    **dict.fromkeys(("0", "false", "no", "off", "n"), False),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +115,9 @@ def read_map_file(path: Path) -> MapFile:
         fields = _fields(read_at_most(path, LARGEST_TEXT))
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise SimulatorError(f"{named(path)}: expected the YAML file of an occupancy map, got none: {reason}; check the path") from None
+        raise SimulatorError(
+            f"{named(path)}: expected the YAML file of an occupancy map, got none: {reason}; check the path"
+        ) from None
     return _Reader(fields, path).map_file()
 
 
@@ -128,17 +133,24 @@ def _fields(data: bytes) -> dict[str, str | list[str]]:
     except yaml.YAMLError as error:
         raise ValueError(" ".join(str(error).split())) from None
     except (RecursionError, ValueError) as error:
-        raise ValueError("nested too deeply" if isinstance(error, RecursionError) else str(error)) from None
+        raise ValueError(
+            "nested too deeply" if isinstance(error, RecursionError) else str(error)
+        ) from None
     if not isinstance(root, yaml.MappingNode):
         raise ValueError("no fields in it")
     found: dict[str, str | list[str]] = {}
     for key, value in root.value:
-        name, line = brief(key.value if isinstance(key, yaml.ScalarNode) else "a list or an object"), key.start_mark.line + 1
+        name, line = (
+            brief(key.value if isinstance(key, yaml.ScalarNode) else "a list or an object"),
+            key.start_mark.line + 1,
+        )
         if key.value in found:
             raise ValueError(f"{name} twice, again in line {line}")
         if isinstance(value, yaml.ScalarNode):
             found[key.value] = value.value
-        elif isinstance(value, yaml.SequenceNode) and all(isinstance(item, yaml.ScalarNode) for item in value.value):
+        elif isinstance(value, yaml.SequenceNode) and all(
+            isinstance(item, yaml.ScalarNode) for item in value.value
+        ):
             found[key.value] = [item.value for item in value.value]
         elif key.value in FIELDS:
             raise ValueError(f"an object or a nested list as {name} in line {line}")
@@ -162,23 +174,43 @@ class _Reader:
         mode = self._mode()
         negate = self._truth("negate")
         if mode == "raw" and negate:
-            raise self._wrong("negate", "0 in mode raw, where map_server and nav2_map_server disagree on what 1 means")
+            raise self._wrong(
+                "negate",
+                "0 in mode raw, where map_server and nav2_map_server disagree on what 1 means",
+            )
         # Mode scale is a scale between both thresholds, so that a guess would change each cell.
         occupied = self._share("occupied_thresh", None if mode == "scale" else OCCUPIED_THRESH)
         free = self._share("free_thresh", None if mode == "scale" else FREE_THRESH)
         if mode == "scale" and free >= occupied:
-            raise self._wrong("free_thresh", f"less than occupied_thresh ({occupied:g}) in mode scale")
+            raise self._wrong(
+                "free_thresh", f"less than occupied_thresh ({occupied:g}) in mode scale"
+            )
         image = self._text("image")
-        return MapFile(self.path.parent / image, self._resolution(), self._origin(), negate, occupied, free, mode)
+        return MapFile(
+            self.path.parent / image,
+            self._resolution(),
+            self._origin(),
+            negate,
+            occupied,
+            free,
+            mode,
+        )
 
     def _wrong(self, name: str, expected: str) -> SimulatorError:
         got = brief(self.fields[name]) if name in self.fields else "none"
-        return SimulatorError(f"{named(self.path)}: {name}: expected {expected}, got {got}; mend it")
+        return SimulatorError(
+            f"{named(self.path)}: {name}: expected {expected}, got {got}; mend it"
+        )
 
     def _text(self, name: str) -> str:
         value = self.fields.get(name)
         if not isinstance(value, str) or not value:
-            raise self._wrong(name, "the path of an image, seen from the YAML file" if name == "image" else "a single value")
+            raise self._wrong(
+                name,
+                "the path of an image, seen from the YAML file"
+                if name == "image"
+                else "a single value",
+            )
         return value
 
     def _mode(self) -> Mode:
@@ -220,7 +252,9 @@ class _Reader:
         value = self.fields.get("origin")
         numbers = [self._number(item) for item in value] if isinstance(value, list) else []
         if len(numbers) != 3 or not all(abs(number) <= FARTHEST for number in numbers):
-            raise self._wrong("origin", f"[x, y, yaw] in metres and radians, of at most {FARTHEST:,.0f}")
+            raise self._wrong(
+                "origin", f"[x, y, yaw] in metres and radians, of at most {FARTHEST:,.0f}"
+            )
         return numbers[0], numbers[1], numbers[2]
 
 
@@ -243,13 +277,26 @@ def _cells(fields: MapFile, path: Path) -> Cells:
                 raise Image.DecompressionBombError(f"got {image.width:,} x {image.height:,}")
             shade, opaque = _shades(image, with_alpha=fields.mode == "trinary")
     except UnidentifiedImageError:
-        raise SimulatorError(f"{where}: expected {kinds}, got {brief(data[:20])}; convert it") from None
+        raise SimulatorError(
+            f"{where}: expected {kinds}, got {brief(data[:20])}; convert it"
+        ) from None
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        raise SimulatorError(f"{where}: expected at most {MOST_PIXELS:,} pixels: {error}; scale it down") from None
+        raise SimulatorError(
+            f"{where}: expected at most {MOST_PIXELS:,} pixels: {error}; scale it down"
+        ) from None
     except OSError as error:
-        raise SimulatorError(f"{where}: expected {kinds}: {error.strerror or error}; check the path and the file") from None
-    except (ValueError, SyntaxError, IndexError, OverflowError) as error:  # of damaged images, and of paths that can be none
-        raise SimulatorError(f"{where}: expected {kinds}: {error}; the file is damaged, or is none") from None
+        raise SimulatorError(
+            f"{where}: expected {kinds}: {error.strerror or error}; check the path and the file"
+        ) from None
+    except (
+        ValueError,
+        SyntaxError,
+        IndexError,
+        OverflowError,
+    ) as error:  # of damaged images, and of paths that can be none
+        raise SimulatorError(
+            f"{where}: expected {kinds}: {error}; the file is damaged, or is none"
+        ) from None
     if fields.mode == "raw":
         value = np.rint(shade * 255)
         return np.where(value <= OCCUPIED, value, UNKNOWN).astype(np.int8)
@@ -257,12 +304,22 @@ def _cells(fields: MapFile, path: Path) -> Cells:
     if fields.mode == "trinary":
         between: NDArray[np.float64] | int = UNKNOWN
     else:
-        between = np.rint((occupancy - fields.free_thresh) / (fields.occupied_thresh - fields.free_thresh) * OCCUPIED)
-    known = np.where(occupancy > fields.occupied_thresh, OCCUPIED, np.where(occupancy < fields.free_thresh, FREE, between))
+        between = np.rint(
+            (occupancy - fields.free_thresh)
+            / (fields.occupied_thresh - fields.free_thresh)
+            * OCCUPIED
+        )
+    known = np.where(
+        occupancy > fields.occupied_thresh,
+        OCCUPIED,
+        np.where(occupancy < fields.free_thresh, FREE, between),
+    )
     return np.where(opaque, known, UNKNOWN).astype(np.int8)
 
 
-def _shades(image: Image.Image, with_alpha: bool) -> tuple[NDArray[np.float64], NDArray[np.bool_] | bool]:
+def _shades(
+    image: Image.Image, with_alpha: bool
+) -> tuple[NDArray[np.float64], NDArray[np.bool_] | bool]:
     """The brightness of the pixels of an image, from 0 (black) to 1, and which of them are opaque.
 
     Args:
@@ -280,7 +337,9 @@ def _shades(image: Image.Image, with_alpha: bool) -> tuple[NDArray[np.float64], 
     return shade, table[:, :, 3] == 255 if has_alpha and not with_alpha else True
 
 
-def _edges(occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float, float]) -> NDArray[np.float64]:
+def _edges(
+    occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float, float]
+) -> NDArray[np.float64]:
     """The borders between occupied and other cells, joined into long segments, (n, 4) in metres. Row 0 of the cells is at the bottom."""
     found: list[tuple[float, float, float, float]] = []
     for flipped in (False, True):

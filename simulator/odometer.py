@@ -62,7 +62,13 @@ class Odometer:
             )
         usual = Odometer()
         share = along / usual.along
-        return replace(self, along=along, across=usual.across * share, heading=usual.heading * share, turning=usual.turning * share)
+        return replace(
+            self,
+            along=along,
+            across=usual.across * share,
+            heading=usual.heading * share,
+            turning=usual.turning * share,
+        )
 
     def parameters(self) -> dict[str, float]:
         """The noise model by name, as it is written into logs."""
@@ -75,7 +81,12 @@ class Odometer:
         noise = rng.normal(size=(4, len(way)))
         told_ahead = (1 + self.scale) * ahead + self.along * np.sqrt(way) * noise[0]
         told_left = (1 + self.scale) * left + self.across * np.sqrt(way) * noise[1]
-        told_turn = turned + self.bend * ahead + self.heading * np.sqrt(way) * noise[2] + self.turning * np.sqrt(np.abs(turned)) * noise[3]
+        told_turn = (
+            turned
+            + self.bend * ahead
+            + self.heading * np.sqrt(way) * noise[2]
+            + self.turning * np.sqrt(np.abs(turned)) * noise[3]
+        )
         heading = np.concatenate([[0.0], np.cumsum(told_turn)])
         cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
         x = np.concatenate([[0.0], np.cumsum(cos * told_ahead - sin * told_left)])
@@ -85,12 +96,28 @@ class Odometer:
     def covariances(self, readings: Array) -> Array:
         """For each reading, (n, 3), the covariance of its noise against the first one, (n, 3, 3), to first order: what a robot can say of its own odometry. The errors that repeat are not in it."""
         found = np.zeros((len(readings), 3, 3))
-        for number, (start, ahead, left, turned) in enumerate(zip(readings, *_motions(readings), strict=False)):
+        for number, (start, ahead, left, turned) in enumerate(
+            zip(readings, *_motions(readings), strict=False)
+        ):
             way, cos, sin = np.hypot(ahead, left), np.cos(start[2]), np.sin(start[2])
-            by_pose = np.array([[1.0, 0.0, -sin * ahead - cos * left], [0.0, 1.0, cos * ahead - sin * left], [0.0, 0.0, 1.0]])
+            by_pose = np.array(
+                [
+                    [1.0, 0.0, -sin * ahead - cos * left],
+                    [0.0, 1.0, cos * ahead - sin * left],
+                    [0.0, 0.0, 1.0],
+                ]
+            )
             by_motion = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-            noise = np.diag([self.along**2 * way, self.across**2 * way, self.heading**2 * way + self.turning**2 * abs(turned)])
-            found[number + 1] = by_pose @ found[number] @ by_pose.T + by_motion @ noise @ by_motion.T
+            noise = np.diag(
+                [
+                    self.along**2 * way,
+                    self.across**2 * way,
+                    self.heading**2 * way + self.turning**2 * abs(turned),
+                ]
+            )
+            found[number + 1] = (
+                by_pose @ found[number] @ by_pose.T + by_motion @ noise @ by_motion.T
+            )
         return found
 
 

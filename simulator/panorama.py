@@ -58,7 +58,9 @@ class Light:
         """The light at an hour, 0 to 24: the sun rises in the east (+x) at 6, is in the south at 12, and sets in the west at 18. Lamps are always on."""
         height = max(0.0, math.sin(math.pi * (hour - 6) / 12))
         sun = height * (SUNRISE + (DAYLIGHT - SUNRISE) * height)
-        return cls(LAMPS * LAMPLIGHT + (1 - LAMPS) * sun, -math.pi * (hour - 6) / 12, SIDEWAYS * height)
+        return cls(
+            LAMPS * LAMPLIGHT + (1 - LAMPS) * sun, -math.pi * (hour - 6) / 12, SIDEWAYS * height
+        )
 
     def on(self, normals: Array) -> Array:
         """How bright walls are that face these directions, in radians, by how bright one is that faces neither to the sun nor away from it."""
@@ -87,9 +89,13 @@ class Paint:
         ways = segments[:, 2:] - segments[:, :2]
         lengths = np.maximum(np.hypot(*ways.T), 1e-9)
         degrees = np.round(np.degrees(np.arctan2(ways[:, 1], ways[:, 0]))).astype(int) % 360
-        offsets = np.round(100 * (ways[:, 0] * segments[:, 1] - ways[:, 1] * segments[:, 0]) / lengths).astype(int)
+        offsets = np.round(
+            100 * (ways[:, 0] * segments[:, 1] - ways[:, 1] * segments[:, 0]) / lengths
+        ).astype(int)
         found: list[tuple[Any, ...]] = []
-        for i, (degree, offset, length) in enumerate(zip(degrees.tolist(), offsets.tolist(), lengths.tolist(), strict=True)):
+        for i, (degree, offset, length) in enumerate(
+            zip(degrees.tolist(), offsets.tolist(), lengths.tolist(), strict=True)
+        ):
             if i >= walls:
                 found.append(("clutter", degree % 180, round(100 * length)))
             else:
@@ -100,9 +106,22 @@ class Paint:
         """The numbers of a texture, (13 + 6 WAVES,): see `_albedo`."""
         an_instance("key", key, tuple, SimulatorError, mend="take one of Paint.keys")
         rng = np.random.default_rng([self.seed, zlib.crc32(repr(key).encode())])
-        base, stripe, skirting = rng.uniform(0.25, 0.75, 3), rng.uniform(0.15, 0.85, 3), rng.uniform(0.1, 0.4, 3)
-        stripes = [rng.uniform(0.5, 1.2), rng.uniform(0.2, 0.5), rng.uniform(0, 1), rng.uniform(0.1, 0.3)]
-        waves = [rng.normal(0, 3.0, (2, WAVES)), rng.uniform(0, math.tau, (1, WAVES)), rng.normal(0, 0.04, (3, WAVES))]
+        base, stripe, skirting = (
+            rng.uniform(0.25, 0.75, 3),
+            rng.uniform(0.15, 0.85, 3),
+            rng.uniform(0.1, 0.4, 3),
+        )
+        stripes = [
+            rng.uniform(0.5, 1.2),
+            rng.uniform(0.2, 0.5),
+            rng.uniform(0, 1),
+            rng.uniform(0.1, 0.3),
+        ]
+        waves = [
+            rng.normal(0, 3.0, (2, WAVES)),
+            rng.uniform(0, math.tau, (1, WAVES)),
+            rng.normal(0, 0.04, (3, WAVES)),
+        ]
         return np.concatenate([base, stripe, skirting, stripes, np.vstack(waves).ravel()])
 
 
@@ -129,11 +148,22 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("rows", "columns"):
             if not is_whole(getattr(self, name)) or not 1 <= getattr(self, name) <= 1000:
-                raise SimulatorError(f"camera.{name}: expected a whole number from 1 to 1000, got {brief(getattr(self, name))}; change it")
+                raise SimulatorError(
+                    f"camera.{name}: expected a whole number from 1 to 1000, got {brief(getattr(self, name))}; change it"
+                )
         an_instance("camera.paint", self.paint, Paint, SimulatorError, mend="make one with Paint()")
-        hours = tuple(a_list("camera.hours", self.hours, SimulatorError, what="the hours at which a run begins and ends"))
+        hours = tuple(
+            a_list(
+                "camera.hours",
+                self.hours,
+                SimulatorError,
+                what="the hours at which a run begins and ends",
+            )
+        )
         if len(hours) != 2:
-            raise SimulatorError(f"camera.hours: expected two, at which a run begins and ends, got {brief(self.hours)}; give both")
+            raise SimulatorError(
+                f"camera.hours: expected two, at which a run begins and ends, got {brief(self.hours)}; give both"
+            )
         object.__setattr__(self, "hours", hours)
         for name, value, most in (
             ("hours", hours[0], 24.0),
@@ -142,7 +172,9 @@ class Camera:
             ("exposure", self.exposure, 1.0),
         ):
             if not is_finite(value) or not 0 <= value <= most:
-                raise SimulatorError(f"camera.{name}: expected a number from 0 to {most:g}, got {brief(value)}; change it")
+                raise SimulatorError(
+                    f"camera.{name}: expected a number from 0 to {most:g}, got {brief(value)}; change it"
+                )
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -154,14 +186,27 @@ class Camera:
         a_number("share", share, SimulatorError, 0, 1, what="a share")
         return self.hours[0] + share * (self.hours[1] - self.hours[0])
 
-    def shot(self, world: World, pose: Pose, rng: np.random.Generator, hour: float = 12.0, walls: int | None = None) -> NDArray[np.uint8]:
+    def shot(
+        self,
+        world: World,
+        pose: Pose,
+        rng: np.random.Generator,
+        hour: float = 12.0,
+        walls: int | None = None,
+    ) -> NDArray[np.uint8]:
         """The panorama from a pose, (rows, columns, 3), each value from 0 to 255.
 
         walls  how many segments of the world are walls, where the others are clutter; None for all of them
         """
-        an_instance("rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)")
+        an_instance(
+            "rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)"
+        )
         light = Light.at(a_number("hour", hour, SimulatorError, 0, 24))
-        scene = self.scene(world, pose, light, walls).reshape(self.rows, DOWN, self.columns, ACROSS, 3).mean(axis=(1, 3))
+        scene = (
+            self.scene(world, pose, light, walls)
+            .reshape(self.rows, DOWN, self.columns, ACROSS, 3)
+            .mean(axis=(1, 3))
+        )
         values = WHITE_VALUE * scene * (GREY_VALUE / (WHITE_VALUE * scene.mean())) ** self.exposure
         noisy = values + rng.normal(0, self.noise, values.shape) if self.noise else values
         pixels: NDArray[np.uint8] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
@@ -173,22 +218,38 @@ class Camera:
         an_instance("light", light, Light, SimulatorError, mend="take Light.at(12)")
         pose = pose_of("pose", pose)
         segments = world.segments
-        bearings = math.pi - (np.arange(ACROSS * self.columns) + 0.5) * math.tau / (ACROSS * self.columns)
+        bearings = math.pi - (np.arange(ACROSS * self.columns) + 0.5) * math.tau / (
+            ACROSS * self.columns
+        )
         far = meetings(segments, np.array([pose]), bearings)[0]
         hit = far.argmin(axis=1)
         distance = np.minimum(far[np.arange(len(hit)), hit], 1e6)
         slopes = STEEPEST * (1 - 2 * (np.arange(DOWN * self.rows) + 0.5) / (DOWN * self.rows))
         height = EYE + slopes[:, None] * distance
-        points = np.array(pose[:2]) + distance[:, None] * np.column_stack([np.cos(pose[2] + bearings), np.sin(pose[2] + bearings)])
+        points = np.array(pose[:2]) + distance[:, None] * np.column_stack(
+            [np.cos(pose[2] + bearings), np.sin(pose[2] + bearings)]
+        )
         ways = segments[:, 2:] - segments[:, :2]
         angles = np.arctan2(ways[:, 1], ways[:, 0])
-        along = (points * np.column_stack([np.cos(angles), np.sin(angles)])[hit]).sum(axis=1) - _beginnings(segments)[hit]
-        textures = np.array([self.paint.texture(key) for key in self.paint.keys(segments, len(segments) if walls is None else walls)])
+        along = (points * np.column_stack([np.cos(angles), np.sin(angles)])[hit]).sum(
+            axis=1
+        ) - _beginnings(segments)[hit]
+        textures = np.array(
+            [
+                self.paint.texture(key)
+                for key in self.paint.keys(segments, len(segments) if walls is None else walls)
+            ]
+        )
         # A wall faces the side of it on which the robot is.
         to_robot = np.angle(np.exp(1j * (pose[2] + bearings + math.pi - angles[hit]))) > 0
         faces = angles[hit] + np.where(to_robot, math.pi / 2, -math.pi / 2)
         wall = _albedo(textures[hit], along, height) * light.on(faces)[None, :, None]
-        return np.where((height < 0)[..., None], FLOOR, np.where((height > CEILING)[..., None], WHITE, wall)) * light.colour
+        return (
+            np.where(
+                (height < 0)[..., None], FLOOR, np.where((height > CEILING)[..., None], WHITE, wall)
+            )
+            * light.colour
+        )
 
 
 def _beginnings(segments: Array) -> Array:
@@ -214,7 +275,9 @@ def _albedo(textures: Array, along: Array, height: Array) -> Array:
     """
     base, stripe, skirting, stripes, waves = np.split(textures, [3, 6, 9, 13], axis=1)
     period, share, phase, board = stripes.T
-    striped = ((along / period + phase) % 1 < share)[None, :, None] & (height < 0.75 * CEILING)[..., None]
+    striped = ((along / period + phase) % 1 < share)[None, :, None] & (height < 0.75 * CEILING)[
+        ..., None
+    ]
     colour = np.where(striped, stripe[None], base[None])
     across, up, begins, *by_colour = waves.reshape(-1, 6, WAVES).transpose(1, 0, 2)
     swing = np.sin(across * along[:, None] + up * np.clip(height, 0, CEILING)[..., None] + begins)

@@ -26,7 +26,14 @@ from scipy.optimize import linear_sum_assignment
 
 from simulator.errors import SimulatorError
 from simulator.motion import Pose, between, reported
-from ssh_abduction.data.checks import a_number, a_path, a_text, a_whole_number, all_instances, an_instance
+from ssh_abduction.data.checks import (
+    a_number,
+    a_path,
+    a_text,
+    a_whole_number,
+    all_instances,
+    an_instance,
+)
 from ssh_abduction.data.errors import brief, named, printable
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.odometry import Odometry
@@ -93,8 +100,16 @@ class Plan:
 
     def __post_init__(self) -> None:
         a_text("plan.name", self.name, SimulatorError)
-        object.__setattr__(self, "rooms", all_instances("plan.rooms", self.rooms, Room, SimulatorError, mend="give rooms"))
-        object.__setattr__(self, "doors", all_instances("plan.doors", self.doors, Door, SimulatorError, mend="give doors"))
+        object.__setattr__(
+            self,
+            "rooms",
+            all_instances("plan.rooms", self.rooms, Room, SimulatorError, mend="give rooms"),
+        )
+        object.__setattr__(
+            self,
+            "doors",
+            all_instances("plan.doors", self.doors, Door, SimulatorError, mend="give doors"),
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
@@ -103,16 +118,26 @@ class Plan:
         try:
             data = read_at_most(path, LARGEST)
         except OSError as error:
-            raise SimulatorError(f"{named(path)}: expected a readable plan: {error.strerror or error}; check the path") from None
+            raise SimulatorError(
+                f"{named(path)}: expected a readable plan: {error.strerror or error}; check the path"
+            ) from None
         except ValueError as error:
-            raise SimulatorError(f"{named(path)}: expected a plan: {error}; check the path") from None
+            raise SimulatorError(
+                f"{named(path)}: expected a plan: {error}; check the path"
+            ) from None
         if b"<!ENTITY" in data:
-            raise SimulatorError(f"{named(path)}: expected a plan without entities of its own, got some; write them out")
+            raise SimulatorError(
+                f"{named(path)}: expected a plan without entities of its own, got some; write them out"
+            )
         try:
             building = ElementTree.fromstring(data)
         except (ElementTree.ParseError, ValueError, LookupError) as error:
-            raise SimulatorError(f"{named(path)}: expected a plan in XML, got something else ({brief(str(error))}); mend it") from None
-        return _Reader(named(path)).plan(printable(Path(path).stem.removesuffix("_updated")), building)
+            raise SimulatorError(
+                f"{named(path)}: expected a plan in XML, got something else ({brief(str(error))}); mend it"
+            ) from None
+        return _Reader(named(path)).plan(
+            printable(Path(path).stem.removesuffix("_updated")), building
+        )
 
     @cached_property
     def gateways(self) -> tuple[tuple[Gateway, ...], ...]:
@@ -136,7 +161,10 @@ class Plan:
     @cached_property
     def connected(self) -> tuple[int, ...]:
         """The most rooms that can be reached from each other."""
-        parts: list[list[int]] = sorted((sorted(part) for part in nx.connected_components(self.graph)), key=lambda part: (-len(part), part))
+        parts: list[list[int]] = sorted(
+            (sorted(part) for part in nx.connected_components(self.graph)),
+            key=lambda part: (-len(part), part),
+        )
         return tuple(parts[0])
 
     @cached_property
@@ -187,12 +215,18 @@ class Plan:
             door = self.doors[number]
             return sum(math.dist(door.position, self.rooms[room].centre) for room in door.rooms)
 
-        bearing = {(g.door, room): g.bearing for room, found in enumerate(self.gateways) for g in found}
+        bearing = {
+            (g.door, room): g.bearing for room, found in enumerate(self.gateways) for g in found
+        }
         kept: list[int] = []
         taken: list[list[float]] = [[] for _ in self.rooms]
         for number in sorted(range(len(self.doors)), key=far):
             rooms = self.doors[number].rooms
-            if all(_apart(bearing[number, room], other) >= degrees for room in rooms for other in taken[room]):
+            if all(
+                _apart(bearing[number, room], other) >= degrees
+                for room in rooms
+                for other in taken[room]
+            ):
                 kept.append(number)
                 for room in rooms:
                     taken[room].append(bearing[number, room])
@@ -233,12 +267,20 @@ def tour(
     a_whole_number("steps", steps, SimulatorError, 0, MOST_STEPS, what="a number of actions")
     a_whole_number("seed", seed, SimulatorError)
     if odometry is not None:
-        an_instance("odometry", odometry, Odometry, SimulatorError, mend="make one with Odometry(), or leave it out")
+        an_instance(
+            "odometry",
+            odometry,
+            Odometry,
+            SimulatorError,
+            mend="make one with Odometry(), or leave it out",
+        )
     a_number("scale", scale, SimulatorError, -1, 1, what="a share")
     a_number("bend", bend, SimulatorError, -1, 1, what="radians a metre")
     plan = plan.told_apart(apart)
     if len(plan.connected) < 2:
-        raise SimulatorError(f"{plan.name}: expected rooms with doors between them, got none that are connected; take another plan")
+        raise SimulatorError(
+            f"{plan.name}: expected rooms with doors between them, got none that are connected; take another plan"
+        )
     # Each has numbers of its own, so that the noise does not change where the robot goes.
     walk, drawn, sighted = (np.random.default_rng([seed, k]) for k in range(3))
     logged: list[Step] = []
@@ -283,14 +325,19 @@ class Floor:
 
     def ends(self, stand: Stand) -> dict[Action, Stand]:
         """What the robot can do there, and where that ends: a turn to each other gateway, and a travel where it faces one."""
-        return dict(next(self.way_through(stand, goal)) for goal in range(len(self.plan.gateways[stand.room])))
+        return dict(
+            next(self.way_through(stand, goal))
+            for goal in range(len(self.plan.gateways[stand.room]))
+        )
 
     def way_through(self, stand: Stand, goal: int) -> Iterator[tuple[Action, Stand]]:
         """The actions that lead through a gateway of the room, and where each of them ends."""
         return _way_through(self.plan, stand, goal)
 
 
-def _drive(plan: Plan, steps: int, chance: np.random.Generator) -> Iterator[tuple[Stand, Action | None]]:
+def _drive(
+    plan: Plan, steps: int, chance: np.random.Generator
+) -> Iterator[tuple[Stand, Action | None]]:
     """Where the robot is at each step, and what it does next; nothing at the last step."""
     room = int(chance.choice(plan.connected))
     stand = Stand(room, int(chance.integers(len(plan.gateways[room]))))
@@ -318,7 +365,10 @@ def _way_through(plan: Plan, stand: Stand, goal: int) -> Iterator[tuple[Action, 
     gateway = plan.gateways[stand.room][goal]
     back = next(k for k, g in enumerate(plan.gateways[gateway.to]) if g.door == gateway.door)
     ahead = plan.gateways[gateway.to][back].opposite
-    yield Action.of("travel"), Stand(gateway.to, back, False) if ahead is None else Stand(gateway.to, ahead)
+    yield (
+        Action.of("travel"),
+        Stand(gateway.to, back, False) if ahead is None else Stand(gateway.to, ahead),
+    )
 
 
 def _turn(plan: Plan, stand: Stand, goal: int) -> Action:
@@ -330,7 +380,9 @@ def _turn(plan: Plan, stand: Stand, goal: int) -> Action:
     clockwise = sorted(bearing for bearing in bearings if bearing > 0)
     side, order = ("right", clockwise) if bearings[goal] < 180 else ("left", clockwise[::-1])
     number = order.index(bearings[goal]) + 1
-    return Action.of({"name": f"{side} to gateway {number}", "kind": "turn", "turn": side, "gateway": number})
+    return Action.of(
+        {"name": f"{side} to gateway {number}", "kind": "turn", "turn": side, "gateway": number}
+    )
 
 
 def _heading(plan: Plan, stand: Stand) -> float:
@@ -341,14 +393,21 @@ def _heading(plan: Plan, stand: Stand) -> float:
 def _bearings(plan: Plan, stand: Stand) -> tuple[float, ...]:
     """For each gateway of the room its bearing, in degrees clockwise from ahead. Whoever sees the order of the gateways could tell headings apart by it, so stars are sorted."""
     heading = _heading(plan, stand)
-    return tuple(round((gateway.bearing - heading) % 360, 3) % 360 for gateway in plan.gateways[stand.room])
+    return tuple(
+        round((gateway.bearing - heading) % 360, 3) % 360 for gateway in plan.gateways[stand.room]
+    )
 
 
-def _sighted(plan: Plan, stand: Stand, spread: float, chance: np.random.Generator) -> tuple[Sighted, ...]:
+def _sighted(
+    plan: Plan, stand: Stand, spread: float, chance: np.random.Generator
+) -> tuple[Sighted, ...]:
     """The star as the robot sees it: each bearing is off by at most `spread` degrees."""
     found = plan.gateways[stand.room]
     off = chance.uniform(-spread, spread, len(found)).tolist()
-    bearings = [round(bearing + wrong, 3) % 360 for bearing, wrong in zip(_bearings(plan, stand), off, strict=True)]
+    bearings = [
+        round(bearing + wrong, 3) % 360
+        for bearing, wrong in zip(_bearings(plan, stand), off, strict=True)
+    ]
     return _star(plan, stand, bearings, spread)
 
 
@@ -358,18 +417,24 @@ def _view(bearings: Sequence[float]) -> str:
     return f"{len(bearings)} door{'s' * (len(bearings) > 1)}: {' '.join(map(str, rough))}"
 
 
-def _star(plan: Plan, stand: Stand, bearings: Sequence[float], spread: float) -> tuple[Sighted, ...]:
+def _star(
+    plan: Plan, stand: Stand, bearings: Sequence[float], spread: float
+) -> tuple[Sighted, ...]:
     """The star of gateways that are seen at these bearings, in their order. Doors through which one path goes on are told to be opposite."""
     found = plan.gateways[stand.room]
     order = sorted(range(len(found)), key=lambda k: bearings[k])
     opposite = [found[k].opposite for k in order]
     return tuple(
-        Sighted(bearings[k], spread, None if other is None else order.index(other)) for k, other in zip(order, opposite, strict=True)
+        Sighted(bearings[k], spread, None if other is None else order.index(other))
+        for k, other in zip(order, opposite, strict=True)
     )
 
 
 def _pose(plan: Plan, stand: Stand) -> Pose:
-    return (*plan.rooms[stand.room].centre, math.remainder(math.radians(90 - _heading(plan, stand)), math.tau))
+    return (
+        *plan.rooms[stand.room].centre,
+        math.remainder(math.radians(90 - _heading(plan, stand)), math.tau),
+    )
 
 
 def _truth(plan: Plan, stand: Stand, pose: Pose) -> dict[str, object]:
@@ -394,9 +459,16 @@ def _with_opposites(found: Sequence[Gateway]) -> tuple[Gateway, ...]:
     """The gateways of a room, those paired that are nearest to being opposite to each other."""
 
     def nearest(k: int) -> int:
-        return min(range(len(found)), key=lambda other: _apart(found[other].bearing, found[k].bearing + 180))
+        return min(
+            range(len(found)),
+            key=lambda other: _apart(found[other].bearing, found[k].bearing + 180),
+        )
 
-    pairs = {k: other for k in range(len(found)) if k == nearest(other := nearest(k)) and _bend(found, k, other) <= STRAIGHT}
+    pairs = {
+        k: other
+        for k in range(len(found))
+        if k == nearest(other := nearest(k)) and _bend(found, k, other) <= STRAIGHT
+    }
     return tuple(replace(gateway, opposite=pairs.get(k)) for k, gateway in enumerate(found))
 
 
@@ -421,22 +493,31 @@ class _Reader:
             raise self.wrong("space", "an id for each space that no other has", None)
         sides: dict[tuple[int, int], dict[int, list[Point]]] = {}
         for here, space in enumerate(spaces):
-            middles = {line.get("id"): self.middle(line, scale) for line in space.findall("space_representation/linesegment")}
+            middles = {
+                line.get("id"): self.middle(line, scale)
+                for line in space.findall("space_representation/linesegment")
+            }
             for i, portal in enumerate(space.findall("portals/portal")):
                 pair = self.pair(portal, numbers, here, f"space[{here}].portal[{i}]")
                 if (middle := middles.get(portal.findtext("linesegment"))) is not None:
                     sides.setdefault(pair, {}).setdefault(here, []).append(middle)
         doors = tuple(
-            Door(pair, position) for pair in sorted(sides) for position in _matched(*(sides[pair].get(room, []) for room in pair))
+            Door(pair, position)
+            for pair in sorted(sides)
+            for position in _matched(*(sides[pair].get(room, []) for room in pair))
         )
         return Plan(name, rooms, doors)
 
     def wrong(self, name: str, expected: str, value: object) -> SimulatorError:
-        return SimulatorError(f"{self.where}: {name}: expected {expected}, got {'none' if value is None else brief(value)}; mend it")
+        return SimulatorError(
+            f"{self.where}: {name}: expected {expected}, got {'none' if value is None else brief(value)}; mend it"
+        )
 
     def scale(self, building: Element) -> float:
         """Metres that a pixel is long."""
-        pixels = self.number(building.findtext("scale/represented_distance/value"), "scale/represented_distance")
+        pixels = self.number(
+            building.findtext("scale/represented_distance/value"), "scale/represented_distance"
+        )
         length = self.number(building.findtext("scale/real_distance/value"), "scale/real_distance")
         unit = building.findtext("scale/real_distance/um")
         if unit not in METRES:
@@ -448,11 +529,15 @@ class _Reader:
     def room(self, space: Element, where: str, scale: float) -> Room:
         if not (name := space.get("id")):
             raise self.wrong(f"{where}.id", "a text", name)
-        corners = tuple(self.point(point, where, scale) for point in space.findall("bounding_polygon/point"))
+        corners = tuple(
+            self.point(point, where, scale) for point in space.findall("bounding_polygon/point")
+        )
         centre = self.point(space.find("centroid/point"), f"{where}.centroid", scale)
         return Room(name, (space.findtext("labels/label") or "").strip(), centre, corners)
 
-    def pair(self, portal: Element, numbers: Mapping[str, int], here: int, where: str) -> tuple[int, int]:
+    def pair(
+        self, portal: Element, numbers: Mapping[str, int], here: int, where: str
+    ) -> tuple[int, int]:
         names = [target.text or "" for target in portal.findall("target/id")]
         rooms = sorted({numbers[name] for name in names if name in numbers})
         if len(names) != 2 or len(rooms) != 2 or here not in rooms:
@@ -469,7 +554,9 @@ class _Reader:
         """A point in metres. In drawings y grows downwards, and here it grows to the north."""
         if point is None:
             raise self.wrong(f"{where}.point", "x and y", None)
-        return scale * self.number(point.get("x"), f"{where}.x"), -scale * self.number(point.get("y"), f"{where}.y")
+        return scale * self.number(point.get("x"), f"{where}.x"), -scale * self.number(
+            point.get("y"), f"{where}.y"
+        )
 
     def number(self, text: str | None, where: str) -> float:
         try:
@@ -483,7 +570,9 @@ class _Reader:
 
 def _matched(here: Sequence[Point], there: Sequence[Point]) -> Iterator[Point]:
     """The doors between two rooms, each of which is drawn on both sides of the wall. A door that is drawn on one side only is there, too."""
-    distances = np.array([[math.dist(a, b) for b in there] for a in here]).reshape(len(here), len(there))
+    distances = np.array([[math.dist(a, b) for b in there] for a in here]).reshape(
+        len(here), len(there)
+    )
     first, second = linear_sum_assignment(distances)
     yield from (_mean([here[i], there[j]]) for i, j in zip(first, second, strict=True))
     yield from (point for i, point in enumerate(here) if i not in first)
@@ -491,4 +580,6 @@ def _matched(here: Sequence[Point], there: Sequence[Point]) -> Iterator[Point]:
 
 
 def _mean(points: Sequence[Point]) -> Point:
-    return math.fsum(x for x, _ in points) / len(points), math.fsum(y for _, y in points) / len(points)
+    return math.fsum(x for x, _ in points) / len(points), math.fsum(y for _, y in points) / len(
+        points
+    )

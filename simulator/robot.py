@@ -44,7 +44,11 @@ class Body:
         for name, least in (("odometry", 0.0), ("scale", -WORST), ("bend", -WORST)):
             value = getattr(self, name)
             if not is_finite(value) or not least <= value <= WORST:
-                unit = f" radians a metre, which are {math.degrees(WORST):.1f} degrees" if name == "bend" else ""
+                unit = (
+                    f" radians a metre, which are {math.degrees(WORST):.1f} degrees"
+                    if name == "bend"
+                    else ""
+                )
                 raise SimulatorError(
                     f"body.{name}: expected a number from {least} to {WORST}{unit}, got {brief(value)}; choose a smaller error (--{OPTIONS[name]})"
                 )
@@ -69,10 +73,16 @@ class Robot:
         self.body = body
         self.pose = pose
         self.driven = 0.0  # metres driven, as odometry reports them
-        self.odometry: Pose = (0.0, 0.0, 0.0)  # the pose against that at the start, as odometry reports it
+        self.odometry: Pose = (
+            0.0,
+            0.0,
+            0.0,
+        )  # the pose against that at the start, as odometry reports it
         self._rng = rng
         self._reported = self.odometry  # as it was at the last report
-        self._covariance = np.zeros((3, 3))  # of the odometry, in its own frame, since the last report
+        self._covariance = np.zeros(
+            (3, 3)
+        )  # of the odometry, in its own frame, since the last report
 
     def move(self, forward: float, turn: float) -> None:
         """Command a motion: so many metres forward (back if negative), and so many radians of turn on the way."""
@@ -109,4 +119,8 @@ class Robot:
 def _moved(pose: Pose, forward: float, turn: float) -> Pose:
     x, y, heading = pose
     middle = heading + turn / 2
-    return x + forward * math.cos(middle), y + forward * math.sin(middle), math.remainder(heading + turn, math.tau)
+    return (
+        x + forward * math.cos(middle),
+        y + forward * math.sin(middle),
+        math.remainder(heading + turn, math.tau),
+    )

@@ -31,7 +31,9 @@ from ssh_abduction.data.words import counted
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]
-Within = tuple[int, int | None, int | None]  # a room, and two of its doors; None stands for its middle
+Within = tuple[
+    int, int | None, int | None
+]  # a room, and two of its doors; None stands for its middle
 # Metres that a round is long before the robot goes home.
 METRES = 200.0
 # Metres from the wall to where a passage through a door begins and ends.
@@ -52,7 +54,9 @@ class Rooms:
     def __init__(self, building: Building, radius: float) -> None:
         self.building = building
         self.space = FreeSpace.of(building.segments, radius)
-        self._shut = self.space.drawn(np.array([opening.threshold for opening in building.openings]).reshape(-1, 4))
+        self._shut = self.space.drawn(
+            np.array([opening.threshold for opening in building.openings]).reshape(-1, 4)
+        )
         self._sides = [_sides(building, number) for number in range(len(building.openings))]
         self._ways: dict[Within, Array] = {}
         self.middles: dict[int, Point] = {}
@@ -61,18 +65,27 @@ class Rooms:
         for room in range(len(building.plan.rooms)):
             doors = [number for number in fits if room in self._sides[number]]
             part = self._part(room)
-            regions = part.region(np.array([self._sides[number][room] for number in doors]).reshape(-1, 2)).tolist()
+            regions = part.region(
+                np.array([self._sides[number][room] for number in doors]).reshape(-1, 2)
+            ).tolist()
             if any(regions):
                 region, _ = Counter(filter(None, regions)).most_common(1)[0]
                 self.middles[room] = part.nearest(region, building.plan.rooms[room].centre, MIDDLE)
-                reached.update(number for number, found in zip(doors, regions, strict=True) if found == region)
+                reached.update(
+                    number for number, found in zip(doors, regions, strict=True) if found == region
+                )
         self.graph = nx.MultiGraph()
-        self.graph.add_edges_from((*building.plan.doors[number].rooms, number) for number in fits if reached[number] == 2)
+        self.graph.add_edges_from(
+            (*building.plan.doors[number].rooms, number) for number in fits if reached[number] == 2
+        )
 
     def way(self, room: int, start: int | None, goal: int | None) -> Array:
         """The way within a room from door to door, (n, 2) metres; None stands for its middle."""
         if (room, start, goal) not in self._ways:
-            ends = [self.middles[room] if door is None else self._sides[door][room] for door in (start, goal)]
+            ends = [
+                self.middles[room] if door is None else self._sides[door][room]
+                for door in (start, goal)
+            ]
             way = self._part(room).way(*ends)
             assert way is not None  # as both are in one region
             self._ways[room, start, goal] = way
@@ -88,13 +101,17 @@ class Rooms:
 
     def _fits(self, door: int) -> bool:
         """Whether the robot can drive straight through a door."""
-        line = _line(*self._sides[door].values()) if len(self._sides[door]) == 2 else np.empty((0, 2))
+        line = (
+            _line(*self._sides[door].values()) if len(self._sides[door]) == 2 else np.empty((0, 2))
+        )
         return len(line) > 0 and bool((self.space.part(line).off(line) >= self.space.least).all())
 
     def _part(self, room: int) -> Part:
         """The part of the building where a room is, with all doors shut."""
         sides = [sides[room] for sides in self._sides if room in sides]
-        return self.space.part(np.vstack([np.array(self.building.plan.rooms[room].polygon), *sides]), self._shut)
+        return self.space.part(
+            np.vstack([np.array(self.building.plan.rooms[room].polygon), *sides]), self._shut
+        )
 
 
 def _sides(building: Building, number: int) -> dict[int, Point]:
@@ -103,7 +120,9 @@ def _sides(building: Building, number: int) -> dict[int, Point]:
     sides = [opening.point(0.0, side * (opening.depth / 2 + APPROACH)) for side in (-1, 1)]
     here, there = (building.plan.rooms[room] for room in door.rooms)
     for one, other in (sides, sides[::-1]):
-        if (holds(here.polygon, one) and not holds(here.polygon, other)) or (holds(there.polygon, other) and not holds(there.polygon, one)):
+        if (holds(here.polygon, one) and not holds(here.polygon, other)) or (
+            holds(there.polygon, other) and not holds(there.polygon, one)
+        ):
             return {door.rooms[0]: one, door.rooms[1]: other}
     return {}
 
@@ -140,7 +159,9 @@ class Round:
     @classmethod
     def drawn(cls, rooms: Rooms, metres: float, chance: np.random.Generator) -> Round:
         """A round that is drawn by chance. Raises SimulatorError where no two rooms are connected by doors through which the robot fits."""
-        parts = sorted(nx.connected_components(rooms.graph), key=lambda part: (-len(part), min(part)))
+        parts = sorted(
+            nx.connected_components(rooms.graph), key=lambda part: (-len(part), min(part))
+        )
         if not parts:
             plan = rooms.building.plan
             raise SimulatorError(
@@ -212,7 +233,9 @@ def record_plan(
     if tours < 1:
         raise SimulatorError(f"tours: expected 1 or more, got {tours}")
     if not is_finite(metres) or metres <= 0:
-        raise SimulatorError(f"metres: expected a length above 0, got {brief(metres)}; 200 is usual")
+        raise SimulatorError(
+            f"metres: expected a length above 0, got {brief(metres)}; 200 is usual"
+        )
     body = body or Body()
     rooms = Rooms(Building.of(plan), body.radius)
     chance, motion = (np.random.default_rng([seed, k]) for k in (0, 1))
@@ -223,19 +246,31 @@ def record_plan(
     robot = Robot(body, (x, y, float(chance.uniform(-math.pi, math.pi))), motion)
     driver = Driver(world, robot, laser, motion, recorder=recorder)
     recorder.note(world, robot.pose)
-    come = [0]  # for each scan the point of the round to which the robot had come, counted on from round to round
+    come = [
+        0
+    ]  # for each scan the point of the round to which the robot had come, counted on from round to round
     for number in range(tours):
         for at in follow(driver, rooms.space, tour.way):
             come += [number * len(tour.way) + at] * (recorder.taken - len(come))
-    drive = recorder.drive(f"{plan.name}, {counted(tours, 'tours')}, seed {seed}", laser, odometer or Odometer(), seed)
+    drive = recorder.drive(
+        f"{plan.name}, {counted(tours, 'tours')}, seed {seed}", laser, odometer or Odometer(), seed
+    )
     come += come[-1:] * (len(drive) - len(come))
-    crossings = [(number * len(tour.way) + at, door) for number in range(tours) for at, door in tour.doors]
+    crossings = [
+        (number * len(tour.way) + at, door) for number in range(tours) for at, door in tour.doors
+    ]
     return drive.judged(
         {_name(room): middle for room, middle in rooms.middles.items()},
         [_name(int(tour.rooms[at % len(tour.way)])) for at in come],
-        crossings=[{"door": f"door {door}", "scan": int(np.searchsorted(come, at))} for at, door in crossings],
+        crossings=[
+            {"door": f"door {door}", "scan": int(np.searchsorted(come, at))}
+            for at, door in crossings
+        ],
         doors={
-            f"door {number}": {"rooms": [_name(one), _name(other)], "at": [round(v, 4) for v in rooms.building.openings[number].middle]}
+            f"door {number}": {
+                "rooms": [_name(one), _name(other)],
+                "at": [round(v, 4) for v in rooms.building.openings[number].middle],
+            }
             for one, other, number in sorted(rooms.graph.edges(keys=True), key=lambda edge: edge[2])
         },
     )

@@ -45,7 +45,11 @@ class Sight:
         """
         marks = [self.front] if self.front is not None and self.front < 2.5 * reach else []
         if streets:
-            marks += [x for x in (self.left_street, self.right_street) if x is not None and x < 2.5 * reach]
+            marks += [
+                x
+                for x in (self.left_street, self.right_street)
+                if x is not None and x < 2.5 * reach
+            ]
         return None if not marks else min(marks) - reach
 
     def offset(self, reach: float) -> float | None:
@@ -74,7 +78,9 @@ def sight(image: Array, reach: float, farthest: float) -> Sight:
     axis = _axis(points)
     points = _turned(points, -axis)
     axis += _finer(points, reach)
-    points = _turned(np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1), -axis)
+    points = _turned(
+        np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1), -axis
+    )
     x, y = points[:, 0], points[:, 1]
     across, along = _spacing(y), _spacing(x)
     # Where the axis of the walls is turned to the left of the robot, the robot is turned to the right of the axis: hence the minus.
@@ -149,4 +155,6 @@ def _line(values: Array, weights: Array, chosen: NDArray[np.bool_]) -> float | N
     first = int(support.argmax())
     if support[first] < LONG or ends[first] - first < 5:
         return None
-    return float(np.average(picked[first : ends[first]], weights=length[first : ends[first]] + 1e-6))
+    return float(
+        np.average(picked[first : ends[first]], weights=length[first : ends[first]] + 1e-6)
+    )

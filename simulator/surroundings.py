@@ -75,7 +75,9 @@ class Street:
         return -(self.middle * cmath.rect(1, -self.bearing)).imag
 
 
-def points_of(ranges: Array, bearings: Array, farthest: float) -> tuple[NDArray[np.complex128], NDArray[np.intp]]:
+def points_of(
+    ranges: Array, bearings: Array, farthest: float
+) -> tuple[NDArray[np.complex128], NDArray[np.intp]]:
     """The points that an image shows, and the numbers of their beams. What is `farthest` or farther was not seen."""
     seen = np.flatnonzero(ranges < farthest - 0.02)
     return ranges[seen] * np.exp(1j * bearings[seen]), seen
@@ -87,13 +89,17 @@ def walls_of(points: NDArray[np.complex128], beams: NDArray[np.intp]) -> list[Wa
     return [wall for stretch in np.split(points, breaks) for wall in _straight(stretch)]
 
 
-def streets_of(walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float) -> list[Street]:
+def streets_of(
+    walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float
+) -> list[Street]:
     """The streets between walls, no two in one direction, clockwise from straight behind.
 
     farther  how many metres from the robot a street has to go on
     """
     found: list[Street] = []
-    for street in sorted(_between(walls, points, reach, farther), key=lambda street: -street.length):
+    for street in sorted(
+        _between(walls, points, reach, farther), key=lambda street: -street.length
+    ):
         if all(apart(street.bearing, other.bearing) > STRAIGHT for other in found):
             found.append(street)
     return sorted(found, key=lambda street: -street.bearing)
@@ -128,7 +134,9 @@ def _fitted(points: NDArray[np.complex128]) -> Wall:
     return Wall(complex(ends[0]), complex(ends[1]))
 
 
-def _between(walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float) -> Iterator[Street]:
+def _between(
+    walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float
+) -> Iterator[Street]:
     """The streets between any two walls: one of them at the right of who goes along it, the other at the left."""
     for right, left in permutations(walls, 2):
         if apart(cmath.phase(right.way), cmath.phase(-left.way)) > PARALLEL:
@@ -138,11 +146,19 @@ def _between(walls: Sequence[Wall], points: NDArray[np.complex128], reach: float
         (a, b), (c, d) = ((wall.start / along, wall.end / along) for wall in (right, left))
         width = (c.imag + d.imag - a.imag - b.imag) / 2
         near, far = max(a.real, d.real), min(b.real, c.real)
-        if not WIDTHS[0] * reach < width < WIDTHS[1] * reach or far < farther or far - max(near, 0.0) < LONG:
+        if (
+            not WIDTHS[0] * reach < width < WIDTHS[1] * reach
+            or far < farther
+            or far - max(near, 0.0) < LONG
+        ):
             continue
         lateral = (a.imag + b.imag + c.imag + d.imag) / 4
         seen = points / along
-        inside = (np.abs(seen.imag - lateral) < width / 4) & (seen.real > max(near, 0.0)) & (seen.real < farther)
+        inside = (
+            (np.abs(seen.imag - lateral) < width / 4)
+            & (seen.real > max(near, 0.0))
+            & (seen.real < farther)
+        )
         if inside.sum() < 3:
             yield Street(cmath.phase(along), 1j * lateral * along, far - near)
 
@@ -164,16 +180,24 @@ class Place:
         points, beams = points_of(np.nan_to_num(ranges, nan=farthest), AROUND, farthest)
         if not len(points):
             return cls((), None)
-        first = int(np.abs(points - np.roll(points, 1)).argmax())  # a wall ends there, so none is cut in two
+        first = int(
+            np.abs(points - np.roll(points, 1)).argmax()
+        )  # a wall ends there, so none is cut in two
         points, beams = np.roll(points, -first), (np.roll(beams, -first) - beams[first]) % 360
         streets = streets_of(walls_of(points, beams), points, reach, FAR * reach)
-        return cls(tuple(streets), _meeting(streets) if len(streets) > 1 else _end(streets, points, reach))
+        return cls(
+            tuple(streets), _meeting(streets) if len(streets) > 1 else _end(streets, points, reach)
+        )
 
     @property
     def headings(self) -> list[float]:
         """The headings of dstates there, in radians: along each street, away from the place and, where no street is opposite, towards it."""
         out = [street.bearing for street in self.streets]
-        return out + [bearing + math.pi for bearing in out if all(apart(bearing + math.pi, other) > STRAIGHT for other in out)]
+        return out + [
+            bearing + math.pi
+            for bearing in out
+            if all(apart(bearing + math.pi, other) > STRAIGHT for other in out)
+        ]
 
     def heading(self, about: float) -> float:
         """The heading of a dstate that is nearest to one."""
@@ -182,7 +206,11 @@ class Place:
     def beside(self, heading: float, side: int) -> float | None:
         """How far to turn to the next street at the left (side=1) or at the right (-1), in radians; None if there is none before straight behind."""
         turns = [side * (street.bearing - heading) % math.tau for street in self.streets]
-        return min((side * turn for turn in turns if STRAIGHT < turn < math.pi - STRAIGHT), key=abs, default=None)
+        return min(
+            (side * turn for turn in turns if STRAIGHT < turn < math.pi - STRAIGHT),
+            key=abs,
+            default=None,
+        )
 
     def faces(self, heading: float) -> bool:
         """Whether a street is straight ahead."""
@@ -248,7 +276,9 @@ def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
     for window, step in ((2 + OFF * math.degrees(abs(turned)), 0.5), (0.5, 0.05)):
         tried = best + np.radians(np.arange(-window, window + step / 2, step))
         known = np.interp(np.degrees(tried[:, None] + BEARINGS), np.arange(360), ranges, period=360)
-        shown = ~np.isnan(known).any(axis=0)  # the same beams for all, or what is not known would look like agreement
+        shown = ~np.isnan(known).any(
+            axis=0
+        )  # the same beams for all, or what is not known would look like agreement
         off = np.minimum(np.abs(known[:, shown] - image[shown]), 0.3)
         best = float(tried[int(off.mean(axis=1).argmin())])
     return best

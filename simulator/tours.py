@@ -50,7 +50,10 @@ class Star:
 
     def act(self, action: str) -> None:
         if action == "travel":
-            self.slots, self.facing = {2: True}, 0  # behind the robot is the opening through which it came
+            self.slots, self.facing = (
+                {2: True},
+                0,
+            )  # behind the robot is the opening through which it came
         else:
             self.facing = (self.facing + QUARTERS[action]) % 4
 
@@ -86,10 +89,23 @@ def simulate(
     Raises SimulatorError where the route cannot be driven.
     """
     if every is not None:
-        a_number("every", every, SimulatorError, above=0, what="a number of metres", mend="leave it out for images at dstates")
+        a_number(
+            "every",
+            every,
+            SimulatorError,
+            above=0,
+            what="a number of metres",
+            mend="leave it out for images at dstates",
+        )
     a_flag("stars", stars, SimulatorError)
     if camera is not None:
-        an_instance("camera", camera, Camera, SimulatorError, mend="make one with Camera(), or leave it out for ranges")
+        an_instance(
+            "camera",
+            camera,
+            Camera,
+            SimulatorError,
+            mend="make one with Camera(), or leave it out for ranges",
+        )
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     if world.by_places:
         raise SimulatorError(
@@ -98,12 +114,23 @@ def simulate(
     driver = _driver(world, tours, seed, laser, body, tolerance)
     body, tolerance = driver.robot.body, driver.tolerance
     log = Log(driver.robot)
-    eye = Eye(camera, len(world.segments), np.random.default_rng([seed, 1]), tours * len(world.route))
-    steps = list(_at_dstates(driver, log, world, tours, stars, eye)) if every is None else _evenly(driver, log, world, tours, every, eye)
+    eye = Eye(
+        camera, len(world.segments), np.random.default_rng([seed, 1]), tours * len(world.route)
+    )
+    steps = (
+        list(_at_dstates(driver, log, world, tours, stars, eye))
+        if every is None
+        else _evenly(driver, log, world, tours, every, eye)
+    )
     steps[-1] = replace(steps[-1], action=None)
     odometry = _noise(log, world, body, tolerance if every is None else None)
     extra = {} if camera is None else {"panorama": list(camera.shape)}
-    return Trace(tuple(steps), name=f"{world.name}, {tours} tours, seed {seed}", odometry=odometry, extra=extra)
+    return Trace(
+        tuple(steps),
+        name=f"{world.name}, {tours} tours, seed {seed}",
+        odometry=odometry,
+        extra=extra,
+    )
 
 
 def record(
@@ -124,8 +151,12 @@ def record(
     recorder = driver.recorder = Recorder(every)
     recorder.note(driver.world, driver.robot.pose)
     steps = []
-    for _, action in _stops(driver, world, tours) if world.by_places else _legs(driver, world, tours):
-        steps.append({"scan": recorder.taken - 1, **_truth(world, driver.robot.pose), "action": action})
+    for _, action in (
+        _stops(driver, world, tours) if world.by_places else _legs(driver, world, tours)
+    ):
+        steps.append(
+            {"scan": recorder.taken - 1, **_truth(world, driver.robot.pose), "action": action}
+        )
     name = f"{world.name}, {counted(tours, 'tours')}, seed {seed}"
     drive = recorder.drive(name, driver.laser, odometer or Odometer(), seed)
     return drive.judged(world.places, [_place(world, pose) for pose in drive.poses], steps=steps)
@@ -151,29 +182,60 @@ def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]
             if way is None:
                 off = world.clearance(*world.stops[stop])
                 mend = f"open the walls, or move {stop}, which is {off:.2f} m off the nearest one"
-                raise SimulatorError(f"{world.name}: route: expected a way from ({x:.2f}, {y:.2f}) to {stop}, got none; {mend}")
+                raise SimulatorError(
+                    f"{world.name}: route: expected a way from ({x:.2f}, {y:.2f}) to {stop}, got none; {mend}"
+                )
             try:
                 deque(follow(driver, space, way), maxlen=0)
             except SimulatorError as error:
-                raise SimulatorError(f"{error} (on the way to {stop}, on tour {tour + 1})") from None
+                raise SimulatorError(
+                    f"{error} (on the way to {stop}, on tour {tour + 1})"
+                ) from None
 
 
-def _driver(world: World, tours: int, seed: int, laser: Laser | None, body: Body | None, tolerance: Tolerance | None) -> Driver:
+def _driver(
+    world: World,
+    tours: int,
+    seed: int,
+    laser: Laser | None,
+    body: Body | None,
+    tolerance: Tolerance | None,
+) -> Driver:
     """A robot at the start of a world. Raises SimulatorError where no tour can begin."""
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     a_whole_number("tours", tours, SimulatorError, 1, MOST_TOURS)
     a_whole_number("seed", seed, SimulatorError)
-    for name, given, kind in (("laser", laser, Laser), ("body", body, Body), ("tolerance", tolerance, Tolerance)):
+    for name, given, kind in (
+        ("laser", laser, Laser),
+        ("body", body, Body),
+        ("tolerance", tolerance, Tolerance),
+    ):
         if given is not None:
-            an_instance(name, given, kind, SimulatorError, mend=f"make one with {kind.__name__}(), or leave it out")
+            an_instance(
+                name,
+                given,
+                kind,
+                SimulatorError,
+                mend=f"make one with {kind.__name__}(), or leave it out",
+            )
     if not world.route:
-        raise SimulatorError(f"{world.name}: route: expected at least one action, got none; add it to the world, or give one")
+        raise SimulatorError(
+            f"{world.name}: route: expected at least one action, got none; add it to the world, or give one"
+        )
     body = body or Body()
     x, y, _ = world.start
     if not world.holds(x, y) or world.clearance(x, y) < body.radius:
-        raise SimulatorError(f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, {y}); move it")
+        raise SimulatorError(
+            f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, {y}); move it"
+        )
     rng = np.random.default_rng(seed)
-    return Driver(world.arranged(rng), Robot(body, world.start, rng), laser or Laser(), rng, tolerance or Tolerance())
+    return Driver(
+        world.arranged(rng),
+        Robot(body, world.start, rng),
+        laser or Laser(),
+        rng,
+        tolerance or Tolerance(),
+    )
 
 
 def _noise(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Noise:
@@ -201,7 +263,11 @@ class Eye:
         if self.camera is None:
             return tuple(round(float(r), 4) for r in ranges)
         hour = self.camera.hour(done / max(self.actions - 1, 1))
-        return tuple(self.camera.shot(driver.world, driver.robot.pose, self.rng, hour, self.walls).ravel().tolist())
+        return tuple(
+            self.camera.shot(driver.world, driver.robot.pose, self.rng, hour, self.walls)
+            .ravel()
+            .tolist()
+        )
 
 
 @dataclass
@@ -235,9 +301,15 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
     """
     ways = math.fsum(math.hypot(*r.displacement[:2]) ** 2 for r in reports)
     turns = math.fsum(r.displacement[2] ** 2 for r in reports)
-    along, across, heading = np.sum([np.diag(r.covariance) for r in reports], axis=0) if reports else np.zeros(3)
+    along, across, heading = (
+        np.sum([np.diag(r.covariance) for r in reports], axis=0) if reports else np.zeros(3)
+    )
     share = 1 / ways if ways else 0.0
-    offset, tilt = (tolerance.close / math.sqrt(3), tolerance.straight / math.sqrt(3)) if tolerance else (0.0, 0.0)
+    offset, tilt = (
+        (tolerance.close / math.sqrt(3), tolerance.straight / math.sqrt(3))
+        if tolerance
+        else (0.0, 0.0)
+    )
     errors = {
         "along": math.sqrt(along * share),
         "across": math.sqrt(across * share + tilt**2),
@@ -251,7 +323,9 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
     return Noise.of({name: round(error, 6) for name, error in errors.items()})
 
 
-def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye) -> Iterator[Step]:
+def _at_dstates(
+    driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye
+) -> Iterator[Step]:
     if world.angles == "any":
         yield from _at_junctions(driver, log, world, tours, stars, eye)
         return
@@ -283,7 +357,9 @@ def _at_dstates(driver: Driver, log: Log, world: World, tours: int, stars: bool,
             star.act(action)
 
 
-def _at_junctions(driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye) -> Iterator[Step]:
+def _at_junctions(
+    driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye
+) -> Iterator[Step]:
     """The same where streets meet at any angles. How much the robot turned to look around differs from step to step, so each displacement has a covariance of its own."""
     pilot, watch = Pilot(driver), Watch(world, driver, tours)
     with watch.start():
@@ -299,7 +375,9 @@ def _at_junctions(driver: Driver, log: Log, world: World, tours: int, stars: boo
                 action=ACTIONS[action],
                 star=pilot.star() if stars else None,
                 displacement=displacement,
-                covariance=None if displacement is None else _covariance(log.reports[-1], driver.tolerance, done),
+                covariance=None
+                if displacement is None
+                else _covariance(log.reports[-1], driver.tolerance, done),
                 truth=_truth(world, driver.robot.pose),
             )
             with watch.action(number, action):
@@ -315,13 +393,17 @@ def _covariance(report: Report, tolerance: Tolerance, action: str) -> Covariance
     dx, dy, _ = report.displacement
     near = tolerance.close / math.sqrt(3) if action == "travel" else 0.001
     left = np.diag([near**2, near**2, tolerance.straight**2 / 3])
-    by_start = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])  # a heading that is off puts the end aside
+    by_start = np.array(
+        [[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]]
+    )  # a heading that is off puts the end aside
     whole = report.covariance + by_start @ left @ by_start.T + left
     a, b, c = (tuple(float(f"{v:.4g}") for v in row) for row in (whole + whole.T) / 2)
     return a, b, c  # type: ignore[return-value]
 
 
-def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float, eye: Eye) -> list[Step]:
+def _evenly(
+    driver: Driver, log: Log, world: World, tours: int, every: float, eye: Eye
+) -> list[Step]:
     """Images each `every` metres of odometry. What is at most that far along the route counts as one spot, tour after tour."""
     logged: list[Step] = []
     leg_began = due = 0.0
@@ -330,10 +412,19 @@ def _evenly(driver: Driver, log: Log, world: World, tours: int, every: float, ey
     def look(driver: Driver) -> None:
         nonlocal due
         if driver.robot.driven >= due:
-            spot = f"leg {leg % len(world.route)}, {round((driver.robot.driven - leg_began) / every)}"
+            spot = (
+                f"leg {leg % len(world.route)}, {round((driver.robot.driven - leg_began) / every)}"
+            )
             truth = {"dstate": spot, "pose": [round(v, 4) for v in driver.robot.pose]}
             image = eye.image(driver, driver.look(STILL), leg)
-            logged.append(Step(image=image, action=Action.of("travel"), displacement=log.displacement(), truth=truth))
+            logged.append(
+                Step(
+                    image=image,
+                    action=Action.of("travel"),
+                    displacement=log.displacement(),
+                    truth=truth,
+                )
+            )
             due += every
 
     driver.on_travel = look
@@ -359,4 +450,14 @@ def _legs(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]
 def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:
     found = world.nearest(pose)
     where = {"pose": [round(float(v), 5) for v in pose]}
-    return {"dstate": found.name, "place": found.place, "path": found.path, "direction": found.direction, **where} if found else dict(where)
+    return (
+        {
+            "dstate": found.name,
+            "place": found.place,
+            "path": found.path,
+            "direction": found.direction,
+            **where,
+        }
+        if found
+        else dict(where)
+    )

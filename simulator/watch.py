@@ -69,11 +69,16 @@ class Watch:
     def _ended(self, tour: int, pose: Pose) -> None:
         """Compare where a tour has ended with where the first one began."""
         assert self._home is not None
-        if math.dist(pose[:2], self._home[:2]) <= self._near and abs(math.remainder(pose[2] - self._home[2], math.tau)) <= FACING:
+        if (
+            math.dist(pose[:2], self._home[:2]) <= self._near
+            and abs(math.remainder(pose[2] - self._home[2], math.tau)) <= FACING
+        ):
             return
         text = f"{self.world.name}: tour {tour + 1}: expected it to end where it began, {_at('', self._home)}, got its end {_at('', pose)}, {_off(self._home, pose)}"
         if self.tours == 1:
-            warnings.warn(f"{text}; it cannot be driven again from there", SimulatorWarning, stacklevel=2)
+            warnings.warn(
+                f"{text}; it cannot be driven again from there", SimulatorWarning, stacklevel=2
+            )
         else:
             raise SimulatorError(f"{text}; mend the route, or drive one tour{self._because()}")
 
@@ -100,7 +105,11 @@ class Watch:
         ahead = []
         for state in self.world.dstates:
             x, y, _ = between(here.pose, state.pose)
-            if (state.path, state.direction) == (here.path, here.direction) and x > NEAR and abs(y) <= STRAIGHT * x:
+            if (
+                (state.path, state.direction) == (here.path, here.direction)
+                and x > NEAR
+                and abs(y) <= STRAIGHT * x
+            ):
                 ahead.append((x, state.place))
         return min(ahead)[1] if ahead else None
 
@@ -113,7 +122,9 @@ class Watch:
         world, body = self.world, self.driver.robot.body
         if world.own_reach is not None and world.own_reach != world.reach:
             yield f"reach is {world.reach:g} m, and the world's own is {world.own_reach:g} m (leave --reach out)"
-        elif (half := self._half_width(before)) and not (0.6 * half if world.angles == "any" else 0.0) <= world.reach <= 1.25 * half:
+        elif (half := self._half_width(before)) and not (
+            0.6 * half if world.angles == "any" else 0.0
+        ) <= world.reach <= 1.25 * half:
             yield f"reach is {world.reach:g} m, and half the width of the street there is {half:.2f} m (give that as reach)"
         if world.angles == "right" and not are_square(world.segments):
             yield 'walls meet at other than right angles, and the world says "right" (write "angles": "any")'

@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.occupancy import FARTHEST, read_occupancy
-from ssh_abduction.data.checks import a_number, a_path, a_text, all_instances, an_instance, an_object, numbers, one_of
+from ssh_abduction.data.checks import (
+    a_number,
+    a_path,
+    a_text,
+    all_instances,
+    an_instance,
+    an_object,
+    numbers,
+    one_of,
+)
 from ssh_abduction.data.errors import brief, is_finite, named, printable
 from ssh_abduction.data.files import parse_json, read_at_most
 
@@ -45,14 +54,24 @@ LARGEST = 64 * 2**20
 
 def checked_segments(name: str, value: object) -> Array:
     """Segments, (n, 4), in metres. Raises SimulatorError."""
-    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.shape[1:] == (4,) and len(value) and np.isfinite(value).all():
+    if (
+        isinstance(value, np.ndarray)
+        and value.dtype.kind in "fiu"
+        and value.shape[1:] == (4,)
+        and len(value)
+        and np.isfinite(value).all()
+    ):
         return value
-    raise SimulatorError(f"{name}: expected an array of segments, (n, 4) in metres, got {brief(value)}; make one with numpy.array")
+    raise SimulatorError(
+        f"{name}: expected an array of segments, (n, 4) in metres, got {brief(value)}; make one with numpy.array"
+    )
 
 
 def pose_of(name: str, value: object) -> tuple[float, float, float]:
     """A pose (x, y, heading), in metres and radians. Raises SimulatorError."""
-    x, y, heading = numbers(name, value, SimulatorError, 3, "x, y and heading, in metres and radians")
+    x, y, heading = numbers(
+        name, value, SimulatorError, 3, "x, y and heading, in metres and radians"
+    )
     return x, y, heading
 
 
@@ -109,14 +128,26 @@ class World:
         object.__setattr__(self, "start", pose_of("world.start", self.start))
         a_number("world.reach", self.reach, SimulatorError, NEAREST, FARTHEST, what="metres")
         if self.own_reach is not None:
-            a_number("world.own_reach", self.own_reach, SimulatorError, NEAREST, FARTHEST, what="metres")
+            a_number(
+                "world.own_reach", self.own_reach, SimulatorError, NEAREST, FARTHEST, what="metres"
+            )
         one_of("world.angles", self.angles, get_args(Angles), SimulatorError)
         for name, kind in (("clutter", Clutter), ("route", str), ("dstates", TrueDState)):
-            members = all_instances(f"world.{name}", getattr(self, name), kind, SimulatorError, mend="read a world with World.load")
+            members = all_instances(
+                f"world.{name}",
+                getattr(self, name),
+                kind,
+                SimulatorError,
+                mend="read a world with World.load",
+            )
             object.__setattr__(self, name, members)
         for name in ("places", "via"):
-            for place, point in an_object(f"world.{name}", getattr(self, name), SimulatorError).items():
-                numbers(f"world.{name}[{brief(place)}]", point, SimulatorError, 2, "x and y in metres")
+            for place, point in an_object(
+                f"world.{name}", getattr(self, name), SimulatorError
+            ).items():
+                numbers(
+                    f"world.{name}[{brief(place)}]", point, SimulatorError, 2, "x and y in metres"
+                )
 
     @property
     def by_places(self) -> bool:
@@ -143,7 +174,9 @@ class World:
 
     def arranged(self, rng: np.random.Generator) -> World:
         """This world as it is on one tour: the clutter has been moved at random, and is part of the walls."""
-        an_instance("rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)")
+        an_instance(
+            "rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)"
+        )
         parts = [self.segments]
         for item in self.clutter:
             shift = rng.uniform(-1, 1, 2) * np.array(item.moves)
@@ -168,11 +201,15 @@ class World:
             return None
 
         def far(s: TrueDState) -> float:
-            return math.hypot(s.pose[0] - x, s.pose[1] - y) + abs(math.remainder(s.pose[2] - heading, math.tau))
+            return math.hypot(s.pose[0] - x, s.pose[1] - y) + abs(
+                math.remainder(s.pose[2] - heading, math.tau)
+            )
 
         return min(self.dstates, key=far)
 
-    def with_choices(self, start: str | None = None, route: str | None = None, reach: float | None = None) -> World:
+    def with_choices(
+        self, start: str | None = None, route: str | None = None, reach: float | None = None
+    ) -> World:
         """This world with another start ("x,y,degrees"), route ("travel,right,…") or reach (metres). Raises SimulatorError."""
         reader = _Reader(self.name)
         world = self
@@ -186,19 +223,27 @@ class World:
             if not isinstance(route, str):
                 raise reader.wrong("route", "actions with commas between", route)
             world = replace(world, route=reader.route(route.split(","), world.stops))
-        return world if reach is None else replace(world, reach=reader.reach(reach), own_reach=world.own_reach or world.reach)
+        return (
+            world
+            if reach is None
+            else replace(world, reach=reader.reach(reach), own_reach=world.own_reach or world.reach)
+        )
 
     @classmethod
     def named(cls, name: str) -> World:
         """A world that comes with the package (as notched-rectangle or triangle), or the one in a file: .json, or .yaml for an occupancy map."""
-        shipped = {path.stem: path for path in (Path(str(files("simulator"))) / "worlds").glob("*.json")}
+        shipped = {
+            path.stem: path for path in (Path(str(files("simulator"))) / "worlds").glob("*.json")
+        }
         if isinstance(name, str) and name in shipped:
             return cls.load(shipped[name])
         if not isinstance(name, str) or not Path(name).suffix:
             raise SimulatorError(
                 f"world: expected one of {', '.join(sorted(shipped))}, or a file, got {brief(name)}; a file ends in .json or .yaml"
             )
-        return cls.from_occupancy(name) if Path(name).suffix in (".yaml", ".yml") else cls.load(name)
+        return (
+            cls.from_occupancy(name) if Path(name).suffix in (".yaml", ".yml") else cls.load(name)
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> World:
@@ -207,9 +252,13 @@ class World:
         try:
             data = parse_json(read_at_most(path, LARGEST).decode("utf-8"))
         except OSError as error:
-            raise SimulatorError(f"{named(path)}: expected a readable world: {error.strerror or error}; check the path") from None
+            raise SimulatorError(
+                f"{named(path)}: expected a readable world: {error.strerror or error}; check the path"
+            ) from None
         except ValueError as error:
-            raise SimulatorError(f"{named(path)}: expected a world in JSON, got something else ({brief(str(error))}); mend it") from None
+            raise SimulatorError(
+                f"{named(path)}: expected a world in JSON, got something else ({brief(str(error))}); mend it"
+            ) from None
         return _Reader(str(path)).world(data)
 
     @classmethod
@@ -237,18 +286,33 @@ class _Reader:
         self.where = where
 
     def world(self, data: Any) -> World:
-        if not isinstance(data, Mapping) or data.get("format") != FORMAT or data.get("version") != VERSION:
-            raise self.wrong("format", f'an object with "format": "{FORMAT}", "version": {VERSION}', data)
+        if (
+            not isinstance(data, Mapping)
+            or data.get("format") != FORMAT
+            or data.get("version") != VERSION
+        ):
+            raise self.wrong(
+                "format", f'an object with "format": "{FORMAT}", "version": {VERSION}', data
+            )
         walls = [self.loop(p, f"polygons[{i}]") for i, p in enumerate(self.list(data, "polygons"))]
-        walls += [self.numbers(s, 4, f"segments[{i}]").reshape(1, 4) for i, s in enumerate(self.list(data, "segments"))]
+        walls += [
+            self.numbers(s, 4, f"segments[{i}]").reshape(1, 4)
+            for i, s in enumerate(self.list(data, "segments"))
+        ]
         walls += [self.arc(a, f"arcs[{i}]") for i, a in enumerate(self.list(data, "arcs"))]
         if "occupancy" in data:
             walls.append(self.occupancy(data["occupancy"]))
         if not walls:
-            raise self.wrong("polygons", "at least one wall in polygons, segments, arcs or occupancy", [])
+            raise self.wrong(
+                "polygons", "at least one wall in polygons, segments, arcs or occupancy", []
+            )
         segments = np.vstack(walls)
-        dstates = tuple(self.dstate(s, f"dstates[{i}]") for i, s in enumerate(self.list(data, "dstates")))
-        places = {state.place: state.pose[:2] for state in dstates} | self.points(data.get("places", {}), "places")
+        dstates = tuple(
+            self.dstate(s, f"dstates[{i}]") for i, s in enumerate(self.list(data, "dstates"))
+        )
+        places = {state.place: state.pose[:2] for state in dstates} | self.points(
+            data.get("places", {}), "places"
+        )
         via = self.points(data.get("via", {}), "via")
         stops = {**via, **places}
         route = self.route(self.list(data, "route"), stops)
@@ -257,7 +321,9 @@ class _Reader:
             name=self.name(data.get("name", printable(Path(self.where).stem))),
             segments=self.ragged(segments, data.get("ragged", 0.0)),
             angles=self.angles(data.get("angles"), segments),
-            clutter=tuple(self.clutter(c, f"clutter[{i}]") for i, c in enumerate(self.list(data, "clutter"))),
+            clutter=tuple(
+                self.clutter(c, f"clutter[{i}]") for i, c in enumerate(self.list(data, "clutter"))
+            ),
             start=self.pose(data.get("start", start), "start"),
             route=route,
             reach=self.reach(data.get("reach", 1.0)),
@@ -272,7 +338,9 @@ class _Reader:
         return value
 
     def wrong(self, name: str, expected: str, value: Any) -> SimulatorError:
-        return SimulatorError(f"{self.where}: {name}: expected {expected}, got {brief(value)}; mend it (docs/worlds.md)")
+        return SimulatorError(
+            f"{self.where}: {name}: expected {expected}, got {brief(value)}; mend it (docs/worlds.md)"
+        )
 
     def list(self, data: Mapping[str, Any], name: str) -> list[Any]:
         value = data.get(name, [])
@@ -297,7 +365,11 @@ class _Reader:
         """An arc as segments: x and y of its centre, its radius, and between which directions it is, counter-clockwise, in degrees."""
         x, y, radius, first, last = self.numbers(value, 5, name)
         if not radius > 0 or not 0 < last - first <= 360:
-            raise self.wrong(name, "[x, y, radius above 0, from, to], where `to` is up to 360 degrees above `from`", value)
+            raise self.wrong(
+                name,
+                "[x, y, radius above 0, from, to], where `to` is up to 360 degrees above `from`",
+                value,
+            )
         angles = np.radians(np.linspace(first, last, 1 + math.ceil((last - first) / ARC)))
         points = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
         return np.hstack([points[:-1], points[1:]])
@@ -315,13 +387,23 @@ class _Reader:
         if not value:
             return walls
         if np.hypot(*(walls[:, 2:] - walls[:, :2]).T).sum() > LONGEST:
-            raise self.wrong("ragged", f"walls of at most {LONGEST:,} m together, as uneven walls have many pieces", value)
+            raise self.wrong(
+                "ragged",
+                f"walls of at most {LONGEST:,} m together, as uneven walls have many pieces",
+                value,
+            )
         pieces = []
         for x1, y1, x2, y2 in walls:
-            line = np.linspace((x1, y1), (x2, y2), 1 + math.ceil(math.hypot(x2 - x1, y2 - y1) / RAGGED))
+            line = np.linspace(
+                (x1, y1), (x2, y2), 1 + math.ceil(math.hypot(x2 - x1, y2 - y1) / RAGGED)
+            )
             pieces.append(np.hstack([line[:-1], line[1:]]))
-        ends, which = np.unique(np.vstack(pieces).reshape(-1, 2).round(6), axis=0, return_inverse=True)  # walls that meet still do
-        moved: Array = (ends + np.random.default_rng(0).normal(0, value, ends.shape))[which.ravel()].reshape(-1, 4)
+        ends, which = np.unique(
+            np.vstack(pieces).reshape(-1, 2).round(6), axis=0, return_inverse=True
+        )  # walls that meet still do
+        moved: Array = (ends + np.random.default_rng(0).normal(0, value, ends.shape))[
+            which.ravel()
+        ].reshape(-1, 4)
         return moved
 
     def points(self, value: Any, name: str) -> dict[str, Point]:
@@ -329,7 +411,9 @@ class _Reader:
             raise self.wrong(name, "an object of names and points [x, y]", value)
         if clash := next((text for text in value if text in ACTIONS or "," in text), None):
             raise self.wrong(name, "names without commas that are no actions", clash)
-        found = {text: self.numbers(point, 2, f"{name}.{text}").tolist() for text, point in value.items()}
+        found = {
+            text: self.numbers(point, 2, f"{name}.{text}").tolist() for text, point in value.items()
+        }
         return {text: (x, y) for text, (x, y) in found.items()}
 
     def route(self, value: Sequence[Any], stops: Mapping[str, Point]) -> tuple[str, ...]:
@@ -337,9 +421,17 @@ class _Reader:
         by_places = any(isinstance(stop, str) and stop in stops for stop in value)
         for i, stop in enumerate(value):
             if by_places and not (isinstance(stop, str) and stop in stops):
-                raise self.wrong(f"route[{i}]", f"a place ({', '.join(stops)}), as there are others in the route", stop)
+                raise self.wrong(
+                    f"route[{i}]",
+                    f"a place ({', '.join(stops)}), as there are others in the route",
+                    stop,
+                )
             if not by_places and stop not in ACTIONS:
-                raise self.wrong(f"route[{i}]", "travel, right, left or around" + (", or the name of a place" if stops else ""), stop)
+                raise self.wrong(
+                    f"route[{i}]",
+                    "travel, right, left or around" + (", or the name of a place" if stops else ""),
+                    stop,
+                )
         return tuple(value)
 
     def reach(self, value: Any) -> float:
@@ -364,13 +456,25 @@ class _Reader:
         present = value.get("present", 1.0)
         if not is_finite(present) or not 0 <= present <= 1:
             raise self.wrong(f"{name}.present", "a probability", present)
-        return Clutter(self.loop(value.get("polygon"), f"{name}.polygon"), (float(moves[0]), float(moves[1])), float(present))
+        return Clutter(
+            self.loop(value.get("polygon"), f"{name}.polygon"),
+            (float(moves[0]), float(moves[1])),
+            float(present),
+        )
 
     def dstate(self, value: Any, name: str) -> TrueDState:
         if not isinstance(value, Mapping) or value.get("direction") not in (1, -1):
-            raise self.wrong(name, "an object with name, place, path, direction 1 or -1, pose", value)
+            raise self.wrong(
+                name, "an object with name, place, path, direction 1 or -1, pose", value
+            )
         texts = [value.get(key) for key in ("name", "place", "path")]
         if not all(isinstance(text, str) for text in texts):
             raise self.wrong(name, "texts for name, place and path", value)
         label, place, path = map(str, texts)
-        return TrueDState(label, place, path, int(value["direction"]), self.pose(value.get("pose"), f"{name}.pose"))
+        return TrueDState(
+            label,
+            place,
+            path,
+            int(value["direction"]),
+            self.pose(value.get("pose"), f"{name}.pose"),
+        )

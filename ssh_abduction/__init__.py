@@ -130,7 +130,9 @@ def lazy_names(
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module = f"{package}.{where[name]}"
         loaded = import_module(module)
-        value = getattr(loaded, name) if hasattr(loaded, name) else import_module(f"{module}.{name}")
+        value = (
+            getattr(loaded, name) if hasattr(loaded, name) else import_module(f"{module}.{name}")
+        )
         setattr(sys.modules[package], name, value)
         return value
 
@@ -154,6 +156,10 @@ def __getattr__(name: str) -> "Any":
         from importlib import import_module
 
         package, _, now = _MOVED[name].rpartition(".")
-        warnings.warn(f"ssh_abduction.{name} is deprecated; use ssh_abduction.{package}.{now}", DeprecationWarning, stacklevel=2)
+        warnings.warn(
+            f"ssh_abduction.{name} is deprecated; use ssh_abduction.{package}.{now}",
+            DeprecationWarning,
+            stacklevel=2,
+        )
         return getattr(import_module(f"{__name__}.{package}"), now)
     return _load(name)

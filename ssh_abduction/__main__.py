@@ -5,7 +5,9 @@ import sys
 
 from ssh_abduction.data import program
 
-sys.path[:] = program.search_path()  # `python -m` puts the current folder first, and a file there is no module of Python's
+sys.path[:] = (
+    program.search_path()
+)  # `python -m` puts the current folder first, and a file there is no module of Python's
 
 try:
     import signal
@@ -24,7 +26,11 @@ def run() -> "NoReturn":
 
     After Ctrl-C at any time the code is 130, after SIGTERM 143, and there is no traceback.
     """
-    numbers = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
+    numbers = [
+        number
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(number) is not signal.SIG_IGN
+    ]
     for number in numbers:  # some shells let programs in the background ignore Ctrl-C
         signal.signal(number, _interrupt)
     try:

@@ -36,9 +36,13 @@ Courses: TypeAlias = tuple[Course | None, ...]
 Key: TypeAlias = tuple[Labels, Places, Courses]
 Link: TypeAlias = tuple[int, Action, int]
 Order: TypeAlias = frozenset[tuple[int, int]]  # (p, q): p comes before q in direction +1
-Branch: TypeAlias = tuple[int, int, int, int, int]  # (p, h, d, h', d'): at p, (h', d') leaves to the right of (h, d)
+Branch: TypeAlias = tuple[
+    int, int, int, int, int
+]  # (p, h, d, h', d'): at p, (h', d') leaves to the right of (h, d)
 Axioms: TypeAlias = frozenset[str]
-Named: TypeAlias = tuple[int, int, int]  # a gateway: its number in the star, its bearing and its spread, in whole degrees
+Named: TypeAlias = tuple[
+    int, int, int
+]  # a gateway: its number in the star, its bearing and its spread, in whole degrees
 
 SLOTS = (0, 1, 2, 3)
 QUARTERS = {"right": 1, "around": 2, "left": 3}
@@ -68,11 +72,18 @@ def key(ssh_map: SSHMap) -> Key:
     return (
         tuple(labels[s] for s in ssh_map.labels),
         tuple(None if s.place is None else places[s.place] for s in visited),
-        tuple(None if s.path is None or s.direction is None else (paths[s.path][0], s.direction * paths[s.path][1]) for s in visited),
+        tuple(
+            None
+            if s.path is None or s.direction is None
+            else (paths[s.path][0], s.direction * paths[s.path][1])
+            for s in visited
+        ),
     )
 
 
-def minimal_maps(trace: Trace, theory: Theory, allows: Callable[[Key], bool] = lambda _: True) -> tuple[Counts | None, set[Key]]:
+def minimal_maps(
+    trace: Trace, theory: Theory, allows: Callable[[Key], bool] = lambda _: True
+) -> tuple[Counts | None, set[Key]]:
     """The counts and the keys of the consistent maps that come first by `theory.priorities`; (None, empty) where there is none.
 
     allows  what an axiom says of a map that the brute force does not know
@@ -114,7 +125,11 @@ def near_minimal_maps(
             if cost == known[0]:
                 known[1].add(found)
     least = min(((cost, number) for number, (cost, _) in best.items()), default=((), 0))[1]
-    return {cost: keys for number, (cost, keys) in sorted(best.items()) if least <= number <= least + within}
+    return {
+        cost: keys
+        for number, (cost, keys) in sorted(best.items())
+        if least <= number <= least + within
+    }
 
 
 def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]]:
@@ -141,26 +156,44 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
                 continue
             if geometry and not geometry.allows(labels, places):
                 continue
-            headings = list(_headings(labels, places, trace.actions, stars, on)) if theory.star == "frame" else []
+            headings = (
+                list(_headings(labels, places, trace.actions, stars, on))
+                if theory.star == "frame"
+                else []
+            )
             if theory.star == "frame" and not headings:
                 continue
             if "planar" in on and not _is_planar(labels, places, links, headings, theory):
                 continue
             for courses in _courses(places, links, on):
-                if headings and not any(_goes_straight(labels, places, courses, h, on) for h in headings):
+                if headings and not any(
+                    _goes_straight(labels, places, courses, h, on) for h in headings
+                ):
                     continue
-                if theory.star == "gateways" and not _gateways_agree(trace, labels, places, courses, on):
+                if theory.star == "gateways" and not _gateways_agree(
+                    trace, labels, places, courses, on
+                ):
                     continue
-                ends = partial(_gateways_agree, trace, labels, places, courses, on) if "gateway_end" in on else None
+                ends = (
+                    partial(_gateways_agree, trace, labels, places, courses, on)
+                    if "gateway_end" in on
+                    else None
+                )
                 excuses = _least_excuses(places, courses, links, on, defeasible, ends)
                 if excuses is not None:
                     paths = len({course[0] for course in courses if course})
-                    yield (labels, places, courses), Counts(dstates, paths, len(set(places)), excuses)
+                    yield (
+                        (labels, places, courses),
+                        Counts(dstates, paths, len(set(places)), excuses),
+                    )
 
 
 def _as_asserted(labels: Labels, places: tuple[int, ...] | None, theory: Theory) -> bool:
     """Whether dstates, and places where they are given, are as the theory says of pairs of steps that the trace has."""
-    there = [[(i, j) for i, j in pairs if j < len(labels)] for pairs in (theory.same, theory.different, theory.elsewhere)]
+    there = [
+        [(i, j) for i, j in pairs if j < len(labels)]
+        for pairs in (theory.same, theory.different, theory.elsewhere)
+    ]
     same, different, elsewhere = there
     return (
         all(labels[i] == labels[j] for i, j in same)
@@ -176,12 +209,21 @@ def _stars_alike(trace: Trace, labels: Labels) -> bool:
         if not one:
             return not any(gateway.open for gateway in other)
         first, *rest = one
-        near = [k for k, g in enumerate(other) if _off(first.bearing, g.bearing) <= first.spread + g.spread]
+        near = [
+            k
+            for k, g in enumerate(other)
+            if _off(first.bearing, g.bearing) <= first.spread + g.spread
+        ]
         paired = any(alike(tuple(rest), other[:k] + other[k + 1 :]) for k in near)
         return paired or (not first.open and alike(tuple(rest), other))
 
     stars = [step.gateways.gateways if step.gateways else () for step in trace.steps]
-    return all(alike(stars[i], stars[t]) for t in range(len(labels)) for i in range(t) if labels[i] == labels[t])
+    return all(
+        alike(stars[i], stars[t])
+        for t in range(len(labels))
+        for i in range(t)
+        if labels[i] == labels[t]
+    )
 
 
 # --- dstates: which steps are equal
@@ -195,10 +237,16 @@ def _labellings(trace: Trace, on: Axioms) -> Iterator[Labels]:
         last = len(labels) - 1
         for i in range(last):
             # C1: a dstate has one view. A view that is unknown may be any.
-            if "functional_view" in on and labels[i] == labels[last] and len({views[i], views[last]} - {None}) > 1:
+            if (
+                "functional_view" in on
+                and labels[i] == labels[last]
+                and len({views[i], views[last]} - {None}) > 1
+            ):
                 return False
             # C2: the same action done in the same dstate leads to the same dstate.
-            same_start = i > 0 and labels[i - 1] == labels[last - 1] and actions[i - 1] == actions[last - 1]
+            same_start = (
+                i > 0 and labels[i - 1] == labels[last - 1] and actions[i - 1] == actions[last - 1]
+            )
             if "deterministic" in on and same_start and labels[i] != labels[last]:
                 return False
         return True
@@ -217,7 +265,9 @@ def _labellings(trace: Trace, on: Axioms) -> Iterator[Labels]:
 # --- places: which dstates are at the same place
 
 
-def _placings(labels: Labels, links: frozenset[Link], stars: tuple[Openings | None, ...], on: Axioms) -> Iterator[tuple[int, ...]]:
+def _placings(
+    labels: Labels, links: frozenset[Link], stars: tuple[Openings | None, ...], on: Axioms
+) -> Iterator[tuple[int, ...]]:
     """The place of each dstate, numbered by first visit."""
     dstates = max(labels) + 1
 
@@ -231,7 +281,11 @@ def _placings(labels: Labels, links: frozenset[Link], stars: tuple[Openings | No
                 if "travel_leaves" in on and action.kind == "travel" and places[s] == places[t]:
                     return False
         # Stars seen at a place are rotations of each other.
-        seen = {star for label, star in zip(labels, stars, strict=True) if star and label < len(places) and places[label] == places[-1]}
+        seen = {
+            star
+            for label, star in zip(labels, stars, strict=True)
+            if star and label < len(places) and places[label] == places[-1]
+        }
         return "star_pattern" not in on or all(_rotated(a, b) for a, b in combinations(seen, 2))
 
     def extend(places: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
@@ -253,7 +307,11 @@ def _rotated(a: Openings, b: Openings) -> bool:
 
 
 def _headings(
-    labels: Labels, places: tuple[int, ...], actions: tuple[Action, ...], stars: tuple[Openings | None, ...], on: Axioms
+    labels: Labels,
+    places: tuple[int, ...],
+    actions: tuple[Action, ...],
+    stars: tuple[Openings | None, ...],
+    on: Axioms,
 ) -> Iterator[tuple[int, ...]]:
     """The headings that fit turns and stars. At the first step at a place it is 0: this chooses the place's frame."""
     at = [places[label] for label in labels]
@@ -269,14 +327,23 @@ def _headings(
         turn = actions[last - 1].turn if last else None
         # Headings at two places are in two frames: without turn_stays a turn may lead from one to the other.
         stays = last and at[last - 1] == at[last]
-        if "turn_rotates" in on and turn and stays and headings[last] != (headings[last - 1] + QUARTERS[turn]) % 4:
+        if (
+            "turn_rotates" in on
+            and turn
+            and stays
+            and headings[last] != (headings[last - 1] + QUARTERS[turn]) % 4
+        ):
             return False
         for i in range(last):
             if "one_heading" in on and labels[i] == labels[last] and headings[i] != headings[last]:
                 return False
             if at[i] != at[last]:
                 continue
-            if "one_dstate_per_heading" in on and headings[i] == headings[last] and labels[i] != labels[last]:
+            if (
+                "one_dstate_per_heading" in on
+                and headings[i] == headings[last]
+                and labels[i] != labels[last]
+            ):
                 return False
             if "star_frame" in on and slots(i, headings[i]) != slots(last, headings[last]):
                 return False
@@ -293,7 +360,9 @@ def _headings(
     return extend(())
 
 
-def _goes_straight(labels: Labels, places: tuple[int, ...], courses: Courses, headings: tuple[int, ...], on: Axioms) -> bool:
+def _goes_straight(
+    labels: Labels, places: tuple[int, ...], courses: Courses, headings: tuple[int, ...], on: Axioms
+) -> bool:
     """A path leaves a place through opposite slots; a slot belongs to one path and direction, and these to one slot."""
     if "path_goes_straight" not in on:
         return True
@@ -302,7 +371,10 @@ def _goes_straight(labels: Labels, places: tuple[int, ...], courses: Courses, he
     for label, heading in zip(labels, headings, strict=True):
         if course := courses[label]:
             path, direction = course
-            for slot, leaving in ((heading, (path, direction)), ((heading + 2) % 4, (path, -direction))):
+            for slot, leaving in (
+                (heading, (path, direction)),
+                ((heading + 2) % 4, (path, -direction)),
+            ):
                 through[places[label], slot].add(leaving)
                 slots[places[label], leaving].add(slot)
     return all(len(x) == 1 for x in through.values()) and all(len(x) == 1 for x in slots.values())
@@ -312,7 +384,12 @@ def _goes_straight(labels: Labels, places: tuple[int, ...], courses: Courses, he
 
 
 def _gateways_agree(
-    trace: Trace, labels: Labels, places: tuple[int, ...], courses: Courses, on: Axioms, orders: dict[int, Order] | None = None
+    trace: Trace,
+    labels: Labels,
+    places: tuple[int, ...],
+    courses: Courses,
+    on: Axioms,
+    orders: dict[int, Order] | None = None,
 ) -> bool:
     """Whether at each place the gateways of all steps can be named, so that stars agree when turned by whole degrees, and lead on where paths go on in these orders."""
     at = [places[label] for label in labels]
@@ -320,13 +397,28 @@ def _gateways_agree(
     for t, label in enumerate(labels):
         if orders and (course := courses[label]):
             path, direction = course
-            later, sooner = any(a == at[t] for a, _ in orders[path]), any(b == at[t] for _, b in orders[path])
+            later, sooner = (
+                any(a == at[t] for a, _ in orders[path]),
+                any(b == at[t] for _, b in orders[path]),
+            )
             ahead, behind = (later, sooner) if direction == 1 else (sooner, later)
             onward[t] = {way for way, goes_on in ((0, ahead), (180, behind)) if goes_on}
-    return all(_named([t for t in range(len(labels)) if at[t] == place], trace, labels, courses, on, onward) for place in set(at))
+    return all(
+        _named(
+            [t for t in range(len(labels)) if at[t] == place], trace, labels, courses, on, onward
+        )
+        for place in set(at)
+    )
 
 
-def _named(steps: list[int], trace: Trace, labels: Labels, courses: Courses, on: Axioms, onward: list[set[int]]) -> bool:
+def _named(
+    steps: list[int],
+    trace: Trace,
+    labels: Labels,
+    courses: Courses,
+    on: Axioms,
+    onward: list[set[int]],
+) -> bool:
     """Whether each of these steps, which are at one place, has a reading of its star: the bearing of each gateway of the place, in a clockwise order that is the same for all."""
 
     def extend(chosen: dict[int, tuple[Named, ...]]) -> bool:
@@ -335,13 +427,16 @@ def _named(steps: list[int], trace: Trace, labels: Labels, courses: Courses, on:
         step = steps[len(chosen)]
         for reading in _readings(trace.steps[step]):
             bent = _way_on(reading, Star.of(trace.steps[step].star or ()).gateways)
-            if not bent and not all(any(_off(b, way) <= 2 * d for _, b, d in reading) for way in onward[step]):
+            if not bent and not all(
+                any(_off(b, way) <= 2 * d for _, b, d in reading) for way in onward[step]
+            ):
                 continue
             for k in range(max(len(reading), 1)) if chosen else (0,):
                 turned = reading[k:] + reading[:k]
-                if all(_agree(i, before, step, turned, trace, labels, courses, on) for i, before in chosen.items()) and extend(
-                    {**chosen, step: turned}
-                ):
+                if all(
+                    _agree(i, before, step, turned, trace, labels, courses, on)
+                    for i, before in chosen.items()
+                ) and extend({**chosen, step: turned}):
                     return True
         return False
 
@@ -359,7 +454,11 @@ def _readings(step: Step) -> list[tuple[Named, ...]]:
             for k, (g, there) in enumerate(zip(gateways, seen, strict=True))
             if there
         ]
-        found.append(tuple(sorted(kept, key=lambda g: (gateways[g[0]].bearing + gateways[g[0]].spread) % 360)))
+        found.append(
+            tuple(
+                sorted(kept, key=lambda g: (gateways[g[0]].bearing + gateways[g[0]].spread) % 360)
+            )
+        )
     return found
 
 
@@ -368,17 +467,34 @@ def _off(a: float, b: float) -> float:
 
 
 def _agree(
-    i: int, seen_i: tuple[Named, ...], t: int, seen_t: tuple[Named, ...], trace: Trace, labels: Labels, courses: Courses, on: Axioms
+    i: int,
+    seen_i: tuple[Named, ...],
+    t: int,
+    seen_t: tuple[Named, ...],
+    trace: Trace,
+    labels: Labels,
+    courses: Courses,
+    on: Axioms,
 ) -> bool:
     """Whether steps i < t at one place may see so."""
     stars = [Star.of(trace.steps[step].star or ()).gateways for step in (i, t)]
     rotations: set[int] = set()
     if len(seen_i) == len(seen_t):
-        rotations = {r for r in range(360) if all(_off(b, c + r) <= d + e for (_, b, d), (_, c, e) in zip(seen_i, seen_t, strict=True))}
+        rotations = {
+            r
+            for r in range(360)
+            if all(
+                _off(b, c + r) <= d + e for (_, b, d), (_, c, e) in zip(seen_i, seen_t, strict=True)
+            )
+        }
         pairs = {(a[0], b[0]) for a, b in zip(seen_i, seen_t, strict=True)}
         for j, k in pairs:
             there = [(stars[0][j].opposite, stars[1][k].opposite)]
-            known = [(a, b) for a, b in there if a in {p for p, _ in pairs} and b in {q for _, q in pairs}]
+            known = [
+                (a, b)
+                for a, b in there
+                if a in {p for p, _ in pairs} and b in {q for _, q in pairs}
+            ]
             if any(pair not in pairs for pair in known):
                 rotations = set()
     if "gateway_frame" in on and not rotations:
@@ -396,8 +512,13 @@ def _agree(
         declared = False
         if rotations and ways[0] and ways[1]:
             now = ways[1][0] if way == "same" else ways[1][1]
-            declared = (ways[0][0], now) in pairs and (way == "same" or (ways[0][0], ways[1][0]) not in pairs)
-        facing[way] = degrees in rotations or declared, (degrees in rotations and not rotations & {90, 270}) or declared
+            declared = (ways[0][0], now) in pairs and (
+                way == "same" or (ways[0][0], ways[1][0]) not in pairs
+            )
+        facing[way] = (
+            degrees in rotations or declared,
+            (degrees in rotations and not rotations & {90, 270}) or declared,
+        )
     one = labels[i] == labels[t]
     if "gateway_heading" in on and one:
         if not facing["same"][0]:
@@ -438,15 +559,21 @@ def _turn(action: Action, seen: tuple[Named, ...], star: tuple[Gateway, ...]) ->
             for r in range(360)
             if _off(r, b) <= d
         }
-    return {"around": {180} | behind, "right": set(range(21, 160)), "left": set(range(201, 340))}[str(action.turn)]
+    return {"around": {180} | behind, "right": set(range(21, 160)), "left": set(range(201, 340))}[
+        str(action.turn)
+    ]
 
 
 def _way_on(seen: tuple[Named, ...], star: tuple[Gateway, ...]) -> tuple[int, int] | None:
     """The gateways ahead and behind, by their numbers in the star, where a path bends through gateways that are declared opposite."""
     by_number = {k: (b, d) for k, b, d in seen}
-    for k, bearing, spread in sorted(seen, key=lambda g: (star[g[0]].bearing + star[g[0]].spread) % 360):
+    for k, bearing, spread in sorted(
+        seen, key=lambda g: (star[g[0]].bearing + star[g[0]].spread) % 360
+    ):
         other = star[k].opposite
-        if other in by_number and (_off(bearing, 0) <= spread or _off(by_number[other][0], 180) <= by_number[other][1]):
+        if other in by_number and (
+            _off(bearing, 0) <= spread or _off(by_number[other][0], 180) <= by_number[other][1]
+        ):
             return k, other
     return None
 
@@ -474,7 +601,11 @@ def _courses(places: tuple[int, ...], links: frozenset[Link], on: Axioms) -> Ite
             and (places[last], course) in zip(places[:last], courses[:last], strict=True)
         ):
             return False
-        return all(_link_allowed(courses[s], action, courses[t], on) for s, action, t in links if max(s, t) == last)
+        return all(
+            _link_allowed(courses[s], action, courses[t], on)
+            for s, action, t in links
+            if max(s, t) == last
+        )
 
     def extend(courses: Courses) -> Iterator[Courses]:
         if len(courses) == len(places):
@@ -498,12 +629,20 @@ def _link_allowed(start: Course | None, action: Action, end: Course | None, on: 
         return False
     # T7: a turn right or left changes the path, where both ends are along paths.
     changes = action.turn in ("right", "left")
-    return not ("turn_changes_path" in on and changes and start is not None and end is not None and start[0] == end[0])
+    return not (
+        "turn_changes_path" in on
+        and changes
+        and start is not None
+        and end is not None
+        and start[0] == end[0]
+    )
 
 
 def _supported(links: frozenset[Link]) -> set[int]:
     """The dstates that a travel starts or ends at, and those that turns around join to them."""
-    found = {s for source, action, target in links if action.kind == "travel" for s in (source, target)}
+    found = {
+        s for source, action, target in links if action.kind == "travel" for s in (source, target)
+    }
     around = [{source, target} for source, action, target in links if action.turn == "around"]
     while more := {s for pair in around if pair & found for s in pair} - found:
         found |= more
@@ -523,11 +662,19 @@ def _least_excuses(
 ) -> int | None:
     """The fewest pairs of paths to be excused from B2, under any orders of the paths that `ends` allows; None where no orders and excuses will do."""
     paths = sorted({course[0] for course in courses if course})
-    on_path = {h: {p for p, c in zip(places, courses, strict=True) if c and c[0] == h} if "on_path" in on else set() for h in paths}
+    on_path = {
+        h: {p for p, c in zip(places, courses, strict=True) if c and c[0] == h}
+        if "on_path" in on
+        else set()
+        for h in paths
+    }
     travels = [  # (p, q, h, d): a travel led from p to q along path h in direction d
         (places[s], places[t], *course)
         for s, action, t in links
-        if action.kind == "travel" and (course := courses[s]) and course == courses[t] and places[s] != places[t]
+        if action.kind == "travel"
+        and (course := courses[s])
+        and course == courses[t]
+        and places[s] != places[t]
     ]
     branches = _branches(places, courses, links, on)
     before: dict[int, set[tuple[int, int]]] = {h: set() for h in paths}
@@ -537,13 +684,25 @@ def _least_excuses(
     choices = []
     for h in paths:
         own = [travel for travel in travels if travel[2] == h]
-        choices.append([o for o in _orders(on_path[h], frozenset(before[h]), on) if "next_place" not in on or _goes_to_next(own, o)])
-    pairs = {frozenset((h, h1)) for _, h, _, h1, _ in branches} if defeasible and "side_of_branch" in on else set()
+        choices.append(
+            [
+                o
+                for o in _orders(on_path[h], frozenset(before[h]), on)
+                if "next_place" not in on or _goes_to_next(own, o)
+            ]
+        )
+    pairs = (
+        {frozenset((h, h1)) for _, h, _, h1, _ in branches}
+        if defeasible and "side_of_branch" in on
+        else set()
+    )
     for excuses in range(len(pairs) + 1):
         for orders in product(*choices):
             for excused in combinations(pairs, excuses):
                 order = dict(zip(paths, orders, strict=True))
-                if _sides_allowed(branches, order, on_path, excused, on) and (ends is None or ends(order)):
+                if _sides_allowed(branches, order, on_path, excused, on) and (
+                    ends is None or ends(order)
+                ):
                     return excuses
     return None
 
@@ -568,12 +727,17 @@ def _goes_to_next(travels: list[tuple[int, int, int, int]], order: Order) -> boo
     """ADJ: no place lies strictly between the ends of a travel."""
     for p, q, _, d in travels:
         first, last = (p, q) if d == 1 else (q, p)
-        if any((first, r) in order and (r, last) in order for r in {place for pair in order for place in pair} - {p, q}):
+        if any(
+            (first, r) in order and (r, last) in order
+            for r in {place for pair in order for place in pair} - {p, q}
+        ):
             return False
     return True
 
 
-def _branches(places: tuple[int, ...], courses: Courses, links: frozenset[Link], on: Axioms) -> set[Branch]:
+def _branches(
+    places: tuple[int, ...], courses: Courses, links: frozenset[Link], on: Axioms
+) -> set[Branch]:
     """B1: what leaves to the right of what."""
     if "branch_side" not in on:
         return set()
@@ -582,7 +746,9 @@ def _branches(places: tuple[int, ...], courses: Courses, links: frozenset[Link],
         start, end = courses[s], courses[t]
         if start is None or end is None or action.turn not in ("right", "left"):
             continue
-        if start[0] == end[0]:  # a branch is another path; without turn_changes_path a turn may lead to the same one
+        if (
+            start[0] == end[0]
+        ):  # a branch is another path; without turn_changes_path a turn may lead to the same one
             continue
         (h, d), (h1, d1) = start, end
         branch = (places[s], h, d if action.turn == "right" else -d, h1, d1)
@@ -594,13 +760,21 @@ def _branches(places: tuple[int, ...], courses: Courses, links: frozenset[Link],
 
 
 def _sides_allowed(
-    branches: set[Branch], orders: dict[int, Order], on_path: dict[int, set[int]], excused: tuple[frozenset[int], ...], on: Axioms
+    branches: set[Branch],
+    orders: dict[int, Order],
+    on_path: dict[int, set[int]],
+    excused: tuple[frozenset[int], ...],
+    on: Axioms,
 ) -> bool:
     right: set[tuple[int, int, int]] = set()  # (q, h, d): q lies to the right of (h, d)
     for p, h, d, h1, d1 in branches:
         # B2: the places ahead on a branch to the right lie to the right.
         if "side_of_branch" in on and frozenset((h, h1)) not in excused:
-            ahead = {b for a, b in orders[h1] if a == p} if d1 == 1 else {a for a, b in orders[h1] if b == p}
+            ahead = (
+                {b for a, b in orders[h1] if a == p}
+                if d1 == 1
+                else {a for a, b in orders[h1] if b == p}
+            )
             right |= {(q, h, d) for q in ahead}
     for q, h, d in right:
         # B3: right and left are disjoint; left of (h, d) is right of (h, -d).
@@ -619,17 +793,30 @@ Edge: TypeAlias = frozenset[
 ]  # the gateways at its ends: a place, and a slot or an arm; one where it comes back to its gateway
 
 
-def _is_planar(labels: Labels, places: tuple[int, ...], links: frozenset[Link], headings: list[tuple[int, ...]], theory: Theory) -> bool:
+def _is_planar(
+    labels: Labels,
+    places: tuple[int, ...],
+    links: frozenset[Link],
+    headings: list[tuple[int, ...]],
+    theory: Theory,
+) -> bool:
     """Whether the edges that travels lead along can be drawn. By headings where places have frames; if not, by sides."""
     travels = {(s, t) for s, action, t in links if action.kind == "travel"}
     if theory.star == "frame":
         for heading in headings:
             facing = dict(zip(labels, heading, strict=True))
-            edges = {frozenset({(places[s], facing[s]), (places[t], (facing[t] + 2) % 4)}) for s, t in travels}
+            edges = {
+                frozenset({(places[s], facing[s]), (places[t], (facing[t] + 2) % 4)})
+                for s, t in travels
+            }
             if _is_drawing(edges, dict.fromkeys(places, SLOTS)):
                 return True
         return False
-    supported = _supported(frozenset(link for link in links if link[1].kind == "travel" or places[link[0]] == places[link[2]]))
+    supported = _supported(
+        frozenset(
+            link for link in links if link[1].kind == "travel" or places[link[0]] == places[link[2]]
+        )
+    )
     arms = {(s, side): (s, side) for s in supported for side in (1, -1)}
 
     def merge(one: tuple[int, int], other: tuple[int, int]) -> None:
@@ -653,15 +840,26 @@ def _is_planar(labels: Labels, places: tuple[int, ...], links: frozenset[Link], 
     for p in sorted(set(places)):
         told: list[list[tuple[int, int]]] = []  # arms one after another, clockwise
         for s, action, t in links:
-            if action.turn in ("right", "left") and places[s] == places[t] == p and {s, t} <= supported:
+            if (
+                action.turn in ("right", "left")
+                and places[s] == places[t] == p
+                and {s, t} <= supported
+            ):
                 right, left = ((t, 1), (t, -1)) if action.turn == "right" else ((t, -1), (t, 1))
                 ends = [(s, 1), right, (s, -1), left]
                 told.append([arms[end] for end in ends if theory.symmetric_sides or end != (t, -1)])
         here = sorted({arms[s, side] for s in supported if places[s] == p for side in (1, -1)})
         used = {arm for edge in edges for q, arm in edge if q == p}
-        good = [order for order in permutations(here) if order[:1] == tuple(here[:1]) and all(_clockwise(order, ends) for ends in told)]
+        good = [
+            order
+            for order in permutations(here)
+            if order[:1] == tuple(here[:1]) and all(_clockwise(order, ends) for ends in told)
+        ]
         rounds.append({tuple(arm for arm in order if arm in used) for order in good})
-    return any(_is_drawing(edges, dict(zip(sorted(set(places)), choice, strict=True))) for choice in product(*rounds))
+    return any(
+        _is_drawing(edges, dict(zip(sorted(set(places)), choice, strict=True)))
+        for choice in product(*rounds)
+    )
 
 
 def _clockwise(order: tuple[object, ...], ends: list[tuple[int, int]]) -> bool:
@@ -678,7 +876,10 @@ def _is_drawing(edges: set[Edge], rounds: dict[int, tuple[object, ...]]) -> bool
     """
     numbered = [sorted(edge, key=repr) for edge in edges]
     ends = {(i, k): edge[k % len(edge)] for i, edge in enumerate(numbered) for k in (0, 1)}
-    if any(edges_there > 1 for edges_there in Counter(gateway for edge in edges for gateway in edge).values()):
+    if any(
+        edges_there > 1
+        for edges_there in Counter(gateway for edge in edges for gateway in edge).values()
+    ):
         return False
     places = {p for p, _ in ends.values()}
     after: dict[tuple[int, int], tuple[int, int]] = {}

@@ -26,7 +26,10 @@ class Geometry:
     def __init__(self, trace: Trace, theory: Theory) -> None:
         self.trace, self.theory = trace, theory
         self.odometry = trace.odometry or Odometry()
-        self.arrivals = [0, *(t for t, action in enumerate(trace.actions, 1) if action.kind != "turn")]
+        self.arrivals = [
+            0,
+            *(t for t, action in enumerate(trace.actions, 1) if action.kind != "turn"),
+        ]
         grid = range(-12, 13) if self.odometry.bend else [0]
         self.bends = [(n * self.odometry.bend / 2, (max(abs(n) - 0.5, 0.0) / 2) ** 2) for n in grid]
         self.drift = self.odometry.bend / 4
@@ -46,8 +49,18 @@ class Geometry:
             start = heading
             half = (-bend + drift) * way / 2
             ahead, left = (1 + scale) * dx, (1 + scale) * dy
-            x += math.cos(start + half) * ahead - math.sin(start + half) * left + math.cos(start) * wrong[0] - math.sin(start) * wrong[1]
-            y += math.sin(start + half) * ahead + math.cos(start + half) * left + math.sin(start) * wrong[0] + math.cos(start) * wrong[1]
+            x += (
+                math.cos(start + half) * ahead
+                - math.sin(start + half) * left
+                + math.cos(start) * wrong[0]
+                - math.sin(start) * wrong[1]
+            )
+            y += (
+                math.sin(start + half) * ahead
+                + math.cos(start + half) * left
+                + math.sin(start) * wrong[0]
+                + math.cos(start) * wrong[1]
+            )
             heading = start + turned + 2 * half + wrong[2]
         return np.array([x, y, heading])
 
@@ -58,7 +71,9 @@ class Geometry:
         for k in range(size):
             errors = np.zeros(size)
             errors[k] = LITTLE
-            rows.append((self.end(i, j, bend, errors) - self.end(i, j, bend, -errors)) / (2 * LITTLE))
+            rows.append(
+                (self.end(i, j, bend, errors) - self.end(i, j, bend, -errors)) / (2 * LITTLE)
+            )
         return np.array(rows).T
 
     @cache  # noqa: B019
@@ -74,7 +89,9 @@ class Geometry:
     @cache  # noqa: B019
     def loop(self, i: int, j: int, bend: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
         """How far off a loop closes, its derivatives, what is added to its covariance, and whether anything is known of it."""
-        off = self.end(i, j, bend, np.zeros(3 * len(self.trace) + 2)) - self.end(i, i, bend, np.zeros(3 * len(self.trace) + 2))
+        off = self.end(i, j, bend, np.zeros(3 * len(self.trace) + 2)) - self.end(
+            i, i, bend, np.zeros(3 * len(self.trace) + 2)
+        )
         off[2] = math.remainder(off[2], math.tau)
         moves, noise = self.derivatives(i, j, bend), self.noise()
         variance = (moves @ noise @ moves.T)[2, 2]
@@ -87,7 +104,12 @@ class Geometry:
         bent = 9.0 * variance * by_heading + 1e-6
         missing = any(self.trace.steps[t].displacement is None for t in range(i + 1, j + 1))
         offset, facing = 2 * self.odometry.offset**2, 2 * self.odometry.facing**2
-        return off, moves, np.diag([bent + offset, bent + offset, 1e-6 + facing]), variance <= 1.0 and not missing
+        return (
+            off,
+            moves,
+            np.diag([bent + offset, bent + offset, 1e-6 + facing]),
+            variance <= 1.0 and not missing,
+        )
 
     def refuses(self, returns: tuple[tuple[int, int, int], ...]) -> bool:
         """Whether these returns (two steps, degrees of freedom) are refused together."""
@@ -107,8 +129,12 @@ class Geometry:
         least = math.inf
         for bend, unlikely in self.bends:
             loops = [self.loop(i, j, bend) for i, j, _ in returns]
-            off = np.concatenate([loop[0][:f] for loop, (*_, f) in zip(loops, returns, strict=True)])
-            moves = np.concatenate([loop[1][:f] for loop, (*_, f) in zip(loops, returns, strict=True)])
+            off = np.concatenate(
+                [loop[0][:f] for loop, (*_, f) in zip(loops, returns, strict=True)]
+            )
+            moves = np.concatenate(
+                [loop[1][:f] for loop, (*_, f) in zip(loops, returns, strict=True)]
+            )
             covariance = moves @ self.noise() @ moves.T
             at = 0
             for loop, (*_, f) in zip(loops, returns, strict=True):
@@ -119,10 +145,18 @@ class Geometry:
 
     def allows(self, labels: tuple[int, ...], places: tuple[int | None, ...] | None) -> bool:
         """Whether no set of at most `joint` returns of a map is refused."""
-        returns = [(i, j, 3) for i, j in combinations(range(len(labels)), 2) if labels[i] == labels[j]]
+        returns = [
+            (i, j, 3) for i, j in combinations(range(len(labels)), 2) if labels[i] == labels[j]
+        ]
         if places is not None:
-            returns += [(i, j, 2) for i, j in combinations(self.arrivals, 2) if places[labels[i]] == places[labels[j]]]
+            returns += [
+                (i, j, 2)
+                for i, j in combinations(self.arrivals, 2)
+                if places[labels[i]] == places[labels[j]]
+            ]
         alone = [(one,) for one in returns]
-        arrived = sorted(one for one in returns if one[0] in self.arrivals and one[1] in self.arrivals)
+        arrived = sorted(
+            one for one in returns if one[0] in self.arrivals and one[1] in self.arrivals
+        )
         together = list(combinations(arrived, 2)) if self.theory.joint > 1 else []
         return not any(map(self.refuses, [*alone, *together]))

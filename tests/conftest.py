@@ -10,7 +10,12 @@ from ssh_abduction.cli import verbosity, view
 
 # No example takes too long, nor does it take too long to draw one. And the examples are the same in each run: of traces at random, some take clingo a hundred
 # times as long as others.
-settings.register_profile("the same everywhere", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "the same everywhere",
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
 settings.load_profile("the same everywhere")
 
 # No line of progress comes where a command takes long; tests of these lines say when they come.

@@ -19,7 +19,11 @@ Cells: TypeAlias = dict[tuple[int, int], Star]  # the open directions of each ce
 
 def lattice(width: int, height: int) -> Cells:
     """A grid of cells within walls."""
-    return {(x, y): (y > 0, x < width - 1, y < height - 1, x > 0) for x in range(width) for y in range(height)}
+    return {
+        (x, y): (y > 0, x < width - 1, y < height - 1, x > 0)
+        for x in range(width)
+        for y in range(height)
+    }
 
 
 def stars_on(route: str, cells: Cells | None) -> list[Star]:
@@ -35,7 +39,9 @@ def stars_on(route: str, cells: Cells | None) -> list[Star]:
     return stars
 
 
-def levels(route: str, cells: Cells | None = None, allows: Sequence[Callable[[Joined], bool]] = ()) -> Iterator[list[Joined]]:
+def levels(
+    route: str, cells: Cells | None = None, allows: Sequence[Callable[[Joined], bool]] = ()
+) -> Iterator[list[Joined]]:
     """The maps after no move, after one, and so on, of those that each of `allows` lets be."""
     stars = stars_on(route, cells)
     begin: tuple[Joined, list[Star], Gateway] = ({}, [_turned(stars[0], 1)], (0, 1))
@@ -53,7 +59,12 @@ def _turned(star: Star, facing: int) -> Star:
 
 
 def _moved(
-    joined: Joined, places: list[Star], faced: Gateway, turn: int, star: Star, allows: Sequence[Callable[[Joined], bool]]
+    joined: Joined,
+    places: list[Star],
+    faced: Gateway,
+    turn: int,
+    star: Star,
+    allows: Sequence[Callable[[Joined], bool]],
 ) -> Iterator[tuple[Joined, list[Star], Gateway]]:
     """The maps after a move, with the stars of their places and what the robot faces."""
     here, facing = faced
@@ -63,14 +74,20 @@ def _moved(
         if places[place] == _turned(star, (slot + 2) % 4):
             yield joined, places, (place, (slot + 2) % 4)
         return
-    ends = [(len(places), 2)] + [(p, s) for p in range(len(places)) for s in range(4) if p != here and (p, s) not in joined]
+    ends = [(len(places), 2)] + [
+        (p, s) for p in range(len(places)) for s in range(4) if p != here and (p, s) not in joined
+    ]
     for place, slot in ends:
         seen = _turned(star, (slot + 2) % 4)
         if place < len(places) and seen != places[place]:
             continue
         after = {**joined, leaving: (place, slot), (place, slot): leaving}
         if all(allowed(after) for allowed in allows):
-            yield after, [*places, seen] if place == len(places) else places, (place, (slot + 2) % 4)
+            yield (
+                after,
+                [*places, seen] if place == len(places) else places,
+                (place, (slot + 2) % 4),
+            )
 
 
 def passes_no_place_twice(joined: Joined) -> bool:

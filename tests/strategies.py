@@ -31,7 +31,10 @@ STARS = ((1, 1, 1, 1), (1, 0, 1, 0), (1, 1, 0, 0), (1, 0, 0, 0), (1, 1, 1, 0))
 FOREIGN = ("without", "rules")  # what the checker cannot judge maps by
 PAIRS = ("same", "different", "elsewhere")
 # Axioms that may be left out: the map can't show what holds without these, as a dstate of a map has one place and one course.
-LEFT_OUT = sorted({axiom.name for axiom in axioms()} - {"one_place", "one_course", "one_heading", "turn_rotates", "star_frame", "asserted"})
+LEFT_OUT = sorted(
+    {axiom.name for axiom in axioms()}
+    - {"one_place", "one_course", "one_heading", "turn_rotates", "star_frame", "asserted"}
+)
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,12 @@ class Toy:
     causal: bool = True
 
 
-def _toy(name: str, part: str, text: str, allows: Callable[[Key], bool], *, causal: bool = True) -> Toy:
-    return Toy(Rules(f"{name}.lp", f"% @axiom({name}) A toy.\n#program {part}(t).\n{text}"), allows, causal)
+def _toy(
+    name: str, part: str, text: str, allows: Callable[[Key], bool], *, causal: bool = True
+) -> Toy:
+    return Toy(
+        Rules(f"{name}.lp", f"% @axiom({name}) A toy.\n#program {part}(t).\n{text}"), allows, causal
+    )
 
 
 def _seen_at_most_twice(key: Key) -> bool:
@@ -58,7 +65,11 @@ def _near(key: Key) -> bool:
 def _short_paths(key: Key) -> bool:
     _, places, courses = key
     paths = {course[0] for course in courses if course}
-    return all(len({p for p, course in zip(places, courses, strict=True) if course and course[0] == h}) <= 2 for h in paths)
+    return all(
+        len({p for p, course in zip(places, courses, strict=True) if course and course[0] == h})
+        <= 2
+        for h in paths
+    )
 
 
 def _even(key: Key) -> bool:
@@ -67,7 +78,12 @@ def _even(key: Key) -> bool:
 
 TOYS = (
     _toy("near", "step", "violation(near,t) :- same(I,t), t-I > 2.", _near),
-    _toy("seldom", "step", "violation(seldom,t) :- is(t,S), 3 #count { I : is(I,S) }.", _seen_at_most_twice),
+    _toy(
+        "seldom",
+        "step",
+        "violation(seldom,t) :- is(t,S), 3 #count { I : is(I,S) }.",
+        _seen_at_most_twice,
+    ),
     _toy(
         "short",
         "step",
@@ -75,7 +91,12 @@ TOYS = (
         _short_paths,
         causal=False,
     ),
-    _toy("even", "check", "violation(even,t) :- query(t), N = #count { S : is(S,S) }, N \\ 2 = 1.", _even),
+    _toy(
+        "even",
+        "check",
+        "violation(even,t) :- query(t), N = #count { S : is(S,S) }, N \\ 2 = 1.",
+        _even,
+    ),
 )
 
 
@@ -85,7 +106,9 @@ def traces(draw: st.DrawFn, max_steps: int = 7) -> Trace:
     steps = draw(st.integers(1, max_steps) | st.just(max_steps))
     views = draw(st.sampled_from(["ab", "abc"]))
     seen = draw(st.lists(st.sampled_from(views), min_size=steps, max_size=steps))
-    few = draw(st.lists(st.sampled_from(ACTIONS), min_size=1, max_size=4, unique_by=lambda a: a.name))  # few are repeated more often
+    few = draw(
+        st.lists(st.sampled_from(ACTIONS), min_size=1, max_size=4, unique_by=lambda a: a.name)
+    )  # few are repeated more often
     actions = draw(st.lists(st.sampled_from(few), min_size=steps - 1, max_size=steps - 1))
     stars = None
     if draw(st.booleans()):
@@ -94,8 +117,17 @@ def traces(draw: st.DrawFn, max_steps: int = 7) -> Trace:
         stars = draw(st.lists(st.sampled_from(rotations), min_size=steps, max_size=steps))
     moved = noise = None
     if draw(st.integers(0, 3)) == 0:
-        wrong = st.tuples(st.sampled_from([-3.0, 0.0, 0.0, 3.0]), st.sampled_from([-3.0, 0.0, 3.0]), st.sampled_from([-0.3, 0.0, 0.3]))
-        moved = [tuple(map(sum, zip(_usual(action), draw(wrong), strict=True))) if draw(st.integers(0, 9)) else None for action in actions]
+        wrong = st.tuples(
+            st.sampled_from([-3.0, 0.0, 0.0, 3.0]),
+            st.sampled_from([-3.0, 0.0, 3.0]),
+            st.sampled_from([-0.3, 0.0, 0.3]),
+        )
+        moved = [
+            tuple(map(sum, zip(_usual(action), draw(wrong), strict=True)))
+            if draw(st.integers(0, 9))
+            else None
+            for action in actions
+        ]
         noise = Odometry(**draw(st.sampled_from(ODOMETRY)))
     return Trace.from_steps(seen, actions, stars=stars, displacements=moved, odometry=noise)
 
@@ -105,7 +137,11 @@ def _usual(action: Action) -> tuple[float, float, float]:
     return (
         (10.0, 0.0, 0.0)
         if action.kind != "turn"
-        else (0.0, 0.0, {"right": -math.pi / 2, "left": math.pi / 2}.get(action.turn or "", math.pi))
+        else (
+            0.0,
+            0.0,
+            {"right": -math.pi / 2, "left": math.pi / 2}.get(action.turn or "", math.pi),
+        )
     )
 
 
@@ -130,12 +166,18 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
         "next_place": st.booleans(),
         "all_on_paths": st.booleans(),
         "planar": st.booleans(),
-        "star": st.sampled_from(["auto", "none", "alike", "pattern", "frame"] if trace.has_stars else ["auto", "none"]),
-        "displacement": st.sampled_from(["auto", "none", "use"] if trace.has_displacements else ["auto", "none"]),
+        "star": st.sampled_from(
+            ["auto", "none", "alike", "pattern", "frame"] if trace.has_stars else ["auto", "none"]
+        ),
+        "displacement": st.sampled_from(
+            ["auto", "none", "use"] if trace.has_displacements else ["auto", "none"]
+        ),
         "reject": st.sampled_from([0.001, 0.3]),
         "joint": st.sampled_from([1, 2]),
         "returns": st.just(0),
-        "prefer": st.permutations(COUNTS).flatmap(lambda order: st.integers(0, len(order)).map(lambda length: order[:length])),
+        "prefer": st.permutations(COUNTS).flatmap(
+            lambda order: st.integers(0, len(order)).map(lambda length: order[:length])
+        ),
         "without": _seldom(st.sampled_from(LEFT_OUT).map(lambda name: (name,))),
         "rules": _seldom(st.sampled_from(TOYS).map(lambda toy: (toy.rules,))),
         "misread": st.just(0.0),  # tests/test_faults.py has tests of its own
@@ -154,7 +196,11 @@ def theories(draw: st.DrawFn, trace: Trace, fixed: Collection[str] = ()) -> Theo
 
     fixed  fields that are left as they are in a new Theory
     """
-    choices: dict[str, Any] = {f.name: draw(choices_of(f.name, trace), label=f.name) for f in fields(Theory) if f.name not in fixed}
+    choices: dict[str, Any] = {
+        f.name: draw(choices_of(f.name, trace), label=f.name)
+        for f in fields(Theory)
+        if f.name not in fixed
+    }
     if draw(st.integers(0, 9)) == 9:
         causal = {
             "level": "causal",
@@ -162,7 +208,15 @@ def theories(draw: st.DrawFn, trace: Trace, fixed: Collection[str] = ()) -> Theo
             "star": draw(st.sampled_from(["none", "alike"] if trace.has_stars else ["none"])),
             "prefer": draw(st.sampled_from([("dstates",), ()])),
         }
-        rules = [rules for rules in choices.get("rules", ()) if next(toy for toy in TOYS if toy.rules == rules).causal]
+        rules = [
+            rules
+            for rules in choices.get("rules", ())
+            if next(toy for toy in TOYS if toy.rules == rules).causal
+        ]
         return Theory(**{**choices, **causal, "rules": rules})
-    prefer: tuple[Count, ...] = tuple(name for name in choices["prefer"] if name != "excuses" or choices["boundary"] == "defeasible")
+    prefer: tuple[Count, ...] = tuple(
+        name
+        for name in choices["prefer"]
+        if name != "excuses" or choices["boundary"] == "defeasible"
+    )
     return Theory(**{**choices, "prefer": prefer})

@@ -44,7 +44,9 @@ SAID_BY = {
 }
 OWN = ("train", "learning-curve", "tell-apart", "recognise")  # which cli/train.py has
 OPTION = re.compile(r"(?:(?<![\w-])(\w[\w-]*) (?:with )?)?(?<![\w-])(--[a-z][a-z-]*)")
-FOREIGN = re.compile(r"--\S+|%.*|[^{}]*\{.*", re.DOTALL)  # an option of clingo's, a comment of an encoding, a style sheet
+FOREIGN = re.compile(
+    r"--\S+|%.*|[^{}]*\{.*", re.DOTALL
+)  # an option of clingo's, a comment of an encoding, a style sheet
 
 
 def texts(path: Path) -> Iterator[str]:
@@ -52,7 +54,12 @@ def texts(path: Path) -> Iterator[str]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     told = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in told and not FOREIGN.fullmatch(node.value):
+        if (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and id(node) not in told
+            and not FOREIGN.fullmatch(node.value)
+        ):
             yield node.value
 
 
@@ -62,7 +69,13 @@ def said_by(path: str) -> tuple[str, ...]:
         if path.startswith(start):
             return verbs
     verb = Path(path).stem
-    return OWN if verb == "train" else (verb,) if path.startswith("ssh_abduction/cli/") and verb in VERBS else tuple(VERBS)
+    return (
+        OWN
+        if verb == "train"
+        else (verb,)
+        if path.startswith("ssh_abduction/cli/") and verb in VERBS
+        else tuple(VERBS)
+    )
 
 
 def wrong(path: str, text: str) -> list[str]:
@@ -70,7 +83,9 @@ def wrong(path: str, text: str) -> list[str]:
     found = []
     for verb, option in OPTION.findall(text):
         asked = (verb,) if verb in VERBS else said_by(path)
-        shared = path.endswith(("options.py", "train.py"))  # which serve several verbs, each with some options
+        shared = path.endswith(
+            ("options.py", "train.py")
+        )  # which serve several verbs, each with some options
         has = [option in VERBS[one] for one in asked]
         if not (any(has) if shared else all(has)):
             found.append(option)
@@ -79,8 +94,15 @@ def wrong(path: str, text: str) -> list[str]:
 
 @pytest.mark.parametrize("folder", ["ssh_abduction", "perception", "simulator"])
 def test_advice_names_options_that_the_verb_has(folder: str) -> None:
-    modules = {path.relative_to(ROOT).as_posix(): path for path in sorted((ROOT / folder).rglob("*.py"))}
-    assert [(name, text, bad) for name, path in modules.items() for text in texts(path) if (bad := wrong(name, text))] == []
+    modules = {
+        path.relative_to(ROOT).as_posix(): path for path in sorted((ROOT / folder).rglob("*.py"))
+    }
+    assert [
+        (name, text, bad)
+        for name, path in modules.items()
+        for text in texts(path)
+        if (bad := wrong(name, text))
+    ] == []
 
 
 @pytest.mark.parametrize(

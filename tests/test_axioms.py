@@ -46,13 +46,25 @@ CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     "side_of_branch": (ON_PATHS, "a T b R a L a", "", ((4, 2, 3), 1), ((4, 2, 2), 1)),
     "sides_disjoint": (ON_PATHS, "a T b R a L a", "", ((4, 2, 3), 1), ((4, 2, 2), 1)),
     "path_between_sides": (PLAIN, "a T b R b T a", "", ((4, 3, 2), 1), ((4, 2, 2), 1)),
-    "star_pattern": (PLAIN.replace(star="pattern"), "b L a", "back right+back", (NONE, 0), ((2, 1, 0), 1)),
+    "star_pattern": (
+        PLAIN.replace(star="pattern"),
+        "b L a",
+        "back right+back",
+        (NONE, 0),
+        ((2, 1, 0), 1),
+    ),
     "star_frame": (FRAME, "b R a", "ahead+right ahead+right", (NONE, 0), ((2, 1, 0), 1)),
     "one_heading": (FRAME, "c R c", "ahead left", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "turn_rotates": (FRAME, "b L a", "ahead back", (NONE, 0), ((2, 1, 0), 1)),
     "one_dstate_per_heading": (FRAME, "a R b L c", "ahead left ahead", (NONE, 0), ((3, 1, 0), 1)),
     "planar": (PLAIN.replace(planar=True), "a T a T a A a T a", "", ((5, 3, 1), 1), ((5, 3, 1), 2)),
-    "asserted": (PLAIN.replace(different=[(0, 2)]), "a R a R a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
+    "asserted": (
+        PLAIN.replace(different=[(0, 2)]),
+        "a R a R a",
+        "",
+        ((2, 1, 0), 1),
+        ((1, 1, 0), 1),
+    ),
     "gateway_frame": (
         GATEWAYS,
         "a T b R c T d R e T f",
@@ -63,24 +75,50 @@ CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     "gateway_heading": (GATEWAYS, "a R a", "0+120 0+240", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "gateway_turn": (GATEWAYS, "b A a", "0 120", (NONE, 0), ((2, 1, 0), 1)),
     "gateway_dstate": (GATEWAYS, "a R b L c", "0+120 0+240 0+120", (NONE, 0), ((3, 1, 0), 1)),
-    "gateway_path": (GATEWAYS, "a T a A a T a", "0+60+240 180 0 0+180+300", ((4, 3, 1), 1), ((4, 2, 1), 1)),
+    "gateway_path": (
+        GATEWAYS,
+        "a T a A a T a",
+        "0+60+240 180 0 0+180+300",
+        ((4, 3, 1), 1),
+        ((4, 2, 1), 1),
+    ),
     "gateway_end": (GATEWAYS, "a T b T c", "0 180 180", (NONE, 0), ((3, 3, 1), 1)),
-    "one_star": (Theory.causal().replace(star="alike"), "a R a", "0+90 0+120", ((2, 0, 0), 1), ((1, 0, 0), 1)),
+    "one_star": (
+        Theory.causal().replace(star="alike"),
+        "a R a",
+        "0+90 0+120",
+        ((2, 0, 0), 1),
+        ((1, 0, 0), 1),
+    ),
     "one_pose": (PLAIN, "a R a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
-    "path_goes_straight": (FRAME, "a T a A a T a", "back right left left", ((4, 3, 1), 1), ((4, 2, 1), 1)),
+    "path_goes_straight": (
+        FRAME,
+        "a T a A a T a",
+        "back right left left",
+        ((4, 3, 1), 1),
+        ((4, 2, 1), 1),
+    ),
 }
 
 MOVED = {"one_pose": [(0.0, 0.0, -math.pi / 2)]}  # the displacements that an axiom is about
 
 
-def trace_of(text: str, openings: str, moved: list[tuple[float, float, float]] | None = None) -> Trace:
+def trace_of(
+    text: str, openings: str, moved: list[tuple[float, float, float]] | None = None
+) -> Trace:
     words = text.split()
     sides = ("ahead", "right", "back", "left")
     stars: list[list[float]] = []
     for seen in openings.split():
         words_seen = seen.split("+")
-        stars.append([float(word) for word in words_seen] if words_seen[0].isdigit() else [side in words_seen for side in sides])
-    return Trace.from_steps(words[0::2], [ACTIONS[a] for a in words[1::2]], stars=stars or None, displacements=moved)
+        stars.append(
+            [float(word) for word in words_seen]
+            if words_seen[0].isdigit()
+            else [side in words_seen for side in sides]
+        )
+    return Trace.from_steps(
+        words[0::2], [ACTIONS[a] for a in words[1::2]], stars=stars or None, displacements=moved
+    )
 
 
 def answer(trace: Trace, theory: Theory) -> Answer:
@@ -113,6 +151,9 @@ def test_an_axiom_has_a_sentence_and_a_source(axiom: Any) -> None:
 def test_every_violation_in_the_encodings_belongs_to_an_axiom(level: str) -> None:
     text = (encodings.folder() / f"{level}.lp").read_text()
     names = {axiom.name for axiom in encodings.axioms() if axiom.level == level}
-    without_a_rule = {"planar", "one_star"}  # what evidence refuses once there is a map, and what is nothing but pairs of steps
+    without_a_rule = {
+        "planar",
+        "one_star",
+    }  # what evidence refuses once there is a map, and what is nothing but pairs of steps
     assert set(re.findall(r"violation\((\w+),t\) :-", text)) - {"N"} == names - without_a_rule
     assert set(re.findall(r"% @axiom\((\w+)\)", text)) == names

@@ -35,10 +35,15 @@ ACES3 = "examples/aces3-route.jsonl"
 LIMIT = 100  # seconds: a search that does not end is a failure, not a hang
 
 
-def expected_pairs(keys: set[Key], one: Callable[[Key, int, int], bool], steps: int) -> dict[tuple[int, int], str]:
+def expected_pairs(
+    keys: set[Key], one: Callable[[Key, int, int], bool], steps: int
+) -> dict[tuple[int, int], str]:
     """For each pair of steps, whether they are one in all, some, or none of the maps."""
     said = {1: "all", 0: "none"}
-    shares = {(i, j): sum(one(key, i, j) for key in keys) / len(keys) for i, j in combinations_with_replacement(range(steps), 2)}
+    shares = {
+        (i, j): sum(one(key, i, j) for key in keys) / len(keys)
+        for i, j in combinations_with_replacement(range(steps), 2)
+    }
     return {pair: said.get(share, "some") for pair, share in shares.items()}
 
 
@@ -60,7 +65,12 @@ def along_one_course(key: Key, i: int, j: int) -> bool:
     return here is not None and here == there
 
 
-SORTS = {"dstates": one_dstate, "places": at_one_place, "paths": along_one_path, "courses": along_one_course}
+SORTS = {
+    "dstates": one_dstate,
+    "places": at_one_place,
+    "paths": along_one_path,
+    "courses": along_one_course,
+}
 
 
 def agrees(backbone: Backbone, keys: set[Key], steps: int) -> None:
@@ -86,7 +96,12 @@ def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
     # Engines that settle dstates first are for longer traces, and those for places without frames only where clingo takes its time.
     few_steps = data.draw(st.sampled_from([0, solver.FEW_STEPS]), label="few steps")
     frame_after = data.draw(st.sampled_from([0.0, solver.FRAME_AFTER]), label="frame after")
-    patches = {"FEW_STEPS": few_steps, "FRAME_AFTER": frame_after, "ONE_MORE": 0.0, "ONE_MORE_SHARE": 0.0}
+    patches = {
+        "FEW_STEPS": few_steps,
+        "FRAME_AFTER": frame_after,
+        "ONE_MORE": 0.0,
+        "ONE_MORE_SHARE": 0.0,
+    }
     with patch.object(prefixes, "FIRST_PREFIX", first_prefix), patch.multiple(solver, **patches):
         every = solve(trace, theory, max_maps=None, time_limit=LIMIT)
         first = solve(trace, theory, max_maps=1, time_limit=LIMIT)
@@ -105,15 +120,27 @@ def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
 @pytest.mark.parametrize(
     ("theory", "count", "shared"),
     [
-        (Theory(), 4, "the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ"),
-        (Theory(star="none", prefer=("dstates", "places", "paths")), 102, "the same dstates and paths; the places of steps 14–22 differ"),
+        (
+            Theory(),
+            4,
+            "the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ",
+        ),
+        (
+            Theory(star="none", prefer=("dstates", "places", "paths")),
+            102,
+            "the same dstates and paths; the places of steps 14–22 differ",
+        ),
     ],
 )
-def test_reasoning_from_one_map_says_what_the_whole_list_says(theory: Theory, count: int, shared: str) -> None:
+def test_reasoning_from_one_map_says_what_the_whole_list_says(
+    theory: Theory, count: int, shared: str
+) -> None:
     trace = Trace.load(ACES3)
     every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
     assert every.summary == f"{count} minimal maps: {shared}"
-    assert first.summary == f"at least 1 minimal map (listing was stopped by the maps limit): {shared}"
+    assert (
+        first.summary == f"at least 1 minimal map (listing was stopped by the maps limit): {shared}"
+    )
     assert first.backbone == every.backbone
     assert first.rivals is not None
     assert first.rivals.sharing.maps < 20
@@ -171,7 +198,9 @@ def test_what_is_listed_is_not_taken_for_proven_where_time_is_over() -> None:
     solution = search.solution(tuple(found))
     assert solution.backbone is not None
     assert not solution.backbone.proven
-    assert solution.summary.startswith("at least 1 minimal map (listing was interrupted): the same dstates, places and paths, as far as")
+    assert solution.summary.startswith(
+        "at least 1 minimal map (listing was interrupted): the same dstates, places and paths, as far as"
+    )
 
 
 def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end() -> None:
@@ -200,9 +229,17 @@ def test_what_is_known_goes_to_other_processes_and_what_asks_clingo_does_not() -
 
 def test_while_the_robot_drives_the_backbone_is_that_of_the_maps_listed() -> None:
     mapper = OnlineMapper("end", time_limit=None)
-    for action, view in [("travel", "hall"), ("travel", "end"), ("around", "end"), ("travel", "hall")]:
+    for action, view in [
+        ("travel", "hall"),
+        ("travel", "end"),
+        ("around", "end"),
+        ("travel", "hall"),
+    ]:
         mapper.observe(action, view)
-    assert mapper.solution.summary == "2 minimal maps: the same dstates and paths; the place of step 4 differs"
+    assert (
+        mapper.solution.summary
+        == "2 minimal maps: the same dstates and paths; the place of step 4 differs"
+    )
 
 
 @pytest.mark.parametrize(
@@ -214,7 +251,12 @@ def test_while_the_robot_drives_the_backbone_is_that_of_the_maps_listed() -> Non
             3,
             "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ; and 7 with up to 3 more",
         ),
-        (Theory(), 4, 3, "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ"),
+        (
+            Theory(),
+            4,
+            3,
+            "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ",
+        ),
         (Theory.causal(), 0, 0, "1 minimal map"),
         (Theory(same=[(0, 1)]), 0, 0, "no map satisfies the axioms"),
     ],
@@ -242,7 +284,9 @@ def solved(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 def test_the_shell_tells_the_backbone_where_the_list_is_cut_off(solved: Callable[..., str]) -> None:
-    shared = "the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ"
+    shared = (
+        "the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ"
+    )
     cut = solved("-n", "2")
     assert f"\nat least 2 minimal maps (listing was stopped by the maps limit): {shared}\n" in cut
     assert "steps at one dstate in all minimal maps" in cut
@@ -272,11 +316,24 @@ def test_of_many_pairs_so_many_are_printed_and_all_are_counted() -> None:
 def test_maps_that_differ_in_directions_along_paths_alone_are_told_apart() -> None:
     trace = maze(3, 3, steps=40, seed=4242, stars=True, follow=True, odometry=Odometry()).trace
     solution = solve(trace, max_maps=None)
-    pairs = [(m, n) for m, n in combinations(solution.maps, 2) if [s.path for s in m.dstates] == [s.path for s in n.dstates]]
+    pairs = [
+        (m, n)
+        for m, n in combinations(solution.maps, 2)
+        if [s.path for s in m.dstates] == [s.path for s in n.dstates]
+    ]
     assert pairs
     for one, other in pairs:
         found = difference(one, other)
-        told = {t for change in found.changes for group in (*change.first, *change.other) for t in group}
+        told = {
+            t for change in found.changes for group in (*change.first, *change.other) for t in group
+        }
         assert {change.sort for change in found.changes} == {"courses"}
-        assert {t for t, (s, x) in enumerate(zip(one.labels, other.labels, strict=True)) if one.dstates[s] != other.dstates[x]} <= told
-        assert all(line.startswith("directions along paths: in the first map steps ") for line in found.lines)
+        assert {
+            t
+            for t, (s, x) in enumerate(zip(one.labels, other.labels, strict=True))
+            if one.dstates[s] != other.dstates[x]
+        } <= told
+        assert all(
+            line.startswith("directions along paths: in the first map steps ")
+            for line in found.lines
+        )

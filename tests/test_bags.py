@@ -66,17 +66,23 @@ def test_packed_logs_are_read_whatever_their_name(tmp_path: Path, format: str, e
 
 
 @pytest.mark.parametrize("ending", PACK)
-def test_packed_lines_that_end_too_early_say_what_unpacks_the_rest(tmp_path: Path, ending: str) -> None:
+def test_packed_lines_that_end_too_early_say_what_unpacks_the_rest(
+    tmp_path: Path, ending: str
+) -> None:
     write_carmen(tmp_path / "a.log", SCANS)
     data = PACK[ending]((tmp_path / "a.log").read_bytes())
     (tmp_path / "a.log").write_bytes(data[: len(data) // 2])
-    with pytest.raises(LogError, match=r"a\.log: expected whole data of .*, but after line \d+ .*cat FILE > PART"):
+    with pytest.raises(
+        LogError, match=r"a\.log: expected whole data of .*, but after line \d+ .*cat FILE > PART"
+    ):
         read_log(tmp_path / "a.log")
 
 
 @pytest.mark.parametrize("format", FILES)
 @pytest.mark.parametrize("share", [0.4, 0.8, 0.97])
-def test_of_a_bag_that_was_cut_the_whole_part_is_read_and_it_is_said(tmp_path: Path, format: str, share: float) -> None:
+def test_of_a_bag_that_was_cut_the_whole_part_is_read_and_it_is_said(
+    tmp_path: Path, format: str, share: float
+) -> None:
     file = written(tmp_path, format, drive(200, SMALL))
     data = file.read_bytes()
     file.write_bytes(data[: int(len(data) * share)])
@@ -99,12 +105,21 @@ def test_a_chunk_that_was_packed_and_cut_is_read_up_to_the_cut(tmp_path: Path, f
         writer: Any = rosbag1.Writer(target)
         writer.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
     else:
-        reader, writer = rosbag2.Reader(plain), rosbag2.Writer(target, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+        reader, writer = (
+            rosbag2.Reader(plain),
+            rosbag2.Writer(target, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP),
+        )
         writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
 
     def added(connection: Connection) -> Any:
-        told = {"md5sum": connection.digest} if format == "ros1" else {"rihs01": connection.digest or "RIHS01_0"}
-        return writer.add_connection(connection.topic, connection.msgtype, msgdef=connection.msgdef.data, **told)
+        told = (
+            {"md5sum": connection.digest}
+            if format == "ros1"
+            else {"rihs01": connection.digest or "RIHS01_0"}
+        )
+        return writer.add_connection(
+            connection.topic, connection.msgtype, msgdef=connection.msgdef.data, **told
+        )
 
     with reader, writer:
         topics = {connection.id: added(connection) for connection in reader.connections}
@@ -133,9 +148,19 @@ def parts(folder: Path, ending: str, count: int = 3) -> None:
             write_bag(folder / f"drive_{number}{ending}", one)
 
 
-@pytest.mark.parametrize("metadata", [None, "rosbag2_bagfile_information: {version: 9, storage_identifier: ''}\n", "not: a bag\n", ""])
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        None,
+        "rosbag2_bagfile_information: {version: 9, storage_identifier: ''}\n",
+        "not: a bag\n",
+        "",
+    ],
+)
 @pytest.mark.parametrize("ending", [".db3", ".mcap", ".bag"])
-def test_parts_without_metadata_that_can_be_used_are_one_drive(tmp_path: Path, ending: str, metadata: str | None) -> None:
+def test_parts_without_metadata_that_can_be_used_are_one_drive(
+    tmp_path: Path, ending: str, metadata: str | None
+) -> None:
     parts(tmp_path / "drive", ending)
     if metadata is not None:
         (tmp_path / "drive" / "metadata.yaml").write_text(metadata)
@@ -151,7 +176,10 @@ def test_one_part_that_is_named_alone_is_said_to_be_one(tmp_path: Path) -> None:
     parts(tmp_path / "drive", ".db3")
     log = read_log(tmp_path / "drive" / "drive_0.db3")
     assert len(log) == len(SCANS) // 3
-    assert "drive_0.db3 is one part of a drive, and is read alone. Beside it lie drive_1.db3, drive_10.db3: name the folder" in notes(log)
+    assert (
+        "drive_0.db3 is one part of a drive, and is read alone. Beside it lie drive_1.db3, drive_10.db3: name the folder"
+        in notes(log)
+    )
     (tmp_path / "drive" / "drive_1.db3").rename(tmp_path / "drive_1.db3")
     assert "these parts are not there: 0" in notes(read_log(tmp_path / "drive_1.db3"))
 
@@ -172,7 +200,8 @@ def test_a_folder_of_several_drives_is_refused(tmp_path: Path) -> None:
     for name in ("monday", "tuesday"):
         write_bag(tmp_path / f"{name}.mcap", SCANS)
     with pytest.raises(
-        LogError, match=r"expected the parts of one drive, .* got monday\.mcap, tuesday\.mcap; name one of the files, or ros2 bag reindex"
+        LogError,
+        match=r"expected the parts of one drive, .* got monday\.mcap, tuesday\.mcap; name one of the files, or ros2 bag reindex",
     ):
         read_log(tmp_path)
 
@@ -192,7 +221,9 @@ def full(*_: Any, **__: Any) -> Any:
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_no_room_for_a_copy_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_room_for_a_copy_is_one_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "a.mcap.gz").write_bytes(gzip.compress(written(tmp_path, "mcap").read_bytes()))
     monkeypatch.setattr(shutil, "copyfileobj", full)
     with pytest.raises(
@@ -203,17 +234,25 @@ def test_no_room_for_a_copy_is_one_clear_error(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("name", ["drive", "drive.mcap", "drive.bag"])
-def test_a_bag_on_a_full_disk_is_one_clear_error_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_a_bag_on_a_full_disk_is_one_clear_error_and_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     from rosbags import rosbag1, rosbag2
 
     def no_room(*_: Any) -> None:
         import apsw
 
-        raise apsw.FullError("database or disk is full") if name == "drive" else OSError(errno.ENOSPC, "No space left on device")
+        raise (
+            apsw.FullError("database or disk is full")
+            if name == "drive"
+            else OSError(errno.ENOSPC, "No space left on device")
+        )
 
     for writer in (rosbag1.Writer, rosbag2.Writer):
         monkeypatch.setattr(writer, "write", no_room)
-    with pytest.raises(LogError, match=rf"{name}: expected a bag that can be written: .*(full|No space)"):
+    with pytest.raises(
+        LogError, match=rf"{name}: expected a bag that can be written: .*(full|No space)"
+    ):
         write_bag(tmp_path / name, SCANS)
     assert not list(tmp_path.iterdir())
 
@@ -223,13 +262,23 @@ def test_a_bag_on_a_full_disk_is_one_clear_error_and_no_file(tmp_path: Path, mon
 TIMES = [0.5 * i for i in range(240)]
 
 
-def clocks(tmp_path: Path, scan: Callable[[float], float], odometer: Callable[[float], float], recorded: Callable[[float], float]) -> Any:
+def clocks(
+    tmp_path: Path,
+    scan: Callable[[float], float],
+    odometer: Callable[[float], float],
+    recorded: Callable[[float], float],
+) -> Any:
     """What is read of a drive at one metre a second, where the clocks of the laser, the odometer and the recorder go as these say."""
 
     def messages(m: Messages) -> list[tuple[str, float, Any]]:
-        both = [("/odom", t, m.odometry(100 + odometer(t), (t, 0.0, 0.0), base="laser")) for t in TIMES]
+        both = [
+            ("/odom", t, m.odometry(100 + odometer(t), (t, 0.0, 0.0), base="laser")) for t in TIMES
+        ]
         both += [("/scan", t + 0.01, m.scan(100 + scan(t))) for t in TIMES]
-        return [(topic, 100 + recorded(t), message) for topic, t, message in sorted(both, key=lambda one: one[1])]
+        return [
+            (topic, 100 + recorded(t), message)
+            for topic, t, message in sorted(both, key=lambda one: one[1])
+        ]
 
     log = read_log(bag(tmp_path / "bag", messages))
     assert len(log) >= 0.99 * len(TIMES)
@@ -261,7 +310,9 @@ BROKEN: dict[str, Callable[[float], float]] = {
 
 @pytest.mark.parametrize("topic", ["scan", "odom"])
 @pytest.mark.parametrize("what", BROKEN)
-def test_clocks_that_part_are_found_and_the_times_of_recording_used(tmp_path: Path, what: str, topic: str) -> None:
+def test_clocks_that_part_are_found_and_the_times_of_recording_used(
+    tmp_path: Path, what: str, topic: str
+) -> None:
     broken = BROKEN[what]
     log = clocks(tmp_path, *((broken, true) if topic == "scan" else (true, broken)), true)
     assert off(log) < 0.1
@@ -279,7 +330,9 @@ def test_clocks_that_part_are_found_and_the_times_of_recording_used(tmp_path: Pa
         (lambda t: 10 * math.ceil(t / 10), "were recorded in 12 bursts, each of up to 9.5 s"),
     ],
 )
-def test_times_of_recording_that_are_worse_are_not_used(tmp_path: Path, recorded: Callable[[float], float], said: str) -> None:
+def test_times_of_recording_that_are_worse_are_not_used(
+    tmp_path: Path, recorded: Callable[[float], float], said: str
+) -> None:
     log = clocks(tmp_path, true, true, recorded)
     assert off(log) < 0.1
     assert said in notes(log)
@@ -319,11 +372,16 @@ def test_each_scan_is_mounted_as_its_own_frame_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("topic", ["/tf_static", "/tf"])
-def test_of_two_transforms_to_a_laser_the_later_one_is_used_and_it_is_said(tmp_path: Path, topic: str) -> None:
+def test_of_two_transforms_to_a_laser_the_later_one_is_used_and_it_is_said(
+    tmp_path: Path, topic: str
+) -> None:
     def messages(m: Messages) -> list[tuple[str, float, Any]]:
         mounts: list[Pose] = [(0.2, 0.0, 0.0), (0.2, 0.0, 0.001), (0.2, 0.0, math.pi)]
         return [
-            *[(topic, 0.5 + i / 10, m.transform("base_link", "laser", mount)) for i, mount in enumerate(mounts)],
+            *[
+                (topic, 0.5 + i / 10, m.transform("base_link", "laser", mount))
+                for i, mount in enumerate(mounts)
+            ],
             *[("/odom", t, m.odometry(t, (t, 0.0, 0.0))) for t in (1.0, 2.0)],
             ("/scan", 1.5, m.scan(1.5)),
         ]
@@ -339,7 +397,10 @@ def test_of_two_transforms_to_a_laser_the_later_one_is_used_and_it_is_said(tmp_p
 def test_a_transform_that_is_repeated_contradicts_nothing(tmp_path: Path) -> None:
     def messages(m: Messages) -> list[tuple[str, float, Any]]:
         return [
-            *[("/tf", t, m.transform("base_link", "laser", (0.2, 0.0, 0.1), t)) for t in (1.0, 1.5, 2.0)],
+            *[
+                ("/tf", t, m.transform("base_link", "laser", (0.2, 0.0, 0.1), t))
+                for t in (1.0, 1.5, 2.0)
+            ],
             *[("/odom", t, m.odometry(t, (t, 0.0, 0.0))) for t in (1.0, 2.0)],
             ("/scan", 1.5, m.scan(1.5)),
         ]
@@ -357,7 +418,10 @@ def test_first_echoes_of_a_laser_with_several_are_read(tmp_path: Path) -> None:
             header=scan.header, angle_min=-1.0, angle_max=1.0, angle_increment=0.5, time_increment=0.0, scan_time=0.1, range_min=0.1, range_max=8.0,
             ranges=[echo(echoes=np.array(beam, dtype=np.float32)) for beam in beams], intensities=[],
         )  # fmt: skip
-        return [*[("/odom", t, m.odometry(t, (t, 0.0, 0.0))) for t in (1.0, 2.0)], ("/echoes", 1.5, scan)]
+        return [
+            *[("/odom", t, m.odometry(t, (t, 0.0, 0.0))) for t in (1.0, 2.0)],
+            ("/echoes", 1.5, scan),
+        ]
 
     log = read_log(bag(tmp_path / "bag", messages))
     assert log.scans[0].ranges.tolist() == [1, 2, math.inf, 4, math.inf]
@@ -376,13 +440,23 @@ def alternate(m: Messages, kind: str) -> list[tuple[str, float, Any]]:
             found += [("/odom", t, m.odometry(t, here, "laser"))]
             found += [("/odom", t + 0.05, m.odometry(t + 0.05, there, "laser"))] * (i % 3 < 2)
         elif kind == "frames":
-            found += [("/odom", t, m.odometry(t, here, "laser")), ("/odom", t, m.odometry(t, there, "camera"))][:: 1 if i % 2 else -1]
-            found += [("/odom", t + 0.05, m.odometry(t + 0.05, (0.1 * i + 0.05, 0.0, 0.0), "laser"))]
+            found += [
+                ("/odom", t, m.odometry(t, here, "laser")),
+                ("/odom", t, m.odometry(t, there, "camera")),
+            ][:: 1 if i % 2 else -1]
+            found += [
+                ("/odom", t + 0.05, m.odometry(t + 0.05, (0.1 * i + 0.05, 0.0, 0.0), "laser"))
+            ]
         elif kind == "transforms":
             found += [("/tf", t, m.transform("odom", "laser", here, t))]
-            found += [("/tf", t + 0.05, m.transform("odom", "laser", there, t + 0.05))] * (i % 3 < 2)
+            found += [("/tf", t + 0.05, m.transform("odom", "laser", there, t + 0.05))] * (
+                i % 3 < 2
+            )
         else:
-            found += [("/tf", t, m.transform("odom", "laser", here, t)), ("/tf", t, m.transform("world", "laser", there, t))]
+            found += [
+                ("/tf", t, m.transform("odom", "laser", here, t)),
+                ("/tf", t, m.transform("world", "laser", there, t)),
+            ]
         found.append(("/scan", t + 0.02, m.scan(t)))
     return found
 
@@ -390,21 +464,66 @@ def alternate(m: Messages, kind: str) -> list[tuple[str, float, Any]]:
 @pytest.mark.parametrize(
     ("kind", "said"),
     [
-        ("topic", "Several sources publish /odom, whose poses alternate, up to 5.8 m apart: 100 and 67 of 167 messages"),
-        ("frames", "Several sources publish /odom: 100 from odom to camera, 200 from odom to laser. Those from odom to laser are read"),
-        ("transforms", "Several sources publish the transforms from odom to laser, whose poses alternate, up to 5.8 m apart"),
+        (
+            "topic",
+            "Several sources publish /odom, whose poses alternate, up to 5.8 m apart: 100 and 67 of 167 messages",
+        ),
+        (
+            "frames",
+            "Several sources publish /odom: 100 from odom to camera, 200 from odom to laser. Those from odom to laser are read",
+        ),
+        (
+            "transforms",
+            "Several sources publish the transforms from odom to laser, whose poses alternate, up to 5.8 m apart",
+        ),
         ("parents", ""),
     ],
 )
-def test_odometry_of_several_sources_is_that_of_one_and_it_is_said(tmp_path: Path, kind: str, said: str) -> None:
+def test_odometry_of_several_sources_is_that_of_one_and_it_is_said(
+    tmp_path: Path, kind: str, said: str
+) -> None:
     log = read_log(bag(tmp_path / "bag", lambda m: alternate(m, kind)))
-    assert max(abs(scan.odometry[0] - 0.1 * i) + abs(scan.odometry[1]) for i, scan in enumerate(log.scans)) < 0.01
+    assert (
+        max(
+            abs(scan.odometry[0] - 0.1 * i) + abs(scan.odometry[1])
+            for i, scan in enumerate(log.scans)
+        )
+        < 0.01
+    )
     assert said in notes(log)
 
 
 def test_import_takes_several_topics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = bag(tmp_path / "two", lambda m: two_lasers(m, "/front", "/rear"))
-    assert main(["import", str(path), "--scan-topic", "/front", "--scan-topic", "/none", "-o", str(tmp_path / "t")]) == 1
+    assert (
+        main(
+            [
+                "import",
+                str(path),
+                "--scan-topic",
+                "/front",
+                "--scan-topic",
+                "/none",
+                "-o",
+                str(tmp_path / "t"),
+            ]
+        )
+        == 1
+    )
     assert "expected a topic of LaserScan, got '/none'" in capsys.readouterr().err
-    assert main(["import", str(path), "--scan-topic", "/front", "--scan-topic", "/rear", "-o", str(tmp_path / "t")]) == 1
+    assert (
+        main(
+            [
+                "import",
+                str(path),
+                "--scan-topic",
+                "/front",
+                "--scan-topic",
+                "/rear",
+                "-o",
+                str(tmp_path / "t"),
+            ]
+        )
+        == 1
+    )
     assert "expected a robot that drives, got a way of 0.7 m" in capsys.readouterr().err

@@ -30,8 +30,19 @@ from ssh_abduction.solver.asp import workers
 from ssh_abduction.theory import Speedups
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-ENDLESS = ["--boundary", "none", "--path-order", "partial", "--prefer", "", "-n", "0"]  # a theory in which slow.jsonl has maps without end
-QUESTION = Question(Theory.topological(), limit=None, maps=100, memory=None, speedups=Speedups(), json=False)
+ENDLESS = [
+    "--boundary",
+    "none",
+    "--path-order",
+    "partial",
+    "--prefer",
+    "",
+    "-n",
+    "0",
+]  # a theory in which slow.jsonl has maps without end
+QUESTION = Question(
+    Theory.topological(), limit=None, maps=100, memory=None, speedups=Speedups(), json=False
+)
 
 
 class Deadly(Question):
@@ -65,7 +76,9 @@ def traces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "slow": rectangle(40),
         "comb": drive(*TOURS["comb"]),
         "deadly": rectangle(8),
-        "impossible": Trace.from_steps("xyabcde", ["right", "travel", "travel", "around", "around", "travel"]),
+        "impossible": Trace.from_steps(
+            "xyabcde", ["right", "travel", "travel", "around", "around", "travel"]
+        ),
     }.items():
         trace.save(tmp_path / f"{name}.jsonl")
     (tmp_path / "broken.jsonl").write_text('{"format": "ssh-trace", "version": 1}\n{"view": }\n')
@@ -77,7 +90,12 @@ def traces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def cluster() -> Iterator[str]:
     """The address of a Dask scheduler with one worker of one thread, in a process of its own, which may take long to come back where the machine is busy."""
     with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0, "distributed.deploy.lost-worker-timeout": "600s"}),
+        dask.config.set(
+            {
+                "distributed.scheduler.allowed-failures": 0,
+                "distributed.deploy.lost-worker-timeout": "600s",
+            }
+        ),
         LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
     ):
         yield cluster.scheduler_address
@@ -95,20 +113,39 @@ def without_seconds(text: str) -> str:
 
 
 def test_each_trace_has_its_line_in_order(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["solve", "comb.jsonl", "broken.jsonl", "quick.jsonl", "missing.jsonl", "impossible.jsonl"]) == 1
+    assert (
+        main(
+            [
+                "solve",
+                "comb.jsonl",
+                "broken.jsonl",
+                "quick.jsonl",
+                "missing.jsonl",
+                "impossible.jsonl",
+            ]
+        )
+        == 1
+    )
     out, err = capsys.readouterr()
     comb, broken, quick, missing, impossible = out.splitlines()
     assert (
-        without_seconds(comb) == "comb.jsonl: optimal: 19 dstates, 10 places, 4 paths; 2 minimal maps; _ s, 22 of 22 steps given to clingo"
+        without_seconds(comb)
+        == "comb.jsonl: optimal: 19 dstates, 10 places, 4 paths; 2 minimal maps; _ s, 22 of 22 steps given to clingo"
     )
-    assert broken.startswith("broken.jsonl: error: broken.jsonl:2: line: expected one JSON object, got broken JSON")
+    assert broken.startswith(
+        "broken.jsonl: error: broken.jsonl:2: line: expected one JSON object, got broken JSON"
+    )
     assert quick.startswith("quick.jsonl: optimal: 8 dstates, 4 places, 4 paths; 1 minimal map;")
     assert missing.startswith("missing.jsonl: error: missing.jsonl: expected a readable trace file")
-    assert impossible.startswith("impossible.jsonl: unsatisfiable: no map satisfies the axioms: in steps 2 to 5 these clash:")
+    assert impossible.startswith(
+        "impossible.jsonl: unsatisfiable: no map satisfies the axioms: in steps 2 to 5 these clash:"
+    )
     assert err == "ssh-abduction: errors in 2 of 5 traces, on their lines\n"
 
 
-def test_a_line_says_what_the_single_trace_says(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_line_says_what_the_single_trace_says(
+    traces: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for words in (["quick.jsonl"], ["impossible.jsonl"], ["slow.jsonl", "--time-limit", "1e-9"]):
         code = main(["solve", *words])
         alone = capsys.readouterr().out.splitlines()[0]
@@ -116,7 +153,9 @@ def test_a_line_says_what_the_single_trace_says(traces: Path, capsys: pytest.Cap
         assert without_seconds(capsys.readouterr().out) == without_seconds(f"{words[0]}: {alone}\n")
 
 
-def test_json_lines_are_the_single_objects(traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_lines_are_the_single_objects(
+    traces: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     paths = ["comb.jsonl", "impossible.jsonl", "quick.jsonl"]
     alone = []
     for path in paths:
@@ -134,10 +173,17 @@ def test_json_lines_are_the_single_objects(traces: Path, capsys: pytest.CaptureF
     assert main(["check", "quick.jsonl", "maps.json"]) == 0  # a line is what the other verbs read
 
 
-def test_everywhere_the_same(traces: Path, scheduler: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_everywhere_the_same(
+    traces: Path, scheduler: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     paths = [f"{name}.jsonl" for name in ("comb", "quick", "broken", "impossible", "quick")]
     shown = {}
-    for where in ((), ("--jobs", "2"), ("--scheduler", scheduler), ("--scheduler", scheduler, "--jobs", "1")):
+    for where in (
+        (),
+        ("--jobs", "2"),
+        ("--scheduler", scheduler),
+        ("--scheduler", scheduler, "--jobs", "1"),
+    ):
         assert main(["solve", *paths, "--json", *where]) == 1
         shown[where] = without_seconds(capsys.readouterr().out)
     assert shown[()].count("\n") == len(paths)
@@ -146,15 +192,24 @@ def test_everywhere_the_same(traces: Path, scheduler: str, capsys: pytest.Captur
 
 @pytest.mark.parametrize(
     ("paths", "code"),
-    [("quick quick", 0), ("quick impossible quick", 20), ("impossible broken", 1), ("slow impossible", 30)],
+    [
+        ("quick quick", 0),
+        ("quick impossible quick", 20),
+        ("impossible broken", 1),
+        ("slow impossible", 30),
+    ],
 )
-def test_the_worst_exit_code(paths: str, code: int, traces: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_worst_exit_code(
+    paths: str, code: int, traces: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     limit = ["--time-limit", "1e-9"] if code == 30 else []
     assert main(["solve", *(f"{name}.jsonl" for name in paths.split()), *limit]) == code
     assert (capsys.readouterr().err == "") == (code != 1)
 
 
-def test_wrong_choices_are_one_line(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_choices_are_one_line(
+    traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(batch, "PATIENCE", 0.5)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -164,9 +219,18 @@ def test_wrong_choices_are_one_line(traces: Path, monkeypatch: pytest.MonkeyPatc
         ([*both, "--jobs", "0"], r"--jobs: expected .* got 0; leave it out for 1"),
         (["quick.jsonl", "-"], r"-: expected files .* got standard input; save it to a file"),
         (["-", "--jobs", "2"], r"-: expected files .* got standard input; save it to a file"),
-        ([*both, "--theory", "causal", "--boundary", "strict"], r"boundary: expected none with level=causal.*"),
-        ([*both, "--scheduler", nobody], rf"--scheduler: expected a Dask scheduler at {nobody}, got none \(.*\); start one with: .*"),
-        ([*both, "--scheduler", "elsewhere"], r"--scheduler: expected an address with a port, such as tcp://host:8786, got 'elsewhere'"),
+        (
+            [*both, "--theory", "causal", "--boundary", "strict"],
+            r"boundary: expected none with level=causal.*",
+        ),
+        (
+            [*both, "--scheduler", nobody],
+            rf"--scheduler: expected a Dask scheduler at {nobody}, got none \(.*\); start one with: .*",
+        ),
+        (
+            [*both, "--scheduler", "elsewhere"],
+            r"--scheduler: expected an address with a port, such as tcp://host:8786, got 'elsewhere'",
+        ),
     ):
         assert main(["solve", *words]) == 1
         out, err = capsys.readouterr()
@@ -174,11 +238,16 @@ def test_wrong_choices_are_one_line(traces: Path, monkeypatch: pytest.MonkeyPatc
         assert re.fullmatch(rf"ssh-abduction: {message}\n", err)
 
 
-def test_a_scheduler_without_workers(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scheduler_without_workers(
+    traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(batch, "PATIENCE", 2)
     with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
         assert main(["solve", "quick.jsonl", "--scheduler", cluster.scheduler_address]) == 1
-    assert re.fullmatch(r"ssh-abduction: --scheduler: expected a worker, got none in 2 s; start one with: .*\n", capsys.readouterr().err)
+    assert re.fullmatch(
+        r"ssh-abduction: --scheduler: expected a worker, got none in 2 s; start one with: .*\n",
+        capsys.readouterr().err,
+    )
 
 
 def test_a_cluster_whose_workers_are_gone_is_waited_for_as_long_as_the_limit(
@@ -189,17 +258,37 @@ def test_a_cluster_whose_workers_are_gone_is_waited_for_as_long_as_the_limit(
     monkeypatch.setattr(Client, "wait_for_workers", lambda *_, **__: None)  # there was one
     with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
         address = cluster.scheduler_address
-        assert main(["solve", "quick.jsonl", "comb.jsonl", "quick.jsonl", "--time-limit", "0.3", "--scheduler", address]) == 1
+        assert (
+            main(
+                [
+                    "solve",
+                    "quick.jsonl",
+                    "comb.jsonl",
+                    "quick.jsonl",
+                    "--time-limit",
+                    "0.3",
+                    "--scheduler",
+                    address,
+                ]
+            )
+            == 1
+        )
     out, err = capsys.readouterr()
-    told = rf"scheduler: expected a worker, got none for \d s; start one with: dask worker {address}"
+    told = (
+        rf"scheduler: expected a worker, got none for \d s; start one with: dask worker {address}"
+    )
     assert all(re.fullmatch(rf"\w+.jsonl: error: {told}", line) for line in out.splitlines())
     assert len(out.splitlines()) == 3
-    assert re.fullmatch(rf"ssh-abduction: warning: {told}, or end this with Ctrl-C", err.splitlines()[0])
+    assert re.fullmatch(
+        rf"ssh-abduction: warning: {told}, or end this with Ctrl-C", err.splitlines()[0]
+    )
     assert err.count("warning") == 1
 
 
 @pytest.mark.parametrize(("limit", "ends"), [(None, None), (5, 10), (25, 25)])
-def test_how_long_a_cluster_may_have_no_worker(limit: float | None, ends: float | None, capsys: pytest.CaptureFixture[str]) -> None:
+def test_how_long_a_cluster_may_have_no_worker(
+    limit: float | None, ends: float | None, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A worker is there for 40 s, and comes back once, after 100 s."""
     now = 0.0
 
@@ -215,10 +304,14 @@ def test_how_long_a_cluster_may_have_no_worker(limit: float | None, ends: float 
         too_long += [second] if absence.is_too_long() else []
         said += [second] if capsys.readouterr().err else []
     assert said == [50, 110]
-    assert too_long == ([] if ends is None else [*range(40 + int(ends), 100), *range(100 + int(ends), 140)])
+    assert too_long == (
+        [] if ends is None else [*range(40 + int(ends), 100), *range(100 + int(ends), 140)]
+    )
 
 
-def test_without_the_extra(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_the_extra(
+    traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert main(["solve", "quick.jsonl", "--scheduler", "tcp://127.0.0.1:1"]) == 1
     assert capsys.readouterr().err.endswith("; pip install 'ssh-abduction[cluster]'\n")
@@ -229,26 +322,41 @@ def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -
         raise MemoryError("no room for\nso many steps")
 
     monkeypatch.setattr(Trace, "load", load)
-    assert QUESTION.answer(3, "a\nb.jsonl") == Answer(3, r"'a\nb.jsonl': error: MemoryError: no room for so many steps", 1)
+    assert QUESTION.answer(3, "a\nb.jsonl") == Answer(
+        3, r"'a\nb.jsonl': error: MemoryError: no room for so many steps", 1
+    )
 
 
 def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler: str) -> None:
     deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
     paths = [f"{name}.jsonl" for name in ("quick", "deadly", "comb", "quick")]
     stop = Stop()
-    for answers in (batch.here(deadly, paths, 2, stop), batch.on_cluster(deadly, paths, scheduler, None, stop)):
+    for answers in (
+        batch.here(deadly, paths, 2, stop),
+        batch.on_cluster(deadly, paths, scheduler, None, stop),
+    ):
         lines = {answer.number: answer.line for answer in answers}
         assert sorted(lines) == [*range(len(paths))]
         for number, path in enumerate(paths):
-            assert lines[number].startswith(f"{path}: {'error: process: expected' if 'deadly' in path else 'optimal'}")
+            assert lines[number].startswith(
+                f"{path}: {'error: process: expected' if 'deadly' in path else 'optimal'}"
+            )
 
 
 def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
-    tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    scheduler: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     quick, deadly = str(tmp_path / "quick.log"), str(tmp_path / "deadly.log")
     monkeypatch.setattr(mapping, "MapQuestion", KilledOnce)
-    assert main(["simulate", "notched-rectangle", "--as", "carmen", "--every", "0.5", "-q", "-o", quick]) == 0
+    assert (
+        main(
+            ["simulate", "notched-rectangle", "--as", "carmen", "--every", "0.5", "-q", "-o", quick]
+        )
+        == 0
+    )
     shutil.copy(quick, deadly)
     command = [
         "map",
@@ -267,8 +375,14 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
     capsys.readouterr()
     for said in ("1 place", "done already"):
         assert main(command) == 0
-        assert [line.partition(",")[0] for line in capsys.readouterr().out.splitlines()] == [f"{quick}: {said}", f"{deadly}: {said}"]
-    assert {path.name: path.read_text().count("begun") for path in tmp_path.glob("*.begun")} == {"quick.begun": 1, "deadly.begun": 2}
+        assert [line.partition(",")[0] for line in capsys.readouterr().out.splitlines()] == [
+            f"{quick}: {said}",
+            f"{deadly}: {said}",
+        ]
+    assert {path.name: path.read_text().count("begun") for path in tmp_path.glob("*.begun")} == {
+        "quick.begun": 1,
+        "deadly.begun": 2,
+    }
 
 
 def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler: str) -> None:
@@ -278,19 +392,36 @@ def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler: str) -> No
     assert next(answers).number == 0
     time.sleep(0.5)  # the only thread of the worker is at the slow one
     answers.close()
-    assert [answer.code for answer in batch.on_cluster(QUESTION, ["comb.jsonl"], scheduler, None, Stop())] == [0]
+    assert [
+        answer.code
+        for answer in batch.on_cluster(QUESTION, ["comb.jsonl"], scheduler, None, Stop())
+    ] == [0]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forgets the peak of memory")
 def test_memory_is_counted_for_each_trace(traces: Path) -> None:
-    command = shlex.join([sys.executable, "-m", "ssh_abduction", "solve", "quick.jsonl", "slow.jsonl", "quick.jsonl", *ENDLESS, "--json"])
+    command = shlex.join(
+        [
+            sys.executable,
+            "-m",
+            "ssh_abduction",
+            "solve",
+            "quick.jsonl",
+            "slow.jsonl",
+            "quick.jsonl",
+            *ENDLESS,
+            "--json",
+        ]
+    )
     command += " --memory-limit 100; exit"  # run by a shell: a process inherits the peak of the one that starts it, which is large here
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [line.get("stopped") for line in lines] == [None, "memory limit", None]
 
 
-def test_ctrl_c_prints_what_waited_for_its_turn(traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_prints_what_waited_for_its_turn(
+    traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def answers(*_: object) -> Iterator[Answer]:
         yield Answer(0, "first", 0)
         yield Answer(3, "fourth", 0)
@@ -300,16 +431,27 @@ def test_ctrl_c_prints_what_waited_for_its_turn(traces: Path, monkeypatch: pytes
 
     monkeypatch.setattr(batch, "here", answers)
     assert main(["solve", *["quick.jsonl"] * 5]) == 130
-    assert capsys.readouterr() == ("first\nthird\nfourth\n", "ssh-abduction: interrupted: 2 of 5 traces not finished\n")
+    assert capsys.readouterr() == (
+        "first\nthird\nfourth\n",
+        "ssh-abduction: interrupted: 2 of 5 traces not finished\n",
+    )
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
-@pytest.mark.parametrize(("jobs", "send"), [("1", os.killpg), ("2", os.killpg), ("2", os.kill)], ids=["1", "2", "2, from another program"])
-def test_ctrl_c_ends_the_processes(jobs: str, send: Callable[[int, int], None], traces: Path) -> None:
+@pytest.mark.parametrize(
+    ("jobs", "send"),
+    [("1", os.killpg), ("2", os.killpg), ("2", os.kill)],
+    ids=["1", "2", "2, from another program"],
+)
+def test_ctrl_c_ends_the_processes(
+    jobs: str, send: Callable[[int, int], None], traces: Path
+) -> None:
     """What was found of the traces under way is printed, whether all processes hear of it, as from a terminal, or the first one alone."""
     paths = ["quick.jsonl", "slow.jsonl", "quick.jsonl", "slow.jsonl", "slow.jsonl"]
     command = [sys.executable, "-m", "ssh_abduction", "solve", *paths, *ENDLESS, "--jobs", jobs]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
         assert process.stdout is not None
         first = process.stdout.readline()
         time.sleep(0.5)
@@ -332,14 +474,26 @@ def test_ctrl_c_ends_the_processes(jobs: str, send: Callable[[int, int], None], 
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals")
-@pytest.mark.parametrize("seen", [False, True], ids=["results to a pipe", "results to the terminal"])
+@pytest.mark.parametrize(
+    "seen", [False, True], ids=["results to a pipe", "results to the terminal"]
+)
 def test_the_bar_is_on_the_terminal(seen: bool, traces: Path) -> None:
     import pty
 
     master, slave = pty.openpty()
-    command = [sys.executable, "-m", "ssh_abduction", "solve", "quick.jsonl", "broken.jsonl", "comb.jsonl"]
+    command = [
+        sys.executable,
+        "-m",
+        "ssh_abduction",
+        "solve",
+        "quick.jsonl",
+        "broken.jsonl",
+        "comb.jsonl",
+    ]
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "60"}
-    with subprocess.Popen(command, stdout=slave if seen else subprocess.PIPE, stderr=slave, env=environment, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=slave if seen else subprocess.PIPE, stderr=slave, env=environment, text=True
+    ) as process:
         os.close(slave)
         shown = b""
         with contextlib.suppress(OSError):  # the terminal is gone when the program is

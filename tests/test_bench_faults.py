@@ -7,7 +7,16 @@ from itertools import product
 import fault_peers
 import faults
 import pytest
-from fault_cases import FAMILIES, Case, Explanation, machine, misread, rectangle_of_five, refined, sized
+from fault_cases import (
+    FAMILIES,
+    Case,
+    Explanation,
+    machine,
+    misread,
+    rectangle_of_five,
+    refined,
+    sized,
+)
 from fault_peers import PEERS
 from instances import Walk
 
@@ -17,7 +26,11 @@ from ssh_abduction import Trace
 @pytest.mark.parametrize("jumps", [False, True])
 def test_the_truth_is_right_and_costs_its_states_and_faults(jumps: bool) -> None:
     for make, seed in product(
-        (lambda s: machine(s, jumps=jumps), lambda s: rectangle_of_five(s, steps=100, **{"jumps" if jumps else "wrong": 1})), range(3)
+        (
+            lambda s: machine(s, jumps=jumps),
+            lambda s: rectangle_of_five(s, steps=100, **{"jumps" if jumps else "wrong": 1}),
+        ),
+        range(3),
     ):
         case = make(seed)
         truth = Explanation.of(case.walk.trace, case.walk.truth)
@@ -66,7 +79,16 @@ def test_maxsat_needs_no_more_faults_than_the_truth(case: Case) -> None:
 def test_a_cell_says_what_came_of_it_and_ends_at_its_limit() -> None:
     found = faults.measured("rectangle n=400, 4 jumps", faults.TOLD, 500, 20, 4096)
     assert (
-        found.items() >= {"status": "ok", "right": True, "proven": True, "found": 4, "named": 4, "tenths": 140, "true_tenths": 140}.items()
+        found.items()
+        >= {
+            "status": "ok",
+            "right": True,
+            "proven": True,
+            "found": 4,
+            "named": 4,
+            "tenths": 140,
+            "true_tenths": 140,
+        }.items()
     )
     assert 0 < found["cpu"] < 20
     late = faults.measured("rectangle n=4000, 40 wrong views", "cloned HMM", 500, 0.2, 4096)
@@ -85,11 +107,40 @@ def test_a_row_of_the_table() -> None:
         "named": 2,
         "among": True,
     }
-    right = {**common, "seed": 0, "status": "ok", "cpu": 1.0, "right": True, "found": 2, "tenths": 80}
-    tie = {**common, "seed": 1, "status": "ok", "cpu": 2.0, "right": False, "found": 1, "tenths": 80}
-    cheaper = {**tie, "seed": 2, "status": "timeout", "proven": False, "among": False, "found": 0, "tenths": 75}
-    row = faults.table([right, tie, cheaper, {**cheaper, "solver": "RC2", "status": "not installed"}]).splitlines()[-2:]
-    assert row[0] == f"| {family} | ssh-abduction | 1 of 3 | 2 of 3 | 2 of 3 | 3 of 6 | 3 | 0.000 | 2.00 | > 9 | 1 cheaper, 1 as cheap |"
+    right = {
+        **common,
+        "seed": 0,
+        "status": "ok",
+        "cpu": 1.0,
+        "right": True,
+        "found": 2,
+        "tenths": 80,
+    }
+    tie = {
+        **common,
+        "seed": 1,
+        "status": "ok",
+        "cpu": 2.0,
+        "right": False,
+        "found": 1,
+        "tenths": 80,
+    }
+    cheaper = {
+        **tie,
+        "seed": 2,
+        "status": "timeout",
+        "proven": False,
+        "among": False,
+        "found": 0,
+        "tenths": 75,
+    }
+    row = faults.table(
+        [right, tie, cheaper, {**cheaper, "solver": "RC2", "status": "not installed"}]
+    ).splitlines()[-2:]
+    assert (
+        row[0]
+        == f"| {family} | ssh-abduction | 1 of 3 | 2 of 3 | 2 of 3 | 3 of 6 | 3 | 0.000 | 2.00 | > 9 | 1 cheaper, 1 as cheap |"
+    )
     assert row[1].startswith(f"| {family} | RC2 | not installed | – |")
     assert faults.contradictions([right, tie, cheaper]) == []
     assert len(faults.contradictions([{**right, "tenths": 90}])) == 1

@@ -31,7 +31,9 @@ def test_the_beam_model_sums_to_one(expected: float) -> None:
     model = BeamModel()
     z = (np.arange(100_000) + 0.5) * (model.reach / 100_000)
     below = np.exp(model.log_likelihood(z, np.full(1, expected))).mean() * model.reach
-    assert below + math.exp(model.log_likelihood(model.reach, np.array(expected))) == pytest.approx(1, abs=1e-3)
+    assert below + math.exp(model.log_likelihood(model.reach, np.array(expected))) == pytest.approx(
+        1, abs=1e-3
+    )
 
 
 def test_the_beam_model_expects_what_is_there_and_people_before_it() -> None:
@@ -42,7 +44,9 @@ def test_the_beam_model_expects_what_is_there_and_people_before_it() -> None:
 def test_the_ranges_of_a_grid_are_those_of_the_world() -> None:
     """To within two cells, a little off the walls: near to one, a beam along it meets a cell of it too early."""
     chosen = np.array([i for i, at in enumerate(grid().centres) if WORLD.clearance(*at) > 0.3])
-    exact = Laser().exact(WORLD, np.column_stack([grid().centres[chosen], np.zeros(len(chosen))]))[:, 5::10]  # -84.5°, -74.5°, …
+    exact = Laser().exact(WORLD, np.column_stack([grid().centres[chosen], np.zeros(len(chosen))]))[
+        :, 5::10
+    ]  # -84.5°, -74.5°, …
     expected = grid().ranges[chosen][:, np.arange(-17, 18, 2) % 72] / 100
     assert np.mean(np.abs(exact - expected) <= 0.2) > 0.98
     assert abs(np.median(exact - expected)) < 0.1
@@ -73,7 +77,12 @@ def test_the_histogram_is_brute_force_bayes() -> None:
 
 
 def _brute_moved(
-    tiny: Grid, poses: list[tuple[float, float, float]], p: np.ndarray, move: tuple[float, ...], covariance: np.ndarray, slipped: float
+    tiny: Grid,
+    poses: list[tuple[float, float, float]],
+    p: np.ndarray,
+    move: tuple[float, ...],
+    covariance: np.ndarray,
+    slipped: float,
 ) -> np.ndarray:
     """p(x') as a sum over x: Gaussians about where x leads to, whose covariance is that of the displacement, of the heading's bin, and of the least blur."""
     dx, dy, turned = move
@@ -82,11 +91,20 @@ def _brute_moved(
     found = np.zeros(len(poses))
     aside = np.array([-dy, dx]) * bin_ / math.sqrt(12)
     for (x, y, heading), mass in zip(poses, p, strict=True):
-        turn = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
-        spread = turn @ (covariance[:2, :2] + np.outer(aside, aside)) @ turn.T + (LEAST_BLUR * tiny.resolution) ** 2 * np.eye(2)
+        turn = np.array(
+            [[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]]
+        )
+        spread = turn @ (covariance[:2, :2] + np.outer(aside, aside)) @ turn.T + (
+            LEAST_BLUR * tiny.resolution
+        ) ** 2 * np.eye(2)
         off = np.array([xs, ys]).T - (np.array([x, y]) + turn @ (dx, dy))
-        place = np.exp(-np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off) / 2) / (math.tau * math.sqrt(np.linalg.det(spread)))
-        apart = [np.remainder(headings - heading - turned + math.pi, math.tau) - math.pi + k * math.tau for k in (-1, 0, 1)]
+        place = np.exp(-np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off) / 2) / (
+            math.tau * math.sqrt(np.linalg.det(spread))
+        )
+        apart = [
+            np.remainder(headings - heading - turned + math.pi, math.tau) - math.pi + k * math.tau
+            for k in (-1, 0, 1)
+        ]
         variance = max(covariance[2, 2], (LEAST_BLUR * bin_) ** 2)
         facing = sum(np.exp(-(a**2) / variance / 2) for a in apart) / math.sqrt(math.tau * variance)
         found += mass * place * tiny.resolution**2 * facing * bin_
@@ -105,7 +123,12 @@ def _brute_likelihood(tiny: Grid, model: BeamModel, pose: int, image: np.ndarray
 @pytest.mark.parametrize("kind", [Histogram, Particles])
 def test_a_robot_that_is_localised_stays_so_and_one_that_is_carried_is_found(kind: type) -> None:
     """In a room that is not symmetric, along a square, and then from somewhere else."""
-    world = replace(WORLD, segments=np.vstack([WORLD.segments, [[1.2, 2.0, 1.2, 1.5], [1.2, 1.5, 1.6, 1.5], [1.6, 1.5, 1.6, 2.0]]]))
+    world = replace(
+        WORLD,
+        segments=np.vstack(
+            [WORLD.segments, [[1.2, 2.0, 1.2, 1.5], [1.2, 1.5, 1.6, 1.5], [1.6, 1.5, 1.6, 2.0]]]
+        ),
+    )
     belief: Filter = kind(Grid.of(world))
     rng = np.random.default_rng(1)
     for start in ((2.0, 0.6, 0.0), (3.2, 1.0, math.pi)):
@@ -113,7 +136,11 @@ def test_a_robot_that_is_localised_stays_so_and_one_that_is_carried_is_found(kin
         for k in range(8):
             if k:
                 belief.moved((0.4, 0.0, math.pi / 2), SURE)
-                at = (at[0] + 0.4 * math.cos(at[2]), at[1] + 0.4 * math.sin(at[2]), at[2] + math.pi / 2)
+                at = (
+                    at[0] + 0.4 * math.cos(at[2]),
+                    at[1] + 0.4 * math.sin(at[2]),
+                    at[2] + math.pi / 2,
+                )
             belief.seen(Laser().scan(world, np.array(at), rng)[0])
             masses.append(belief.mass(at, 0.3, math.radians(15)))
         assert min(masses[-5:]) > 0.95, masses
@@ -135,7 +162,10 @@ def test_what_looks_alike_stays_undecided() -> None:
     assert min(masses) > 0.2
 
 
-@pytest.mark.parametrize("make", [lambda: rectangle(0.03), taylor_hall, lambda: comb(3), lambda: ring(True), lambda: maze(3, 1)])
+@pytest.mark.parametrize(
+    "make",
+    [lambda: rectangle(0.03), taylor_hall, lambda: comb(3), lambda: ring(True), lambda: maze(3, 1)],
+)
 def test_a_scene_is_explored_and_its_moves_lead_where_they_say(make: object) -> None:
     scene: Scene = make()  # type: ignore[operator]
     start, route = scene.explore
@@ -148,12 +178,16 @@ def test_a_scene_is_explored_and_its_moves_lead_where_they_say(make: object) -> 
     assert set(scene.moves) == {s.name for s in scene.world.dstates}
     trace = scene.driven(8, 3, boxes(1) if len(scene.moves) == 20 else None)
     at = [str(step.truth["dstate"]) for step in trace]
-    assert [scene.moves[a][step.action.name] for a, step in zip(at, trace, strict=False) if step.action] == at[1:]
+    assert [
+        scene.moves[a][step.action.name] for a, step in zip(at, trace, strict=False) if step.action
+    ] == at[1:]
 
 
 def test_localised_means_sure_and_right_for_five_steps() -> None:
     def judged(good: str) -> Judged:
-        return Judged("", tuple(c in "ra" for c in good), tuple(c in "sa" for c in good), 0, 0, 0.0, 0.0)
+        return Judged(
+            "", tuple(c in "ra" for c in good), tuple(c in "sa" for c in good), 0, 0, 0.0, 0.0
+        )
 
     assert judged("aaaaa").localised(0, 5) == 0
     assert judged("saaaaraaaaa").localised(0, 11) == 6
@@ -166,7 +200,11 @@ def test_a_run_compares_all_methods_and_can_be_saved(
     monkeypatch: pytest.MonkeyPatch, tmp_path: object, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(grid_localisation, "STEPS", 6)
-    monkeypatch.setattr(grid_localisation, "PARTS", {"aliasing": [Case("maze", lambda seed: maze(2, seed), people=0.5)]})
+    monkeypatch.setattr(
+        grid_localisation,
+        "PARTS",
+        {"aliasing": [Case("maze", lambda seed: maze(2, seed), people=0.5)]},
+    )
     path = f"{tmp_path}/found.json"
     found = grid_localisation.measured(["aliasing"], range(1), path)
     assert grid_localisation.loaded(path) == found

@@ -42,7 +42,13 @@ def fewest(trace: Trace) -> int:
 def tiny(seed: int) -> Trace:
     chance = random.Random(seed)
     states = chance.randint(1, 4)
-    return moore(states, chance.randint(1, states), steps=chance.randint(0, 14), seed=seed, actions=chance.randint(1, 3)).trace
+    return moore(
+        states,
+        chance.randint(1, states),
+        steps=chance.randint(0, 14),
+        seed=seed,
+        actions=chance.randint(1, 3),
+    ).trace
 
 
 @pytest.mark.parametrize("name", PEERS)
@@ -71,7 +77,10 @@ def test_a_machine_that_shows_something_else_is_found_out() -> None:
 
 def test_words_ask_for_the_view_bit_by_bit() -> None:
     words = Words(Trace.from_steps(["a", "b", "c", "b"], ["travel", "right", "travel"]))
-    assert [list(words.at(t)) for t in (0, 2)] == [[([], False), (["2"], False)], [(["0", "1"], False), (["0", "1", "2"], True)]]
+    assert [list(words.at(t)) for t in (0, 2)] == [
+        [([], False), (["2"], False)],
+        [(["0", "1"], False), (["0", "1", "2"], True)],
+    ]
 
 
 def test_small_traces_are_those_of_the_tables() -> None:
@@ -84,7 +93,13 @@ def test_small_traces_are_those_of_the_tables() -> None:
 def test_a_cell_has_all_its_fields() -> None:
     ours = bench.run("ssh-abduction", SUITE["full aces3"], 0, 100, 4096)
     assert ours.keys() == ALWAYS | MEASURED | OURS
-    assert (ours["status"], ours["dstates"], ours["proven"], ours["images"], ours["theory"]) == ("ok", 19, True, 23, "full")
+    assert (ours["status"], ours["dstates"], ours["proven"], ours["images"], ours["theory"]) == (
+        "ok",
+        19,
+        True,
+        23,
+        "full",
+    )
     theirs = bench.run("plain.lp", SUITE["rectangle n=400"], 0, 100, 4096)
     assert theirs.keys() == ALWAYS | MEASURED | {"dstates", "proven"}
     assert (theirs["status"], theirs["dstates"], theirs["true_dstates"]) == ("ok", 4, 8)
@@ -98,7 +113,15 @@ def test_a_cell_ends_at_its_limit() -> None:
 
 
 def cell(tool: str, status: str = "ok", seed: int = 0, **fields: Any) -> dict[str, Any]:
-    return {"instance": "x", "tool": tool, "seed": seed, "status": status, "reason": "", "images": 9, **fields}
+    return {
+        "instance": "x",
+        "tool": tool,
+        "seed": seed,
+        "status": status,
+        "reason": "",
+        "images": 9,
+        **fields,
+    }
 
 
 def results(*cells: dict[str, Any]) -> dict[str, Any]:
@@ -109,15 +132,31 @@ def results(*cells: dict[str, Any]) -> dict[str, Any]:
     ("ours", "theirs", "row"),
     [
         ({"seconds": 2}, {"seconds": 5}, "| 4 | 2.0 s | 7 | 5.0 s, 8 MB, ×2.5 |"),
-        ({"seconds": 2}, {"status": "timeout", "seconds": 10, "proven": False}, "| 4 | 2.0 s | 7 | > 10 s, 8 MB, >×5.0 |"),
+        (
+            {"seconds": 2},
+            {"status": "timeout", "seconds": 10, "proven": False},
+            "| 4 | 2.0 s | 7 | > 10 s, 8 MB, >×5.0 |",
+        ),
         (
             {"status": "timeout", "seconds": 10, "proven": False, "bound": 3, "dstates": 6},
             {"status": "timeout", "seconds": 10, "proven": False},
             "| 3 – 4 | > 10 s | 7 | > 10 s, 8 MB |",
         ),
-        ({"status": "timeout", "seconds": 10, "proven": False}, {"seconds": 5}, "| 4 | > 10 s | 7 | 5.0 s, 8 MB, <×0.5 |"),
-        ({"seconds": 2}, {"seconds": 1, "proven": False, "dstates": 9}, "| 4 | 2.0 s | 7 | 1.0 s, 8 MB, ×0.5, 9 states |"),
-        ({"seconds": 2}, {"status": "error", "seconds": 1, "reason": "it broke", "proven": False}, "| 4 | 2.0 s | 7 | error¹, 8 MB |"),
+        (
+            {"status": "timeout", "seconds": 10, "proven": False},
+            {"seconds": 5},
+            "| 4 | > 10 s | 7 | 5.0 s, 8 MB, <×0.5 |",
+        ),
+        (
+            {"seconds": 2},
+            {"seconds": 1, "proven": False, "dstates": 9},
+            "| 4 | 2.0 s | 7 | 1.0 s, 8 MB, ×0.5, 9 states |",
+        ),
+        (
+            {"seconds": 2},
+            {"status": "error", "seconds": 1, "reason": "it broke", "proven": False},
+            "| 4 | 2.0 s | 7 | error¹, 8 MB |",
+        ),
     ],
 )
 def test_a_row_of_the_table(ours: dict[str, Any], theirs: dict[str, Any], row: str) -> None:
@@ -133,17 +172,33 @@ def test_a_row_of_the_table(ours: dict[str, Any], theirs: dict[str, Any], row: s
 def test_many_seeds_show_the_median_and_how_many_were_solved() -> None:
     seconds = (1, 3, 10)
     cells = [
-        cell("ssh-abduction", "ok" if s < 10 else "timeout", seed, seconds=s, memory=5, proven=s < 10, dstates=4)
+        cell(
+            "ssh-abduction",
+            "ok" if s < 10 else "timeout",
+            seed,
+            seconds=s,
+            memory=5,
+            proven=s < 10,
+            dstates=4,
+        )
         for seed, s in enumerate(seconds)
     ]
     assert "3.0 s (2 of 3)" in table.times(results(*cells))
 
 
 def test_answers_that_contradict_each_other_are_named() -> None:
-    proven, fewer, bound = cell("a", dstates=4, proven=True), cell("b", dstates=3, proven=False), cell("c", "timeout", bound=5)
+    proven, fewer, bound = (
+        cell("a", dstates=4, proven=True),
+        cell("b", dstates=3, proven=False),
+        cell("c", "timeout", bound=5),
+    )
     assert table.contradictions(results(proven, cell("b", dstates=5, proven=False))) == []
-    assert table.contradictions(results(proven, fewer)) == ["x, seed 0: a proved 4 states, b found 3"]
-    assert table.contradictions(results(proven, bound)) == ["x, seed 0: c proved 5 states, a found 4"]
+    assert table.contradictions(results(proven, fewer)) == [
+        "x, seed 0: a proved 4 states, b found 3"
+    ]
+    assert table.contradictions(results(proven, bound)) == [
+        "x, seed 0: c proved 5 states, a found 4"
+    ]
     assert table.contradictions(results(proven, {**fewer, "seed": 1})) == []
     assert table.contradictions(results(cell("a", "wrong", reason="no"))) == ["x, seed 0: a: no"]
 
@@ -155,14 +210,24 @@ def test_a_stored_run_has_its_fields_and_no_contradiction(path: Path) -> None:
     assert run["machine"].keys() == {"cpu", "cores", "memory", "system", "python"}
     for cell in run["cells"]:
         assert cell.keys() >= ALWAYS
-        assert cell.keys() >= MEASURED or cell["status"] in ("not applicable", "not installed", "error")
-        assert cell["status"] != "ok" or cell.keys() >= {"dstates", "proven"} | (OURS if cell["tool"] == "ssh-abduction" else set())
+        assert cell.keys() >= MEASURED or cell["status"] in (
+            "not applicable",
+            "not installed",
+            "error",
+        )
+        assert cell["status"] != "ok" or cell.keys() >= {"dstates", "proven"} | (
+            OURS if cell["tool"] == "ssh-abduction" else set()
+        )
     assert table.contradictions(run) == []
 
 
 def stored(page: str, name: str) -> Path:
     """The stored run that the named table of a page says it is from."""
-    found = re.search(rf"<!-- bench:begin {name} -->.*(benchmarks/results/[\w.-]+\.json)\).*<!-- bench:end {name} -->", page, re.DOTALL)
+    found = re.search(
+        rf"<!-- bench:begin {name} -->.*(benchmarks/results/[\w.-]+\.json)\).*<!-- bench:end {name} -->",
+        page,
+        re.DOTALL,
+    )
     assert found
     return ROOT / found[1]
 
@@ -202,7 +267,9 @@ def test_the_table_of_speedups_has_each_of_them() -> None:
         ("dstates", {}, {"dstates": None}, 1),
     ],
 )
-def test_what_a_speedup_gains(measure: str, base: dict[str, Any], without: dict[str, Any], ratio: float) -> None:
+def test_what_a_speedup_gains(
+    measure: str, base: dict[str, Any], without: dict[str, Any], ratio: float
+) -> None:
     assert pruning.ratio(measure, 10, base, without) == ratio
 
 
@@ -214,7 +281,10 @@ def test_a_speedup_stays_that_gains_on_two_families() -> None:
 
 def test_each_speedup_is_tried_on_three_families() -> None:
     for name in SPEEDUPS:
-        assert len({trial.family for trial in pruning.TRIALS if trial.switch == name}) >= pruning.FAMILIES, name
+        assert (
+            len({trial.family for trial in pruning.TRIALS if trial.switch == name})
+            >= pruning.FAMILIES
+        ), name
     assert {trial.family for trial in pruning.TRIALS} <= set(INSTANCES)
 
 
@@ -240,7 +310,9 @@ def test_following_is_no_speedup_of_a_user_and_can_be_left_out() -> None:
 
 def test_the_page_of_pruning_shows_its_stored_run() -> None:
     path = ROOT / "benchmarks" / "results" / "pruning.json"
-    assert (ROOT / "docs" / "pruning.md").read_text() == pruning.page(json.loads(path.read_text()), path)
+    assert (ROOT / "docs" / "pruning.md").read_text() == pruning.page(
+        json.loads(path.read_text()), path
+    )
 
 
 def test_the_picture_of_growth_is_drawn_from_the_run(tmp_path: Path) -> None:

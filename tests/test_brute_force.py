@@ -27,7 +27,10 @@ def read(text: str) -> Trace:
 
 def rectangle(actions: int, views: int = 4) -> Trace:
     """The notched rectangle, clockwise: a turn right and a travel in turn, seen as `views` views in turn."""
-    return Trace.from_steps([f"v{i % views}" for i in range(actions + 1)], [LETTERS["RT"[i % 2]] for i in range(actions)])
+    return Trace.from_steps(
+        [f"v{i % views}" for i in range(actions + 1)],
+        [LETTERS["RT"[i % 2]] for i in range(actions)],
+    )
 
 
 PATHS_FIRST = ("paths", "places", "dstates")
@@ -104,7 +107,9 @@ def test_next_place_makes_the_map_unique(name: str) -> None:
         (P2.replace(boundary="defeasible", prefer=(*PATHS_FIRST, "excuses")), (4, 2, 2), (4, 2, 2)),
     ],
 )
-def test_notched_rectangle(theory: Theory, at_four: tuple[int, ...], at_six: tuple[int, ...] | None) -> None:
+def test_notched_rectangle(
+    theory: Theory, at_four: tuple[int, ...], at_six: tuple[int, ...] | None
+) -> None:
     assert triple(rectangle(4), theory) == (*at_four, 1)
     if at_six is not None:
         assert triple(rectangle(6), theory) == (*at_six, 1)
@@ -115,20 +120,29 @@ def test_stars_separate_what_views_do_not() -> None:
     stars = [(1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 1, 0), (1, 1, 0, 0)]
     trace = Trace.from_steps("aaaaa", ["travel", "around", "travel", "right"], stars=stars)
     assert triple(trace, Theory(star="none")) == (5, 2, 1, 1)
-    assert triple(trace, Theory(star="pattern")) == triple(trace, Theory(star="frame")) == (5, 3, 1, 1)
+    assert (
+        triple(trace, Theory(star="pattern")) == triple(trace, Theory(star="frame")) == (5, 3, 1, 1)
+    )
 
 
 def test_frames_know_headings() -> None:
     """After a turn right the opening ahead is on the left: the same pattern, and not to be seen from another heading."""
     ahead, left, back, right = (1, 0, 0, 0), (0, 0, 0, 1), (0, 0, 1, 0), (0, 1, 0, 0)
-    for seen, pattern, frame in (((ahead, left), 1, 2), ((ahead, ahead), 1, 0), ((ahead, right), 1, 0), ((ahead, back), 1, 0)):
+    for seen, pattern, frame in (
+        ((ahead, left), 1, 2),
+        ((ahead, ahead), 1, 0),
+        ((ahead, right), 1, 0),
+        ((ahead, back), 1, 0),
+    ):
         trace = Trace.from_steps("aa", ["right"], stars=seen)
         for star, expected in (("pattern", pattern), ("frame", frame)):
             counts, _ = minimal_maps(trace, Theory(star=star))
             assert (counts.dstates if counts else 0) == expected
 
 
-@pytest.mark.parametrize("theory", [P1, P2, P2.replace(all_on_paths=True), P2.replace(boundary="defeasible")])
+@pytest.mark.parametrize(
+    "theory", [P1, P2, P2.replace(all_on_paths=True), P2.replace(boundary="defeasible")]
+)
 def test_every_map_is_listed_once(theory: Theory) -> None:
     for text, *_ in TABLE.values():
         keys = [found for found, _ in consistent_maps(read(text), theory)]
@@ -136,6 +150,11 @@ def test_every_map_is_listed_once(theory: Theory) -> None:
 
 
 def test_key_numbers_by_first_visit() -> None:
-    dstates = (DState(0, "b", 5, 8, -1), DState(1, "a", 9, 8, -1), DState(2, "c", 5, None, None), DState(3, "d", 9, 8, 1))
+    dstates = (
+        DState(0, "b", 5, 8, -1),
+        DState(1, "a", 9, 8, -1),
+        DState(2, "c", 5, None, None),
+        DState(3, "d", 9, 8, 1),
+    )
     ssh_map = SSHMap((1, 0, 2, 3), dstates, (), (5, 9), (MapPath(8, (5, 9)),))
     assert key(ssh_map) == ((0, 1, 2, 3), (0, 1, 1, 0), ((0, 1), (0, 1), None, (0, -1)))

@@ -163,14 +163,40 @@ RIGHT: dict[str, set[str]] = {
 }
 # The package makes these values: nobody needs their constructors, which take what they are given. Their methods are swept.
 MADE_BY_THE_PACKAGE = {
-    *("Solution", "Status", "Cost", "Bound", "Certificate", "Level", "Progress", "Backbone", "SSHMap", "DState", "Path", "Pose", "Fit"),
-    *("Comparison", "Difference", "Listing", "Page", "Evaluation", "MapEvaluation", "VisitsEvaluation", "Rung", "Route", "Move", "Belief"),
+    *(
+        "Solution",
+        "Status",
+        "Cost",
+        "Bound",
+        "Certificate",
+        "Level",
+        "Progress",
+        "Backbone",
+        "SSHMap",
+        "DState",
+        "Path",
+        "Pose",
+        "Fit",
+    ),
+    *(
+        "Comparison",
+        "Difference",
+        "Listing",
+        "Page",
+        "Evaluation",
+        "MapEvaluation",
+        "VisitsEvaluation",
+        "Rung",
+        "Route",
+        "Move",
+        "Belief",
+    ),
     *("Experiment", "Exploration"),
 }
 # Images are checked by scikit-learn, whose errors are ValueErrors and TypeErrors by convention.
-OF_SCIKIT_LEARN = {f"{name}.X" for name in ("BootstrapLearner.predict", "BootstrapLearner.score")} | {
-    f"ViewClusterer.{name}.X" for name in ("fit", "predict", "score")
-}
+OF_SCIKIT_LEARN = {
+    f"{name}.X" for name in ("BootstrapLearner.predict", "BootstrapLearner.score")
+} | {f"ViewClusterer.{name}.X" for name in ("fit", "predict", "score")}
 
 
 class Ring:
@@ -196,7 +222,10 @@ def known() -> dict[str, Any]:
         ["travel", "travel", "around", "travel"],
         displacements=[(5, 0, 0), (5, 0, 0), (0, 0, 3.14), (5, 0, 0)],
     )
-    told = [replace(s, truth={"dstate": i, "place": i, "pose": [0.0, float(i), 0.0]}) for i, s in enumerate(trace.steps)]
+    told = [
+        replace(s, truth={"dstate": i, "place": i, "pose": [0.0, float(i), 0.0]})
+        for i, s in enumerate(trace.steps)
+    ]
     trace = replace(trace, steps=tuple(told))
     solution = solve(trace)
     world = World.named("notched-rectangle")
@@ -210,8 +239,14 @@ def known() -> dict[str, Any]:
         "world": world,
         "drive": drive,
         "images": images,
-        "plan": Plan("plan", (Room("a", "room", (0.0, 0.0)), Room("b", "room", (5.0, 0.0))), (Door((0, 1), (2.5, 0.0)),)),
-        "learner": BootstrapLearner(Theory.causal(), ViewClusterer(3, n_init=1, random_state=0)).fit(drive),
+        "plan": Plan(
+            "plan",
+            (Room("a", "room", (0.0, 0.0)), Room("b", "room", (5.0, 0.0))),
+            (Door((0, 1), (2.5, 0.0)),),
+        ),
+        "learner": BootstrapLearner(
+            Theory.causal(), ViewClusterer(3, n_init=1, random_state=0)
+        ).fit(drive),
         "clusterer": ViewClusterer(3, random_state=0).fit(images),
         "localiser": Localiser(solution.maps[0]),
         "search": ended(Search(trace)),
@@ -399,14 +434,24 @@ def calls() -> Iterator[tuple[str, Any]]:
             home = next((c for c in found.__mro__ if name in c.__dict__), object)
             ours = home.__module__.partition(".")[0] in ("ssh_abduction", "perception", "simulator")
             held = inspect.getattr_static(found, name)
-            if ours and not name.startswith("_") and (isinstance(held, staticmethod | classmethod) or inspect.isfunction(held)):
+            if (
+                ours
+                and not name.startswith("_")
+                and (isinstance(held, staticmethod | classmethod) or inspect.isfunction(held))
+            ):
                 yield f"{found.__name__}.{name}", getattr(found, name)
 
 
 def parameters(function: Any) -> list[inspect.Parameter]:
     found = inspect.signature(function).parameters.values()
     anything = [p for p in found if p.name in ANYTHING and p.default is None]
-    return [p for p in found if p.name != "self" and p not in anything and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
+    return [
+        p
+        for p in found
+        if p.name != "self"
+        and p not in anything
+        and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+    ]
 
 
 def do(call: str, function: Any, arguments: dict[str, Any]) -> None:
@@ -442,8 +487,14 @@ def test_wrong_arguments_are_refused_by_errors_of_the_package(call: str, functio
     right = {p.name: good(call, p) for p in parameters(function)}
     for parameter in parameters(function):
         key = f"{call}.{parameter.name}"
-        allowed = RIGHT.get(key, RIGHT_BY_NAME.get(parameter.name, set())) | ({"None"} if parameter.default is None else set())
-        allowed |= {"True"} if isinstance(parameter.default, bool) or "bool" in str(parameter.annotation) else set()
+        allowed = RIGHT.get(key, RIGHT_BY_NAME.get(parameter.name, set())) | (
+            {"None"} if parameter.default is None else set()
+        )
+        allowed |= (
+            {"True"}
+            if isinstance(parameter.default, bool) or "bool" in str(parameter.annotation)
+            else set()
+        )
         allowed |= {"3.5"} if call == "Odometry" and parameter.name != "extra" else set()
         for name, make in WRONG.items():
             try:

@@ -38,7 +38,11 @@ def test_a_solution_shows_the_first_map_and_what_all_share() -> None:
     assert "optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps" in text
     assert solution.summary in text
     assert len(list(tree.iter(f"{SVG}svg"))) == 1
-    assert rows(tree)[:3] == [["map", "dstates", "places", "paths"], ["1", "19", "10", "4"], ["2", "19", "10", "4"]]
+    assert rows(tree)[:3] == [
+        ["map", "dstates", "places", "paths"],
+        ["1", "19", "10", "4"],
+        ["2", "19", "10", "4"],
+    ]
     assert len(solution._repr_html_()) < 60_000
 
 
@@ -68,13 +72,25 @@ def test_a_trace_shows_its_first_steps() -> None:
 @pytest.mark.parametrize(
     ("trace", "choices", "said", "drawn"),
     [
-        (Trace.from_steps("abcd", ["travel", "around", "around"]), {}, "unsatisfiable: no map of 4 steps satisfies the axioms", 0),
-        (Trace.from_steps("abcd", ["travel", "around", "around"]), {"limit": 1e-9}, "unknown (time limit): no map of 4 steps yet", 0),
+        (
+            Trace.from_steps("abcd", ["travel", "around", "around"]),
+            {},
+            "unsatisfiable: no map of 4 steps satisfies the axioms",
+            0,
+        ),
+        (
+            Trace.from_steps("abcd", ["travel", "around", "around"]),
+            {"limit": 1e-9},
+            "unknown (time limit): no map of 4 steps yet",
+            0,
+        ),
         (ACES, {"limit": 1e-9}, "feasible (time limit): 23 dstates", 1),
         (rectangle(20), {"theory": Theory.causal().replace(misread=1.5)}, "optimal: 4 dstates", 1),
     ],
 )
-def test_every_kind_of_answer_is_shown(trace: Trace, choices: dict[str, Any], said: str, drawn: int) -> None:
+def test_every_kind_of_answer_is_shown(
+    trace: Trace, choices: dict[str, Any], said: str, drawn: int
+) -> None:
     solution = solve(trace, **choices)
     tree, text = shown(solution)
     assert text.startswith(said)
@@ -91,20 +107,34 @@ def test_an_unknown_answer_shows_the_best_map_of_the_first_steps() -> None:
 
 def test_to_show_a_solution_takes_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     solution = solve(ACES, max_maps=2)
-    monkeypatch.setattr("ssh_abduction.solver.backbone.prove_backbone", lambda *_: pytest.fail("it searched"))
+    monkeypatch.setattr(
+        "ssh_abduction.solver.backbone.prove_backbone", lambda *_: pytest.fail("it searched")
+    )
     assert "at least 2 minimal maps" in shown(solution)[1]
 
 
 def test_what_is_said_of_faults_and_of_displacements() -> None:
     seen = [f"v{t % 4}" if t != 9 else "v0" for t in range(25)]
     trace = Trace.from_steps(seen, ["right", "travel"] * 12)
-    assert "the view at step 9 is misread: v0, expected v1" in shown(solve(trace, Theory.causal().replace(misread=1.5)))[1]
-    square = Trace.from_steps("cwcwcwcwc", ["travel", "left"] * 4, displacements=[(10, 0, 0), (0, 0, 1.5708)] * 4)
-    assert re.search(r"chi-square \d+\.\d for \d+ degrees of freedom", shown(solve(square, Theory.causal())[0])[1])
+    assert (
+        "the view at step 9 is misread: v0, expected v1"
+        in shown(solve(trace, Theory.causal().replace(misread=1.5)))[1]
+    )
+    square = Trace.from_steps(
+        "cwcwcwcwc", ["travel", "left"] * 4, displacements=[(10, 0, 0), (0, 0, 1.5708)] * 4
+    )
+    assert re.search(
+        r"chi-square \d+\.\d for \d+ degrees of freedom",
+        shown(solve(square, Theory.causal())[0])[1],
+    )
 
 
 def test_nothing_that_a_trace_says_becomes_html() -> None:
-    trace = Trace.from_steps([SCRIPT, "b", SCRIPT], [{"name": SCRIPT, "kind": "travel"}, "around"], name=f"{SCRIPT}\x1b[2J")
+    trace = Trace.from_steps(
+        [SCRIPT, "b", SCRIPT],
+        [{"name": SCRIPT, "kind": "travel"}, "around"],
+        name=f"{SCRIPT}\x1b[2J",
+    )
     solution = solve(trace)
     for value in (trace, solution, solution[0]):
         html = value._repr_html_()
@@ -117,7 +147,9 @@ def test_nothing_that_a_trace_says_becomes_html() -> None:
 
 def test_a_large_map_is_not_drawn_and_its_table_is_cut() -> None:
     dstates = tuple(DState(i, f"v{i}") for i in range(DRAWN + 1))
-    large = SSHMap(tuple(range(DRAWN + 1)), dstates, tuple((i, "travel", i + 1) for i in range(DRAWN)))
+    large = SSHMap(
+        tuple(range(DRAWN + 1)), dstates, tuple((i, "travel", i + 1) for i in range(DRAWN))
+    )
     tree, text = shown(large)
     assert not list(tree.iter(f"{SVG}svg"))
     assert f"not drawn, as it has more than {DRAWN} dstates" in text

@@ -35,7 +35,13 @@ def links(trace: Trace, labels: tuple[int, ...]) -> tuple[tuple[int, str, int], 
     return tuple(dict.fromkeys(zip(labels, names, labels[1:], strict=False)))
 
 
-def chart(trace: Trace, labels: str, states: str, orders: str = "", excused: tuple[tuple[int, int], ...] = ()) -> SSHMap:
+def chart(
+    trace: Trace,
+    labels: str,
+    states: str,
+    orders: str = "",
+    excused: tuple[tuple[int, int], ...] = (),
+) -> SSHMap:
     """A map from its labels; a word `place[:path±][^heading]` a dstate; and a word a path with its places, `-` if it lists none."""
     steps = tuple(map(int, labels.split()))
     dstates = []
@@ -53,7 +59,10 @@ def chart(trace: Trace, labels: str, states: str, orders: str = "", excused: tup
             )
         )
     places = tuple(range(1 + max((s.place for s in dstates if s.place is not None), default=-1)))
-    paths = tuple(MapPath(i, () if word == "-" else tuple(map(int, word))) for i, word in enumerate(orders.split()))
+    paths = tuple(
+        MapPath(i, () if word == "-" else tuple(map(int, word)))
+        for i, word in enumerate(orders.split())
+    )
     return SSHMap(steps, tuple(dstates), links(trace, steps), places, paths, excused)
 
 
@@ -83,48 +92,99 @@ NOTCHED = seen("v0 R v1 T v2 R v3 T " * 2 + "v0")
 NOTCHED_TWICE = seen("v0 R v1 T v2 R v3 T " * 4 + "v0")
 RECTANGLE = ("0:0+ 0:1+ 1:1+ 1:2+ 2:2+ 2:3+ 3:3+ 3:0+", "30 01 12 23")
 CORRIDOR = seen("a T b A c T d A a")
-STARRED = seen("a T b A c T d A a", [(1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0)])
+STARRED = seen(
+    "a T b A c T d A a", [(1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 0, 0, 0)]
+)
 HALF = seen("v0 R v1 T v2 R v3 T v0")
 LENS = ("0 1 2 3 4", "0 0:0+ 1:0+ 1:1+ 0:1+", "01 10")
 FORK = seen("a T b A c T d")
 
 CORRECT = {
     "notched rectangle, one circuit": case(TOPOLOGICAL, NOTCHED, "0 1 2 3 4 5 6 7 0", *RECTANGLE),
-    "notched rectangle, two circuits": case(TOPOLOGICAL, NOTCHED_TWICE, "0 1 2 3 4 5 6 7 0 1 2 3 4 5 6 7 0", *RECTANGLE),
-    "notched rectangle, next place": case(TOPOLOGICAL.replace(next_place=True), NOTCHED, "0 1 2 3 4 5 6 7 0", *RECTANGLE),
-    "notched rectangle, all on paths": case(TOPOLOGICAL.replace(all_on_paths=True), NOTCHED, "0 1 2 3 4 5 6 7 0", *RECTANGLE),
+    "notched rectangle, two circuits": case(
+        TOPOLOGICAL, NOTCHED_TWICE, "0 1 2 3 4 5 6 7 0 1 2 3 4 5 6 7 0", *RECTANGLE
+    ),
+    "notched rectangle, next place": case(
+        TOPOLOGICAL.replace(next_place=True), NOTCHED, "0 1 2 3 4 5 6 7 0", *RECTANGLE
+    ),
+    "notched rectangle, all on paths": case(
+        TOPOLOGICAL.replace(all_on_paths=True), NOTCHED, "0 1 2 3 4 5 6 7 0", *RECTANGLE
+    ),
     "notched rectangle, never closed": case(
-        TOPOLOGICAL, NOTCHED, "0 1 2 3 4 5 6 7 8", "0 0:0+ 1:0+ 1:1+ 2:1+ 2:2+ 3:2+ 3:3+ 4:3+", "01 12 23 34"
+        TOPOLOGICAL,
+        NOTCHED,
+        "0 1 2 3 4 5 6 7 8",
+        "0 0:0+ 1:0+ 1:1+ 2:1+ 2:2+ 3:2+ 3:3+ 4:3+",
+        "01 12 23 34",
     ),
     "notched rectangle, fourth side taken for the first": case(
-        TOPOLOGICAL, NOTCHED, "0 1 2 3 4 5 6 7 8", "0 0:0+ 1:0+ 1:1+ 2:1+ 2:2+ 3:2+ 3:0+ 4:0+", "3401 12 23"
+        TOPOLOGICAL,
+        NOTCHED,
+        "0 1 2 3 4 5 6 7 8",
+        "0 0:0+ 1:0+ 1:1+ 2:1+ 2:2+ 3:2+ 3:0+ 4:0+",
+        "3401 12 23",
     ),
-    "notched rectangle without sides": case(NO_SIDES, HALF, "0 1 2 3 0", "0:0+ 0:1+ 1:1+ 1:0+", "10 01"),
+    "notched rectangle without sides": case(
+        NO_SIDES, HALF, "0 1 2 3 0", "0:0+ 0:1+ 1:1+ 1:0+", "10 01"
+    ),
     "corridor out and back": case(TOPOLOGICAL, CORRIDOR, "0 1 2 3 0", "0:0+ 1:0+ 1:0- 0:0-", "01"),
-    "corridor with frames": case(TOPOLOGICAL, STARRED, "0 1 2 3 0", "0:0+^0 1:0+^0 1:0-^2 0:0-^2", "01"),
-    "corridor with patterns": case(TOPOLOGICAL.replace(star="pattern"), STARRED, "0 1 2 3 0", "0:0+ 1:0+ 1:0- 0:0-", "01"),
-    "corridor, stars not looked at": case(TOPOLOGICAL.replace(star="none"), STARRED, "0 1 2 3 0", "0:0+ 1:0+ 1:0- 0:0-", "01"),
+    "corridor with frames": case(
+        TOPOLOGICAL, STARRED, "0 1 2 3 0", "0:0+^0 1:0+^0 1:0-^2 0:0-^2", "01"
+    ),
+    "corridor with patterns": case(
+        TOPOLOGICAL.replace(star="pattern"), STARRED, "0 1 2 3 0", "0:0+ 1:0+ 1:0- 0:0-", "01"
+    ),
+    "corridor, stars not looked at": case(
+        TOPOLOGICAL.replace(star="none"), STARRED, "0 1 2 3 0", "0:0+ 1:0+ 1:0- 0:0-", "01"
+    ),
     "causal": case(Theory.causal(), CORRIDOR, "0 1 2 3 0", ". . . ."),
     "causal, aliased": case(Theory.causal(), HALF, "0 1 2 3 0", ". . . ."),
     "spin": case(TOPOLOGICAL, seen("a R b R c R d R a"), "0 1 2 3 0", "0 0 0 0"),
-    "spin with frame": case(TOPOLOGICAL, seen("a R b R c R d R a", [ALL_OPEN] * 5), "0 1 2 3 0", "0^0 0^1 0^2 0^3"),
-    "fork, partial": case(TOPOLOGICAL.replace(path_order="partial"), FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"),
-    "fork, partial, other list": case(TOPOLOGICAL.replace(path_order="partial"), FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "201"),
-    "fork, partial, nothing between": case(
-        TOPOLOGICAL.replace(path_order="partial", next_place=True), FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"
+    "spin with frame": case(
+        TOPOLOGICAL, seen("a R b R c R d R a", [ALL_OPEN] * 5), "0 1 2 3 0", "0^0 0^1 0^2 0^3"
     ),
-    "lens, excused": Case(TOPOLOGICAL.replace(boundary="defeasible"), HALF, chart(HALF, *LENS, excused=((0, 1),))),
-    "lens, excused the other way round": Case(TOPOLOGICAL.replace(boundary="defeasible"), HALF, chart(HALF, *LENS, excused=((1, 0),))),
+    "fork, partial": case(
+        TOPOLOGICAL.replace(path_order="partial"), FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"
+    ),
+    "fork, partial, other list": case(
+        TOPOLOGICAL.replace(path_order="partial"), FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "201"
+    ),
+    "fork, partial, nothing between": case(
+        TOPOLOGICAL.replace(path_order="partial", next_place=True),
+        FORK,
+        "0 1 2 3",
+        "0:0+ 1:0+ 1:0- 2:0-",
+        "021",
+    ),
+    "lens, excused": Case(
+        TOPOLOGICAL.replace(boundary="defeasible"), HALF, chart(HALF, *LENS, excused=((0, 1),))
+    ),
+    "lens, excused the other way round": Case(
+        TOPOLOGICAL.replace(boundary="defeasible"), HALF, chart(HALF, *LENS, excused=((1, 0),))
+    ),
     "one step": case(TOPOLOGICAL, seen("a"), "0", "0"),
 }
 
-SPUN = replace(seen("a R a"), steps=tuple(replace(s, displacement=(0, 0, -1.5) if t else None) for t, s in enumerate(seen("a R a"))))
+SPUN = replace(
+    seen("a R a"),
+    steps=tuple(
+        replace(s, displacement=(0, 0, -1.5) if t else None) for t, s in enumerate(seen("a R a"))
+    ),
+)
 BROKEN = {
     "one_pose": case(TOPOLOGICAL, SPUN, "0 0", "0"),
-    "one_star": case(Theory.causal().replace(star="alike"), seen("a R a", [(0, 90), (0, 120)]), "0 0", "."),
+    "one_star": case(
+        Theory.causal().replace(star="alike"), seen("a R a", [(0, 90), (0, 120)]), "0 0", "."
+    ),
     "asserted": case(TOPOLOGICAL.replace(different=[(0, 2)]), seen("a R a R a"), "0 0 0", "0"),
     # After turning back, past the place before.
-    "planar": case(TOPOLOGICAL.replace(planar=True), seen("a T b T c A d T e"), "0 1 2 3 4", "0:0+ 1:0+ 2:0+ 2:0- 0:0-", "012"),
+    "planar": case(
+        TOPOLOGICAL.replace(planar=True),
+        seen("a T b T c A d T e"),
+        "0 1 2 3 4",
+        "0:0+ 1:0+ 2:0+ 2:0- 0:0-",
+        "012",
+    ),
     "functional_view": case(TOPOLOGICAL, seen("a R b"), "0 0", "0"),
     "deterministic": case(TOPOLOGICAL, seen("a R b R a R c"), "0 1 0 2", "0 0 0"),
     "one_place": case(TOPOLOGICAL, seen("a"), "0", "."),
@@ -133,14 +193,31 @@ BROKEN = {
     "travel_follows_path": case(TOPOLOGICAL, seen("a T b"), "0 1", "0 1:0+", "1"),
     "one_course": case(TOPOLOGICAL, seen("a"), "0", "0:0?", "-"),
     "turn_around_reverses": case(TOPOLOGICAL, seen("a T b A c"), "0 1 2", "0:0+ 1:0+ 1", "01"),
-    "turn_changes_path": case(NO_SIDES, seen("a T b R c T d"), "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"),
-    "one_dstate_per_course": case(TOPOLOGICAL, seen("a T b A c A d"), "0 1 2 3", "0:0+ 1:0+ 1:0- 1:0+", "01"),
+    "turn_changes_path": case(
+        NO_SIDES, seen("a T b R c T d"), "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"
+    ),
+    "one_dstate_per_course": case(
+        TOPOLOGICAL, seen("a T b A c A d"), "0 1 2 3", "0:0+ 1:0+ 1:0- 1:0+", "01"
+    ),
     "on_path": case(NO_SIDES, seen("a T b R c T d"), "0 1 2 3", "0:0+ 1:0+ 1:1+ 2:1+", "012 12"),
     "travel_orders": case(TOPOLOGICAL, seen("a T b"), "0 1", "0:0+ 1:0+", "10"),
-    "order_asymmetric": case(TOPOLOGICAL, seen("a T b T a"), "0 1 0", "0:0+ 1:0+", "01", also="travel_orders"),
-    "order_transitive": case(TOPOLOGICAL, seen("a T b T c T a"), "0 1 2 0", "0:0+ 1:0+ 2:0+", "012", also="travel_orders order_asymmetric"),
-    "path_order_total": case(TOPOLOGICAL, FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "01", also="on_path"),
-    "next_place": case(TOPOLOGICAL.replace(next_place=True), FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"),
+    "order_asymmetric": case(
+        TOPOLOGICAL, seen("a T b T a"), "0 1 0", "0:0+ 1:0+", "01", also="travel_orders"
+    ),
+    "order_transitive": case(
+        TOPOLOGICAL,
+        seen("a T b T c T a"),
+        "0 1 2 0",
+        "0:0+ 1:0+ 2:0+",
+        "012",
+        also="travel_orders order_asymmetric",
+    ),
+    "path_order_total": case(
+        TOPOLOGICAL, FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "01", also="on_path"
+    ),
+    "next_place": case(
+        TOPOLOGICAL.replace(next_place=True), FORK, "0 1 2 3", "0:0+ 1:0+ 1:0- 2:0-", "021"
+    ),
     "all_on_paths": case(TOPOLOGICAL.replace(all_on_paths=True), seen("a"), "0", "0"),
     "course_needs_travel": case(TOPOLOGICAL, seen("a"), "0", "0:0+", "0"),
     "branch_side": case(ONE_SIDE, HALF, *LENS, also="side_of_branch path_between_sides"),
@@ -164,14 +241,25 @@ BROKEN = {
         "013 12 32",
         also="branch_side side_of_branch",
     ),
-    "star_pattern": case(TOPOLOGICAL.replace(star="pattern"), seen("a R b", [(1, 0, 0, 0), (1, 1, 0, 0)]), "0 1", "0 0"),
+    "star_pattern": case(
+        TOPOLOGICAL.replace(star="pattern"),
+        seen("a R b", [(1, 0, 0, 0), (1, 1, 0, 0)]),
+        "0 1",
+        "0 0",
+    ),
     "star_frame": case(TOPOLOGICAL, seen("a R b", [(1, 0, 0, 0), (1, 0, 0, 0)]), "0 1", "0^0 0^1"),
     "one_heading": case(TOPOLOGICAL, seen("a", [ALL_OPEN]), "0", "0"),
     "turn_rotates": case(TOPOLOGICAL, seen("a R b", [ALL_OPEN] * 2), "0 1", "0^0 0^2"),
-    "one_dstate_per_heading": case(TOPOLOGICAL, seen("a R b R c R d R e", [ALL_OPEN] * 5), "0 1 2 3 4", "0^0 0^1 0^2 0^3 0^0"),
+    "one_dstate_per_heading": case(
+        TOPOLOGICAL, seen("a R b R c R d R e", [ALL_OPEN] * 5), "0 1 2 3 4", "0^0 0^1 0^2 0^3 0^0"
+    ),
     # Two right turns, but the way back is taken for another path.
     "path_goes_straight": case(
-        TOPOLOGICAL, seen("a T b R c R d T e", [ALL_OPEN] * 5), "0 1 2 3 4", "0:0+^0 1:0+^0 1^1 1:1+^2 2:1+^0", "01 12"
+        TOPOLOGICAL,
+        seen("a T b R c R d T e", [ALL_OPEN] * 5),
+        "0 1 2 3 4",
+        "0:0+^0 1:0+^0 1^1 1:1+^2 2:1+^0",
+        "01 12",
     ),
     # Round a triangle: place 0 has a gateway less when it is seen again.
     "gateway_frame": case(
@@ -183,7 +271,13 @@ BROKEN = {
     ),
     "gateway_heading": case(GATEWAYS, seen("a", [(0, 120)]), "0", "0"),
     "gateway_turn": case(GATEWAYS, seen("a L b", [(0, 120), (0, 240)]), "0 1", "0^0 0^120"),
-    "gateway_dstate": case(GATEWAYS, seen("a R b L c", [(0, 120), (0, 240), (0, 120)]), "0 1 2", "0^0 0^120 0^0", also="gateway_frame"),
+    "gateway_dstate": case(
+        GATEWAYS,
+        seen("a R b L c", [(0, 120), (0, 240), (0, 120)]),
+        "0 1 2",
+        "0^0 0^120 0^0",
+        also="gateway_frame",
+    ),
     "gateway_path": case(
         GATEWAYS,
         seen("a T b R c R d T e", [(0,), (70, 180), (0, 110), (0, 250), (180,)]),
@@ -192,9 +286,17 @@ BROKEN = {
         "01 12",
         also="gateway_frame",
     ),
-    "gateway_end": case(GATEWAYS, seen("a T b T c", [(0,), (180,), (180,)]), "0 1 2", "0:0+^0 1:0+^0 2:0+^0", "012"),
+    "gateway_end": case(
+        GATEWAYS, seen("a T b T c", [(0,), (180,), (180,)]), "0 1 2", "0:0+^0 1:0+^0 2:0+^0", "012"
+    ),
 }
-HIDDEN = ("branch_side", "symmetric_sides", "side_of_branch", "order_asymmetric", "order_transitive")
+HIDDEN = (
+    "branch_side",
+    "symmetric_sides",
+    "side_of_branch",
+    "order_asymmetric",
+    "order_transitive",
+)
 AXIOM_NAMES = [a.name for a in encodings.axioms()]
 
 
@@ -206,7 +308,12 @@ def test_correct_maps_satisfy_every_axiom(name: str) -> None:
 def test_topological_is_the_default_theory() -> None:
     closed = CORRECT["notched rectangle, one circuit"]
     assert check(closed.trace, closed.map) == ()
-    assert names(check(HALF, chart(HALF, *LENS))) == {"branch_side", "symmetric_sides", "side_of_branch", "path_between_sides"}
+    assert names(check(HALF, chart(HALF, *LENS))) == {
+        "branch_side",
+        "symmetric_sides",
+        "side_of_branch",
+        "path_between_sides",
+    }
 
 
 def test_every_axiom_has_a_check() -> None:
@@ -258,13 +365,21 @@ def test_partial_order_is_the_least_one(order: str, listed: str) -> None:
     """A turn at place 2 leads onto path 0 in direction -. Place 0 is ahead there only if the list, and not a travel, decides."""
     trace = seen("a T b A c T d R e T f A g T h T i A j T e T f A g T h R d")
     states = "0:0+ 1:0+ 1:0- 2:0- 2:1+ 3:1+ 3:1- 2:1- 0:1- 0:1+"
-    forked = case(ONE_SIDE.replace(path_order=order), trace, "0 1 2 3 4 5 6 7 8 9 4 5 6 7 3", states, f"{listed} 023")
+    forked = case(
+        ONE_SIDE.replace(path_order=order),
+        trace,
+        "0 1 2 3 4 5 6 7 8 9 4 5 6 7 3",
+        states,
+        f"{listed} 023",
+    )
     broken = {"branch_side", "side_of_branch", "path_between_sides"}
     assert names(forked.check()) == (broken if (order, listed) == ("total", "021") else set())
 
 
 def test_an_order_that_goes_against_a_travel_is_flagged_in_a_partial_order_too() -> None:
-    assert names(BROKEN["travel_orders"].check(TOPOLOGICAL.replace(path_order="partial"))) == {"travel_orders"}
+    assert names(BROKEN["travel_orders"].check(TOPOLOGICAL.replace(path_order="partial"))) == {
+        "travel_orders"
+    }
 
 
 def test_only_defeasible_sides_are_excused() -> None:
@@ -285,7 +400,9 @@ def relabel(m: SSHMap, i: int, j: int) -> SSHMap:
 
 
 def change(m: SSHMap, dstate: int, **fields: object) -> SSHMap:
-    return replace(m, dstates=tuple(replace(s, **fields) if s.id == dstate else s for s in m.dstates))
+    return replace(
+        m, dstates=tuple(replace(s, **fields) if s.id == dstate else s for s in m.dstates)
+    )
 
 
 ONCE = CORRECT["notched rectangle, one circuit"]
@@ -296,34 +413,82 @@ MUTATIONS = {
     "labels of two views swapped": (ONCE, relabel(ONCE.map, 2, 3), COHERENCE),
     "a label too few": (ONCE, replace(ONCE.map, labels=ONCE.map.labels[:-1]), COHERENCE),
     "a label too many": (ONCE, replace(ONCE.map, labels=(*ONCE.map.labels, 0)), COHERENCE),
-    "a label out of range": (ONCE, replace(ONCE.map, labels=(*ONCE.map.labels[:-1], 99)), COHERENCE),
+    "a label out of range": (
+        ONCE,
+        replace(ONCE.map, labels=(*ONCE.map.labels[:-1], 99)),
+        COHERENCE,
+    ),
     "no label": (ONCE, replace(ONCE.map, labels=()), COHERENCE),
     "a link dropped": (ONCE, replace(ONCE.map, links=ONCE.map.links[1:]), COHERENCE),
-    "a link twice": (ONCE, replace(ONCE.map, links=(*ONCE.map.links, ONCE.map.links[0])), COHERENCE),
-    "a link made up": (ONCE, replace(ONCE.map, links=(*ONCE.map.links, (0, "travel", 1))), COHERENCE),
-    "an order turned": (ONCE, replace(ONCE.map, paths=(MapPath(0, (0, 3)), *ONCE.map.paths[1:])), "travel_orders"),
-    "an order lists a place twice": (ONCE, replace(ONCE.map, paths=(MapPath(0, (3, 0, 3)), *ONCE.map.paths[1:])), COHERENCE),
-    "an order lists no place": (ONCE, replace(ONCE.map, paths=(MapPath(0, ()), *ONCE.map.paths[1:])), "on_path"),
-    "an order lists None": (ONCE, replace(ONCE.map, paths=(MapPath(0, (3, None, 0)), *ONCE.map.paths[1:])), COHERENCE),
-    "an order lists an unknown place": (ONCE, replace(ONCE.map, paths=(MapPath(0, (3, 0, 9)), *ONCE.map.paths[1:])), COHERENCE),
+    "a link twice": (
+        ONCE,
+        replace(ONCE.map, links=(*ONCE.map.links, ONCE.map.links[0])),
+        COHERENCE,
+    ),
+    "a link made up": (
+        ONCE,
+        replace(ONCE.map, links=(*ONCE.map.links, (0, "travel", 1))),
+        COHERENCE,
+    ),
+    "an order turned": (
+        ONCE,
+        replace(ONCE.map, paths=(MapPath(0, (0, 3)), *ONCE.map.paths[1:])),
+        "travel_orders",
+    ),
+    "an order lists a place twice": (
+        ONCE,
+        replace(ONCE.map, paths=(MapPath(0, (3, 0, 3)), *ONCE.map.paths[1:])),
+        COHERENCE,
+    ),
+    "an order lists no place": (
+        ONCE,
+        replace(ONCE.map, paths=(MapPath(0, ()), *ONCE.map.paths[1:])),
+        "on_path",
+    ),
+    "an order lists None": (
+        ONCE,
+        replace(ONCE.map, paths=(MapPath(0, (3, None, 0)), *ONCE.map.paths[1:])),
+        COHERENCE,
+    ),
+    "an order lists an unknown place": (
+        ONCE,
+        replace(ONCE.map, paths=(MapPath(0, (3, 0, 9)), *ONCE.map.paths[1:])),
+        COHERENCE,
+    ),
     "places merged": (ONCE, change(change(ONCE.map, 4, place=0), 5, place=0), "path_between_sides"),
     "a place not used": (ONCE, replace(ONCE.map, places=(0, 1, 2, 3, 4)), COHERENCE),
     "a place not listed": (ONCE, replace(ONCE.map, places=(0, 1, 2)), COHERENCE),
     "no place": (ONCE, change(ONCE.map, 4, place=None), "one_place"),
     "a place out of range": (ONCE, change(ONCE.map, 4, place=9), COHERENCE),
-    "a path not used": (ONCE, replace(ONCE.map, paths=(*ONCE.map.paths, MapPath(4, ()))), COHERENCE),
+    "a path not used": (
+        ONCE,
+        replace(ONCE.map, paths=(*ONCE.map.paths, MapPath(4, ()))),
+        COHERENCE,
+    ),
     "a path not listed": (ONCE, replace(ONCE.map, paths=ONCE.map.paths[:-1]), COHERENCE),
-    "a path twice": (ONCE, replace(ONCE.map, paths=(*ONCE.map.paths, ONCE.map.paths[0])), COHERENCE),
+    "a path twice": (
+        ONCE,
+        replace(ONCE.map, paths=(*ONCE.map.paths, ONCE.map.paths[0])),
+        COHERENCE,
+    ),
     "a path out of range": (ONCE, change(ONCE.map, 4, path=9), COHERENCE),
     "a path turned": (ONCE, change(change(ONCE.map, 1, direction=-1), 2, direction=-1), COHERENCE),
     "a direction out of range": (ONCE, change(ONCE.map, 4, direction=2), "one_course"),
-    "a course dropped": (ONCE, change(ONCE.map, 4, path=None, direction=None), "travel_follows_path"),
+    "a course dropped": (
+        ONCE,
+        change(ONCE.map, 4, path=None, direction=None),
+        "travel_follows_path",
+    ),
     "a view changed": (ONCE, change(ONCE.map, 4, view="v1"), COHERENCE),
     "an id out of range": (ONCE, change(ONCE.map, 4, id=99), COHERENCE),
     "an id of None": (ONCE, change(ONCE.map, 4, id=None), COHERENCE),
     "two dstates of one id, two places": (ONCE, change(ONCE.map, 7, id=0), "one_place"),
     "two dstates of one id, two courses": (ONCE, change(ONCE.map, 1, id=0), "one_course"),
-    "a dstate not visited": (ONCE, replace(ONCE.map, dstates=(*ONCE.map.dstates, DState(8, "v0", 0))), COHERENCE),
+    "a dstate not visited": (
+        ONCE,
+        replace(ONCE.map, dstates=(*ONCE.map.dstates, DState(8, "v0", 0))),
+        COHERENCE,
+    ),
     "no dstates": (ONCE, replace(ONCE.map, dstates=()), COHERENCE),
     "excused for nothing": (ONCE, replace(ONCE.map, excused=((0, 1),)), COHERENCE),
     "a heading too many": (ONCE, change(ONCE.map, 4, heading=0), COHERENCE),
@@ -331,15 +496,27 @@ MUTATIONS = {
     "a heading out of range": (FRAMED, change(FRAMED.map, 1, heading=4), "one_heading"),
     "no heading": (FRAMED, change(FRAMED.map, 1, heading=None), "one_heading"),
     "two dstates of one id, two headings": (FRAMED, change(FRAMED.map, 3, id=0), "one_heading"),
-    "headings from another slot": (FRAMED, change(change(FRAMED.map, 0, heading=1), 3, heading=3), COHERENCE),
+    "headings from another slot": (
+        FRAMED,
+        change(change(FRAMED.map, 0, heading=1), 3, heading=3),
+        COHERENCE,
+    ),
     "places numbered otherwise": (
         FRAMED,
-        replace(FRAMED.map, dstates=tuple(replace(s, place=1 - s.place) for s in FRAMED.map.dstates), paths=(MapPath(0, (1, 0)),)),
+        replace(
+            FRAMED.map,
+            dstates=tuple(replace(s, place=1 - s.place) for s in FRAMED.map.dstates),
+            paths=(MapPath(0, (1, 0)),),
+        ),
         COHERENCE,
     ),
     "places at the causal level": (CAUSAL, replace(CAUSAL.map, places=(0,)), COHERENCE),
     "a course at the causal level": (CAUSAL, change(CAUSAL.map, 0, path=0, direction=1), COHERENCE),
-    "no places at the topological level": (CORRECT["corridor out and back"], CAUSAL.map, "one_place"),
+    "no places at the topological level": (
+        CORRECT["corridor out and back"],
+        CAUSAL.map,
+        "one_place",
+    ),
 }
 
 
@@ -350,7 +527,16 @@ def test_a_mutated_map_is_flagged(name: str) -> None:
     assert expected in names(found)
 
 
-@pytest.mark.parametrize("name", ["a link dropped", "a link made up", "a path turned", "places numbered otherwise", "a view changed"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a link dropped",
+        "a link made up",
+        "a path turned",
+        "places numbered otherwise",
+        "a view changed",
+    ],
+)
 def test_what_no_axiom_says_is_left_to_coherence(name: str) -> None:
     original, mutant, _ = MUTATIONS[name]
     bare = original.theory.replace(without=tuple(AXIOM_NAMES))
@@ -384,19 +570,55 @@ def mutants(draw: st.DrawFn) -> tuple[Case, SSHMap]:
     original = draw(st.sampled_from(GROUNDS))
     m = original.map
     for _ in range(draw(st.integers(0, 5))):
-        part = draw(st.sampled_from(["labels", "dstates", "links", "places", "paths", "order", "excused", "field", "field", "label"]))
+        part = draw(
+            st.sampled_from(
+                [
+                    "labels",
+                    "dstates",
+                    "links",
+                    "places",
+                    "paths",
+                    "order",
+                    "excused",
+                    "field",
+                    "field",
+                    "label",
+                ]
+            )
+        )
         if part == "field":
-            m = change(m, draw(st.integers(0, max(len(m.dstates) - 1, 0))), **{draw(FIELDS): draw(NUMBERS)})
+            m = change(
+                m, draw(st.integers(0, max(len(m.dstates) - 1, 0))), **{draw(FIELDS): draw(NUMBERS)}
+            )
         elif part == "label" and m.labels:
             i = draw(st.integers(0, len(m.labels) - 1))
             m = replace(m, labels=(*m.labels[:i], draw(NUMBERS), *m.labels[i + 1 :]))
         elif part == "order" and m.paths:
             i = draw(st.integers(0, len(m.paths) - 1))
-            m = replace(m, paths=(*m.paths[:i], MapPath(draw(NUMBERS), tuple(draw(st.lists(NUMBERS, max_size=4)))), *m.paths[i + 1 :]))
+            m = replace(
+                m,
+                paths=(
+                    *m.paths[:i],
+                    MapPath(draw(NUMBERS), tuple(draw(st.lists(NUMBERS, max_size=4)))),
+                    *m.paths[i + 1 :],
+                ),
+            )
         elif part == "excused":
             m = replace(m, excused=tuple(draw(st.lists(st.tuples(NUMBERS, NUMBERS), max_size=2))))
         elif part not in ("label", "order") and getattr(m, part):
-            m = replace(m, **{part: tuple(draw(st.lists(st.sampled_from(getattr(m, part)), max_size=len(getattr(m, part)) + 1)))})
+            m = replace(
+                m,
+                **{
+                    part: tuple(
+                        draw(
+                            st.lists(
+                                st.sampled_from(getattr(m, part)),
+                                max_size=len(getattr(m, part)) + 1,
+                            )
+                        )
+                    )
+                },
+            )
     return original, m
 
 
@@ -424,18 +646,29 @@ def growths(n: int) -> Iterator[tuple[int, ...]]:
             yield (*head, last)
 
 
-def courses_of(supported: list[bool], edges: list[tuple[int, int, int]]) -> Iterator[tuple[tuple[int, int] | None, ...]]:
+def courses_of(
+    supported: list[bool], edges: list[tuple[int, int, int]]
+) -> Iterator[tuple[tuple[int, int] | None, ...]]:
     """Courses of dstates: along a path where supported, and agreeing along each edge (dstate, dstate, +1 or -1)."""
 
-    def grow(head: tuple[tuple[int, int] | None, ...]) -> Iterator[tuple[tuple[int, int] | None, ...]]:
+    def grow(
+        head: tuple[tuple[int, int] | None, ...],
+    ) -> Iterator[tuple[tuple[int, int] | None, ...]]:
         if len(head) == len(supported):
             yield head
             return
         new = 1 + max((c[0] for c in head if c), default=-1)
-        choices = [(h, d) for h in range(new) for d in (1, -1)] + [(new, 1)] if supported[len(head)] else [None]
+        choices = (
+            [(h, d) for h in range(new) for d in (1, -1)] + [(new, 1)]
+            if supported[len(head)]
+            else [None]
+        )
         for choice in choices:
             here = (*head, choice)
-            if all(max(a, b) >= len(here) or here[b] == (here[a][0], here[a][1] * sign) for a, b, sign in edges):
+            if all(
+                max(a, b) >= len(here) or here[b] == (here[a][0], here[a][1] * sign)
+                for a, b, sign in edges
+            ):
                 yield from grow(here)
 
     return grow(())
@@ -446,12 +679,14 @@ def all_maps(trace: Trace) -> Iterator[list[SSHMap]]:
     kinds = [a.turn or a.kind for a in trace.actions]
     for labels in growths(len(trace)):
         views = [trace.views[labels.index(i)] for i in range(max(labels) + 1)]
-        if [views[i] for i in labels] != list(trace.views) or len({(a, k) for a, k in zip(labels, kinds, strict=False)}) < len(
-            links(trace, labels)
-        ):
+        if [views[i] for i in labels] != list(trace.views) or len(
+            {(a, k) for a, k in zip(labels, kinds, strict=False)}
+        ) < len(links(trace, labels)):
             continue
         moves = set(zip(labels, kinds, labels[1:], strict=False))
-        supported = [any(k == "travel" and i in (a, b) for a, k, b in moves) for i in range(len(views))]
+        supported = [
+            any(k == "travel" and i in (a, b) for a, k, b in moves) for i in range(len(views))
+        ]
         edges = [(a, b, 1) for a, k, b in moves if k == "travel"]
         for places in growths(len(views)):
             if any((places[a] == places[b]) == (k == "travel") for a, k, b in moves):
@@ -461,7 +696,10 @@ def all_maps(trace: Trace) -> Iterator[list[SSHMap]]:
 
 
 def listings(trace, labels, views, places, courses) -> Iterator[SSHMap]:
-    dstates = tuple(DState(i, v, p, *(c or (None, None))) for i, (v, p, c) in enumerate(zip(views, places, courses, strict=True)))
+    dstates = tuple(
+        DState(i, v, p, *(c or (None, None)))
+        for i, (v, p, c) in enumerate(zip(views, places, courses, strict=True))
+    )
     on: dict[int, set[int]] = {}
     for s in dstates:
         if s.path is not None:
@@ -473,12 +711,20 @@ def listings(trace, labels, views, places, courses) -> Iterator[SSHMap]:
 
 @pytest.mark.parametrize(
     ("theory", "numbers"),
-    [(TOPOLOGICAL, [1, 1, 1, 1, 1, 1, 2, 2]), (NO_SIDES.replace(path_order="partial"), [1, 1, 1, 1, 3, 4, 13, 16])],
+    [
+        (TOPOLOGICAL, [1, 1, 1, 1, 1, 1, 2, 2]),
+        (NO_SIDES.replace(path_order="partial"), [1, 1, 1, 1, 3, 4, 13, 16]),
+    ],
     ids=["sides and total order", "neither"],
 )
-def test_the_notched_rectangle_has_as_many_maps_as_the_theory_says(theory: Theory, numbers: list[int]) -> None:
+def test_the_notched_rectangle_has_as_many_maps_as_the_theory_says(
+    theory: Theory, numbers: list[int]
+) -> None:
     counts = [
-        sum(any(not check(NOTCHED.prefix(n + 1), m, theory) for m in maps) for maps in all_maps(NOTCHED.prefix(n + 1)))
+        sum(
+            any(not check(NOTCHED.prefix(n + 1), m, theory) for m in maps)
+            for maps in all_maps(NOTCHED.prefix(n + 1))
+        )
         for n in range(len(numbers))
     ]
     assert counts == numbers

@@ -25,7 +25,9 @@ def answer(trace: str, capsys: pytest.CaptureFixture[str], *words: str) -> dict[
     return found
 
 
-def check(trace: str, data: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
+def check(
+    trace: str, data: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[str], *words: str
+) -> tuple[int, str]:
     (folder / "maps.json").write_text(json.dumps(data))
     code = main(["check", "--bound", trace, str(folder / "maps.json"), *words])
     return code, capsys.readouterr().out
@@ -48,8 +50,12 @@ CHOICES = [
 ]
 
 
-@pytest.mark.parametrize(("tour", "words"), [*product(("square", "tee"), CHOICES), ("comb", ""), ("comb", "-n 2")])
-def test_what_solve_prints_is_true(tour: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("tour", "words"), [*product(("square", "tee"), CHOICES), ("comb", ""), ("comb", "-n 2")]
+)
+def test_what_solve_prints_is_true(
+    tour: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = str(tmp_path / "trace.jsonl")
     drive(*TOURS[tour]).save(path)
     code, out = check(path, answer(path, capsys, *words.split()), tmp_path, capsys)
@@ -67,9 +73,18 @@ def test_that_there_is_no_map_is_no_lie(tmp_path: Path, capsys: pytest.CaptureFi
 
 LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = {
     "more maps than listed": ({"count": 5}, "count: expected 4, as so many maps are listed, got 5"),
-    "true is no number": ({"count": True}, "count: expected 4, as so many maps are listed, got True"),
-    "fewer maps than listed": (lambda d: d["maps"].pop(), "count: expected 3, as so many maps are listed, got 4"),
-    "a map twice": (lambda d: d["maps"].append(d["maps"][1]), "maps: expected each map once, got maps 2 and 5, which are the same"),
+    "true is no number": (
+        {"count": True},
+        "count: expected 4, as so many maps are listed, got True",
+    ),
+    "fewer maps than listed": (
+        lambda d: d["maps"].pop(),
+        "count: expected 3, as so many maps are listed, got 4",
+    ),
+    "a map twice": (
+        lambda d: d["maps"].append(d["maps"][1]),
+        "maps: expected each map once, got maps 2 and 5, which are the same",
+    ),
     "another trace": ({"steps": 22}, "steps: expected 23, as the trace has so many, got 22"),
     "a prefix longer than the trace": ({"prefix": 99}, "prefix: expected 0 to 23"),
     "a smaller cost": (
@@ -80,9 +95,18 @@ LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = 
         lambda d: d["cost"].update(excuses=1),
         "cost: expected 19 dstates, 10 places, 4 paths, as map 1 has these",
     ),
-    "no cost": ({"cost": None}, "cost: expected 19 dstates, 10 places, 4 paths, as map 1 has these, got None"),
-    "a cost of another type": ({"cost": [19]}, "cost: expected 19 dstates, 10 places, 4 paths, as map 1 has these, got [19]"),
-    "a bound above the cost": ({"bound": {"dstates": 20}}, "bound: expected at most 19 dstates, as map 1 has no more, got 20"),
+    "no cost": (
+        {"cost": None},
+        "cost: expected 19 dstates, 10 places, 4 paths, as map 1 has these, got None",
+    ),
+    "a cost of another type": (
+        {"cost": [19]},
+        "cost: expected 19 dstates, 10 places, 4 paths, as map 1 has these, got [19]",
+    ),
+    "a bound above the cost": (
+        {"bound": {"dstates": 20}},
+        "bound: expected at most 19 dstates, as map 1 has no more, got 20",
+    ),
     "a bound that is not proven": (
         lambda d: d["certificate"]["refuted"].pop(),
         "bound: expected at most 18 dstates, as the certificate proves no more, got 19",
@@ -91,9 +115,18 @@ LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = 
         {"bound": {"dstates": 12}},
         "bound: expected 19 dstates, the cost of map 1, as the status is optimal, got 12",
     ),
-    "optimal, and no bound": ({"bound": {}}, "bound: expected 19 dstates, the cost of map 1, as the status is optimal, got none"),
-    "a bound of another type": ({"bound": {"dstates": "19"}}, "bound: expected numbers of dstates, paths, places, excuses, got"),
-    "a bound of something else": ({"bound": {"rooms": 1}}, "bound: expected numbers of dstates, paths, places, excuses, got"),
+    "optimal, and no bound": (
+        {"bound": {}},
+        "bound: expected 19 dstates, the cost of map 1, as the status is optimal, got none",
+    ),
+    "a bound of another type": (
+        {"bound": {"dstates": "19"}},
+        "bound: expected numbers of dstates, paths, places, excuses, got",
+    ),
+    "a bound of something else": (
+        {"bound": {"rooms": 1}},
+        "bound: expected numbers of dstates, paths, places, excuses, got",
+    ),
     "a bound of what is not minimised first": (
         {"bound": {"dstates": 19, "paths": 1}},
         "bound: expected none of paths, as the theory minimises dstates first, got 1",
@@ -102,27 +135,59 @@ LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = 
         {"complete": False, "stopped": "lunch"},
         "stopped: expected one of time limit, memory limit, interrupted, maps limit, no proof, got 'lunch'",
     ),
-    "no such status": ({"status": "perfect"}, "status: expected one of optimal, feasible, unsatisfiable, unknown, got 'perfect'"),
-    "a status of another type": ({"status": [1]}, "status: expected one of optimal, feasible, unsatisfiable, unknown, got [1]"),
+    "no such status": (
+        {"status": "perfect"},
+        "status: expected one of optimal, feasible, unsatisfiable, unknown, got 'perfect'",
+    ),
+    "a status of another type": (
+        {"status": [1]},
+        "status: expected one of optimal, feasible, unsatisfiable, unknown, got [1]",
+    ),
     "no map, though there are some": (
         {"status": "unsatisfiable"},
         "status: expected optimal or feasible, as there is a map, got unsatisfiable",
     ),
-    "without proof, though there are several": ({"status": "feasible"}, "maps: expected one, as the status is feasible, got 4"),
-    "complete without proof": ({"status": "feasible"}, "complete: expected false, as the status is feasible, got true"),
-    "complete, though stopped": ({"stopped": "maps limit"}, "complete: expected false, as the search was stopped ('maps limit'), got true"),
+    "without proof, though there are several": (
+        {"status": "feasible"},
+        "maps: expected one, as the status is feasible, got 4",
+    ),
+    "complete without proof": (
+        {"status": "feasible"},
+        "complete: expected false, as the status is feasible, got true",
+    ),
+    "complete, though stopped": (
+        {"stopped": "maps limit"},
+        "complete: expected false, as the search was stopped ('maps limit'), got true",
+    ),
     "complete of another type": ({"complete": 1}, "complete: expected true or false, got 1"),
     "a false id": (lambda d: d["maps"][1].update(id="000000000000"), "maps[1].id: expected "),
     "an id of another type": (lambda d: d["maps"][1].update(id=7), "maps[1].id: expected "),
-    "the id of another map": (lambda d: d["maps"][1].update(id=d["maps"][0]["id"]), "maps[1].id: expected "),
-    "a false summary": ({"summary": "1 minimal map"}, "summary: expected '4 minimal maps: the same dstates; "),
-    "a summary of another type": ({"summary": [4]}, "summary: expected '4 minimal maps: the same dstates; "),
-    "a false backbone": (lambda d: d["backbone"]["places"].update(sometimes=[]), "backbone: expected the same dstates; "),
+    "the id of another map": (
+        lambda d: d["maps"][1].update(id=d["maps"][0]["id"]),
+        "maps[1].id: expected ",
+    ),
+    "a false summary": (
+        {"summary": "1 minimal map"},
+        "summary: expected '4 minimal maps: the same dstates; ",
+    ),
+    "a summary of another type": (
+        {"summary": [4]},
+        "summary: expected '4 minimal maps: the same dstates; ",
+    ),
+    "a false backbone": (
+        lambda d: d["backbone"]["places"].update(sometimes=[]),
+        "backbone: expected the same dstates; ",
+    ),
     "a fit without displacements": (
-        lambda d: d["maps"][0].update(fit={"chi2": 1.0, "dof": 1, "p": 0.5, "scale": 0.0, "bend": 0.0}),
+        lambda d: d["maps"][0].update(
+            fit={"chi2": 1.0, "dof": 1, "p": 0.5, "scale": 0.0, "bend": 0.0}
+        ),
         "maps[0].fit: expected none, as the trace has no displacements",
     ),
-    "optimal without a map": ({"maps": []}, "status: expected unsatisfiable or unknown, as there is no map, got optimal"),
+    "optimal without a map": (
+        {"maps": []},
+        "status: expected unsatisfiable or unknown, as there is no map, got optimal",
+    ),
 }
 
 
@@ -139,21 +204,30 @@ def test_a_lie_is_named(case: str, tmp_path: Path, capsys: pytest.CaptureFixture
     assert any(shown.startswith(line) for shown in out.splitlines()), out
 
 
-@pytest.mark.parametrize(("part", "value"), [("chi2", 0.0), ("dof", 0), ("p", 1.0), ("scale", 0.5), ("bend", -1.0)])
-def test_a_false_fit_is_named(part: str, value: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("part", "value"), [("chi2", 0.0), ("dof", 0), ("p", 1.0), ("scale", 0.5), ("bend", -1.0)]
+)
+def test_a_false_fit_is_named(
+    part: str, value: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = str(tmp_path / "trace.jsonl")
     moves = [(10, 0.3, 0.1), (0.1, 0, 1.5)] * 4
     Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=moves).save(path)
     data = answer(path, capsys, "--theory", "causal")
     assert check(path, data, tmp_path, capsys)[0] == 0
     assert data["maps"][0]["fit"][part] != pytest.approx(value, abs=0.01)
-    for change in ({"fit": data["maps"][0]["fit"] | {part: value}}, {"poses": [[0, 0, 0]] * len(data["maps"][0]["dstates"])}):
+    for change in (
+        {"fit": data["maps"][0]["fit"] | {part: value}},
+        {"poses": [[0, 0, 0]] * len(data["maps"][0]["dstates"])},
+    ):
         code, out = check(path, data | {"maps": [data["maps"][0] | change]}, tmp_path, capsys)
         assert code == 20
         assert f"maps[0].{next(iter(change))}: expected" in out
 
 
-def test_maps_that_are_not_equally_good_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_maps_that_are_not_equally_good_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = str(tmp_path / "trace.jsonl")
     rectangle(24).save(path)
     data = answer(path, capsys, "--boundary", "none")
@@ -162,10 +236,15 @@ def test_maps_that_are_not_equally_good_are_named(tmp_path: Path, capsys: pytest
     data["count"] += 1
     code, out = check(path, data, tmp_path, capsys)
     assert code == 20
-    assert "maps: expected equal numbers of dstates, paths, places, as minimal maps have, got [4, " in out
+    assert (
+        "maps: expected equal numbers of dstates, paths, places, as minimal maps have, got [4, "
+        in out
+    )
 
 
-def test_a_map_under_other_numbers_is_the_same_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_map_under_other_numbers_is_the_same_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     data = json.loads(aces.answer())
     rng = random.Random(0)
     for original in [SSHMap.from_dict(m) for m in data["maps"]]:
@@ -177,14 +256,17 @@ def test_a_map_under_other_numbers_is_the_same_map(tmp_path: Path, capsys: pytes
     data["maps"][3] = _renamed(data["maps"][0], rng)
     code, out = check(ACES, data, tmp_path, capsys)
     assert code == 20
-    assert "maps: expected each map once, got maps 1 and 4, which are the same up to renaming\n" in out
+    assert (
+        "maps: expected each map once, got maps 1 and 4, which are the same up to renaming\n" in out
+    )
 
 
 def _renamed(data: dict[str, Any], rng: random.Random) -> dict[str, Any]:
     """The same map with other numbers, and some paths in the other direction."""
     data = copy.deepcopy(data)
     dstate, place, path = (
-        {x: i for i, x in enumerate(rng.sample(range(n), n))} for n in map(len, (data["dstates"], data["places"], data["paths"]))
+        {x: i for i, x in enumerate(rng.sample(range(n), n))}
+        for n in map(len, (data["dstates"], data["places"], data["paths"]))
     )
     flipped = {p["id"] for p in data["paths"] if rng.random() < 0.5}
     for s in data["dstates"]:

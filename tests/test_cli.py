@@ -39,7 +39,9 @@ def saved(trace: Trace, folder: Path) -> str:
     return str(path)
 
 
-def test_solve_prints_the_maps_and_what_tells_them_apart(capsys: pytest.CaptureFixture[str]) -> None:
+def test_solve_prints_the_maps_and_what_tells_them_apart(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["solve", ACES]) == 0
     out = capsys.readouterr().out
     assert out.startswith("optimal: 19 dstates, 10 places, 4 paths; 4 minimal maps;")
@@ -49,7 +51,12 @@ def test_solve_prints_the_maps_and_what_tells_them_apart(capsys: pytest.CaptureF
 
 def test_json_is_the_contract(solved: Path) -> None:
     data = json.loads(solved.read_text())
-    assert (data["status"], data["complete"], data["count"], data["steps"]) == ("optimal", True, 4, 23)
+    assert (data["status"], data["complete"], data["count"], data["steps"]) == (
+        "optimal",
+        True,
+        4,
+        23,
+    )
     assert data["cost"] == {"dstates": 19, "places": 10, "paths": 4}
     assert data["bound"] == {"dstates": 19}
     assert data["theory"]["star"] == "frame"
@@ -66,14 +73,24 @@ def test_json_is_the_contract(solved: Path) -> None:
 
 def test_all_maps_and_a_few(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     route = saved(drive(*TOURS["comb"]), tmp_path)
-    flags = ["--boundary", "none", "--path-order", "partial", "--prefer", "paths,places,dstates", "--json"]
+    flags = [
+        "--boundary",
+        "none",
+        "--path-order",
+        "partial",
+        "--prefer",
+        "paths,places,dstates",
+        "--json",
+    ]
     for n, count, complete in (("5", 5, False), ("308", 308, True)):
         assert main(["solve", route, "-n", n, *flags]) == 0
         data = json.loads(capsys.readouterr().out)
         assert (data["count"], len(data["maps"]), data["complete"]) == (count, count, complete)
 
 
-def test_every_field_of_a_theory_is_a_flag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_field_of_a_theory_is_a_flag(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     flags = [
         *(
             "--theory",
@@ -86,7 +103,17 @@ def test_every_field_of_a_theory_is_a_flag(tmp_path: Path, capsys: pytest.Captur
             "--next-place",
             "--planar",
         ),
-        *("--no-all-on-paths", "--star", "pattern", "--prefer", "places,excuses", "--without", "on_path", "--level", "topological"),
+        *(
+            "--no-all-on-paths",
+            "--star",
+            "pattern",
+            "--prefer",
+            "places,excuses",
+            "--without",
+            "on_path",
+            "--level",
+            "topological",
+        ),
         *("--displacement", "none", "--reject", "0.01", "--joint", "1"),
     ]
     route = saved(drive(*TOURS["square"], stars=True), tmp_path)
@@ -107,17 +134,26 @@ def test_every_field_of_a_theory_is_a_flag(tmp_path: Path, capsys: pytest.Captur
     assert Theory.from_dict(json.loads(capsys.readouterr().out)["theory"]) == expected
 
 
-def test_an_impossible_trace_says_which_axioms_clash_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_impossible_trace_says_which_axioms_clash_where(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trace = Trace.from_steps("xyabcd", ["right", "travel", "travel", "around", "around"])
     path = saved(Trace.from_steps("xyabcde", [*trace.actions, "travel"]), tmp_path)
     assert main(["solve", path]) == 20
     out = capsys.readouterr().out
-    assert out.startswith("unsatisfiable: no map satisfies the axioms: in steps 2 to 5 these clash: functional_view (step 5)")
+    assert out.startswith(
+        "unsatisfiable: no map satisfies the axioms: in steps 2 to 5 these clash: functional_view (step 5)"
+    )
     assert "turn_around_reverses (steps 4, 5)" in out
     assert f"from {path}:4 to {path}:7" in out
     assert main(["solve", path, "--json"]) == 20
     data = json.loads(capsys.readouterr().out)
-    assert (data["status"], data["count"], data["cost"], data["complete"]) == ("unsatisfiable", 0, None, True)
+    assert (data["status"], data["count"], data["cost"], data["complete"]) == (
+        "unsatisfiable",
+        0,
+        None,
+        True,
+    )
     assert data["explanation"]["first"] == 2
     assert {"axiom": "functional_view", "steps": [5]} in data["explanation"]["clashes"]
 
@@ -139,7 +175,12 @@ def test_a_map_without_proof(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     path = saved(too_hard(), tmp_path)
     assert main(["solve", path, "--theory", "causal", "--time-limit", "1", "--json"]) == 10
     data = json.loads(capsys.readouterr().out)
-    assert (data["status"], data["stopped"], data["count"], data["complete"]) == ("feasible", "time limit", 1, False)
+    assert (data["status"], data["stopped"], data["count"], data["complete"]) == (
+        "feasible",
+        "time limit",
+        1,
+        False,
+    )
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
@@ -163,7 +204,9 @@ def test_ctrl_c_prints_what_is_known(tmp_path: Path) -> None:
     assert data["count"] == len(data["maps"]) > 0
 
 
-def test_ctrl_c_while_the_end_is_printed_leaves_it_whole(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_while_the_end_is_printed_leaves_it_whole(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     from ssh_abduction.cli import solve as verb
 
     def ending(*args: Any) -> dict[str, Any]:
@@ -196,7 +239,9 @@ def test_check_under_another_theory(solved: Path, capsys: pytest.CaptureFixture[
     assert "next_place" in capsys.readouterr().out
 
 
-def test_flags_are_laid_over_the_theory_of_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_flags_are_laid_over_the_theory_of_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["solve", ACES, "--json", "--boundary", "none"]) == 0
     loose = tmp_path / "loose.json"
     loose.write_text(capsys.readouterr().out)
@@ -204,7 +249,10 @@ def test_flags_are_laid_over_the_theory_of_the_file(tmp_path: Path, capsys: pyte
     assert main(["check", ACES, str(loose), "--boundary", "strict"]) == 20
     assert "0 of 8 maps satisfy the 27 axioms" in capsys.readouterr().out
     data = json.loads(loose.read_text())
-    for theory, message in ((5, "theory: expected an object"), ({"prefer": None}, "prefer: expected a list")):
+    for theory, message in (
+        (5, "theory: expected an object"),
+        ({"prefer": None}, "prefer: expected a list"),
+    ):
         loose.write_text(json.dumps({**data, "theory": theory}))
         assert main(["check", ACES, str(loose)]) == 1
         assert message in capsys.readouterr().err
@@ -213,7 +261,9 @@ def test_flags_are_laid_over_the_theory_of_the_file(tmp_path: Path, capsys: pyte
 def test_one_is_not_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = saved(Trace.from_steps("a", []), tmp_path)
     assert main(["solve", path, "--theory", "topological"]) == 0
-    assert capsys.readouterr().out.startswith("optimal: 1 dstate, 1 place, 0 paths; 1 minimal map; ")
+    assert capsys.readouterr().out.startswith(
+        "optimal: 1 dstate, 1 place, 0 paths; 1 minimal map; "
+    )
     assert main(["solve", path, "--json"]) == 0
     maps = tmp_path / "maps.json"
     maps.write_text(capsys.readouterr().out)
@@ -221,9 +271,19 @@ def test_one_is_not_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "at least 1 dstate: as many steps" in capsys.readouterr().out
 
 
-def test_the_bound_of_an_answer_without_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str], solved: Path) -> None:
+def test_the_bound_of_an_answer_without_maps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], solved: Path
+) -> None:
     bare = tmp_path / "bare.json"
-    none = {"maps": [], "count": 0, "cost": None, "status": "unknown", "complete": False, "summary": "no map was found", "backbone": None}
+    none = {
+        "maps": [],
+        "count": 0,
+        "cost": None,
+        "status": "unknown",
+        "complete": False,
+        "summary": "no map was found",
+        "backbone": None,
+    }
     bare.write_text(json.dumps({**json.loads(solved.read_text()), **none}))
     assert main(["check", "--bound", ACES, str(bare)]) == 0
     assert "at least 19 dstates, if clingo is right" in capsys.readouterr().out
@@ -262,8 +322,16 @@ def test_facts_run_in_plain_clingo(tmp_path: Path, capsys: pytest.CaptureFixture
     facts = capsys.readouterr().out
     (tmp_path / "trace.lp").write_text(facts)
     command = next(line for line in facts.splitlines() if "python run.py" in line).lstrip("% ")
-    words = [str(tmp_path / "trace.lp") if word == "THIS_FILE" else word for word in command.split()[1:]]
-    done = subprocess.run([sys.executable, *words], cwd=encodings.folder(), capture_output=True, text=True, check=False)
+    words = [
+        str(tmp_path / "trace.lp") if word == "THIS_FILE" else word for word in command.split()[1:]
+    ]
+    done = subprocess.run(
+        [sys.executable, *words],
+        cwd=encodings.folder(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert "OPTIMUM FOUND" in done.stdout
     assert "Optimization : 19 4 10" in done.stdout
     assert re.search(r"Optimal +: 4\n", done.stdout)
@@ -290,7 +358,9 @@ BAD_INPUT = {
 
 @pytest.mark.parametrize("case", BAD_INPUT)
 @pytest.mark.parametrize("verb", ["solve", "facts"])
-def test_bad_input_is_one_line(verb: str, case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(
+    verb: str, case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "t.jsonl"
     path.write_bytes(BAD_INPUT[case])
     assert main([verb, str(path)]) == 1
@@ -313,7 +383,9 @@ def test_bad_input_is_one_line(verb: str, case: str, tmp_path: Path, capsys: pyt
     ],
 )
 @pytest.mark.parametrize("verb", ["show", "check"])
-def test_bad_maps_are_one_line(verb: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_maps_are_one_line(
+    verb: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "maps.json"
     path.write_text(text)
     assert main([verb, *([ACES] if verb == "check" else []), str(path)]) == 1
@@ -324,7 +396,9 @@ def test_bad_maps_are_one_line(verb: str, text: str, tmp_path: Path, capsys: pyt
 
 def test_contradicting_choices_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["solve", ACES, "--theory", "causal", "--boundary", "strict"]) == 1
-    assert capsys.readouterr().err.startswith("ssh-abduction: boundary: expected none with level=causal")
+    assert capsys.readouterr().err.startswith(
+        "ssh-abduction: boundary: expected none with level=causal"
+    )
 
 
 def test_the_level_alone_is_a_choice(capsys: pytest.CaptureFixture[str]) -> None:
@@ -342,7 +416,9 @@ def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
 
 
-def test_strange_names_stay_on_their_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_strange_names_stay_on_their_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "two\nlines"
     path.write_text("{}")
     assert main(["solve", str(path)]) == 1
@@ -362,18 +438,32 @@ def test_strange_names_stay_on_their_line(tmp_path: Path, capsys: pytest.Capture
 def test_output_that_cannot_be_written() -> None:
     for target in ("> /dev/full", ">&-"):
         done = subprocess.run(
-            f"{sys.executable} -m ssh_abduction solve {ACES} --json {target}", shell=True, capture_output=True, text=True, check=False
+            f"{sys.executable} -m ssh_abduction solve {ACES} --json {target}",
+            shell=True,
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 1
         assert done.stderr.count("\n") == 1
-    done = subprocess.run(f"{sys.executable} -m ssh_abduction solve - <&-", shell=True, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        f"{sys.executable} -m ssh_abduction solve - <&-",
+        shell=True,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
 
 
 def test_a_terminal_of_few_letters() -> None:
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     done = subprocess.run(
-        [sys.executable, "-m", "ssh_abduction", "solve", ACES], env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-m", "ssh_abduction", "solve", ACES],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert "travel ? 1" in done.stdout
 
@@ -385,9 +475,19 @@ def test_standard_input_and_a_reader_that_leaves(tmp_path: Path) -> None:
     assert done.stdout.startswith(b"optimal: 19 dstates")
     assert done.stderr == b""  # no progress where there is no terminal
     maps = subprocess.run([*command, "--json"], input=trace, capture_output=True, check=True).stdout
-    shown = subprocess.run([sys.executable, "-m", "ssh_abduction", "show", "-"], input=maps, capture_output=True, check=True).stdout
+    shown = subprocess.run(
+        [sys.executable, "-m", "ssh_abduction", "show", "-"],
+        input=maps,
+        capture_output=True,
+        check=True,
+    ).stdout
     assert shown.count(b"path 0: places") == 4
-    pipe = subprocess.run(f"{sys.executable} -m ssh_abduction facts {ACES} | head -1", shell=True, capture_output=True, check=True)
+    pipe = subprocess.run(
+        f"{sys.executable} -m ssh_abduction facts {ACES} | head -1",
+        shell=True,
+        capture_output=True,
+        check=True,
+    )
     assert pipe.stderr == b""
 
 
@@ -399,9 +499,21 @@ def test_progress_shows_on_a_terminal(tmp_path: Path) -> None:
 
     path = saved(too_hard(), tmp_path)
     master, slave = pty.openpty()
-    command = [sys.executable, "-m", "ssh_abduction", "solve", path, "--theory", "causal", "--time-limit", "2.5"]
+    command = [
+        sys.executable,
+        "-m",
+        "ssh_abduction",
+        "solve",
+        path,
+        "--theory",
+        "causal",
+        "--time-limit",
+        "2.5",
+    ]
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "160"}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=slave, env=environment) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=slave, env=environment
+    ) as process:
         os.close(slave)
         shown = b""
         with contextlib.suppress(OSError):  # the terminal is gone when the program is
@@ -421,7 +533,9 @@ def test_what_programs_read_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
 
     def printed(*words: str, given: bytes = b"") -> str:
         command = [sys.executable, "-m", "ssh_abduction", *words]
-        return subprocess.run(command, input=given, env=environment, capture_output=True, check=True).stdout.decode("utf-8")
+        return subprocess.run(
+            command, input=given, env=environment, capture_output=True, check=True
+        ).stdout.decode("utf-8")
 
     maps = printed("solve", path, "--json")
     assert [s["view"] for s in json.loads(maps)["maps"][0]["dstates"]] == ["日本", "中国", "Küche"]
@@ -434,9 +548,15 @@ def test_what_programs_read_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["simulate", "notched-rectangle", "--seed", "-1", "-o", "x"], "--seed: expected a number from 0 to"),
+        (
+            ["simulate", "notched-rectangle", "--seed", "-1", "-o", "x"],
+            "--seed: expected a number from 0 to",
+        ),
         (["learning-curve", "x", "y", "--seed", "1e3"], "--seed: expected a number from 0 to"),
-        (["cluster", "x", "-o", "y", "--plot", "z.foo"], "--plot: expected a name that ends in .png, .pdf or .svg"),
+        (
+            ["cluster", "x", "-o", "y", "--plot", "z.foo"],
+            "--plot: expected a name that ends in .png, .pdf or .svg",
+        ),
     ],
 )
 def test_wrong_usage(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -445,19 +565,27 @@ def test_wrong_usage(words: list[str], message: str, capsys: pytest.CaptureFixtu
     assert message in capsys.readouterr().err
 
 
-def test_errors_say_what_mends_them(tmp_path: Path, capsys: pytest.CaptureFixture[str], solved: Path) -> None:
+def test_errors_say_what_mends_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], solved: Path
+) -> None:
     many, none, taken = tmp_path / "many.jsonl", tmp_path / "none.json", tmp_path / "taken"
     many.write_text("{}\n{}\n")
     none.write_text('{"maps": []}')
     taken.touch()
     for words, message in [
-        (["show", str(many)], "many.jsonl:2: expected one JSON value, got more after it; solve prints a line for each of several traces"),
+        (
+            ["show", str(many)],
+            "many.jsonl:2: expected one JSON value, got more after it; solve prints a line for each of several traces",
+        ),
         (["show", str(none), "--svg"], "maps: expected one to draw, got none"),
         (["show", str(none), "--map", "1"], "--map: expected a map, got none"),
         (["check", ACES, str(none)], "maps: expected one to check, got none"),
         (["train", ACES, str(solved), "--map", "5", "-o", "x"], "--map: expected 1 to 4, got 5"),
         (["reproduce", "notched-rectangle", "--jobs", "0"], "--jobs: expected how many processes"),
-        (["reproduce", "notched-rectangle", "--seeds", "0", "--jobs", "1", "-o", str(taken)], "File exists; take another name"),
+        (
+            ["reproduce", "notched-rectangle", "--seeds", "0", "--jobs", "1", "-o", str(taken)],
+            "File exists; take another name",
+        ),
     ]:
         assert main(words) == 1, words
         err = capsys.readouterr().err

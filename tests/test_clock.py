@@ -39,15 +39,25 @@ def driven(trace: Trace, wrong: int = 0) -> Trace:
     steps, chance = list(trace.steps), random.Random(0)
     for t, action in enumerate(trace.actions, 1):
         travels = action.kind == "travel"
-        steps[t] = replace(steps[t], displacement=(5.0, 0.0, 0.0) if travels else (0.0, 0.0, TURNED[str(action.turn)]))
-    for t in chance.sample([t for t, action in enumerate(trace.actions, 1) if action.kind == "travel"], wrong):
-        steps[t] = replace(steps[t], displacement=(chance.uniform(15, 30), chance.uniform(15, 30), 0.0))
+        steps[t] = replace(
+            steps[t],
+            displacement=(5.0, 0.0, 0.0) if travels else (0.0, 0.0, TURNED[str(action.turn)]),
+        )
+    for t in chance.sample(
+        [t for t, action in enumerate(trace.actions, 1) if action.kind == "travel"], wrong
+    ):
+        steps[t] = replace(
+            steps[t], displacement=(chance.uniform(15, 30), chance.uniform(15, 30), 0.0)
+        )
     return replace(trace, steps=tuple(steps))
 
 
 def sketched(trace: Trace, theory: Theory, homing: bool = True, framed: bool = True) -> SSHMap:
     sketch = Sketch(trace.steps[0], theory, homing, framed)
-    assert all(sketch.extend(action, step) for action, step in zip(trace.actions, trace.steps[1:], strict=True))
+    assert all(
+        sketch.extend(action, step)
+        for action, step in zip(trace.actions, trace.steps[1:], strict=True)
+    )
     return sketch.map()
 
 
@@ -55,14 +65,20 @@ DRIVEN = driven(maze(3, 3, steps=80, seed=0).trace)
 USED = Theory.topological().resolve(DRIVEN)
 RING = rectangle(2).trace
 PLANAR = Theory.topological().replace(planar=True).resolve(RING)
-GATEWAYS = Trace.from_steps("abab", ["travel", "around", "travel"], stars=[[0, 120], [60, 180], [0, 120], [60, 180]])
+GATEWAYS = Trace.from_steps(
+    "abab", ["travel", "around", "travel"], stars=[[0, 120], [60, 180], [0, 120], [60, 180]]
+)
 IN_TOLERANCE = Theory.topological().resolve(GATEWAYS)
 MAP = sketched(DRIVEN, USED)
 
 LONG: dict[str, Callable[[], object]] = {
     "checker": lambda: check(DRIVEN, MAP, USED),
-    "gateways": lambda: check(GATEWAYS, sketched(GATEWAYS, IN_TOLERANCE, framed=False), IN_TOLERANCE),
-    "displacements of two returns": lambda: Judging(driven(maze(3, 3, steps=80, seed=0).trace), USED).refusal(MAP),
+    "gateways": lambda: check(
+        GATEWAYS, sketched(GATEWAYS, IN_TOLERANCE, framed=False), IN_TOLERANCE
+    ),
+    "displacements of two returns": lambda: Judging(
+        driven(maze(3, 3, steps=80, seed=0).trace), USED
+    ).refusal(MAP),
     "crossings": lambda: Planar.of(PLANAR).refuse(RING, solve(RING, max_maps=1).maps[0]),
     "fit": lambda: fit(DRIVEN, MAP),
 }
@@ -98,7 +114,9 @@ def test_whoever_uses_an_item_is_not_under_the_limit_of_whoever_makes_it() -> No
         look_at_clock()
 
 
-@pytest.mark.parametrize(("steps", "wrong", "stars"), [(60, 0, False), (60, 6, False), (150, 20, False), (150, 20, True)])
+@pytest.mark.parametrize(
+    ("steps", "wrong", "stars"), [(60, 0, False), (60, 6, False), (150, 20, False), (150, 20, True)]
+)
 def test_there_is_a_map_when_the_time_is_over(steps: int, wrong: int, stars: bool) -> None:
     """Though the checker refuses the sketches that take places for some seen before, as displacements are wrong."""
     trace = driven(maze(4, 4, steps=steps, seed=steps, stars=stars).trace, wrong)
@@ -126,7 +144,10 @@ def test_no_sketch_takes_all_the_time() -> None:
         over_time = candidates.LimitError("time limit")
         raise over_time
 
-    with patch.multiple(solver, OVERTIME=100.0), patch.object(candidates.Candidates, "_go_on_to_end", deaf):
+    with (
+        patch.multiple(solver, OVERTIME=100.0),
+        patch.object(candidates.Candidates, "_go_on_to_end", deaf),
+    ):
         assert solve(trace, time_limit=1e-6).status is Status.UNKNOWN
     assert len(tried) == len(Sketch.all_of(trace.steps[0], Theory.topological().resolve(trace)))
 
@@ -135,7 +156,10 @@ def test_a_certificate_is_written_without_a_look_at_each_pair() -> None:
     """Of 3,000 steps that show different views no pair needs a word."""
     trace = Trace.from_steps([*range(3000), 0, 1], ["travel"] * 3000 + ["right"])
     asked = []
-    with patch("ssh_abduction.solver.steps.certificate._word", side_effect=lambda *pair: asked.append(pair) or ("travel",)):
+    with patch(
+        "ssh_abduction.solver.steps.certificate._word",
+        side_effect=lambda *pair: asked.append(pair) or ("travel",),
+    ):
         written = Certificate((*range(3000), 3001)).to_dict(trace)
     assert [pair[1:] for pair in asked] == [(1, 3001)]
     assert written["words"] == [[1, 3001, ["travel"]]]

@@ -39,7 +39,9 @@ from ssh_abduction.solver.engines import framed, naming
 from ssh_abduction.solver.sharing import Backbone, Sharing
 
 ACES3 = "examples/aces3-route.jsonl"
-FREE_PLACES = Theory(star="none", prefer=("dstates", "places", "paths"))  # under which the route has 102 maps
+FREE_PLACES = Theory(
+    star="none", prefer=("dstates", "places", "paths")
+)  # under which the route has 102 maps
 
 
 def divisions(items: Sequence[int]) -> Iterator[list[list[int]]]:
@@ -54,20 +56,30 @@ def divisions(items: Sequence[int]) -> Iterator[list[list[int]]]:
 
 
 relations = st.integers(1, 5).flatmap(
-    lambda n: st.lists(st.lists(st.booleans(), min_size=n, max_size=n), min_size=1, max_size=12, unique_by=tuple)
+    lambda n: st.lists(
+        st.lists(st.booleans(), min_size=n, max_size=n), min_size=1, max_size=12, unique_by=tuple
+    )
 )
 
 
-def _product(blocks: Sequence[Sequence[tuple[bool, ...]]], order: Sequence[int]) -> list[list[bool]]:
+def _product(
+    blocks: Sequence[Sequence[tuple[bool, ...]]], order: Sequence[int]
+) -> list[list[bool]]:
     rows = [[x for part in parts for x in part] for parts in product(*blocks)]
     return [[row[i] for i in order] for row in rows]
 
 
 products = st.lists(
-    st.integers(1, 2).flatmap(lambda n: st.lists(st.tuples(*[st.booleans()] * n), min_size=1, max_size=3, unique=True)),
+    st.integers(1, 2).flatmap(
+        lambda n: st.lists(st.tuples(*[st.booleans()] * n), min_size=1, max_size=3, unique=True)
+    ),
     min_size=1,
     max_size=3,
-).flatmap(lambda blocks: st.permutations(range(sum(len(block[0]) for block in blocks))).map(lambda order: _product(blocks, order)))
+).flatmap(
+    lambda blocks: st.permutations(range(sum(len(block[0]) for block in blocks))).map(
+        lambda order: _product(blocks, order)
+    )
+)
 
 
 @settings(max_examples=75)
@@ -76,10 +88,16 @@ def test_choices_are_the_finest_division_that_brute_force_finds(rows: list[list[
     table = np.array(rows, dtype=bool)
 
     def is_product(division: list[list[int]]) -> bool:
-        return prod(len({tuple(row[i] for i in part) for row in rows}) for part in division) == len(rows)
+        return prod(len({tuple(row[i] for i in part) for row in rows}) for part in division) == len(
+            rows
+        )
 
-    finest = max((division for division in divisions(range(len(rows[0]))) if is_product(division)), key=len)
-    assert {frozenset(part) for part in independent(table.T)} == {frozenset(part) for part in finest}
+    finest = max(
+        (division for division in divisions(range(len(rows[0]))) if is_product(division)), key=len
+    )
+    assert {frozenset(part) for part in independent(table.T)} == {
+        frozenset(part) for part in finest
+    }
 
 
 @settings(max_examples=50)
@@ -93,10 +111,14 @@ def test_deciding_questions_tell_all_apart_and_none_is_superfluous(rows: list[li
 
     assert apart(chosen) == len(rows)
     assert all(apart([j for j in chosen if j != i]) < len(rows) for i in chosen)
-    if chosen:  # the first one splits most pairs, or was made superfluous by others that split as many
+    if (
+        chosen
+    ):  # the first one splits most pairs, or was made superfluous by others that split as many
         most = max(sum(a[i] != b[i] for a, b in combinations(rows, 2)) for i in range(len(rows[0])))
         first = chosen[0]
-        assert sum(a[first] != b[first] for a, b in combinations(rows, 2)) == most or len(chosen) > 1
+        assert (
+            sum(a[first] != b[first] for a, b in combinations(rows, 2)) == most or len(chosen) > 1
+        )
 
 
 def is_one(ssh_map: SSHMap, sort: Matter, i: int, j: int) -> bool:
@@ -112,7 +134,11 @@ def is_one(ssh_map: SSHMap, sort: Matter, i: int, j: int) -> bool:
 
 
 def answer(ssh_map: SSHMap, question: Question) -> bool:
-    return question.fault in ssh_map.faults if question.fault else is_one(ssh_map, question.sort, question.first, question.later)
+    return (
+        question.fault in ssh_map.faults
+        if question.fault
+        else is_one(ssh_map, question.sort, question.first, question.later)
+    )
 
 
 def holds_of(found: Comparison, maps: Sequence[SSHMap]) -> None:
@@ -127,19 +153,31 @@ def holds_of(found: Comparison, maps: Sequence[SSHMap]) -> None:
     assert prod(len(choice.options) for choice in found.choices) == len(maps)
     assert len(set(product(*(range(len(choice.options)) for choice in found.choices)))) == len(maps)
     for choice in found.choices:
-        assert sorted(i for option in choice.options for i in option.maps) == list(range(1, len(maps) + 1))
+        assert sorted(i for option in choice.options for i in option.maps) == list(
+            range(1, len(maps) + 1)
+        )
         for option in choice.options:
             assert len(option.maps) * len(choice.options) == len(maps)
-            assert {tuple(answer(maps[i - 1], q) for q in choice.questions) for i in option.maps} == {option.answers}
+            assert {
+                tuple(answer(maps[i - 1], q) for q in choice.questions) for i in option.maps
+            } == {option.answers}
     for question in found.deciding:
         assert question.yes == sum(answer(m, question) for m in maps)
         assert 0 < question.yes < len(maps)
         if not question.fault:
             assert {
-                answer(m, replace(question, first=i, later=question.later)) for m in maps for i in question.here if i != question.later
+                answer(m, replace(question, first=i, later=question.later))
+                for m in maps
+                for i in question.here
+                if i != question.later
             } <= {True, False}
             for side, step in ((question.here, question.first), (question.there, question.later)):
-                assert all(is_one(m, question.sort, step, t) for m in maps for t in side if is_one(m, question.sort, step, step))
+                assert all(
+                    is_one(m, question.sort, step, t)
+                    for m in maps
+                    for t in side
+                    if is_one(m, question.sort, step, step)
+                )
     assert sorts_differing(found) == naive_differing(maps)
 
 
@@ -156,7 +194,14 @@ def naive_differing(maps: Sequence[SSHMap]) -> dict[str, set[int]]:
     """The steps of which the first step that they are one with is not the same in all maps."""
     steps = range(len(maps[0].labels))
     sorts: tuple[Matter, ...] = ("dstates", "places", "paths", "courses")
-    found = {sort: {t for t in steps if len({next((i for i in steps if is_one(m, sort, i, t)), None) for m in maps}) > 1} for sort in sorts}
+    found = {
+        sort: {
+            t
+            for t in steps
+            if len({next((i for i in steps if is_one(m, sort, i, t)), None) for m in maps}) > 1
+        }
+        for sort in sorts
+    }
     return {sort: differing for sort, differing in found.items() if differing}
 
 
@@ -167,8 +212,14 @@ def test_what_is_said_of_maps_is_so_in_the_explicit_list(data: st.DataObject) ->
     maps = solve(trace, data.draw(theories(trace), label="theory"), max_maps=60, time_limit=10).maps
     if not maps:
         return
-    if len(maps) > 1 and data.draw(st.booleans(), label="few"):  # any maps of one trace are compared, not only all minimal ones
-        maps = tuple(data.draw(st.lists(st.sampled_from(maps), min_size=1, max_size=7, unique=True), label="maps"))
+    if len(maps) > 1 and data.draw(
+        st.booleans(), label="few"
+    ):  # any maps of one trace are compared, not only all minimal ones
+        maps = tuple(
+            data.draw(
+                st.lists(st.sampled_from(maps), min_size=1, max_size=7, unique=True), label="maps"
+            )
+        )
     holds_of(compare(maps), maps)
     for one, other in list(combinations(maps, 2))[:5]:
         regroups(one, other)
@@ -178,7 +229,13 @@ def regroups(one: SSHMap, other: SSHMap) -> None:
     """The difference of two maps, applied to the first one, makes the other one."""
     found = difference(one, other)
     assert (str(found) == "the maps are the same") == found.same == (one == other)
-    moved_courses = {t for change in found.changes if change.sort == "paths" for group in (*change.first, *change.other) for t in group}
+    moved_courses = {
+        t
+        for change in found.changes
+        if change.sort == "paths"
+        for group in (*change.first, *change.other)
+        for t in group
+    }
     for sort in ("dstates", "places", "paths", "courses"):
         groups = [naive_groups(ssh_map, sort) for ssh_map in (one, other)]
         changes = [change for change in found.changes if change.sort == sort]
@@ -186,7 +243,10 @@ def regroups(one: SSHMap, other: SSHMap) -> None:
             assert set(change.first) <= groups[0]
             assert set(change.other) <= groups[1]
             assert set(change.first) != set(change.other)
-        kept = [g - {x for c in changes for x in side(c)} for g, side in zip(groups, (lambda c: c.first, lambda c: c.other), strict=True)]
+        kept = [
+            g - {x for c in changes for x in side(c)}
+            for g, side in zip(groups, (lambda c: c.first, lambda c: c.other), strict=True)
+        ]
         if sort == "courses":
             kept = [{g for g in some if moved_courses.isdisjoint(g)} for some in kept]
         assert kept[0] == kept[1]
@@ -194,13 +254,19 @@ def regroups(one: SSHMap, other: SSHMap) -> None:
 
 def naive_groups(ssh_map: SSHMap, sort: Matter) -> set[tuple[int, ...]]:
     steps = range(len(ssh_map.labels))
-    return {group for t in steps if (group := tuple(i for i in steps if is_one(ssh_map, sort, i, t)))}
+    return {
+        group for t in steps if (group := tuple(i for i in steps if is_one(ssh_map, sort, i, t)))
+    }
 
 
 def test_maps_that_differ_in_places_alone() -> None:
     solution = solve(Trace.load(ACES3), FREE_PLACES, max_maps=None)
     found = compare(solution)
-    assert found.sentence == solution.summary == "102 minimal maps: the same dstates and paths; the places of steps 14–22 differ"
+    assert (
+        found.sentence
+        == solution.summary
+        == "102 minimal maps: the same dstates and paths; the places of steps 14–22 differ"
+    )
     assert found.variants == {"dstates": 1, "places": 102, "paths": 1, "courses": 1}
     assert {question.sort for question in found.deciding} == {"places"}
     holds_of(found, solution.maps)
@@ -230,14 +296,23 @@ def of_streets(rng: random.Random, count: int, dstates: int, steps: int) -> list
     maps = []
     for _ in range(count):
         labels = tuple(range(dstates)) + tuple(
-            rng.randrange(dstates - 3, dstates) if t % 50 == 0 else t % dstates for t in range(steps - dstates)
+            rng.randrange(dstates - 3, dstates) if t % 50 == 0 else t % dstates
+            for t in range(steps - dstates)
         )
         states = tuple(
-            DState(i, "v", i // 4 if rng.random() < 0.99 else 0, i // 10 if rng.random() < 0.99 else 1, rng.choice([1, 1, 1, -1]))
+            DState(
+                i,
+                "v",
+                i // 4 if rng.random() < 0.99 else 0,
+                i // 10 if rng.random() < 0.99 else 1,
+                rng.choice([1, 1, 1, -1]),
+            )
             for i in range(dstates)
         )
         places = tuple(sorted({s.place for s in states if s.place is not None}))
-        paths = tuple(MapPath(h, ()) for h in sorted({s.path for s in states if s.path is not None}))
+        paths = tuple(
+            MapPath(h, ()) for h in sorted({s.path for s in states if s.path is not None})
+        )
         maps.append(SSHMap(labels, states, (), places, paths).renumbered())
     return maps
 
@@ -257,10 +332,19 @@ def test_ids_do_not_depend_on_how_things_are_numbered(seed: int) -> None:
     maps = solve(Trace.load(ACES3), max_maps=None).maps
     assert len({m.id for m in maps}) == len(maps)
     for ssh_map in maps:
-        number, place, path = (rng.sample(range(n), n) for n in (len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths)))
+        number, place, path = (
+            rng.sample(range(n), n)
+            for n in (len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths))
+        )
         way = [rng.choice([1, -1]) for _ in path]
         states = [
-            replace(s, id=number[s.id], place=place[s.place or 0], path=path[s.path or 0], direction=(s.direction or 0) * way[s.path or 0])
+            replace(
+                s,
+                id=number[s.id],
+                place=place[s.place or 0],
+                path=path[s.path or 0],
+                direction=(s.direction or 0) * way[s.path or 0],
+            )
             if s.path is not None
             else replace(s, id=number[s.id], place=place[s.place or 0])
             for s in ssh_map.dstates
@@ -270,7 +354,10 @@ def test_ids_do_not_depend_on_how_things_are_numbered(seed: int) -> None:
             labels=tuple(number[label] for label in ssh_map.labels),
             dstates=tuple(sorted(states, key=lambda s: s.id)),
             links=tuple((number[s], action, number[x]) for s, action, x in ssh_map.links),
-            paths=tuple(MapPath(path[p.id], tuple(place[q] for q in p.order[:: way[p.id]])) for p in ssh_map.paths),
+            paths=tuple(
+                MapPath(path[p.id], tuple(place[q] for q in p.order[:: way[p.id]]))
+                for p in ssh_map.paths
+            ),
         )
         assert other.id == ssh_map.id
         assert compare([ssh_map], [other]).others is not None
@@ -290,7 +377,11 @@ for trace, theory in ((Trace.load("examples/aces3-route.jsonl"), None), (maze(5,
 def test_ids_and_their_order_are_the_same_in_each_run() -> None:
     runs = [
         subprocess.run(
-            [sys.executable, "-c", LISTS], env={"PYTHONHASHSEED": seed, "PYTHONPATH": "."}, capture_output=True, text=True, check=True
+            [sys.executable, "-c", LISTS],
+            env={"PYTHONHASHSEED": seed, "PYTHONPATH": "."},
+            capture_output=True,
+            text=True,
+            check=True,
         ).stdout
         for seed in ("0", "4242")
     ]
@@ -298,7 +389,9 @@ def test_ids_and_their_order_are_the_same_in_each_run() -> None:
     assert runs[0].count("[") == 2
 
 
-def test_the_order_of_a_complete_list_is_the_same_with_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_order_of_a_complete_list_is_the_same_with_any_number_of_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     given: list[int] = []
     lists = []
     for threads in (1, 4):
@@ -317,7 +410,9 @@ def test_the_order_of_a_complete_list_is_the_same_with_any_number_of_threads(mon
     assert set(given) == {1, 4}
 
 
-def test_a_list_is_in_order_whatever_order_maps_are_found_in(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_list_is_in_order_whatever_order_maps_are_found_in(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     usual = solve(Trace.load(ACES3), FREE_PLACES, max_maps=None)
     found = searching.Search._found
 
@@ -363,7 +458,9 @@ def file_of(tmp_path: Path) -> Callable[..., Path]:
     return written_by
 
 
-def test_the_shell_prints_what_python_says(file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_shell_prints_what_python_says(
+    file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     path = file_of(ACES3, "-n", "0")
     solution = solve(Trace.load(ACES3), max_maps=None)
     found = compare(solution)
@@ -415,17 +512,26 @@ def test_causal_maps_and_maps_with_faults() -> None:
     assert set(found.variants) == {"dstates"}
     holds_of(found, causal.maps)
     seen = [f"v{t % 4}" if t != 9 else "v0" for t in range(14)]
-    faulty = solve(Trace.from_steps(seen, (["right", "travel"] * 7)[:13]), Theory.causal().replace(misread=0.5, slipped=0.5), max_maps=None)
+    faulty = solve(
+        Trace.from_steps(seen, (["right", "travel"] * 7)[:13]),
+        Theory.causal().replace(misread=0.5, slipped=0.5),
+        max_maps=None,
+    )
     assert len({m.faults for m in faulty.maps}) > 1
     told = compare(faulty)
     holds_of(told, faulty.maps)
     assert told.deciding[0].sort == "faults"
     assert str(told.deciding[0]).startswith(("the view at step ", "the action at step "))
     one, other = next((m, n) for m, n in combinations(faulty.maps, 2) if m.faults != n.faults)
-    assert any(line.startswith("faults: only in the first map the ") for line in difference(one, other).lines)
+    assert any(
+        line.startswith("faults: only in the first map the ")
+        for line in difference(one, other).lines
+    )
 
 
-def test_larger_maps_are_told_from_minimal_ones(file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_larger_maps_are_told_from_minimal_ones(
+    file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     path = file_of(ACES3, "-n", "0", "--within", "3")
     assert main(["compare", str(path)]) == 0
     printed = capsys.readouterr().out
@@ -449,17 +555,35 @@ def edited(path: Path, change: Callable[[dict[str, object]], object]) -> Path:
         (lambda d: d.update(maps=5), "maps: expected a list, got 5"),
         (lambda d: d.update(steps=7), "steps: expected 23, as map 1 has, got 7"),
         (lambda d: d.update(complete="yes"), "complete: expected true or false, got 'yes'"),
-        (lambda d: d.update(backbone=[]), "backbone: expected an object with proven and dstates, got []"),
-        (lambda d: d["backbone"]["dstates"]["always"].pop(), "backbone: dstates.always: expected 23 numbers"),
-        (lambda d: d["backbone"]["places"].update(sometimes=[[0, 99]]), "backbone: places.sometimes: expected pairs of steps, 0 to 22"),
-        (lambda d: (d.update(complete=False), d["backbone"]["places"].update(sometimes=[])), "backbone: places: steps "),
-        (lambda d: (d["maps"][0]["dstates"][0].update(view="x"), d["maps"][0].pop("id")), "expected the view 'x' at step 0, as "),
+        (
+            lambda d: d.update(backbone=[]),
+            "backbone: expected an object with proven and dstates, got []",
+        ),
+        (
+            lambda d: d["backbone"]["dstates"]["always"].pop(),
+            "backbone: dstates.always: expected 23 numbers",
+        ),
+        (
+            lambda d: d["backbone"]["places"].update(sometimes=[[0, 99]]),
+            "backbone: places.sometimes: expected pairs of steps, 0 to 22",
+        ),
+        (
+            lambda d: (d.update(complete=False), d["backbone"]["places"].update(sometimes=[])),
+            "backbone: places: steps ",
+        ),
+        (
+            lambda d: (d["maps"][0]["dstates"][0].update(view="x"), d["maps"][0].pop("id")),
+            "expected the view 'x' at step 0, as ",
+        ),
         (lambda d: d["theory"].update(level="no"), "level"),
         (lambda d: d.update(levels=[]), "levels: expected a list"),
     ],
 )
 def test_files_that_are_not_what_they_should_be(
-    file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str], change: Callable[[dict[str, object]], object], message: str
+    file_of: Callable[..., Path],
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[dict[str, object]], object],
+    message: str,
 ) -> None:
     assert main(["compare", str(edited(file_of(ACES3, "-n", "0"), change))]) == 1
     error = capsys.readouterr().err
@@ -467,16 +591,30 @@ def test_files_that_are_not_what_they_should_be(
     assert error.count("\n") == 1
 
 
-def test_maps_of_other_traces_are_refused(file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_maps_of_other_traces_are_refused(
+    file_of: Callable[..., Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     path = file_of(ACES3, "-n", "0")
     rectangle(22).save(tmp_path / "other.jsonl")
     rectangle(9).save(tmp_path / "short.jsonl")
-    other, short = file_of(str(tmp_path / "other.jsonl"), name="other.json"), file_of(str(tmp_path / "short.jsonl"), name="short.json")
+    other, short = (
+        file_of(str(tmp_path / "other.jsonl"), name="other.json"),
+        file_of(str(tmp_path / "short.jsonl"), name="short.json"),
+    )
     for words, message in (
-        ((str(path), str(other)), "expected the view 'open-ahead-right-back' at step 0, as the maps of "),
+        (
+            (str(path), str(other)),
+            "expected the view 'open-ahead-right-back' at step 0, as the maps of ",
+        ),
         ((str(path), str(short)), "expected 23 steps, as the maps of "),
-        ((str(path), "--diff", "1", "9"), "expected the number of a map, 1 to 4, or its id, got '9'"),
-        ((str(path), "--diff", "0", "1"), "expected the number of a map, 1 to 4, or its id, got '0'"),
+        (
+            (str(path), "--diff", "1", "9"),
+            "expected the number of a map, 1 to 4, or its id, got '9'",
+        ),
+        (
+            (str(path), "--diff", "0", "1"),
+            "expected the number of a map, 1 to 4, or its id, got '0'",
+        ),
         ((str(path), "--diff", "abcdef012345", "1"), "or its id, got 'abcdef012345'"),
     ):
         assert main(["compare", *words]) == 1
@@ -485,14 +623,19 @@ def test_maps_of_other_traces_are_refused(file_of: Callable[..., Path], capsys: 
     for wrong, said in (
         ([maps[0], others[0]], "maps[1]: expected 23 steps, as maps[0] has, got 10"),
         ([maps[0], 5], "maps[1]: expected a map, got 5"),
-        ("maps.json", "maps: expected a solution or maps, got 'maps.json'; read a file with Listing.load"),
+        (
+            "maps.json",
+            "maps: expected a solution or maps, got 'maps.json'; read a file with Listing.load",
+        ),
         (7, "maps: expected a solution or maps, got 7"),
         ([], "maps: expected maps, got none"),
     ):
         with pytest.raises(MapError) as error:
             compare(wrong)  # type: ignore[arg-type]
         assert str(error.value).startswith(said)
-    with pytest.raises(MapError, match="expected two of one trace, got one of 23 steps and one of 10"):
+    with pytest.raises(
+        MapError, match="expected two of one trace, got one of 23 steps and one of 10"
+    ):
         difference(maps[0], others[0])
 
 
@@ -509,12 +652,16 @@ def test_the_backbone_survives_files_also_where_pairs_are_left_out() -> None:
         assert again.sorts[sort].always == shared.always
 
 
-def test_json_streams_what_is_too_much_to_hold(monkeypatch: pytest.MonkeyPatch, file_of: Callable[..., Path]) -> None:
+def test_json_streams_what_is_too_much_to_hold(
+    monkeypatch: pytest.MonkeyPatch, file_of: Callable[..., Path]
+) -> None:
     held = json.loads(file_of(ACES3, "-n", "0").read_text())
     printed_by.cache_clear()
     monkeypatch.setattr(solving, "HELD", 2)
     streamed = json.loads(file_of(ACES3, "-n", "0").read_text())
-    assert [m["id"] for m in held["maps"]] == [m.id for m in solve(Trace.load(ACES3), max_maps=None).maps]
+    assert [m["id"] for m in held["maps"]] == [
+        m.id for m in solve(Trace.load(ACES3), max_maps=None).maps
+    ]
     assert {m["id"] for m in streamed["maps"]} == {m["id"] for m in held["maps"]}
     assert streamed["count"] == held["count"] == len(streamed["maps"])
     printed_by.cache_clear()
@@ -522,7 +669,12 @@ def test_json_streams_what_is_too_much_to_hold(monkeypatch: pytest.MonkeyPatch, 
 
 def test_one_map_has_nothing_to_be_told_apart_from() -> None:
     found = compare(solve(written("a T b")))
-    assert (found.sentence, found.choices, found.deciding, found.product) == ("1 minimal map", (), (), "")
+    assert (found.sentence, found.choices, found.deciding, found.product) == (
+        "1 minimal map",
+        (),
+        (),
+        "",
+    )
     assert list(compared(found)) == []
 
 

@@ -23,7 +23,13 @@ PLAIN = Speedups.without(SPEEDUPS)
 def broken_traces(draw: st.DrawFn, most_steps: int = 6) -> Trace:
     """Traces some of whose actions slipped: what stands there is no action that is known."""
     steps = draw(st.integers(2, most_steps))
-    names = draw(st.lists(st.sampled_from(["travel", "travel", "right", "around"]), min_size=steps - 1, max_size=steps - 1))
+    names = draw(
+        st.lists(
+            st.sampled_from(["travel", "travel", "right", "around"]),
+            min_size=steps - 1,
+            max_size=steps - 1,
+        )
+    )
     slipped = draw(st.sets(st.integers(0, steps - 2), min_size=1, max_size=2))
     actions = [Action.that_slipped(t) if t in slipped else name for t, name in enumerate(names)]
     seen = draw(st.lists(st.sampled_from("ab"), min_size=steps, max_size=steps))
@@ -42,7 +48,9 @@ def maps_of(trace: Trace, theory: Theory, speedups: Speedups) -> set[object]:
 
 @settings(max_examples=10)
 @given(broken_traces(), st.sampled_from(["none", "strict"]), st.booleans())
-def test_nothing_is_known_of_where_an_action_led_that_slipped(trace: Trace, boundary: str, framed: bool) -> None:
+def test_nothing_is_known_of_where_an_action_led_that_slipped(
+    trace: Trace, boundary: str, framed: bool
+) -> None:
     theory = Theory(boundary=boundary, star="frame" if framed and trace.has_stars else "none")  # type: ignore[arg-type]
     _, expected = minimal_maps(trace, theory)
     assert maps_of(trace, theory, PLAIN) == set(expected)
@@ -56,7 +64,10 @@ def test_maps_of_mended_traces_are_those_of_the_plain_encodings(data: st.DataObj
     trace = data.draw(small_traces())
     slipped = data.draw(st.sampled_from([0.0, 1.2]))
     theory = Theory(
-        boundary="none", misread=data.draw(st.sampled_from([0.4, 1.5])), slipped=slipped, star="frame" if trace.has_stars else "none"
+        boundary="none",
+        misread=data.draw(st.sampled_from([0.4, 1.5])),
+        slipped=slipped,
+        star="frame" if trace.has_stars else "none",
     )
     plain = Search(trace, theory, max_maps=None, speedups=PLAIN)
     expected = {(*key(ssh_map), ssh_map.faults) for ssh_map in plain}
@@ -73,9 +84,17 @@ def test_maps_of_mended_traces_are_those_of_the_plain_encodings(data: st.DataObj
 def small_traces(draw: st.DrawFn) -> Trace:
     """Out and back along a corridor, with a view or a star that may be wrong."""
     steps = draw(st.integers(3, 6))
-    actions = draw(st.lists(st.sampled_from(["travel", "around"]), min_size=steps - 1, max_size=steps - 1))
+    actions = draw(
+        st.lists(st.sampled_from(["travel", "around"]), min_size=steps - 1, max_size=steps - 1)
+    )
     seen = draw(st.lists(st.sampled_from("ab"), min_size=steps, max_size=steps))
     if draw(st.booleans()):
         return Trace.from_steps(seen, actions)
-    stars = draw(st.lists(st.sampled_from([(1, 0, 1, 0), (1, 0, 1, 0), (1, 1, 1, 0)]), min_size=steps, max_size=steps))
+    stars = draw(
+        st.lists(
+            st.sampled_from([(1, 0, 1, 0), (1, 0, 1, 0), (1, 1, 1, 0)]),
+            min_size=steps,
+            max_size=steps,
+        )
+    )
     return Trace.from_steps(seen, actions, stars=stars)

@@ -31,7 +31,13 @@ WHITE = Odometry(scale=0.0, bend=0.0)
 
 
 def circuit(
-    corners: int, sides: int, noise: float = 0.0, seed: int = 0, odometry: Odometry = WHITE, scale: float = 0.0, bend: float = 0.0
+    corners: int,
+    sides: int,
+    noise: float = 0.0,
+    seed: int = 0,
+    odometry: Odometry = WHITE,
+    scale: float = 0.0,
+    bend: float = 0.0,
 ) -> Trace:
     """A robot that drives round a regular polygon to the right, so many sides, all corners of which look alike.
 
@@ -45,10 +51,15 @@ def circuit(
         error = rng.multivariate_normal(np.zeros(3), np.array(odometry.covariance(true))) * noise
         way = math.hypot(*true[:2])
         turned = bend * way
-        ahead, left = (1 + scale) * way * math.cos(turned / 2), (1 + scale) * way * math.sin(turned / 2)
+        ahead, left = (
+            (1 + scale) * way * math.cos(turned / 2),
+            (1 + scale) * way * math.sin(turned / 2),
+        )
         moved.append((ahead + error[0], left + error[1], true[2] + turned + error[2]))
     views = [("after", "before")[step % 2] for step in range(2 * sides + 1)]
-    return Trace.from_steps(views, ["travel", "right"] * sides, displacements=moved, odometry=odometry)
+    return Trace.from_steps(
+        views, ["travel", "right"] * sides, displacements=moved, odometry=odometry
+    )
 
 
 @settings(max_examples=5)
@@ -60,8 +71,15 @@ def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject)
 
 
 @settings(max_examples=5)
-@given(st.integers(0, 10_000), st.integers(3, 6), st.sampled_from([1.0, 2.0, 3.0]), st.sampled_from([0.0, 0.01]))
-def test_sets_of_two_are_those_of_matrices_written_out(seed: int, corners: int, noise: float, bend: float) -> None:
+@given(
+    st.integers(0, 10_000),
+    st.integers(3, 6),
+    st.sampled_from([1.0, 2.0, 3.0]),
+    st.sampled_from([0.0, 0.01]),
+)
+def test_sets_of_two_are_those_of_matrices_written_out(
+    seed: int, corners: int, noise: float, bend: float
+) -> None:
     """Labels that need not be a map's: every second step is at one of few dstates, so that many returns share displacements."""
     odometry = replace(WHITE, bend=bend)
     trace = circuit(corners, 5, noise, seed, odometry)
@@ -81,13 +99,25 @@ def test_sets_of_two_are_those_of_matrices_written_out(seed: int, corners: int, 
         assert (first, second) in expected
     apart = {(i, j) for j, others in returns.pairs.apart.items() for i in others}
     assert apart == {
-        (i, j) for j in range(len(labels)) for i in range(j) if trace.views[i] == trace.views[j] and written_out.refuses(((i, j, 3),))
+        (i, j)
+        for j in range(len(labels))
+        for i in range(j)
+        if trace.views[i] == trace.views[j] and written_out.refuses(((i, j, 3),))
     }
 
 
 def test_covariances_of_closings_are_those_of_many_noisy_drives() -> None:
     """With little noise, so that first order is good."""
-    little = Odometry(along=0.0005, across=0.0003, heading=0.0001, turning=0.0002, position=0.001, angle=0.0002, scale=0.0, bend=0.0)
+    little = Odometry(
+        along=0.0005,
+        across=0.0003,
+        heading=0.0001,
+        turning=0.0002,
+        position=0.001,
+        angle=0.0002,
+        scale=0.0,
+        bend=0.0,
+    )
     true = Loops.of(circuit(5, 4, 0.0, 0, little)).poses
 
     def closing(poses: np.ndarray, i: int, j: int) -> np.ndarray:
@@ -101,7 +131,9 @@ def test_covariances_of_closings_are_those_of_many_noisy_drives() -> None:
     measured = np.cov(np.array(ends).T)
     loops = Loops.of(circuit(5, 4, 0.0, 0, little))
     shared = loops.shared(([1], [8]), ([3], [6]))[0]
-    assert measured[:3, 3:] == pytest.approx(shared, abs=0.15 * np.sqrt(np.outer(measured.diagonal()[:3], measured.diagonal()[3:])).max())
+    assert measured[:3, 3:] == pytest.approx(
+        shared, abs=0.15 * np.sqrt(np.outer(measured.diagonal()[:3], measured.diagonal()[3:])).max()
+    )
 
 
 def test_a_square_whose_corners_look_alike_is_a_square() -> None:
@@ -124,7 +156,9 @@ def test_polygons_are_told_by_displacements_alone(corners: int) -> None:
     assert solution.count == 1
 
 
-@pytest.mark.parametrize(("scale", "bend"), [(0.1, 0.0), (0.0, math.radians(0.2)), (-0.1, -math.radians(0.2))])
+@pytest.mark.parametrize(
+    ("scale", "bend"), [(0.1, 0.0), (0.0, math.radians(0.2)), (-0.1, -math.radians(0.2))]
+)
 def test_errors_that_repeat_are_estimated_along(scale: float, bend: float) -> None:
     trace = circuit(5, 16, 1.0, 1, Odometry(heading=0.001, turning=0.01, angle=0.005), scale, bend)
     solution = solve(trace, Theory.causal())
@@ -134,8 +168,13 @@ def test_errors_that_repeat_are_estimated_along(scale: float, bend: float) -> No
     assert found.fit.p > 0.001
     assert found.fit.bend == pytest.approx(bend, abs=0.0015)
     x, y = found.fit.poses[1].x, found.fit.poses[1].y
-    assert math.hypot(x, y) == pytest.approx(ROOM, rel=0.12)  # loops that close hardly notice the scale
-    stiff = solve(replace(trace, odometry=replace(trace.odometry or WHITE, scale=0.0, bend=0.0)), Theory.causal())
+    assert math.hypot(x, y) == pytest.approx(
+        ROOM, rel=0.12
+    )  # loops that close hardly notice the scale
+    stiff = solve(
+        replace(trace, odometry=replace(trace.odometry or WHITE, scale=0.0, bend=0.0)),
+        Theory.causal(),
+    )
     if bend:
         assert stiff.maps[0].labels != found.labels or stiff.odometry_warning
 
@@ -170,7 +209,9 @@ def test_poses_are_where_the_dstates_are() -> None:
     trace = circuit(4, 8, 0.3, 2)
     found = fit(trace, true_circuit(trace, 4))
     at = [(pose.x, pose.y) for pose in found.poses]
-    for s, corner in enumerate([(0, 0), (10, 0), (10, 0), (10, -10), (10, -10), (0, -10), (0, -10), (0, 0)]):
+    for s, corner in enumerate(
+        [(0, 0), (10, 0), (10, 0), (10, -10), (10, -10), (0, -10), (0, -10), (0, 0)]
+    ):
         assert at[s] == pytest.approx(corner, abs=0.8)
     assert found.poses[0].spread == (0.0, 0.0, 0.0)
     assert all(pose.spread[0] > 0 for pose in found.poses[1:7])
@@ -185,7 +226,10 @@ def test_a_noise_model_that_is_off_is_noticed(factor: float, said: str | None) -
         return
     assert warning is not None
     assert said in warning
-    assert f"multiply them by {factor:.1g}"[:-1] in warning or abs(float(warning.rsplit(" ", 1)[1]) - factor) < 0.2 * factor
+    assert (
+        f"multiply them by {factor:.1g}"[:-1] in warning
+        or abs(float(warning.rsplit(" ", 1)[1]) - factor) < 0.2 * factor
+    )
 
 
 def test_kilometres_are_noticed() -> None:
@@ -193,7 +237,12 @@ def test_kilometres_are_noticed() -> None:
     trace = circuit(4, 9)
 
     def scaled(by: float, **noise: float) -> Trace:
-        steps = (replace(s, displacement=s.displacement and (s.displacement[0] * by, 0.0, s.displacement[2])) for s in trace.steps)
+        steps = (
+            replace(
+                s, displacement=s.displacement and (s.displacement[0] * by, 0.0, s.displacement[2])
+            )
+            for s in trace.steps
+        )
         return replace(trace, steps=tuple(steps), odometry=replace(WHITE, **noise))
 
     said = "the odometry tells no travel from standing still: the longest displacement of one is 0.01 m, and its noise about 0.1 m; "
@@ -218,7 +267,12 @@ def test_the_map_that_closes_best_comes_first_and_rivals_have_weights() -> None:
 
 def test_steps_without_displacements_cut_what_is_known() -> None:
     trace = circuit(4, 9, 1.0)
-    cut = replace(trace, steps=tuple(replace(s, displacement=None) if t == 7 else s for t, s in enumerate(trace.steps)))
+    cut = replace(
+        trace,
+        steps=tuple(
+            replace(s, displacement=None) if t == 7 else s for t, s in enumerate(trace.steps)
+        ),
+    )
     theory = Theory.topological().resolve(cut)
     pairs = pairs_of(cut, theory)
     assert pairs.apart
@@ -228,10 +282,19 @@ def test_steps_without_displacements_cut_what_is_known() -> None:
 
 def test_displacements_may_be_left_out_or_asked_for() -> None:
     trace = circuit(4, 9, 1.0)
-    assert solve(trace, Theory(displacement="none")).cost == solve(trace.without_displacements()).cost
+    assert (
+        solve(trace, Theory(displacement="none")).cost == solve(trace.without_displacements()).cost
+    )
     with pytest.raises(TheoryError, match="displacement: expected a trace with displacements"):
         solve(trace.without_displacements(), Theory(displacement="use"))
-    for wrong in ({"reject": 0.0}, {"reject": 1.5}, {"joint": 3}, {"joint": 0}, {"displacement": "some"}, {"prefer": ("auto", "paths")}):
+    for wrong in (
+        {"reject": 0.0},
+        {"reject": 1.5},
+        {"joint": 3},
+        {"joint": 0},
+        {"displacement": "some"},
+        {"prefer": ("auto", "paths")},
+    ):
         with pytest.raises(TheoryError, match=next(iter(wrong))):
             Theory(**wrong)  # type: ignore[arg-type]
 
@@ -247,7 +310,11 @@ def test_places_go_before_paths_where_displacements_are_used() -> None:
 def test_the_checker_says_which_returns_are_refused() -> None:
     trace = circuit(4, 9, 1.0)
     wrong = solve(trace, Theory(displacement="none")).maps[0]
-    said = [violation for violation in check(trace, wrong, Theory(displacement="use", prefer=())) if violation.axiom == "one_pose"]
+    said = [
+        violation
+        for violation in check(trace, wrong, Theory(displacement="use", prefer=()))
+        if violation.axiom == "one_pose"
+    ]
     assert said
     assert "By the displacements it cannot be that" in said[0].message
 
@@ -271,16 +338,25 @@ def test_fits_of_true_maps_are_as_likely_where_displacements_are_missing(kept: s
         walk = maze(3, 3, steps=30, seed=seed, stars=True, follow=True, odometry=Odometry())
         rng = np.random.default_rng(seed)
         keeps = [
-            {"travels": action.kind == "travel", "turns": action.kind == "turn", "most": rng.random() < 0.8, "few": rng.random() < 0.2}[
-                kept
-            ]
+            {
+                "travels": action.kind == "travel",
+                "turns": action.kind == "turn",
+                "most": rng.random() < 0.8,
+                "few": rng.random() < 0.2,
+            }[kept]
             for action in walk.trace.actions
         ]
-        steps = (step if keep else replace(step, displacement=None) for step, keep in zip(walk.trace, [True, *keeps], strict=True))
+        steps = (
+            step if keep else replace(step, displacement=None)
+            for step, keep in zip(walk.trace, [True, *keeps], strict=True)
+        )
         number: dict[object, int] = {}
         labels = tuple(number.setdefault(state, len(number)) for state in walk.truth)
         places: dict[object, int] = {}
-        dstates = tuple(DState(i, "", places.setdefault(state[:2], len(places))) for i, state in enumerate(number))  # type: ignore[index]
+        dstates = tuple(
+            DState(i, "", places.setdefault(state[:2], len(places)))
+            for i, state in enumerate(number)
+        )  # type: ignore[index]
         found = fit(replace(walk.trace, steps=tuple(steps)), SSHMap(labels, dstates, ()))
         assert found.p > 1e-5
         squares, freedom, above = squares + found.chi2, freedom + found.dof, above + (found.p > 0.5)

@@ -45,16 +45,26 @@ def steps_of(poses: np.ndarray) -> list[tuple[float, float, float]]:
 
 def test_an_odometer_errs_as_it_says() -> None:
     """Over many drives of 9 m straight ahead, and of two radians on the spot: the spread of what is read is the noise times the root of the motion, and the mean shows what repeats."""
-    odometer, rng = Odometer(along=0.04, across=0.03, heading=0.0, turning=0.05, scale=0.1, bend=0.01), np.random.default_rng(0)
+    odometer, rng = (
+        Odometer(along=0.04, across=0.03, heading=0.0, turning=0.05, scale=0.1, bend=0.01),
+        np.random.default_rng(0),
+    )
     line = np.column_stack([1 + 3 * np.linspace(0, 3, 31), np.full(31, 2.0), np.zeros(31)])
-    ends = np.array([Odometer(along=0.04, across=0.03, heading=0.0, scale=0.1).reading(line, rng)[-1] for _ in range(2000)])
+    ends = np.array(
+        [
+            Odometer(along=0.04, across=0.03, heading=0.0, scale=0.1).reading(line, rng)[-1]
+            for _ in range(2000)
+        ]
+    )
     np.testing.assert_allclose(ends.mean(0), (9.9, 0.0, 0.0), atol=0.02)
     np.testing.assert_allclose(ends.std(0), (0.04 * 3, 0.03 * 3, 0.0), rtol=0.07)
     spin = np.column_stack([np.zeros((31, 2)), np.linspace(0, 2, 31)])
     ends = np.array([odometer.reading(spin, rng)[-1] for _ in range(2000)])
     np.testing.assert_allclose(ends.mean(0), (0.0, 0.0, 2.0), atol=0.01)
     np.testing.assert_allclose(ends.std(0), (0.0, 0.0, 0.05 * math.sqrt(2)), rtol=0.07)
-    assert odometer.reading(line, rng)[-1, 2] == pytest.approx(0.09, abs=1e-9)  # the bend, in each metre
+    assert odometer.reading(line, rng)[-1, 2] == pytest.approx(
+        0.09, abs=1e-9
+    )  # the bend, in each metre
 
 
 def test_an_exact_odometer_reads_the_way_itself() -> None:
@@ -74,9 +84,17 @@ def test_a_wrong_odometer_names_its_field(field: str) -> None:
 def test_scans_are_taken_all_along() -> None:
     """Also within a long motion: the next scan is at most a fifth farther than was asked for, in metres and degrees."""
     recorder = Recorder(every=0.3)
-    for pose in ((1.0, 1.0, 0.0), (3.0, 1.0, 0.0), (3.0, 1.0, 3.0), (3.1, 1.0, 3.0), (3.15, 1.0, 3.0)):
+    for pose in (
+        (1.0, 1.0, 0.0),
+        (3.0, 1.0, 0.0),
+        (3.0, 1.0, 3.0),
+        (3.1, 1.0, 3.0),
+        (3.15, 1.0, 3.0),
+    ):
         recorder.note(RECTANGLE, pose)
-    drive = recorder.drive("by hand", Laser(noise=0.0, dropouts=0.0, reach=2.5), Odometer(0, 0, 0, 0), 0)
+    drive = recorder.drive(
+        "by hand", Laser(noise=0.0, dropouts=0.0, reach=2.5), Odometer(0, 0, 0, 0), 0
+    )
     for dx, dy, turned in steps_of(drive.poses):
         assert math.hypot(dx, dy) < 0.3 * 1.2
         assert abs(turned) < math.radians(10) * 1.2
@@ -95,12 +113,16 @@ def test_a_drive_of_a_world_says_where_the_robot_was() -> None:
     assert [visit["place"] for visit in drive.truth["visits"]] == ["A", "B", "C", "D"] * 2 + ["A"]
     for visit in drive.truth["visits"]:
         x, y = drive.truth["places"][visit["place"]]
-        near = [math.dist(pose[:2], (x, y)) for pose in drive.poses[visit["first"] : visit["last"] + 1]]
+        near = [
+            math.dist(pose[:2], (x, y)) for pose in drive.poses[visit["first"] : visit["last"] + 1]
+        ]
         assert max(near) <= RECTANGLE.reach
         assert min(near) < 0.2
     assert [step["dstate"] for step in drive.truth["steps"]] == [f"x{i % 8}" for i in range(16)]
     again = record(RECTANGLE, tours=2, seed=1, odometer=Odometer(along=0.2))
-    np.testing.assert_array_equal(drive.poses, again.poses)  # noise of the odometer changes the log alone
+    np.testing.assert_array_equal(
+        drive.poses, again.poses
+    )  # noise of the odometer changes the log alone
     assert not np.array_equal(drive.odometry, again.odometry)
 
 
@@ -109,7 +131,13 @@ def test_the_covariance_of_an_odometer_is_that_of_its_errors() -> None:
     rng, odometer = np.random.default_rng(0), Odometer()
     side = np.column_stack([np.linspace(0, 4, 41), np.zeros((41, 2))])
     turn = np.column_stack([np.full(11, 4.0), np.zeros(11), np.linspace(0, math.pi / 2, 11)])
-    poses = np.vstack([side, turn, np.column_stack([np.full(41, 4.0), np.linspace(0, 4, 41), np.full(41, math.pi / 2)])])
+    poses = np.vstack(
+        [
+            side,
+            turn,
+            np.column_stack([np.full(41, 4.0), np.linspace(0, 4, 41), np.full(41, math.pi / 2)]),
+        ]
+    )
     errors = []
     for _ in range(300):
         read = odometer.reading(poses, rng)
@@ -139,7 +167,9 @@ def test_a_robot_drives_through_doors_from_room_to_room(ring: Building) -> None:
     world = ring.world()
     assert min(world.clearance(x, y) for x, y, _ in drive.poses) >= 0.3
     assert len(drive.truth["scans"]) == len(drive)
-    for pose, room in zip(drive.poses, drive.truth["scans"], strict=True):  # in the room that the truth says, or in the wall between two
+    for pose, room in zip(
+        drive.poses, drive.truth["scans"], strict=True
+    ):  # in the room that the truth says, or in the wall between two
         outline = np.array(ring.plan.rooms[int(room.removeprefix("room "))].polygon)
         assert (outline.min(0) - 0.6 < pose[:2]).all()
         assert (pose[:2] < outline.max(0) + 0.6).all()
@@ -164,19 +194,26 @@ def test_rounds_that_cannot_be_driven(ring: Building, tmp_path: Path) -> None:
     with pytest.raises(SimulatorError, match="through which the robot fits, got none"):
         record_plan(replace(ring.plan, doors=()))
     with pytest.raises(
-        SimulatorError, match=r"walls: expected them on at most 200,000 square metres, .*, got 2,784 x 1,984 m; check the scale"
+        SimulatorError,
+        match=r"walls: expected them on at most 200,000 square metres, .*, got 2,784 x 1,984 m; check the scale",
     ):
         record_plan(plan_of(tmp_path, xml(unit="m")))
     with pytest.raises(SimulatorError, match="metres: expected a length above 0"):
         record_plan(ring.plan, metres=0.0)
     with pytest.raises(SimulatorError, match="room 4: expected a bounding_polygon"):
-        Building.of(replace(ring.plan, rooms=(*ring.plan.rooms[:4], replace(ring.plan.rooms[4], polygon=()))))
+        Building.of(
+            replace(
+                ring.plan, rooms=(*ring.plan.rooms[:4], replace(ring.plan.rooms[4], polygon=()))
+            )
+        )
 
 
 @pytest.mark.skipif(not SCHOOLS, reason="the school plans are not here")
 def test_a_school_can_be_driven() -> None:
     """The robot goes through 30 doors of a school, hits nothing, and comes home."""
-    drive = record_plan(Plan.load(next(path for path in SCHOOLS if "Sabadell" in path.name)), seed=0, metres=100.0)
+    drive = record_plan(
+        Plan.load(next(path for path in SCHOOLS if "Sabadell" in path.name)), seed=0, metres=100.0
+    )
     assert len(drive.truth["crossings"]) > 10
     assert drive.truth["scans"][0] == drive.truth["scans"][-1]
     assert math.dist(drive.poses[0][:2], drive.poses[-1][:2]) < 1.0
@@ -190,7 +227,9 @@ def test_shipped_worlds_are_driven_off_their_walls_and_furniture(name: str, tour
     """Each place is visited as often as the route says, also on a second tour, on which the furniture stands differently, and the robot touches nothing."""
     world = World.named(name)
     drive = record(world, tours, seed=4, every=1.0)
-    asked = [stop for stop, _ in groupby(stop for stop in world.route * tours if stop in world.places)]
+    asked = [
+        stop for stop, _ in groupby(stop for stop in world.route * tours if stop in world.places)
+    ]
     assert [visit["place"] for visit in drive.truth["visits"]] == asked
     assert all((world.route * 2).count(place) >= 2 for place in world.places)
     assert min(world.clearance(x, y) for x, y, _ in drive.poses) > 0.2
@@ -201,13 +240,29 @@ def test_walls_may_be_round_uneven_or_those_of_an_occupancy_map(tmp_path: Path) 
     cells = np.full((24, 44), 254, np.uint8)
     cells[[0, 1, -2, -1]] = cells[:, [0, 1, -2, -1]] = 0
     (tmp_path / "map.pgm").write_bytes(b"P5 44 24 255\n" + cells.tobytes())
-    (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.1\norigin: [-0.2, -0.2, 0.0]\noccupied_thresh: 0.65\n")
-    fields = {"format": "ssh-world", "version": 1, "places": {"a": [1, 1], "b": [3, 1]}, "route": ["a", "b", "a"], "reach": 0.5}
+    (tmp_path / "map.yaml").write_text(
+        "image: map.pgm\nresolution: 0.1\norigin: [-0.2, -0.2, 0.0]\noccupied_thresh: 0.65\n"
+    )
+    fields = {
+        "format": "ssh-world",
+        "version": 1,
+        "places": {"a": [1, 1], "b": [3, 1]},
+        "route": ["a", "b", "a"],
+        "reach": 0.5,
+    }
     (tmp_path / "room.json").write_text(json.dumps({**fields, "occupancy": "map.yaml"}))
     room = World.load(tmp_path / "room.json")
     assert room.start == (1.0, 1.0, 0.0)
-    assert [visit["place"] for visit in record(room, tours=2, every=1.0).truth["visits"]] == ["a", "b", "a", "b", "a"]
-    (tmp_path / "round.json").write_text(json.dumps({**fields, "arcs": [[2, 1, 3, 0, 360]], "ragged": 0.02}))
+    assert [visit["place"] for visit in record(room, tours=2, every=1.0).truth["visits"]] == [
+        "a",
+        "b",
+        "a",
+        "b",
+        "a",
+    ]
+    (tmp_path / "round.json").write_text(
+        json.dumps({**fields, "arcs": [[2, 1, 3, 0, 360]], "ragged": 0.02})
+    )
     walls = World.load(tmp_path / "round.json").segments
     np.testing.assert_array_equal(walls[:, 2:], np.roll(walls[:, :2], -1, axis=0))  # still closed
     off = np.hypot(walls[:, 0] - 2, walls[:, 1] - 1) - 3
@@ -221,17 +276,31 @@ def test_walls_may_be_round_uneven_or_those_of_an_occupancy_map(tmp_path: Path) 
         ({"arcs": [[0, 0, 1, 90, 0]]}, r"arcs\[0\]: expected \[x, y, radius above 0, from, to\]"),
         ({"arcs": [[0, 0, 1]]}, r"arcs\[0\]: expected 5 finite numbers"),
         ({"ragged": 2}, "ragged: expected metres by which walls are uneven"),
-        ({"ragged": 0.1, "arcs": [[0, 0, 1e5, 0, 360]]}, "ragged: expected walls of at most 20,000 m together"),
+        (
+            {"ragged": 0.1, "arcs": [[0, 0, 1e5, 0, 360]]},
+            "ragged: expected walls of at most 20,000 m together",
+        ),
         ({"occupancy": 3}, "occupancy: expected the name of a YAML file"),
         ({"places": [1]}, "places: expected an object of names and points"),
         ({"places": {"a": [1]}}, r"places\.a: expected 2 finite numbers"),
-        ({"places": {"left": [1, 1]}}, "places: expected names without commas that are no actions, got 'left'"),
-        ({"route": ["a", "travel"]}, r"route\[1\]: expected a place \(b, a\), as there are others in the route, got 'travel'"),
-        ({"route": ["c"]}, r"route\[0\]: expected travel, right, left or around, or the name of a place, got 'c'"),
+        (
+            {"places": {"left": [1, 1]}},
+            "places: expected names without commas that are no actions, got 'left'",
+        ),
+        (
+            {"route": ["a", "travel"]},
+            r"route\[1\]: expected a place \(b, a\), as there are others in the route, got 'travel'",
+        ),
+        (
+            {"route": ["c"]},
+            r"route\[0\]: expected travel, right, left or around, or the name of a place, got 'c'",
+        ),
         ({"route": ["a", ["b"]]}, r"route\[1\]: expected a place"),
     ],
 )
-def test_worlds_with_places_name_what_is_wrong(changes: dict[str, object], message: str, tmp_path: Path) -> None:
+def test_worlds_with_places_name_what_is_wrong(
+    changes: dict[str, object], message: str, tmp_path: Path
+) -> None:
     fields = {
         "format": "ssh-world",
         "version": 1,
@@ -245,13 +314,23 @@ def test_worlds_with_places_name_what_is_wrong(changes: dict[str, object], messa
 
 
 def test_a_route_of_places_that_cannot_be_driven(tmp_path: Path) -> None:
-    fields = {"format": "ssh-world", "version": 1, "polygons": [[[0, 0], [4, 0], [4, 2], [0, 2]]], "places": {"a": [1, 1], "b": [3, 1]}}
-    (tmp_path / "world.json").write_text(json.dumps({**fields, "segments": [[2, 0, 2, 2]], "route": ["a", "b"]}))
+    fields = {
+        "format": "ssh-world",
+        "version": 1,
+        "polygons": [[[0, 0], [4, 0], [4, 2], [0, 2]]],
+        "places": {"a": [1, 1], "b": [3, 1]},
+    }
+    (tmp_path / "world.json").write_text(
+        json.dumps({**fields, "segments": [[2, 0, 2, 2]], "route": ["a", "b"]})
+    )
     with pytest.raises(
-        SimulatorError, match=r"route: expected a way from \(1\.00, 1\.00\) to b, got none; open the walls, or move b, which is 1\.00 m off"
+        SimulatorError,
+        match=r"route: expected a way from \(1\.00, 1\.00\) to b, got none; open the walls, or move b, which is 1\.00 m off",
     ):
         record(World.load(tmp_path / "world.json"))
-    with pytest.raises(SimulatorError, match=r"route: expected actions, got places, .*; write --as carmen"):
+    with pytest.raises(
+        SimulatorError, match=r"route: expected actions, got places, .*; write --as carmen"
+    ):
         simulate(World.load(tmp_path / "world.json"))
 
 
@@ -271,13 +350,18 @@ def test_a_route_of_places_that_cannot_be_driven(tmp_path: Path) -> None:
         (replace(RECTANGLE, start=(3.4, 1.4, 0.7), route=("travel",)), None, None, r"the start heads 40 degrees off the walls"),
     ],
 )  # fmt: skip
-def test_what_goes_wrong_is_told_with_its_cause(world: World, body: Body | None, laser: Laser | None, message: str) -> None:
+def test_what_goes_wrong_is_told_with_its_cause(
+    world: World, body: Body | None, laser: Laser | None, message: str
+) -> None:
     with pytest.raises(SimulatorError, match=message):
         simulate(world, tours=2, seed=0, body=body, laser=laser)
 
 
 def test_a_single_tour_that_does_not_return_is_a_warning() -> None:
-    with pytest.warns(SimulatorWarning, match=r"tour 1: expected it to end where it began, .*; it cannot be driven again from there"):
+    with pytest.warns(
+        SimulatorWarning,
+        match=r"tour 1: expected it to end where it began, .*; it cannot be driven again from there",
+    ):
         assert len(simulate(RECTANGLE.with_choices(route="right"))) == 1
 
 
@@ -292,7 +376,9 @@ def test_a_way_leads_around_what_was_not_known() -> None:
     way = space.way((1.0, 1.5), (11.0, 1.5))
     assert way is not None
     rng = np.random.default_rng(0)
-    driver = Driver(World("box", np.vstack([walls, box])), Robot(Body(), (1.0, 1.5, 0.0), rng), Laser(), rng)
+    driver = Driver(
+        World("box", np.vstack([walls, box])), Robot(Body(), (1.0, 1.5, 0.0), rng), Laser(), rng
+    )
     track = []
     come = []
     for at in follow(driver, space, way):
@@ -311,8 +397,16 @@ def test_a_way_that_is_closed_is_an_error() -> None:
     way = space.way((1.0, 1.5), (11.0, 1.5))
     assert way is not None
     rng = np.random.default_rng(0)
-    driver = Driver(World("shut", np.vstack([walls, [[6, 0, 6, 3]]])), Robot(Body(), (1.0, 1.5, 0.0), rng), Laser(), rng)
-    with pytest.raises(SimulatorError, match=r"shut: drive at \(\d\.\d+, 1\.\d+\): expected a way around what stands there, got none"):
+    driver = Driver(
+        World("shut", np.vstack([walls, [[6, 0, 6, 3]]])),
+        Robot(Body(), (1.0, 1.5, 0.0), rng),
+        Laser(),
+        rng,
+    )
+    with pytest.raises(
+        SimulatorError,
+        match=r"shut: drive at \(\d\.\d+, 1\.\d+\): expected a way around what stands there, got none",
+    ):
         for _ in follow(driver, space, way):
             pass
     part = space.part(np.array([(1.0, 1.5), (11.0, 1.5)]), space.drawn(np.array([[6.0, 0, 6, 3]])))
@@ -325,7 +419,9 @@ def test_a_way_that_is_closed_is_an_error() -> None:
 # The verb
 
 
-def test_simulate_writes_logs_that_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_simulate_writes_logs_that_can_be_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "school.xml").write_text(xml())
     assert (
         main(
@@ -351,7 +447,9 @@ def test_simulate_writes_logs_that_can_be_read(tmp_path: Path, capsys: pytest.Ca
     assert len(log) == len(truth["scans"]) == len(truth["poses"])
     assert log.scans[-1].corrected == pytest.approx(truth["poses"][-1], abs=1e-3)
     assert log.scans[-1].odometry != pytest.approx(truth["poses"][-1], abs=0.1)
-    assert b"PARAM simulator_odometry_scale 0.1 " in gzip.decompress((tmp_path / "run.log.gz").read_bytes())
+    assert b"PARAM simulator_odometry_scale 0.1 " in gzip.decompress(
+        (tmp_path / "run.log.gz").read_bytes()
+    )
 
 
 def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
@@ -362,10 +460,15 @@ def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
     log = read_log(bag)
     with rosbags.AnyReader([bag], default_typestore=None) as reader:
         messages = [
-            reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages([c for c in reader.connections if c.topic == "/odom"])
+            reader.deserialize(raw, c.msgtype)
+            for c, _, raw in reader.messages([c for c in reader.connections if c.topic == "/odom"])
         ]
-    told = np.array([message.pose.covariance for message in messages]).reshape(-1, 6, 6)[:, [[0], [1], [5]], [0, 1, 5]]
-    np.testing.assert_allclose(told, Odometer().covariances(np.array([scan.odometry for scan in log.scans])), atol=1e-6)
+    told = np.array([message.pose.covariance for message in messages]).reshape(-1, 6, 6)[
+        :, [[0], [1], [5]], [0, 1, 5]
+    ]
+    np.testing.assert_allclose(
+        told, Odometer().covariances(np.array([scan.odometry for scan in log.scans])), atol=1e-6
+    )
     assert not told[0].any()
     assert told[-1, 2, 2] > 0.001
 
@@ -374,14 +477,28 @@ def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["school.xml"], "school.xml: expected --as carmen or --as bag beside a floor plan"),
-        (["school.xml", "--as", "carmen", "--reach", "1"], "--reach: expected none beside a floor plan"),
+        (
+            ["school.xml", "--as", "carmen", "--reach", "1"],
+            "--reach: expected none beside a floor plan",
+        ),
         (["triangle", "--as", "carmen", "--no-stars"], "--no-stars: expected none beside --as"),
-        (["triangle", "--as", "carmen", "--images", "panoramas"], "--images panoramas: expected none beside --as"),
+        (
+            ["triangle", "--as", "carmen", "--images", "panoramas"],
+            "--images panoramas: expected none beside --as",
+        ),
         (["triangle", "--as", "carmen", "--hours", "7,19"], "--hours: expected none beside --as"),
-        (["triangle", "--as", "carmen", "--every", "0"], "every: expected metres, 0.01 or more, got 0"),
-        (["triangle", "--as", "carmen", "--odometry-noise", "nan"], "--odometry-noise: expected a number from 0 to 1, got nan"),
+        (
+            ["triangle", "--as", "carmen", "--every", "0"],
+            "every: expected metres, 0.01 or more, got 0",
+        ),
+        (
+            ["triangle", "--as", "carmen", "--odometry-noise", "nan"],
+            "--odometry-noise: expected a number from 0 to 1, got nan",
+        ),
     ],
 )
-def test_logs_that_cannot_be_simulated(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_logs_that_cannot_be_simulated(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["simulate", *arguments, "-o", "run.log"]) == 1
     assert message in capsys.readouterr().err

@@ -33,7 +33,12 @@ def drive() -> tuple[Scan, ...]:
     return tuple(scans_of(record(World.named("taylor-hall"), every=1.0)))[:80]
 
 
-def written(scans: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float = 12.0, nearest: float = 0.0) -> list[Scan]:
+def written(
+    scans: tuple[Scan, ...],
+    say: Callable[[Array, Array], Array],
+    reach: float = 12.0,
+    nearest: float = 0.0,
+) -> list[Scan]:
     """The scans of a laser that sees up to SEES, as a driver writes them.
 
     Args:
@@ -43,7 +48,11 @@ def written(scans: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach
         nearest: The least range that the driver says.
     """
     return [
-        replace(scan, ranges=say(scan.ranges.copy(), scan.ranges > SEES), laser=replace(scan.laser, reach=reach, nearest=nearest))
+        replace(
+            scan,
+            ranges=say(scan.ranges.copy(), scan.ranges > SEES),
+            laser=replace(scan.laser, reach=reach, nearest=nearest),
+        )
         for scan in scans
     ]
 
@@ -51,7 +60,9 @@ def written(scans: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach
 def constant(value: float, noise: float = 0.0) -> Callable[[Array, Array], Array]:
     """A driver that writes a constant where nothing came back."""
     rng = np.random.default_rng(0)
-    return lambda ranges, beyond: np.where(beyond, value * (1 + noise * rng.uniform(-1, 1, len(ranges))), ranges)
+    return lambda ranges, beyond: np.where(
+        beyond, value * (1 + noise * rng.uniform(-1, 1, len(ranges))), ranges
+    )
 
 
 def with_rays_beyond(ranges: Array, beyond: Array) -> Array:
@@ -75,10 +86,15 @@ def with_rays_beyond(ranges: Array, beyond: Array) -> Array:
         (with_rays_beyond, 12.0),
     ],
 )
-def test_a_range_that_repeats_is_no_return(drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float) -> None:
+def test_a_range_that_repeats_is_no_return(
+    drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float
+) -> None:
     scans, notes = understood(written(drive, say, reach), Told())
     assert len(notes) == 1
-    assert re.search(r"Ranges of \d\.?\d* m repeat in \d+ % of the beams, and hardly any are longer.*--no-return", notes[0])
+    assert re.search(
+        r"Ranges of \d\.?\d* m repeat in \d+ % of the beams, and hardly any are longer.*--no-return",
+        notes[0],
+    )
     for scan, true in zip(scans, drive, strict=True):
         assert np.array_equal(np.isinf(scan.ranges), true.ranges > SEES)
 
@@ -91,7 +107,9 @@ def test_a_range_that_repeats_is_no_return(drive: tuple[Scan, ...], say: Callabl
         (lambda ranges, _: ranges, 8.0),
     ],
 )
-def test_walls_are_walls(drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float) -> None:
+def test_walls_are_walls(
+    drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float
+) -> None:
     scans, notes = understood(written(drive, say, reach), Told())
     assert notes == ()
     for scan, true in zip(scans, drive, strict=True):
@@ -100,16 +118,23 @@ def test_walls_are_walls(drive: tuple[Scan, ...], say: Callable[[Array, Array], 
         assert (true.ranges[~seen] >= SEES).all()
 
 
-def test_a_robot_that_stands_before_a_wall_sees_no_range_that_repeats(drive: tuple[Scan, ...]) -> None:
+def test_a_robot_that_stands_before_a_wall_sees_no_range_that_repeats(
+    drive: tuple[Scan, ...],
+) -> None:
     flat = replace(drive[0], ranges=np.full(180, 2.0))
     assert not any("repeat" in note for note in understood([flat] * 200, Told())[1])
 
 
 def test_a_reach_of_nothing_is_that_of_the_largest_range(drive: tuple[Scan, ...]) -> None:
-    scans, notes = understood(written(drive, lambda ranges, beyond: np.where(beyond, np.inf, ranges), math.inf), Told())
+    scans, notes = understood(
+        written(drive, lambda ranges, beyond: np.where(beyond, np.inf, ranges), math.inf), Told()
+    )
     most = max(scan.ranges[scan.ranges <= SEES].max() for scan in drive)
     assert re.search(rf"does not say how far the laser reaches.* it is {most:.4g} m", notes[0])
-    assert all(np.isfinite(scan.ranges[true.ranges <= SEES]).all() for scan, true in zip(scans, drive, strict=True))
+    assert all(
+        np.isfinite(scan.ranges[true.ranges <= SEES]).all()
+        for scan, true in zip(scans, drive, strict=True)
+    )
 
 
 @pytest.mark.parametrize("value", [0.0, math.nan, -1.0, 0.05])
@@ -123,26 +148,36 @@ def test_zeros_beside_long_beams_are_free(drive: tuple[Scan, ...], value: float)
 @pytest.mark.parametrize("value", [0.0, math.nan])
 def test_zeros_at_random_are_unknown(drive: tuple[Scan, ...], value: float) -> None:
     rng = np.random.default_rng(0)
-    scans, notes = understood(written(drive, lambda ranges, _: np.where(rng.random(len(ranges)) < 0.1, value, ranges)), Told())
+    scans, notes = understood(
+        written(drive, lambda ranges, _: np.where(rng.random(len(ranges)) < 0.1, value, ranges)),
+        Told(),
+    )
     (note,) = (note for note in notes if "of the beams are" in note)
     assert re.search(r"\d+ % of the beams are .*nothing is known there.*--zero-is free", note)
     assert all(np.isnan(scan.ranges).any() for scan in scans)
 
 
 @pytest.mark.parametrize("meaning", MEANINGS)
-def test_what_the_user_says_of_zeros_is_obeyed_in_silence(drive: tuple[Scan, ...], meaning: str) -> None:
+def test_what_the_user_says_of_zeros_is_obeyed_in_silence(
+    drive: tuple[Scan, ...], meaning: str
+) -> None:
     told = Told(zero_is=meaning, no_return=11.0)
     scans, notes = understood(written(drive, constant(0.0)), told)
     assert notes == ()
     is_meant = np.isinf if meaning == "free" else np.isnan
-    for scan, alone, true in zip(scans, (as_told(s, told) for s in written(drive, constant(0.0))), drive, strict=True):
+    for scan, alone, true in zip(
+        scans, (as_told(s, told) for s in written(drive, constant(0.0))), drive, strict=True
+    ):
         assert is_meant(scan.ranges[true.ranges > SEES]).all()
         assert np.array_equal(scan.ranges, alone.ranges, equal_nan=True)
 
 
 def test_ranges_from_no_return_on_are_none(drive: tuple[Scan, ...]) -> None:
     scans, _ = understood(drive, Told(no_return=3.0))
-    assert all(np.array_equal(np.isinf(scan.ranges), true.ranges >= 3.0) for scan, true in zip(scans, drive, strict=True))
+    assert all(
+        np.array_equal(np.isinf(scan.ranges), true.ranges >= 3.0)
+        for scan, true in zip(scans, drive, strict=True)
+    )
 
 
 @pytest.mark.parametrize(
@@ -175,7 +210,9 @@ def test_a_good_drive_is_not_doubted(drive: tuple[Scan, ...]) -> None:
 
 
 @pytest.mark.parametrize("fov", [120.0, 135.0, 240.0, 270.0])
-def test_a_wrong_field_of_view_is_said_with_the_likely_one(drive: tuple[Scan, ...], fov: float) -> None:
+def test_a_wrong_field_of_view_is_said_with_the_likely_one(
+    drive: tuple[Scan, ...], fov: float
+) -> None:
     """The true one is 180 degrees."""
     said = doubt(tuple(Told(fov=fov).placed(scan) for scan in drive))
     (about,) = map(float, re.findall(rf"cover about (\d+) degrees, not {fov:.0f} \(--fov\)", said))
@@ -209,10 +246,18 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
 ) -> None:
     path = tmp_path / "dri\x1b[31mve.bag"  # a name that would colour a terminal
     write_bag(path, written(tuple(Told(fov=135).placed(scan) for scan in drive), constant(5.0)))
-    out = ["-o", str(tmp_path / "out"), *(["--no-ladder", "--time-limit", "5"] if verb == "map" else [])]
+    out = [
+        "-o",
+        str(tmp_path / "out"),
+        *(["--no-ladder", "--time-limit", "5"] if verb == "map" else []),
+    ]
     main([verb, str(path), *out])
     said = capsys.readouterr().err
-    for note in ("Scans are those of", "Ranges of 5 m repeat", "The way by scans is not the way by odometry"):
+    for note in (
+        "Scans are those of",
+        "Ranges of 5 m repeat",
+        "The way by scans is not the way by odometry",
+    ):
         assert said.count(f"warning: {note}") == 1
     if verb == "map":
         for file in ("run.json", "report.html"):
@@ -221,18 +266,36 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
             assert "The way by scans is not" in text
             assert "\x1b" not in text
     else:
-        main([verb, str(path), *out, "--fov", "180", "--no-return", "5", "--mount=0,0,0", "--zero-is", "unknown"])
+        main(
+            [
+                verb,
+                str(path),
+                *out,
+                "--fov",
+                "180",
+                "--no-return",
+                "5",
+                "--mount=0,0,0",
+                "--zero-is",
+                "unknown",
+            ]
+        )
         said = capsys.readouterr().err
         assert "Scans are those of" in said
         assert "repeat" not in said
         assert "The way by scans" not in said
 
 
-def test_a_field_of_view_that_a_log_does_not_say_is_noted(drive: tuple[Scan, ...], tmp_path: Path) -> None:
+def test_a_field_of_view_that_a_log_does_not_say_is_noted(
+    drive: tuple[Scan, ...], tmp_path: Path
+) -> None:
     """CARMEN's FLASER lines have no field of view; custom says that of 180 beams, and of 181, and not that of 150."""
     for beams, is_noted in ((180, False), (150, True)):
         path = tmp_path / "drive.log"
-        few = [replace(scan, ranges=scan.ranges[:beams], laser=replace(scan.laser, beams=beams)) for scan in drive]
+        few = [
+            replace(scan, ranges=scan.ranges[:beams], laser=replace(scan.laser, beams=beams))
+            for scan in drive
+        ]
         lines = [
             f"FLASER {beams} {' '.join(f'{min(r, 81.0):.2f}' for r in s.ranges)} 0 0 0 {' '.join(map(str, s.odometry))} {t} x {t}"
             for t, s in enumerate(few)
@@ -246,9 +309,19 @@ def test_a_field_of_view_that_a_log_does_not_say_is_noted(drive: tuple[Scan, ...
 
 
 @pytest.mark.parametrize(
-    "words", [["--fov", "0"], ["--fov", "x"], ["--mount", "1,2"], ["--no-return", "-1"], ["--zero-is", "wall"], ["--mount=1,2,nan"]]
+    "words",
+    [
+        ["--fov", "0"],
+        ["--fov", "x"],
+        ["--mount", "1,2"],
+        ["--no-return", "-1"],
+        ["--zero-is", "wall"],
+        ["--mount=1,2,nan"],
+    ],
 )
-def test_nonsense_in_the_shell_is_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_nonsense_in_the_shell_is_refused(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as end:
         main(["import", "drive.log", *words])
     assert end.value.code == 2

@@ -27,16 +27,26 @@ ACES = str(ROOT / "examples" / "aces3-route.jsonl")
 
 def told(trace: Trace, truths: Sequence[Any]) -> Trace:
     """The trace with this truth, one value a step."""
-    return replace(trace, steps=tuple(replace(step, truth=truth) for step, truth in zip(trace.steps, truths, strict=True)))
+    return replace(
+        trace,
+        steps=tuple(
+            replace(step, truth=truth) for step, truth in zip(trace.steps, truths, strict=True)
+        ),
+    )
 
 
 def walk(truths: Sequence[Any]) -> Trace:
     """A trace in which nothing is seen but that the robot travels, with this truth."""
-    return told(Trace.from_steps("v" * len(truths), [{"name": "go", "kind": "travel"}] * (len(truths) - 1)), truths)
+    return told(
+        Trace.from_steps("v" * len(truths), [{"name": "go", "kind": "travel"}] * (len(truths) - 1)),
+        truths,
+    )
 
 
 def labelled(
-    labels: Sequence[int], places: Sequence[int | None] | None = None, courses: Sequence[tuple[int, int] | None] | None = None
+    labels: Sequence[int],
+    places: Sequence[int | None] | None = None,
+    courses: Sequence[tuple[int, int] | None] | None = None,
 ) -> SSHMap:
     """A map with these labels, and with the place and the course of each dstate."""
     size = max(labels) + 1
@@ -62,7 +72,10 @@ def naive_accuracy(labels: Sequence[int], truths: Sequence[Any]) -> float | None
     known = [(x, y) for x, y in zip(labels, truths, strict=True) if y is not None]
     own, true = sorted({x for x, _ in known}), sorted({y for _, y in known})
     spare = [*true, *([None] * len(own))]  # what is assigned to nothing is right nowhere
-    best = max(sum(assigned[own.index(x)] == y for x, y in known) for assigned in permutations(spare, len(own)))
+    best = max(
+        sum(assigned[own.index(x)] == y for x, y in known)
+        for assigned in permutations(spare, len(own))
+    )
     return share(best, len(known))
 
 
@@ -70,8 +83,12 @@ def naive_edges(said: Sequence[int], true: Sequence[int]) -> set[tuple[float | N
     """Precision and recall of edges under each of the one-to-one assignments that fit most steps."""
     own = sorted(set(said))
     spare = [*sorted(set(true)), *(-1 - x for x in own)]  # a negative place is none
-    assignments = [dict(zip(own, assigned, strict=True)) for assigned in permutations(spare, len(own))]
-    fits = [sum(assigned[x] == y for x, y in zip(said, true, strict=True)) for assigned in assignments]
+    assignments = [
+        dict(zip(own, assigned, strict=True)) for assigned in permutations(spare, len(own))
+    ]
+    fits = [
+        sum(assigned[x] == y for x, y in zip(said, true, strict=True)) for assigned in assignments
+    ]
     edges = {frozenset(edge) for edge in pairwise(said)}
     true_edges = {frozenset(edge) for edge in pairwise(true)}
     found = set()
@@ -100,14 +117,20 @@ def test_accuracy_and_pairs_are_those_that_are_counted_naively(seed: int) -> Non
     place = [rng.randrange(3) for _ in range(4)]
     true_place = [rng.randrange(3) for _ in range(4)]
     names = [rng.choice([0, 1, 2, 3, None]) for _ in range(steps - 1)] + [0]
-    trace = walk([None if d is None else {"dstate": d, "place": f"p{true_place[d]}"} for d in names])
+    trace = walk(
+        [None if d is None else {"dstate": d, "place": f"p{true_place[d]}"} for d in names]
+    )
     found = one(labelled([*labels[:-1], 3], place), trace)
     labels[-1] = 3
     assert found.accuracy == naive_accuracy(labels, names)
     true = [None if d is None else true_place[d] for d in names]
-    assert (found.place_precision, found.place_recall) == naive_pairs([place[x] for x in labels], true)
+    assert (found.place_precision, found.place_recall) == naive_pairs(
+        [place[x] for x in labels], true
+    )
     known = [(x, y) for x, y in zip(labels, names, strict=True) if y is not None]
-    assert found.dstates_right == all((a == b) == (c == d) for (a, c), (b, d) in combinations(known, 2))
+    assert found.dstates_right == all(
+        (a == b) == (c == d) for (a, c), (b, d) in combinations(known, 2)
+    )
     assert found.dstates == len({x for x, _ in known})
 
 
@@ -126,7 +149,9 @@ def test_names_make_no_difference(seed: int) -> None:
     labels = [*(rng.randrange(6) for _ in range(15)), 5]
     truths = [rng.randrange(6) for _ in labels]
     place, true_place = ([rng.randrange(4) for _ in range(6)] for _ in range(2))
-    course, true_course = ([(rng.randrange(2), rng.choice([1, -1])) for _ in range(6)] for _ in range(2))
+    course, true_course = (
+        [(rng.randrange(2), rng.choice([1, -1])) for _ in range(6)] for _ in range(2)
+    )
 
     def figures(ids: Sequence[int], names: Sequence[Any], flip: int) -> Evaluation:
         """With dstate i called ids[i] in the map and names[i] in the truth, and paths in the other direction."""
@@ -135,14 +160,22 @@ def test_names_make_no_difference(seed: int) -> None:
         courses = [(1 - course[at[x]][0], flip * course[at[x]][1]) for x in range(6)]
         trace = walk(
             [
-                {"dstate": names[y], "place": [names[true_place[y]]], "path": names[true_course[y][0]], "direction": true_course[y][1]}
+                {
+                    "dstate": names[y],
+                    "place": [names[true_place[y]]],
+                    "path": names[true_course[y][0]],
+                    "direction": true_course[y][1],
+                }
                 for y in truths
             ]
         )
         return evaluate([labelled([ids[x] for x in labels], places, courses)], trace)
 
     plain = figures(range(6), range(6), 1)
-    assert figures(rng.sample(range(6), 6), rng.sample(["a", "b", 3, [1, 2], {"x": 1}, True], 6), -1) == plain
+    assert (
+        figures(rng.sample(range(6), 6), rng.sample(["a", "b", 3, [1, 2], {"x": 1}, True], 6), -1)
+        == plain
+    )
 
 
 # Maps that are known
@@ -154,11 +187,20 @@ def test_a_map_is_isomorphic_to_itself_as_the_truth(tour: str) -> None:
     solution = solve(trace, max_maps=3)
     for ssh_map in solution.maps:
         at = [ssh_map.dstates[label] for label in ssh_map.labels]
-        truths = [{"dstate": f"d{s.id}", "place": s.place, "path": s.path, "direction": s.direction} for s in at]
+        truths = [
+            {"dstate": f"d{s.id}", "place": s.place, "path": s.path, "direction": s.direction}
+            for s in at
+        ]
         found = evaluate(solution.maps, told(trace, truths))
         assert found.rank == 1 + solution.maps.index(ssh_map)  # minimal maps differ
         assert found.maps[found.rank - 1] == MapEvaluation(
-            True, True, True, *[1.0] * 7, len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths)
+            True,
+            True,
+            True,
+            *[1.0] * 7,
+            len(ssh_map.dstates),
+            len(ssh_map.places),
+            len(ssh_map.paths),
         )
         assert (found.true_dstates, found.true_places, found.true_paths) == (
             len(ssh_map.dstates),
@@ -174,8 +216,17 @@ def test_the_notched_rectangle() -> None:
     assert (found.rank, found.true_dstates, found.true_places, found.true_paths) == (1, 8, 4, None)
     assert found.ambiguity == 4 / 28  # four pairs of opposite dstates
     causal = one(solve(trace, Theory.causal()).maps[0], trace)
-    assert (causal.dstates, causal.isomorphic, causal.accuracy) == (4, False, 21 / 41)  # opposite corners are taken for one
-    assert (causal.places, causal.places_right, causal.place_precision, causal.edge_recall) == (None, None, None, None)
+    assert (causal.dstates, causal.isomorphic, causal.accuracy) == (
+        4,
+        False,
+        21 / 41,
+    )  # opposite corners are taken for one
+    assert (causal.places, causal.places_right, causal.place_precision, causal.edge_recall) == (
+        None,
+        None,
+        None,
+        None,
+    )
     assert (causal.link_precision, causal.link_recall) == (3 / 4, 3 / 8)
 
 
@@ -198,7 +249,9 @@ def test_edges_are_counted_by_hand() -> None:
 
 
 def test_turns_are_no_edges() -> None:
-    trace = told(Trace.from_steps("vvvv", ["right", "travel", "left"]), [{"place": p} for p in "AABB"])
+    trace = told(
+        Trace.from_steps("vvvv", ["right", "travel", "left"]), [{"place": p} for p in "AABB"]
+    )
     found = one(labelled([0, 1, 2, 3], [0, 0, 0, 0]), trace)
     assert (found.edge_precision, found.edge_recall) == (0, 0)  # the turns alone are right
 
@@ -224,15 +277,40 @@ def test_levels_are_told_apart() -> None:
 
     right = [0, 0, 1, 1]
     assert levels(labelled(range(4), right, courses)) == (True, True, True, True)
-    assert levels(labelled(range(4), right, [(0, -1), (1, 1), (0, -1), (1, 1)])) == (True, True, True, True)
-    assert levels(labelled(range(4), right, [(0, 1), (1, 1), (0, -1), (1, 1)])) == (False, True, True, False)  # another direction
-    assert levels(labelled(range(4), right, [(0, 1), (1, 1), (2, 1), (1, 1)])) == (False, True, True, False)  # another path
-    assert levels(labelled(range(4), right, [(0, 1), (1, 1), None, (1, 1)])) == (False, True, True, False)  # along no path
+    assert levels(labelled(range(4), right, [(0, -1), (1, 1), (0, -1), (1, 1)])) == (
+        True,
+        True,
+        True,
+        True,
+    )
+    assert levels(labelled(range(4), right, [(0, 1), (1, 1), (0, -1), (1, 1)])) == (
+        False,
+        True,
+        True,
+        False,
+    )  # another direction
+    assert levels(labelled(range(4), right, [(0, 1), (1, 1), (2, 1), (1, 1)])) == (
+        False,
+        True,
+        True,
+        False,
+    )  # another path
+    assert levels(labelled(range(4), right, [(0, 1), (1, 1), None, (1, 1)])) == (
+        False,
+        True,
+        True,
+        False,
+    )  # along no path
     assert levels(labelled(range(4), [0, 1, 2, 2], courses)) == (False, True, False, True)
     assert levels(labelled([0, 1, 0, 1], [0, 1], [(0, 1), (1, 1)])) == (False, False, False, True)
     assert levels(labelled(range(4))) == (True, True, None, None)
     truths = [{k: v for k, v in truth.items() if k != "direction"} for truth in truths]
-    assert levels(labelled(range(4), right, [(0, 1), (1, 1), (0, -1), (1, 1)])) == (True, True, True, True)
+    assert levels(labelled(range(4), right, [(0, 1), (1, 1), (0, -1), (1, 1)])) == (
+        True,
+        True,
+        True,
+        True,
+    )
 
 
 @pytest.mark.parametrize(
@@ -241,8 +319,14 @@ def test_levels_are_told_apart() -> None:
         (["a", "b", "a"], (3, 2, None, None)),
         ([1, "1", True], (3, 3, None, None)),
         ([[0, 0, "E"], [0, 0, "N"], [0, 0, "E"]], (3, 2, None, None)),
-        ([{"place": "N", "heading": "E"}, {"place": "N", "heading": "S"}, {"place": "N"}], (3, 2, 1, None)),
-        ([{"dstate": "x", "heading": 1}, {"dstate": "x", "heading": 2}, {"pose": [0, 0, 0]}], (2, 1, None, None)),
+        (
+            [{"place": "N", "heading": "E"}, {"place": "N", "heading": "S"}, {"place": "N"}],
+            (3, 2, 1, None),
+        ),
+        (
+            [{"dstate": "x", "heading": 1}, {"dstate": "x", "heading": 2}, {"pose": [0, 0, 0]}],
+            (2, 1, None, None),
+        ),
         ([{"path": "main", "direction": 1}, {"dstate": "x", "place": None}, None], (2, 1, None, 1)),
     ],
 )
@@ -253,7 +337,9 @@ def test_the_forms_of_truth(truths: list[Any], counts: tuple[int | None, ...]) -
 
 def test_ambiguity_is_of_dstates_and_not_of_steps() -> None:
     seen = Trace.from_steps(["a", "a", "b", "c", "a", "b"], ["go"] * 5)
-    assert evaluate([], told(seen, ["u", "v", "w", "x", "u", "x"])).ambiguity == 2 / 6  # u and v by a, w and x by b
+    assert (
+        evaluate([], told(seen, ["u", "v", "w", "x", "u", "x"])).ambiguity == 2 / 6
+    )  # u and v by a, w and x by b
     assert evaluate([], told(seen, ["u"] * 6)).ambiguity is None
     blind = replace(seen, steps=tuple(replace(step, view=None, image=0) for step in seen.steps))
     assert evaluate([], told(blind, "uvwxux")).ambiguity is None
@@ -264,7 +350,16 @@ def test_values_print_as_they_are_called() -> None:
     assert (found.rank, len({found, replace(found)})) == (1, 1)
     data = found.to_dict()
     assert json.loads(json.dumps(data)) == data
-    assert set(data) == {"count", "rank", "steps", "true_dstates", "true_places", "true_paths", "ambiguity", "maps"}
+    assert set(data) == {
+        "count",
+        "rank",
+        "steps",
+        "true_dstates",
+        "true_places",
+        "true_paths",
+        "ambiguity",
+        "maps",
+    }
     text = (ROOT / "docs" / "formats.md").read_text()
     for name in (*data, *data["maps"][0]):
         assert f"`{name}`" in text
@@ -277,14 +372,21 @@ def test_values_print_as_they_are_called() -> None:
     ("truths", "message"),
     [
         ([None] * 3, "trace: truth: expected the true dstate or place of some step, got none"),
-        ([{"pose": [1]}] * 3, "trace: truth: expected the true dstate or place of some step, got none"),
+        (
+            [{"pose": [1]}] * 3,
+            "trace: truth: expected the true dstate or place of some step, got none",
+        ),
         (["a", {1, 2}, "b"], "step 1: truth: expected what JSON can hold, got {1, 2}"),
         (
             [{"dstate": "x", "place": "A"}, "y", {"dstate": "x", "place": "B"}],
             "step 2: truth.place: expected 'A', as step 0 says of the same dstate, got 'B'",
         ),
         (
-            [{"dstate": "x", "path": "A", "direction": 1}, "x", {"dstate": "x", "path": "A", "direction": -1}],
+            [
+                {"dstate": "x", "path": "A", "direction": 1},
+                "x",
+                {"dstate": "x", "path": "A", "direction": -1},
+            ],
             "step 2: truth.direction: expected 1, as step 0 says of the same dstate, got -1",
         ),
     ],
@@ -296,9 +398,14 @@ def test_truth_that_cannot_be_used(truths: list[Any], message: str) -> None:
 
 def test_maps_that_cannot_be_used() -> None:
     trace = walk("aba")
-    with pytest.raises(MapError, match=r"^maps\[1\]: labels: expected 3, one for each step of the trace, got 2; solve this trace"):
+    with pytest.raises(
+        MapError,
+        match=r"^maps\[1\]: labels: expected 3, one for each step of the trace, got 2; solve this trace",
+    ):
         evaluate([labelled([0, 1, 0]), labelled([0, 1])], trace)
-    with pytest.raises(MapError, match=r"^maps\[0\]: labels: expected 0 to 1, the dstates of the map, got 7"):
+    with pytest.raises(
+        MapError, match=r"^maps\[0\]: labels: expected 0 to 1, the dstates of the map, got 7"
+    ):
         evaluate([replace(labelled([0, 1, 0]), labels=(0, 1, 7))], trace)
     with pytest.raises(MapError, match=r"^maps\[0\]: expected an SSHMap, got 5"):
         evaluate([5], trace)  # type: ignore[list-item]
@@ -308,7 +415,9 @@ def test_maps_that_cannot_be_used() -> None:
 
 def test_it_loads_nothing_that_infers() -> None:
     program = "import sys, ssh_abduction.evaluation; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT
+    )
     loaded = {".".join(name.split(".")[:2]) for name in done.stdout.split()}
     assert "ssh_abduction.evaluation" in loaded
     rooms = ("learning", "online", "solver", "checker", "theory", "rivals")
@@ -330,7 +439,10 @@ def test_the_shell_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str
     assert main(["evaluate", solved, ACES]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "no map is the true one, of 4 maps"
-    assert lines[1] == "the truth, told at 23 of 23 steps: 22 dstates, 9 places; 13 % of the pairs of dstates share a view"
+    assert (
+        lines[1]
+        == "the truth, told at 23 of 23 steps: 22 dstates, 9 places; 13 % of the pairs of dstates share a view"
+    )
     assert re.sub(r"  +", "|", lines[3]).startswith("|1|no|19 wrong|10 wrong|–|0.826|")
     assert len(lines) == 3 + 4
 
@@ -338,10 +450,15 @@ def test_the_shell_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str
 def test_the_shell_prints_json(solved: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", solved, ACES, "--json"]) == 0
     trace = Trace.load(ACES)
-    assert json.loads(capsys.readouterr().out) == evaluate(solve(trace, max_maps=None).maps, trace).to_dict()
+    assert (
+        json.loads(capsys.readouterr().out)
+        == evaluate(solve(trace, max_maps=None).maps, trace).to_dict()
+    )
 
 
-def test_the_shell_says_which_map_is_true(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_shell_says_which_map_is_true(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     names = [f"x{i % 8}" for i in range(25)]
     trace = told(rectangle(24), names)
     trace.save(tmp_path / "trace.jsonl")
@@ -350,27 +467,46 @@ def test_the_shell_says_which_map_is_true(tmp_path: Path, capsys: pytest.Capture
     files = [str(tmp_path / "map.json"), str(tmp_path / "trace.jsonl")]
     assert main(["evaluate", *files]) == 0
     out = capsys.readouterr().out
-    assert out.startswith("map 1 is the true one, of 1 map\nthe truth, told at 25 of 25 steps: 8 dstates; 14 % of")
-    assert re.sub(r" +", " ", out.splitlines()[-1]) == " 1 yes 8 right – – 1.000 – – – – 1.000 1.000"
+    assert out.startswith(
+        "map 1 is the true one, of 1 map\nthe truth, told at 25 of 25 steps: 8 dstates; 14 % of"
+    )
+    assert (
+        re.sub(r" +", " ", out.splitlines()[-1]) == " 1 yes 8 right – – 1.000 – – – – 1.000 1.000"
+    )
     cut = {"maps": [labelled([0] * 25).to_dict()], "complete": False}
     (tmp_path / "map.json").write_text(json.dumps(cut))
     assert main(["evaluate", *files]) == 0
-    assert capsys.readouterr().out.startswith("no map is the true one, of 1 map, and there may be more\n")
+    assert capsys.readouterr().out.startswith(
+        "no map is the true one, of 1 map, and there may be more\n"
+    )
     told(trace, [{"place": name} for name in names]).save(tmp_path / "trace.jsonl")
     assert main(["evaluate", *files]) == 0
-    assert capsys.readouterr().out.startswith("unknown which map is the true one, of 1 map, and there may be more: the truth names")
+    assert capsys.readouterr().out.startswith(
+        "unknown which map is the true one, of 1 map, and there may be more: the truth names"
+    )
 
 
-def test_errors_of_the_shell_are_one_line(solved: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_of_the_shell_are_one_line(
+    solved: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     bare, short, none = tmp_path / "bare.jsonl", tmp_path / "short.jsonl", tmp_path / "none.json"
     told(Trace.load(ACES), [None] * 23).save(bare)
     Trace.load(ACES).prefix(9).save(short)
     none.write_text('{"maps": []}')
     for words, message in [
-        ([solved, str(bare)], f"{bare}: truth: expected the true dstate or place of some step, got none; write"),
-        ([solved, str(short)], f"{solved}: maps[0]: labels: expected 9, one for each step of the trace, got 23; solve this trace"),
+        (
+            [solved, str(bare)],
+            f"{bare}: truth: expected the true dstate or place of some step, got none; write",
+        ),
+        (
+            [solved, str(short)],
+            f"{solved}: maps[0]: labels: expected 9, one for each step of the trace, got 23; solve this trace",
+        ),
         ([str(none), ACES], f"{none}: maps: expected one to evaluate, got none"),
-        ([ACES, solved], f"{ACES}: expected a file of maps, got a trace; name the maps first, and then the trace"),
+        (
+            [ACES, solved],
+            f"{ACES}: expected a file of maps, got a trace; name the maps first, and then the trace",
+        ),
         ([solved, solved], f"{solved}:1: header: expected a trace, got maps, as solve prints them"),
         ([str(tmp_path / "nosuch"), ACES], "nosuch: expected a readable file of maps"),
     ]:

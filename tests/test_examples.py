@@ -21,7 +21,9 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 def run(*words: str) -> str:
-    return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        [sys.executable, *words], capture_output=True, text=True, check=True
+    ).stdout
 
 
 @pytest.mark.parametrize(
@@ -40,13 +42,20 @@ def test_example_traces(name: str, theory: Theory, counts: tuple[int, int, int],
     assert solution.status is Status.OPTIMAL
     assert solution.complete
     assert solution.cost is not None
-    assert ((solution.cost.dstates, solution.cost.places, solution.cost.paths), solution.count) == (counts, maps)
+    assert ((solution.cost.dstates, solution.cost.places, solution.cost.paths), solution.count) == (
+        counts,
+        maps,
+    )
     for ssh_map in solution.maps:
         assert check(trace, ssh_map, theory) == ()
 
 
 def test_every_example_trace_is_tested() -> None:
-    assert {path.stem for path in EXAMPLES.glob("*.jsonl")} == {"aces3-route", "notched-rectangle", "adventure"}
+    assert {path.stem for path in EXAMPLES.glob("*.jsonl")} == {
+        "aces3-route",
+        "notched-rectangle",
+        "adventure",
+    }
 
 
 def test_x0_and_x4_share_a_view_and_are_told_apart() -> None:
@@ -68,7 +77,9 @@ def test_demo(tmp_path: Path) -> None:
 
 
 def test_adventure(tmp_path: Path) -> None:
-    assert run(str(EXAMPLES / "adventure.py")).endswith("6 rooms, 1 minimal map(s)\nthe map is the maze\n")
+    assert run(str(EXAMPLES / "adventure.py")).endswith(
+        "6 rooms, 1 minimal map(s)\nthe map is the maze\n"
+    )
     run(str(EXAMPLES / "adventure.py"), "--play", str(tmp_path / "again.jsonl"))
     assert (tmp_path / "again.jsonl").read_text() == (EXAMPLES / "adventure.jsonl").read_text()
 
@@ -85,7 +96,9 @@ def test_the_notebook_tells_what_it_shows(monkeypatch: pytest.MonkeyPatch) -> No
             stored = {output["output_type"]: output for output in cell["outputs"]}
             assert said == "".join(stored.get("stream", {}).get("text", ()))
             shown = stored.get("execute_result")
-            assert (None if value is None else repr(value)) == (shown and "".join(shown["data"]["text/plain"]))
+            assert (None if value is None else repr(value)) == (
+                shown and "".join(shown["data"]["text/plain"])
+            )
 
 
 def executed(text: str, space: dict[str, Any]) -> tuple[str, object]:

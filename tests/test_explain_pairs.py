@@ -33,26 +33,45 @@ def never() -> bool:
 def only(theory: Theory, names: set[str]) -> Theory:
     """The theory with these axioms and no others."""
     rules = {axiom.name for each in theory.rules for axiom in each.axioms}
-    return theory.replace(without=[axiom.name for axiom in axioms() if axiom.name not in names | rules])
+    return theory.replace(
+        without=[axiom.name for axiom in axioms() if axiom.name not in names | rules]
+    )
 
 
-def possible(derivation: Derivation, trace: Trace, theory: Theory, links: list[tuple[str, int]]) -> bool:
+def possible(
+    derivation: Derivation, trace: Trace, theory: Theory, links: list[tuple[str, int]]
+) -> bool:
     """Whether what a derivation rules out is possible where just these axioms hold at just these steps."""
     piece = Piece.of(trace, theory.resolve(trace), derivation.steps)
     pair = piece.steps.index(derivation.first), piece.steps.index(derivation.second)
     active = [facts.active(axiom, piece.steps.index(step)) for axiom, step in links]
-    return Axioms(piece, never, relaxed=True).consistent(active, [(facts.are_one(*pair), not derivation.one)])
+    return Axioms(piece, never, relaxed=True).consistent(
+        active, [(facts.are_one(*pair), not derivation.one)]
+    )
 
 
 def check_derivation(derivation: Derivation, trace: Trace, theory: Theory) -> None:
     """The links suffice, none can be spared, the checker sees each of them broken, and the lines name all of them."""
     links = [(link.axiom, link.step) for link in derivation.links]
     assert not possible(derivation, trace, theory, links)
-    first, second = derivation.steps.index(derivation.first), derivation.steps.index(derivation.second)
+    first, second = (
+        derivation.steps.index(derivation.first),
+        derivation.steps.index(derivation.second),
+    )
     for link in derivation.links:
-        assert possible(derivation, trace, theory, [other for other in links if other != (link.axiom, link.step)])
+        assert possible(
+            derivation,
+            trace,
+            theory,
+            [other for other in links if other != (link.axiom, link.step)],
+        )
         assert (link.without.labels[first] == link.without.labels[second]) != derivation.one
-    told = {(clash.axiom, step) for line in derivation.inferences for clash in line.links for step in clash.steps}
+    told = {
+        (clash.axiom, step)
+        for line in derivation.inferences
+        for clash in line.links
+        for step in clash.steps
+    }
     assert told == set(links)
     for number, line in enumerate(derivation.inferences):
         assert line.says
@@ -76,7 +95,9 @@ def test_the_argument_of_the_paper() -> None:
         "step 0 is at a place on the path that steps 1 and 2 define; step 4 would be at a place to the right of that path; "
         "no place on a path lies right or left of it"
     )
-    assert {"on_path", "branch_side", "side_of_branch", "path_between_sides"} <= set(derivation.axioms)
+    assert {"on_path", "branch_side", "side_of_branch", "path_between_sides"} <= set(
+        derivation.axioms
+    )
     check_derivation(derivation, RECTANGLE, Theory())
     assert all(link.violations for link in derivation.links)
 
@@ -109,7 +130,11 @@ def compare(trace: Trace, theory: Theory, first: int, second: int) -> PairExplan
     def allows(found: Key) -> bool:
         return all(toy.allows(found) for toy in toys)
 
-    consistent = [labels[first] == labels[second] for (labels, *rest), _ in consistent_maps(trace, theory) if allows((labels, *rest))]  # type: ignore[arg-type]
+    consistent = [
+        labels[first] == labels[second]
+        for (labels, *rest), _ in consistent_maps(trace, theory)
+        if allows((labels, *rest))
+    ]  # type: ignore[arg-type]
     _, minimal = minimal_maps(trace, theory, allows)
     ones = [labels[first] == labels[second] for labels, *_ in minimal]
     explanation = explain_pair(trace, first, second, theory, time_limit=100, max_maps=None)
@@ -120,16 +145,27 @@ def compare(trace: Trace, theory: Theory, first: int, second: int) -> PairExplan
         assert explanation.derivation is not None
         check_derivation(explanation.derivation, trace, theory)
     elif len(set(ones)) == 1:
-        assert explanation.verdict is (Verdict.SAME_IN_MINIMAL if ones[0] else Verdict.DIFFERENT_IN_MINIMAL)
+        assert explanation.verdict is (
+            Verdict.SAME_IN_MINIMAL if ones[0] else Verdict.DIFFERENT_IN_MINIMAL
+        )
         lost = explanation.different if ones[0] else explanation.same
-        best, _ = minimal_maps(trace, theory, lambda found: allows(found) and (found[0][first] == found[0][second]) != ones[0])
+        best, _ = minimal_maps(
+            trace,
+            theory,
+            lambda found: allows(found) and (found[0][first] == found[0][second]) != ones[0],
+        )
         assert best is not None
         assert lost.cost is not None
         assert lost.proven
-        assert lost.cost.preferred_by(explanation.theory) == tuple(getattr(best, name) for name in explanation.theory.priorities)
+        assert lost.cost.preferred_by(explanation.theory) == tuple(
+            getattr(best, name) for name in explanation.theory.priorities
+        )
     else:
         assert explanation.verdict is Verdict.DISAGREE
-        assert (explanation.same.maps, explanation.different.maps) == (sum(ones), len(ones) - sum(ones))
+        assert (explanation.same.maps, explanation.different.maps) == (
+            sum(ones),
+            len(ones) - sum(ones),
+        )
         assert explanation.listed
     return explanation
 
@@ -138,7 +174,14 @@ def test_what_planarity_rules_out_is_ruled_out_by_the_links_that_are_named() -> 
     """While axioms are left out, a dstate may be at two places, and then nothing says what is drawn: which maps planarity refused hung on what was asked before."""
     trace = Trace.from_steps("aaaa", ["travel"] * 3, stars=[(1, 1, 1, 1)] * 4)
     (even,) = (toy.rules for toy in TOYS if toy.rules.name == "even.lp")
-    theory = Theory(boundary="defeasible", all_on_paths=True, star="pattern", prefer=(), planar=True, rules=(even,))
+    theory = Theory(
+        boundary="defeasible",
+        all_on_paths=True,
+        star="pattern",
+        prefer=(),
+        planar=True,
+        rules=(even,),
+    )
     derivation = compare(trace, theory, 0, 3).derivation
     assert derivation is not None
     assert "planar" in derivation.axioms
@@ -176,9 +219,16 @@ def test_what_a_rival_costs_that_lost() -> None:
 
 def test_rivals_that_disagree_are_counted() -> None:
     """Turned back, travel may stop at the place before, or skip it (G1 of docs/theory.md)."""
-    trace = Trace.from_steps("batbbb".replace("t", "b"), ["travel", "travel", "around", "travel", "travel"])
+    trace = Trace.from_steps(
+        "batbbb".replace("t", "b"), ["travel", "travel", "around", "travel", "travel"]
+    )
     maps = solve(trace, max_maps=None).maps
-    pairs = [(i, j) for j in range(len(trace)) for i in range(j) if len({m.labels[i] == m.labels[j] for m in maps}) == 2]
+    pairs = [
+        (i, j)
+        for j in range(len(trace))
+        for i in range(j)
+        if len({m.labels[i] == m.labels[j] for m in maps}) == 2
+    ]
     for i, j in pairs:
         explanation = explain_pair(trace, i, j)
         assert explanation.verdict is Verdict.DISAGREE
@@ -232,7 +282,13 @@ def test_a_limit_leaves_what_is_known() -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "said"), [(0, 400, "from 0 to 399, got 400"), (-1, 3, "got -1"), (3, 3, "3 twice"), (True, 3, "got True")]
+    ("first", "second", "said"),
+    [
+        (0, 400, "from 0 to 399, got 400"),
+        (-1, 3, "got -1"),
+        (3, 3, "3 twice"),
+        (True, 3, "got True"),
+    ],
 )
 def test_steps_that_cannot_be_explained(first: int, second: int, said: str) -> None:
     with pytest.raises(TraceError, match=said):
@@ -257,7 +313,9 @@ def test_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", str(rectangle)]) == 0
 
 
-def test_maps_tell_the_theory_that_is_explained_by(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_maps_tell_the_theory_that_is_explained_by(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trace, maps = str(tmp_path / "impossible.jsonl"), tmp_path / "maps.json"
     IMPOSSIBLE.save(trace)
     solve(IMPOSSIBLE, Theory.causal()).save(maps)
@@ -275,7 +333,9 @@ def test_keys_are_labels_first() -> None:
     assert key(ssh_map)[0] == ssh_map.labels
 
 
-def test_what_was_interrupted_is_said_so(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_interrupted_is_said_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The verdict is known by then, and the axioms are not."""
 
     def interrupted(*_: object, **__: object) -> None:
@@ -284,4 +344,6 @@ def test_what_was_interrupted_is_said_so(tmp_path: Path, capsys: pytest.CaptureF
     monkeypatch.setattr("ssh_abduction.explain.pairs.derive", interrupted)
     RECTANGLE.prefix(5).save(tmp_path / "rectangle.jsonl")
     assert main(["explain", str(tmp_path / "rectangle.jsonl"), "0", "4"]) == 130
-    assert capsys.readouterr().out.endswith("different dstates in every map\nwhich axioms it takes was not found out (interrupted)\n")
+    assert capsys.readouterr().out.endswith(
+        "different dstates in every map\nwhich axioms it takes was not found out (interrupted)\n"
+    )

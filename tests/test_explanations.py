@@ -48,7 +48,9 @@ def test_a_turn_on_the_spot_that_does_not_come_round() -> None:
     expected = f"steps 0 and 4 are not one dstate: by the odometry their headings are 120 ± {sigma:.0f} degrees apart"
     assert explanation.sentences == (expected,)
     assert why_apart(TURNS, 4, 0) == expected
-    assert why_apart(TURNS, 0, 2) is None  # they show different views, and the robot has not moved: displacements need not tell them apart
+    assert (
+        why_apart(TURNS, 0, 2) is None
+    )  # they show different views, and the robot has not moved: displacements need not tell them apart
     assert explain(TURNS, Theory(displacement="none")) is None
 
 
@@ -62,7 +64,10 @@ def test_two_returns_that_cannot_both_be() -> None:
     assert solve(trace, theory).status is Status.UNSATISFIABLE
     explanation = explain(trace, theory)
     assert explanation
-    assert {clash.axiom: clash.steps for clash in explanation.clashes} == {"asserted": (9, 11), "one_pose": (11,)}
+    assert {clash.axiom: clash.steps for clash in explanation.clashes} == {
+        "asserted": (9, 11),
+        "one_pose": (11,),
+    }
     said = "steps 1 and 9, and steps 3 and 11 cannot both be returns: the loops of 44 m and 36 m close 3.5 m and 3.5 m off"
     assert explanation.sentences == (said,)
     assert explanation.to_dict()["sentences"] == [said]
@@ -78,14 +83,21 @@ def test_explanations_are_smallest_where_returns_are_refused_together() -> None:
     stretch = explanation.first, explanation.last
     assert stretch == (1, 11)
     for axiom in ("deterministic", "one_pose"):
-        left = theory.replace(without=(axiom,)) if axiom != "one_pose" else theory.replace(displacement="none")
+        left = (
+            theory.replace(without=(axiom,))
+            if axiom != "one_pose"
+            else theory.replace(displacement="none")
+        )
         assert explain(trace.prefix(12), left) is None
 
 
 def test_streets_that_would_cross_are_named() -> None:
     """A street that is travelled back and forth leads back to where it began, or it could not be drawn. That is found out of maps alone, and the explanation names it."""
     trace = Trace.from_steps("aaaaa", ["travel", "around", "travel", "around"])
-    drawn, crossed = Theory(planar=True, same=[(0, 4)]), Theory(planar=True, different=[(0, 4)], elsewhere=[(0, 3)])
+    drawn, crossed = (
+        Theory(planar=True, same=[(0, 4)]),
+        Theory(planar=True, different=[(0, 4)], elsewhere=[(0, 3)]),
+    )
     assert solve(trace, drawn).status is Status.OPTIMAL
     assert explain(trace, drawn) is None
     assert solve(trace, crossed).status is Status.UNSATISFIABLE
@@ -109,7 +121,8 @@ def test_distances_are_those_of_dead_reckoning() -> None:
             assert i not in pairs.apart.get(j, ())
             continue
         found = re.search(
-            r"(?:by the odometry|and) (?:they|steps (\d+) and (\d+), where their visits begin,) are ([\d.]+) ± ([\d.]+) m apart", said
+            r"(?:by the odometry|and) (?:they|steps (\d+) and (\d+), where their visits begin,) are ([\d.]+) ± ([\d.]+) m apart",
+            said,
         )
         if found is None:
             assert "degrees apart" in said
@@ -121,7 +134,9 @@ def test_distances_are_those_of_dead_reckoning() -> None:
         covariance = moves @ geometry.noise() @ moves.T + added
         along = off[:2] / np.hypot(*off[:2])
         assert float(found[3]) == pytest.approx(np.hypot(*off[:2]), abs=0.06)
-        assert float(found[4]) == pytest.approx(math.sqrt(along @ covariance[:2, :2] @ along), abs=0.06)
+        assert float(found[4]) == pytest.approx(
+            math.sqrt(along @ covariance[:2, :2] @ along), abs=0.06
+        )
     assert compared > 50
 
 
@@ -139,10 +154,14 @@ def test_returns_of_a_stretch_are_those_of_the_whole_trace() -> None:
             assert kept
 
 
-def test_the_shell_prints_what_the_odometry_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_shell_prints_what_the_odometry_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "turns.jsonl"
     TURNS.save(path)
-    said = "steps 0 and 4 are not one dstate: by the odometry their headings are 120 ± 3 degrees apart"
+    said = (
+        "steps 0 and 4 are not one dstate: by the odometry their headings are 120 ± 3 degrees apart"
+    )
     assert main(["solve", str(path)]) == 20
     assert said in capsys.readouterr().out.splitlines()
     assert main(["solve", str(path), "--json"]) == 20
@@ -154,9 +173,15 @@ def test_the_judge_says_it_in_metres() -> None:
     wrong = solve(trace, Theory(displacement="none")).maps[0]
     theory = Theory(displacement="use", prefer=())
     said = next(v.message for v in check(trace, wrong, theory) if v.axiom == "one_pose")
-    found = re.search(r"steps (\d+) and (\d+) are at one (place|dstate): they are ([\d.]+ ± [\d.]+ m)", said)
+    found = re.search(
+        r"steps (\d+) and (\d+) are at one (place|dstate): they are ([\d.]+ ± [\d.]+ m)", said
+    )
     assert found
-    (displacement,) = (evidence for evidence in evidence_of(theory.resolve(trace)) if evidence.name == "displacement")
+    (displacement,) = (
+        evidence
+        for evidence in evidence_of(theory.resolve(trace))
+        if evidence.name == "displacement"
+    )
     assert displacement.returns_of(trace).closing(int(found[1]), int(found[2])).metres == found[4]  # type: ignore[attr-defined]
 
 

@@ -18,7 +18,14 @@ from ssh_abduction.solver import Status
 
 TURNS = {"right": 1, "around": 2, "left": 3}
 CORRIDOR = streets(("a", "E", "b"), ("b", "E", "c"))
-RING = streets(("a", "E", "b"), ("b", "E", "c"), ("a", "S", "d"), ("d", "E", "e"), ("e", "E", "f"), ("c", "S", "f"))
+RING = streets(
+    ("a", "E", "b"),
+    ("b", "E", "c"),
+    ("a", "S", "d"),
+    ("d", "E", "e"),
+    ("e", "E", "f"),
+    ("c", "S", "f"),
+)
 
 
 class Streetwalker:
@@ -34,7 +41,9 @@ class Streetwalker:
         return self.place, self.facing
 
     def look(self) -> Step:
-        star = tuple(int(HEADINGS[(self.facing + k) % 4] in self.world[self.place]) for k in range(4))
+        star = tuple(
+            int(HEADINGS[(self.facing + k) % 4] in self.world[self.place]) for k in range(4)
+        )
         truth = {"dstate": str(self.truth), "place": self.place} if self.told else None
         return Step("".join(map(str, star)), star=star, truth=truth)
 
@@ -83,8 +92,14 @@ def test_streets_are_known_when_it_is_done(world: Streets, start: str, margin: i
     assert (found.ending, found.is_unique, found.is_true) == ("done", True, True)
     assert found.steps == len(robot.done)
     assert set(robot.been) == {(place, heading) for place in world for heading in range(4)}
-    travels = {before for (before, _), action in zip(pairwise(robot.been), robot.done, strict=True) if action == "travel"}
-    assert travels == {(place, HEADINGS.index(heading)) for place, ways in world.items() for heading in ways}
+    travels = {
+        before
+        for (before, _), action in zip(pairwise(robot.been), robot.done, strict=True)
+        if action == "travel"
+    }
+    assert travels == {
+        (place, HEADINGS.index(heading)) for place, ways in world.items() for heading in ways
+    }
     for ssh_map in found.solution.maps:
         assert partition(ssh_map.labels) == partition(robot.been)
 
@@ -118,13 +133,20 @@ def test_rivals_that_nothing_tells_apart_are_said() -> None:
     one_way = {0: {"p": 1}, 1: {"n": 2}, 2: {"p": 3}, 3: {"n": 4}, 4: {}}
     explorer = Explorer(Machine("axaza", one_way), Theory.causal(), time_limit=None)
     found = explorer.explore(50)
-    assert (found.steps, found.ending, found.is_unique, found.is_true) == (4, "inseparable", False, False)
+    assert (found.steps, found.ending, found.is_unique, found.is_true) == (
+        4,
+        "inseparable",
+        False,
+        False,
+    )
     assert len(solve(explorer.trace, Theory.causal(), max_maps=None)) == found.solution.count > 1
     assert "not unique" in found.sentence
 
 
 def test_the_map_of_a_world_that_hides_its_states_is_not_true() -> None:
-    blind = Explorer(Machine("aaa", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 0}}), Theory.causal(), time_limit=None).explore(50)
+    blind = Explorer(
+        Machine("aaa", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 0}}), Theory.causal(), time_limit=None
+    ).explore(50)
     assert (blind.ending, blind.is_unique, blind.is_true) == ("done", True, False)
     assert "not true" in blind.sentence
 
@@ -134,13 +156,20 @@ def test_a_margin_finds_what_the_fewest_dstates_hide() -> None:
     for margin in (0, 2):
         ring = Machine("abbc", {0: {"on": 1}, 1: {"on": 2}, 2: {"on": 3}, 3: {"on": 0}})
         found[margin] = Explorer(ring, Theory.causal(), margin=margin, time_limit=None).explore(50)
-    assert {margin: (said.ending, said.is_true) for margin, said in found.items()} == {0: ("done", False), 2: ("done", True)}
+    assert {margin: (said.ending, said.is_true) for margin, said in found.items()} == {
+        0: ("done", False),
+        2: ("done", True),
+    }
     assert found[0].steps == 2  # after a, b, b it takes the last two for one
     assert found[2].steps >= 4
 
 
 def test_a_rival_with_more_dstates_that_nothing_tells_apart_is_said() -> None:
-    found = Explorer(Machine("abab", {s: {"on": (s + 1) % 4} for s in range(4)}), Theory.causal(), time_limit=None).explore(50)
+    found = Explorer(
+        Machine("abab", {s: {"on": (s + 1) % 4} for s in range(4)}),
+        Theory.causal(),
+        time_limit=None,
+    ).explore(50)
     assert (found.ending, found.is_unique, found.is_true) == ("inseparable", True, False)
     assert found.rival is not None
     assert (len(found.solution.maps[0].dstates), len(found.rival.dstates)) == (2, 4)
@@ -158,13 +187,19 @@ class Crooked(Streetwalker):
 def test_no_map_is_said() -> None:
     explorer = Explorer(Crooked(TEE, "W", "E", told=False), time_limit=None)
     found = explorer.explore(10)
-    assert (found.ending, found.is_unique, found.solution.status) == ("contradicted", False, Status.UNSATISFIABLE)
+    assert (found.ending, found.is_unique, found.solution.status) == (
+        "contradicted",
+        False,
+        Status.UNSATISFIABLE,
+    )
     assert solve(explorer.trace).status is Status.UNSATISFIABLE
     assert found.steps < 10
 
 
 def test_a_step_goes_on_where_exploring_was_left() -> None:
-    whole, parts = (Explorer(Streetwalker(CORRIDOR, "a", "E"), margin=0, time_limit=None) for _ in range(2))
+    whole, parts = (
+        Explorer(Streetwalker(CORRIDOR, "a", "E"), margin=0, time_limit=None) for _ in range(2)
+    )
     whole.explore(100)
     while parts.explore(1).ending == "steps":
         pass
@@ -182,13 +217,37 @@ class Nothing(Machine):
 @pytest.mark.parametrize(
     ("build", "error", "message"),
     [
-        (lambda robot: Explorer(robot, margin=-1), TraceError, "margin: expected a number of dstates, 0 or more, got -1"),
-        (lambda robot: Explorer(robot, margin=float("nan")), TraceError, "margin: expected a number of dstates"),
+        (
+            lambda robot: Explorer(robot, margin=-1),
+            TraceError,
+            "margin: expected a number of dstates, 0 or more, got -1",
+        ),
+        (
+            lambda robot: Explorer(robot, margin=float("nan")),
+            TraceError,
+            "margin: expected a number of dstates",
+        ),
         (lambda robot: Explorer(robot, time_limit=float("nan")), AbductionError, "limit"),
-        (lambda robot: Explorer(robot, Theory.causal().replace(misread=1)), TheoryError, "theory: expected one without faults"),
-        (lambda robot: Explorer(Nothing("a", {0: {}})), TraceError, "look: expected a Step with a view, got None"),
-        (lambda robot: Explorer(robot).explore(-1), TraceError, "steps: expected a number of actions, 0 or more, got -1"),
-        (lambda robot: Explorer(robot).explore(2.5), TraceError, "steps: expected a number of actions"),
+        (
+            lambda robot: Explorer(robot, Theory.causal().replace(misread=1)),
+            TheoryError,
+            "theory: expected one without faults",
+        ),
+        (
+            lambda robot: Explorer(Nothing("a", {0: {}})),
+            TraceError,
+            "look: expected a Step with a view, got None",
+        ),
+        (
+            lambda robot: Explorer(robot).explore(-1),
+            TraceError,
+            "steps: expected a number of actions, 0 or more, got -1",
+        ),
+        (
+            lambda robot: Explorer(robot).explore(2.5),
+            TraceError,
+            "steps: expected a number of actions",
+        ),
     ],
 )
 def test_bad_input_is_refused(build: Any, error: type[AbductionError], message: str) -> None:

@@ -26,10 +26,14 @@ from ssh_abduction.output.export.tmap2 import tmap2
 @pytest.fixture(scope="module")
 def square() -> SSHMap:
     moves = [(10, 0, 0), (0, 0, 1.5708)] * 4
-    return solve(Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=moves)).maps[0]
+    return solve(
+        Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=moves)
+    ).maps[0]
 
 
-def nav2_graph(text: str) -> tuple[dict[int, tuple[float, float]], dict[int, tuple[int, int, float]]]:
+def nav2_graph(
+    text: str,
+) -> tuple[dict[int, tuple[float, float]], dict[int, tuple[int, int, float]]]:
     """Nodes and edges by the rules of Nav2's loader. Fails where the loader would."""
     data = json.loads(text)
     assert data["type"] == "FeatureCollection"
@@ -51,10 +55,16 @@ def nav2_graph(text: str) -> tuple[dict[int, tuple[float, float]], dict[int, tup
             assert geometry["type"] in ("LineString", "MultiLineString")
             assert type(properties["cost"]) in (int, float)
             assert properties["cost"] > 0, "the planner refuses an edge that costs nothing"
-            edges[properties["id"]] = (properties["startid"], properties["endid"], properties["cost"])
+            edges[properties["id"]] = (
+                properties["startid"],
+                properties["endid"],
+                properties["cost"],
+            )
     assert nodes
     assert edges
-    assert {end for start, end, _ in edges.values()} | {start for start, _, _ in edges.values()} <= set(nodes)
+    assert {end for start, end, _ in edges.values()} | {
+        start for start, _, _ in edges.values()
+    } <= set(nodes)
     return nodes, edges
 
 
@@ -86,7 +96,13 @@ def checked_tmap2(text: str) -> dict[str, Any]:
 
 
 # The actions that one can import from nav2_msgs.action.
-NAV2_ACTIONS = {"NavigateToPose", "NavigateThroughPoses", "FollowWaypoints", "ComputePathToPose", "ComputePathThroughPoses"}
+NAV2_ACTIONS = {
+    "NavigateToPose",
+    "NavigateThroughPoses",
+    "FollowWaypoints",
+    "ComputePathToPose",
+    "ComputePathThroughPoses",
+}
 
 
 def looked_up(node: dict[str, Any], path: str) -> Any:
@@ -112,7 +128,9 @@ def goals_of_humble(text: str) -> dict[str, tuple[str, dict[str, Any]]]:
             assert edge["action"] in NAV2_ACTIONS
             target = filled(edge["goal"], nodes[edge["node"]])["target_pose"]
             for part, axes in (("position", "xyz"), ("orientation", "xyzw")):
-                assert all(type(target["pose"][part][axis]) is float for axis in axes), "a message takes floating-point numbers alone"
+                assert all(type(target["pose"][part][axis]) is float for axis in axes), (
+                    "a message takes floating-point numbers alone"
+                )
             found[edge["edge_id"]] = target["header"]["frame_id"], target["pose"]
     return found
 
@@ -122,11 +140,19 @@ def graph_of_lcas(text: str) -> nx.DiGraph[Any]:
     data = yaml.safe_load(text)
     for action in data["actions"].values():
         module, _, name = action["action_type"].rpartition(".")
-        assert (module, name in NAV2_ACTIONS, action["action_server"][0]) == ("nav2_msgs.action", True, "/")
+        assert (module, name in NAV2_ACTIONS, action["action_server"][0]) == (
+            "nav2_msgs.action",
+            True,
+            "/",
+        )
     graph: nx.DiGraph[Any] = nx.DiGraph()
     for entry in data["nodes"]:
         node = entry["node"]
-        graph.add_node(node["name"], x=float(node["pose"]["position"]["x"]), y=float(node["pose"]["position"]["y"]))
+        graph.add_node(
+            node["name"],
+            x=float(node["pose"]["position"]["x"]),
+            y=float(node["pose"]["position"]["y"]),
+        )
         for edge in node["edges"]:
             assert edge["action"] in data["actions"]
             graph.add_edge(node["name"], edge["node"], weight=float(edge["properties"]["weight"]))
@@ -153,7 +179,11 @@ def test_lcas_can_drive_a_tmap2(level: str, has_poses: bool, square: SSHMap) -> 
 @pytest.mark.parametrize("x", [0.0, -4e-6, 12345.678949, -0.0, 1e6, 1e20])
 def test_numbers_have_a_decimal_point_and_no_exponent(x: float, heading: float) -> None:
     stops = (Stop(0, x, -x, heading, ("a",)), Stop(1, 5.0, 0.0, 0.0, ("b",)))
-    text = tmap2(Roads("places", True, stops, (Road(0, 1, math.hypot(5 - x, x), None, None, None),)), "m", "map")
+    text = tmap2(
+        Roads("places", True, stops, (Road(0, 1, math.hypot(5 - x, x), None, None, None),)),
+        "m",
+        "map",
+    )
     assert not re.search(r"\d[eE][-+]?\d", text.replace("place-", ""))
     (pose,) = (entry["node"]["pose"] for entry in yaml.safe_load(text)["nodes"][:1])
     assert all(type(value) is float for part in pose.values() for value in part.values())
@@ -167,7 +197,9 @@ def test_a_turn_costs_a_planner_more_than_nothing(square: SSHMap) -> None:
     assert costs[True] == TURN
     assert costs[False] == pytest.approx(10, abs=0.2)
     assert Road(0, 1, 1e-9, None, None, None).cost > 0
-    near = Roads("dstates", True, (Stop(0, 0, 0, 0, ()), Stop(1, 1e-9, 0, 0, ()), Stop(2, 3, 0, 0, ())), ())
+    near = Roads(
+        "dstates", True, (Stop(0, 0, 0, 0, ()), Stop(1, 1e-9, 0, 0, ()), Stop(2, 3, 0, 0, ())), ()
+    )
     assert near.together == 2
 
 
@@ -176,13 +208,23 @@ def test_a_turn_costs_a_planner_more_than_nothing(square: SSHMap) -> None:
     [
         ("topological", "places", None),
         ("topological", None, None),
-        ("topological", "dstates", "8 of 8 dstates share their position with others: .* export places"),
+        (
+            "topological",
+            "dstates",
+            "8 of 8 dstates share their position with others: .* export places",
+        ),
         ("causal", None, "2 of 2 dstates share their position with others: .*--theory topological"),
     ],
 )
 @pytest.mark.parametrize("to", formats.FOR_NAVIGATION)
 def test_nodes_at_one_position_are_told(
-    to: str, theory: str, level: str | None, doubt: str | None, square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]
+    to: str,
+    theory: str,
+    level: str | None,
+    doubt: str | None,
+    square: SSHMap,
+    tmp_path: object,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     file = f"{tmp_path}/map.json"
     (square if theory == "topological" else causal_pair()).save(file)
@@ -193,14 +235,18 @@ def test_nodes_at_one_position_are_told(
 
 def causal_pair() -> SSHMap:
     """A map without places: one position, two headings."""
-    trace = Trace.from_steps(["a", "b", "a"], ["left", "right"], displacements=[(0, 0, 1.5708), (0, 0, -1.5708)])
+    trace = Trace.from_steps(
+        ["a", "b", "a"], ["left", "right"], displacements=[(0, 0, 1.5708), (0, 0, -1.5708)]
+    )
     return solve(trace, Theory.causal()).maps[0]
 
 
 def test_nav2_gets_metres_from_poses(square: SSHMap) -> None:
     nodes, edges = nav2_graph(export_map(square, "nav2"))
     assert len(nodes) == 4
-    assert {(a, b) for a, b, _ in edges.values()} == {(a, b) for i in range(4) for a, b in ((i, (i + 1) % 4), ((i + 1) % 4, i))}
+    assert {(a, b) for a, b, _ in edges.values()} == {
+        (a, b) for i in range(4) for a, b in ((i, (i + 1) % 4), ((i + 1) % 4, i))
+    }
     for start, end, cost in edges.values():
         assert cost == pytest.approx(math.dist(nodes[start], nodes[end]), abs=1e-3)
         assert cost == pytest.approx(10, abs=0.2)
@@ -236,18 +282,38 @@ def test_maps_without_poses_have_a_layout(to: str, level: str) -> None:
     elif to == "networkx-json":
         graph = nx.node_link_graph(json.loads(text), edges="edges")
         assert len(graph) == count
-        assert level == "places" or set(graph.edges(data="action")) == {(s, x, action) for s, action, x in ssh_map.links}
+        assert level == "places" or set(graph.edges(data="action")) == {
+            (s, x, action) for s, action, x in ssh_map.links
+        }
 
 
 def test_maps_of_dstates_alone_are_exported(square: SSHMap) -> None:
     ssh_map = solve(rectangle(8), Theory.causal()).maps[0]
     assert len(nav2_graph(export_map(ssh_map, "nav2"))[0]) == len(ssh_map.dstates)
     assert len(checked_tmap2(export_map(ssh_map, "tmap2"))["nodes"]) == len(ssh_map.dstates)
-    with pytest.raises(MapError, match="level: expected dstates, got places: the map has no places"):
+    with pytest.raises(
+        MapError, match="level: expected dstates, got places: the map has no places"
+    ):
         export_map(ssh_map, "nav2", level="places")
 
 
-@pytest.mark.parametrize("text", ["a: b", "- x", '"', "\\", "\x07\x1b[31m", "\u0085\u2028\ufeff", "null", "#", "é😀", "{}", "\n\t", "yes"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a: b",
+        "- x",
+        '"',
+        "\\",
+        "\x07\x1b[31m",
+        "\u0085\u2028\ufeff",
+        "null",
+        "#",
+        "é😀",
+        "{}",
+        "\n\t",
+        "yes",
+    ],
+)
 def test_any_text_comes_back_from_yaml(text: str) -> None:
     ssh_map = SSHMap((0, 1), (DState(0, text), DState(1, "b")), ((0, text, 1),))
     data = checked_tmap2(export_map(ssh_map, "tmap2", name=text))
@@ -270,7 +336,9 @@ def test_what_no_file_can_hold_is_refused(square: SSHMap) -> None:
         export_map(SSHMap((0,), (DState(0, "a"),), ()), "nav2")
 
 
-def test_the_command_writes_what_python_makes(square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_what_python_makes(
+    square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert verb.FORMATS == formats.FORMATS
     file = f"{tmp_path}/map.json"
     square.save(file)

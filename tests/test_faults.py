@@ -32,15 +32,25 @@ from ssh_abduction.solver.front import fault_front
 from ssh_abduction.solver.guesses.robust import Explainer
 from ssh_abduction.theory import Speedups
 
-Told = tuple[tuple[int, ...], frozenset[tuple[int, str, object]]]  # the labels of the steps, and the faults
+Told = tuple[
+    tuple[int, ...], frozenset[tuple[int, str, object]]
+]  # the labels of the steps, and the faults
 
 
 @st.composite
 def small_traces(draw: st.DrawFn, max_steps: int = 6) -> Trace:
     steps = draw(st.integers(1, max_steps))
     seen = draw(st.lists(st.sampled_from("ab"), min_size=steps, max_size=steps))
-    trace = Trace.from_steps(seen, draw(st.lists(st.sampled_from(["travel", "right"]), min_size=steps - 1, max_size=steps - 1)))
-    return trace.with_views(seen, draw(st.lists(st.sampled_from([None, None, 0.9, 0.4]), min_size=steps, max_size=steps)))
+    trace = Trace.from_steps(
+        seen,
+        draw(
+            st.lists(st.sampled_from(["travel", "right"]), min_size=steps - 1, max_size=steps - 1)
+        ),
+    )
+    return trace.with_views(
+        seen,
+        draw(st.lists(st.sampled_from([None, None, 0.9, 0.4]), min_size=steps, max_size=steps)),
+    )
 
 
 # What the confidences of these traces make of a price, as a share of it: log(0.9 / 0.1) / log 99, and the least one.
@@ -59,7 +69,9 @@ def partitions(steps: int) -> Iterator[tuple[int, ...]]:
     yield from found
 
 
-def votes(trace: Trace, labels: tuple[int, ...]) -> tuple[dict[int, Counter[object]], dict[tuple[int, str], Counter[int]]]:
+def votes(
+    trace: Trace, labels: tuple[int, ...]
+) -> tuple[dict[int, Counter[object]], dict[tuple[int, str], Counter[int]]]:
     """How often each view is seen at each dstate, and how often each action done there leads where."""
     views, ends = defaultdict(Counter), defaultdict(Counter)
     for label, view in zip(labels, trace.views, strict=True):
@@ -78,11 +90,23 @@ def cheapest(trace: Trace, misread: int, slipped: int) -> tuple[int | None, set[
         for shows in product(*(list(views[s]) for s in sorted(views))):
             for targets in product(*(list(counts) for counts in ends.values())):
                 goes = dict(zip(ends, targets, strict=True))
-                wrong = frozenset((t, "misread", shows[s]) for t, s in enumerate(labels) if trace.views[t] != shows[s])
-                slips = frozenset((t, "slipped", None) for t, a in enumerate(trace.actions) if goes[labels[t], a.name] != labels[t + 1])
+                wrong = frozenset(
+                    (t, "misread", shows[s])
+                    for t, s in enumerate(labels)
+                    if trace.views[t] != shows[s]
+                )
+                slips = frozenset(
+                    (t, "slipped", None)
+                    for t, a in enumerate(trace.actions)
+                    if goes[labels[t], a.name] != labels[t + 1]
+                )
                 if (wrong and not misread) or (slips and not slipped):
                     continue
-                cost = 10 * len(views) + sum(price_of(misread, trace.steps[t]) for t, _, _ in wrong) + slipped * len(slips)
+                cost = (
+                    10 * len(views)
+                    + sum(price_of(misread, trace.steps[t]) for t, _, _ in wrong)
+                    + slipped * len(slips)
+                )
                 if best is None or cost < best:
                     best, maps = cost, set()
                 if cost == best:
@@ -91,15 +115,26 @@ def cheapest(trace: Trace, misread: int, slipped: int) -> tuple[int | None, set[
 
 
 def told(ssh_map: SSHMap) -> Told:
-    return ssh_map.labels, frozenset((fault.step, fault.kind, fault.expected) for fault in ssh_map.faults)
+    return ssh_map.labels, frozenset(
+        (fault.step, fault.kind, fault.expected) for fault in ssh_map.faults
+    )
 
 
 @settings(max_examples=15)
-@given(small_traces(), st.sampled_from([0.0, 0.4, 1.0]), st.sampled_from([0.0, 0.3, 1.0]), st.booleans())
-def test_causal_maps_with_faults_are_those_of_brute_force(trace: Trace, misread: float, slipped: float, names: bool) -> None:
+@given(
+    small_traces(),
+    st.sampled_from([0.0, 0.4, 1.0]),
+    st.sampled_from([0.0, 0.3, 1.0]),
+    st.booleans(),
+)
+def test_causal_maps_with_faults_are_those_of_brute_force(
+    trace: Trace, misread: float, slipped: float, names: bool
+) -> None:
     """By names and by the readable encoding. A cost of whole dstates makes ties."""
     theory = Theory.causal().replace(misread=misread, slipped=slipped)
-    solution = solve(trace, theory, max_maps=None, speedups=Speedups() if names else Speedups.without("names"))
+    solution = solve(
+        trace, theory, max_maps=None, speedups=Speedups() if names else Speedups.without("names")
+    )
     cost, expected = cheapest(trace, round(10 * misread), round(10 * slipped))
     assert solution.complete
     assert solution.cost is not None
@@ -113,9 +148,20 @@ def test_causal_maps_with_faults_are_those_of_brute_force(trace: Trace, misread:
 @given(st.data())
 def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) -> None:
     trace = data.draw(small_traces(max_steps=7))
-    theory = Theory.causal().replace(misread=data.draw(st.sampled_from([0.0, 0.4, 1.0])), slipped=data.draw(st.sampled_from([0.3, 1.0])))
+    theory = Theory.causal().replace(
+        misread=data.draw(st.sampled_from([0.0, 0.4, 1.0])),
+        slipped=data.draw(st.sampled_from([0.3, 1.0])),
+    )
     with (
-        patch.multiple(faulty, FEW=data.draw(st.sampled_from([2, 9])), AT_FIRST=2, AROUND=0, PLACES=1, NAMES=1, MORE_NAMES=1),
+        patch.multiple(
+            faulty,
+            FEW=data.draw(st.sampled_from([2, 9])),
+            AT_FIRST=2,
+            AROUND=0,
+            PLACES=1,
+            NAMES=1,
+            MORE_NAMES=1,
+        ),
         patch.object(search, "FEW_STEPS", 0),
     ):
         solution = solve(trace, theory, max_maps=None)
@@ -133,13 +179,28 @@ def test_topological_maps_are_those_of_corrected_traces(trace: Trace, misread: f
     best: tuple[int, ...] | None = None
     expected: set[object] = set()
     for views in product("ab", repeat=len(trace)):
-        wrong = sum(price_of(round(10 * misread), step) for a, step in zip(views, trace.steps, strict=True) if a != step.view)
-        corrected = replace(trace, steps=tuple(replace(step, view=view) for step, view in zip(trace.steps, views, strict=True)))
+        wrong = sum(
+            price_of(round(10 * misread), step)
+            for a, step in zip(views, trace.steps, strict=True)
+            if a != step.view
+        )
+        corrected = replace(
+            trace,
+            steps=tuple(
+                replace(step, view=view) for step, view in zip(trace.steps, views, strict=True)
+            ),
+        )
         counts, maps = minimal_maps(corrected, theory)
         if counts is None:
             continue
         cost = 10 * counts.dstates + wrong, counts.paths, counts.places
-        seen = {(k, views) for k in maps if all(any(x == s and views[t] == trace.views[t] for t, x in enumerate(k[0])) for s in k[0])}
+        seen = {
+            (k, views)
+            for k in maps
+            if all(
+                any(x == s and views[t] == trace.views[t] for t, x in enumerate(k[0])) for s in k[0]
+            )
+        }
         if seen and (best is None or cost < best):
             best, expected = cost, set()
         if cost == best:
@@ -155,13 +216,17 @@ def test_topological_maps_are_those_of_corrected_traces(trace: Trace, misread: f
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_faults_of_machines_are_found(seed: int) -> None:
-    walk, wrong, jumps = faulty_machine(6, 5, steps=200, seed=910 + seed, wrong=seed % 2, jumps=1 - seed % 2)
+    walk, wrong, jumps = faulty_machine(
+        6, 5, steps=200, seed=910 + seed, wrong=seed % 2, jumps=1 - seed % 2
+    )
     theory = Theory.causal().replace(misread=1.5 if wrong else 0.0, slipped=1.5 if jumps else 0.0)
     solution = solve(walk.trace, theory)
     assert solution.status is Status.OPTIMAL
     assert solution.cost is not None
     assert (solution.cost.dstates, solution.cost.faults) == (6, 1.5)
-    assert any([fault.step for fault in ssh_map.faults] == [*wrong, *jumps] for ssh_map in solution.maps)
+    assert any(
+        [fault.step for fault in ssh_map.faults] == [*wrong, *jumps] for ssh_map in solution.maps
+    )
 
 
 @settings(max_examples=10)
@@ -169,24 +234,40 @@ def test_the_faults_of_machines_are_found(seed: int) -> None:
 def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> None:
     """Whatever map is known: here one dstate for each view, or one for each step, and all that disagrees is a fault."""
     trace = data.draw(small_traces(max_steps=7))
-    theory = Theory.causal().replace(misread=data.draw(st.sampled_from([0.4, 1.0])), slipped=data.draw(st.sampled_from([0.3, 1.0])))
+    theory = Theory.causal().replace(
+        misread=data.draw(st.sampled_from([0.4, 1.0])),
+        slipped=data.draw(st.sampled_from([0.3, 1.0])),
+    )
     task = Task.of(trace, theory)
-    price = {kind: [theory.fault_tenths(kind, step) for step in trace.steps] for kind in ("misread", "slipped")}
-    machine = Explainer(task.log.seen, task.log.actions, price).read_off(data.draw(st.sampled_from([task.log.seen, range(len(trace))])))
+    price = {
+        kind: [theory.fault_tenths(kind, step) for step in trace.steps]
+        for kind in ("misread", "slipped")
+    }
+    machine = Explainer(task.log.seen, task.log.actions, price).read_off(
+        data.draw(st.sampled_from([task.log.seen, range(len(trace))]))
+    )
     known = Explainer(task.log.seen, task.log.actions, price).completed(machine)
     faults = {"misread": known.misread, "slipped": known.slips}
-    blocks = Blocks(task.log.seen, task.log.actions, price, faults, len(set(known.labels)), task.watch)
+    blocks = Blocks(
+        task.log.seen, task.log.actions, price, faults, len(set(known.labels)), task.watch
+    )
     cost, _ = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))
     assert cost is not None
     assert blocks.bound() <= cost <= known.tenths == blocks.cost
-    assert all(blocks.least_faults(most) <= known.tenths for most in range(len(set(known.labels)), 8))
+    assert all(
+        blocks.least_faults(most) <= known.tenths for most in range(len(set(known.labels)), 8)
+    )
 
 
 @pytest.mark.parametrize("kind", ["misread", "slipped"])
 def test_many_faults_of_a_long_trace_are_proven(kind: str) -> None:
     """A rectangle of eight dstates and five views, 1,200 steps, and twelve faults: disjoint blocks add up to what the map costs."""
     wrong = range(60, 1200, 100)
-    at = list(accumulate((3 if kind == "slipped" and t in wrong else 1 for t in range(1, 1200)), initial=0))
+    at = list(
+        accumulate(
+            (3 if kind == "slipped" and t in wrong else 1 for t in range(1, 1200)), initial=0
+        )
+    )
     seen = ["v4" if s % 8 == 4 else f"v{s % 4}" for s in at]
     for t in wrong if kind == "misread" else ():
         seen[t] = "v3" if seen[t] != "v3" else "v2"
@@ -208,16 +289,22 @@ def test_a_star_that_is_misread_is_excused() -> None:
     assert (solution.cost.dstates, solution.cost.places, solution.cost.faults) == (4, 2, 1.5)
     assert solution.maps[0].faults == (Fault(4, "misseen"),)
     assert check(trace, solution.maps[0], Theory(misread=1.5)) == ()
-    assert {v.axiom for v in check(trace, replace(solution.maps[0], faults=()), Theory(misread=1.5))} == {"star_frame", "star_pattern"}
+    assert {
+        v.axiom for v in check(trace, replace(solution.maps[0], faults=()), Theory(misread=1.5))
+    } == {"star_frame", "star_pattern"}
 
 
-RECTANGLE = Trace.from_steps([f"v{t % 4}" if t != 9 else "v0" for t in range(25)], ["right", "travel"] * 12)
+RECTANGLE = Trace.from_steps(
+    [f"v{t % 4}" if t != 9 else "v0" for t in range(25)], ["right", "travel"] * 12
+)
 
 
 def test_the_checker_judges_faults_itself() -> None:
     theory = Theory.causal().replace(misread=1.5)
     ssh_map = solve(RECTANGLE, theory).maps[0]
-    assert [str(fault) for fault in ssh_map.faults] == ["the view at step 9 is misread: v0, expected v1"]
+    assert [str(fault) for fault in ssh_map.faults] == [
+        "the view at step 9 is misread: v0, expected v1"
+    ]
     assert SSHMap.from_dict(ssh_map.to_dict()) == ssh_map
     assert {v.axiom for v in check(RECTANGLE, ssh_map, Theory.causal())} == {"map_explains_trace"}
     for faults in (
@@ -249,17 +336,24 @@ def test_what_faults_do_not_go_with_is_refused(choices: dict[str, object], said:
         Theory(**choices)  # type: ignore[arg-type]
 
 
-def test_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_the_shell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     RECTANGLE.save("trace.jsonl")
-    assert main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--slipped", "3"]) == 0
+    assert (
+        main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--slipped", "3"])
+        == 0
+    )
     said = capsys.readouterr().out
     assert "4 dstates, and the view at step 9 is misread: v0, expected v1" in said
     assert main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--json"]) == 0
     text = capsys.readouterr().out
     Path("maps.json").write_text(text)
     answer = json.loads(text)
-    assert answer["maps"][0]["faults"] == [{"step": 9, "kind": "misread", "seen": "v0", "expected": "v1", "cost": 1.5}]
+    assert answer["maps"][0]["faults"] == [
+        {"step": 9, "kind": "misread", "seen": "v0", "expected": "v1", "cost": 1.5}
+    ]
     assert answer["cost"]["faults"] == 1.5
     assert main(["check", "trace.jsonl", "maps.json"]) == 0
     assert main(["check", "--bound", "trace.jsonl", "maps.json"]) == 1
@@ -269,7 +363,9 @@ def test_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkey
 def test_confidence_scales_what_a_fault_costs() -> None:
     """0.99 costs the whole price, as does a step without one; the log odds of the others are its share, between a tenth and five times."""
     shares = {None: 15, 0.99: 15, 0.9: 7, 0.6: 2, 0.5: 2, 0.0: 2, 0.999: 23, 1.0: 75}
-    assert {c: Theory(misread=1.5).fault_tenths("misread", Step("a", confidence=c)) for c in shares} == shares
+    assert {
+        c: Theory(misread=1.5).fault_tenths("misread", Step("a", confidence=c)) for c in shares
+    } == shares
     assert Theory(slipped=3).fault_tenths("slipped", Step("a", confidence=0.5)) == 30
     assert Theory().fault_tenths("misread", Step("a", confidence=0.5)) == 0
     doubtful = RECTANGLE.with_views(RECTANGLE.views, [0.6 if t == 9 else None for t in range(25)])
@@ -286,7 +382,9 @@ def test_the_front_is_what_brute_force_finds() -> None:
     for kinds in ({"misread": 1.5}, {"slipped": 1.5}, {"misread": 1.5, "slipped": 1.5}):
         front = fault_front(trace, Theory.causal().replace(**kinds), most=3)
         assert [point.proven for point in front.points] == [True] * 4
-        assert [point.dstates for point in front.points] == [fewest(trace, faults, set(kinds)) for faults in range(4)]
+        assert [point.dstates for point in front.points] == [
+            fewest(trace, faults, set(kinds)) for faults in range(4)
+        ]
         for point in front.points:
             assert point.map is not None
             assert len(point.map.faults) <= point.faults
@@ -297,12 +395,22 @@ def test_the_front_is_what_brute_force_finds() -> None:
 def test_the_front_of_what_is_asserted_is_what_brute_force_finds(seed: int) -> None:
     rng = random.Random(seed)
     steps = rng.randint(3, 5)
-    trace = Trace.from_steps([rng.choice("abc") for _ in range(steps)], [rng.choice(["right", "travel"]) for _ in range(steps - 1)])
+    trace = Trace.from_steps(
+        [rng.choice("abc") for _ in range(steps)],
+        [rng.choice(["right", "travel"]) for _ in range(steps - 1)],
+    )
     same, different = (tuple(sorted(rng.sample(range(steps), 2))) for _ in range(2))
-    theory = Theory.causal().replace(same=[same], different=[different] if rng.random() < 0.6 else [])
-    expected = [fewest(trace, faults, {"misread", "slipped"}, theory.same, theory.different) for faults in range(4)]
+    theory = Theory.causal().replace(
+        same=[same], different=[different] if rng.random() < 0.6 else []
+    )
+    expected = [
+        fewest(trace, faults, {"misread", "slipped"}, theory.same, theory.different)
+        for faults in range(4)
+    ]
     front = fault_front(trace, theory, most=3)
-    assert {point.faults: point.dstates for point in front.points} == {k: count for k, count in enumerate(expected) if count is not None}
+    assert {point.faults: point.dstates for point in front.points} == {
+        k: count for k, count in enumerate(expected) if count is not None
+    }
     assert not front.stopped
     for point in front.points:
         assert point.map is not None
@@ -339,32 +447,55 @@ def test_a_front_without_points_says_why(
 
 
 def fewest(
-    trace: Trace, faults: int, kinds: set[str], same: Iterable[tuple[int, int]] = (), different: Iterable[tuple[int, int]] = ()
+    trace: Trace,
+    faults: int,
+    kinds: set[str],
+    same: Iterable[tuple[int, int]] = (),
+    different: Iterable[tuple[int, int]] = (),
 ) -> int | None:
     """The fewest dstates with so many faults, by trying all labels; None where there are none."""
     counts = []
     for labels in partitions(len(trace)):
-        if any(labels[i] != labels[j] for i, j in same) or any(labels[i] == labels[j] for i, j in different):
+        if any(labels[i] != labels[j] for i, j in same) or any(
+            labels[i] == labels[j] for i, j in different
+        ):
             continue
         views, ends = votes(trace, labels)
-        wrong, slips = (sum(sum(c.values()) - max(c.values()) for c in found.values()) for found in (views, ends))
-        if (not wrong or "misread" in kinds) and (not slips or "slipped" in kinds) and wrong + slips <= faults:
+        wrong, slips = (
+            sum(sum(c.values()) - max(c.values()) for c in found.values())
+            for found in (views, ends)
+        )
+        if (
+            (not wrong or "misread" in kinds)
+            and (not slips or "slipped" in kinds)
+            and wrong + slips <= faults
+        ):
             counts.append(len(views))
     return min(counts, default=None)
 
 
-def test_the_front_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_front_in_the_shell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     RECTANGLE.save("trace.jsonl")
-    assert main(["solve", "trace.jsonl", "--front", "2", "--theory", "causal", "--misread", "1.5"]) == 0
+    assert (
+        main(["solve", "trace.jsonl", "--front", "2", "--theory", "causal", "--misread", "1.5"])
+        == 0
+    )
     said = capsys.readouterr().out
-    assert re.search(r"^  1 +4 +knee +the view at step 9 is misread: v0, expected v1$", said, re.MULTILINE)
+    assert re.search(
+        r"^  1 +4 +knee +the view at step 9 is misread: v0, expected v1$", said, re.MULTILINE
+    )
     assert "a fault that costs more than 0 and less than 9 dstates" in said
     assert main(["solve", "trace.jsonl", "--front", "1", "--json"]) == 0
     assert [point["dstates"] for point in json.loads(capsys.readouterr().out)["front"]] == [13, 4]
     assert main(["solve", "trace.jsonl", "--front", "2", "--theory", "topological"]) == 1
     assert "expected a causal theory" in capsys.readouterr().err
-    assert main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--within", "1"]) == 1
+    assert (
+        main(["solve", "trace.jsonl", "--theory", "causal", "--misread", "1.5", "--within", "1"])
+        == 1
+    )
     assert "within: expected 0 where faults are allowed" in capsys.readouterr().err
 
 

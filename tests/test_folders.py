@@ -13,7 +13,15 @@ import pytest
 
 from ssh_abduction.cli import main, mapping
 from ssh_abduction.cli.import_log import named_after
-from ssh_abduction.cli.mapping import RUN, MapAnswer, MapQuestion, digest, folders_of, is_done, write_run
+from ssh_abduction.cli.mapping import (
+    RUN,
+    MapAnswer,
+    MapQuestion,
+    digest,
+    folders_of,
+    is_done,
+    write_run,
+)
 
 QUESTION = MapQuestion(None, {}, (None, None, None), None, None, None, None, 300, False)
 LONG = "n" * 251
@@ -79,19 +87,35 @@ def test_a_folder_of_a_log_has_no_ending(tmp_path: Path) -> None:
         ([f"a/{LONG}.log", f"b/{LONG}.log"], [f"{'n' * 246}-*", f"{'n' * 246}-*"]),
         ([f"a/{'ж' * 125}.log", f"b/{'ж' * 125}.log"], ["ж*-*", "ж*-*"]),
     ],
-    ids=["numbers", "folders", "endings", "case", "accents", "dots", "only dots", "long", "long, of two bytes"],
+    ids=[
+        "numbers",
+        "folders",
+        "endings",
+        "case",
+        "accents",
+        "dots",
+        "only dots",
+        "long",
+        "long, of two bytes",
+    ],
 )
-def test_no_two_logs_share_a_folder_in_whatever_order_they_come(tmp_path: Path, files: list[str], names: list[str]) -> None:
+def test_no_two_logs_share_a_folder_in_whatever_order_they_come(
+    tmp_path: Path, files: list[str], names: list[str]
+) -> None:
     logs = [log_at(tmp_path / file, file) for file in files]
     found = names_of(tmp_path / "runs", logs)
     assert all(Path(one).match(name) for one, name in zip(found, names, strict=True))
     assert len({one.casefold() for one in found}) == len(logs)
     assert all(len(os.fsencode(one)) <= 255 for one in found)
     for order in itertools.permutations(logs):
-        assert dict(zip(order, names_of(tmp_path / "runs", list(order)), strict=True)) == dict(zip(logs, found, strict=True))
+        assert dict(zip(order, names_of(tmp_path / "runs", list(order)), strict=True)) == dict(
+            zip(logs, found, strict=True)
+        )
 
 
-def test_a_log_keeps_its_folder_whatever_joins_it_and_whatever_it_is_called(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_keeps_its_folder_whatever_joins_it_and_whatever_it_is_called(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     runs = tmp_path / "runs"
     first, second, third = (log_at(tmp_path / str(i) / "run.log", str(i)) for i in range(3))
     map_in(runs / "run", first)
@@ -106,7 +130,9 @@ def test_a_log_keeps_its_folder_whatever_joins_it_and_whatever_it_is_called(tmp_
     assert names_of(runs, [str(packed), moved])[0].startswith("run-")
 
 
-def test_one_log_alone_has_the_folder_that_is_named_unless_another_log_has_it(tmp_path: Path) -> None:
+def test_one_log_alone_has_the_folder_that_is_named_unless_another_log_has_it(
+    tmp_path: Path,
+) -> None:
     runs = tmp_path / "runs"
     first, second = (log_at(tmp_path / f"run.{i}.log", str(i)) for i in range(2))
     assert names_of(runs, [first]) == ["."]
@@ -144,7 +170,9 @@ def test_an_interrupted_run_is_not_done(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("at", range(1, 5))
-def test_a_run_that_could_not_be_written_is_not_done(tmp_path: Path, at: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_could_not_be_written_is_not_done(
+    tmp_path: Path, at: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The disk is full at the first, second, … file. What is left of an earlier run does not stand beside what is new."""
     files = [(RUN, b"new"), ("trace.jsonl", b"new"), ("maps.json", b"new"), ("report.html", b"new")]
     write_run(tmp_path, [(name, b"old") for name in mapping.FILES])
@@ -176,7 +204,9 @@ def test_what_cannot_be_written_is_a_line_and_the_other_logs_go_on(
     def here(question: object, paths: list[str], *_: object) -> object:
         for number, path in enumerate(paths):
             asked.append(path)
-            yield MapAnswer(number, f"{path}: mapped", 0, ("it is odd",), (("maps.json", b"maps"), (RUN, b"{}")))
+            yield MapAnswer(
+                number, f"{path}: mapped", 0, ("it is odd",), (("maps.json", b"maps"), (RUN, b"{}"))
+            )
 
     def write(path: Path, data: bytes) -> None:
         if path.parent.name == "full":

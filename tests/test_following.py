@@ -29,8 +29,15 @@ def test_what_a_map_is_followed_to_is_a_map(trace: Trace, data: st.DataObject) -
     """Also where the map of the beginning is wrong, or robots are told to be where few steps say so. What evidence says of steps is not known there."""
     trace = trace.without_displacements()
     beginning = trace.prefix(data.draw(st.integers(1, len(trace))))
-    settings = {name: data.draw(st.integers(1, 4)) for name in ("SETTLED", "FOUND", "AHEAD", "LOOKED")}
-    with patch.multiple(following, WALKS=data.draw(st.integers(0, 30)), MANY=data.draw(st.integers(1, 10)), **settings):
+    settings = {
+        name: data.draw(st.integers(1, 4)) for name in ("SETTLED", "FOUND", "AHEAD", "LOOKED")
+    }
+    with patch.multiple(
+        following,
+        WALKS=data.draw(st.integers(0, 30)),
+        MANY=data.draw(st.integers(1, 10)),
+        **settings,
+    ):
         labels = followed(Log(trace, CAUSAL), solve(beginning, CAUSAL).maps[0].labels)
     if labels is not None:
         assert check(trace, facts.causal_map(labels, trace), CAUSAL) == ()
@@ -62,6 +69,11 @@ def test_the_last_steps_of_a_map_are_where_actions_lead() -> None:
     log = Log(walk.trace, CAUSAL)
     with patch.object(following._Map, "_predicting", side_effect=AssertionError):
         labels = followed(log, numbered(walk.truth[:1500]))
-    leads = {(here, action): there for (here, there), action in zip(pairwise(labels or ()), log.actions, strict=True)}
+    leads = {
+        (here, action): there
+        for (here, there), action in zip(pairwise(labels or ()), log.actions, strict=True)
+    }
     assert labels == numbered(walk.truth)
-    assert len(leads) == len({(here, action) for here, action in zip(walk.truth[:-1], log.actions, strict=True)})
+    assert len(leads) == len(
+        {(here, action) for here, action in zip(walk.truth[:-1], log.actions, strict=True)}
+    )

@@ -48,10 +48,20 @@ PLAIN = Speedups.without(SPEEDUPS)
 def framed_traces(draw: st.DrawFn, most_steps: int = 9) -> Trace:
     """Walks on a torus of few cells with any stars, so that views mislead; and stars that fit no frame."""
     steps = draw(st.integers(1, most_steps))
-    few = draw(st.sampled_from([["travel", "right"], ["travel", "right", "left", "around"], ["travel", "travel", "right", "around"]]))
+    few = draw(
+        st.sampled_from(
+            [
+                ["travel", "right"],
+                ["travel", "right", "left", "around"],
+                ["travel", "travel", "right", "around"],
+            ]
+        )
+    )
     actions = draw(st.lists(st.sampled_from(few), min_size=steps - 1, max_size=steps - 1))
     width, height = draw(st.integers(1, 3)), draw(st.integers(1, 3))
-    star_of = draw(st.lists(st.sampled_from(STARS), min_size=width * height, max_size=width * height))
+    star_of = draw(
+        st.lists(st.sampled_from(STARS), min_size=width * height, max_size=width * height)
+    )
     views = draw(st.sampled_from(["a", "ab"]))
     x = y = heading = 0
     seen, stars = [], []
@@ -93,14 +103,18 @@ def always_named_at(engine: FramedEngine, dstates: int) -> NearbySearch | None:
     return engine._named if engine._named and engine._named.bound == dstates else None
 
 
-def plainly_charted(engine: FramedEngine, size: int, before: FramedChart | None = None) -> FramedChart | None:
+def plainly_charted(
+    engine: FramedEngine, size: int, before: FramedChart | None = None
+) -> FramedChart | None:
     """Without what the trace alone says of order and sides, so that it has to be found."""
     return Chart.framed(engine._task.trace, engine._task.log, size)
 
 
 @settings(max_examples=12)
 @given(framed_traces(), framed_theories(), st.sets(st.sampled_from(SPEEDUPS)), st.data())
-def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off: set[str], data: st.DataObject) -> None:
+def test_lists_the_maps_of_the_plain_encoding(
+    trace: Trace, theory: Theory, off: set[str], data: st.DataObject
+) -> None:
     """With prefixes, cores and what is told in one go so small that all of it happens on short traces; and with any speed-ups off."""
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, engine.FIRST_PREFIXES]), label="first prefixes")
@@ -108,7 +122,9 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         "AT_A_TIME": data.draw(st.sampled_from([1, same.AT_A_TIME]), label="at a time"),
         "MANY": data.draw(st.sampled_from([1, 2, same.MANY]), label="many"),
         "FAR": data.draw(st.sampled_from([0, same.FAR]), label="far"),
-        "FIRST_PAIRS": data.draw(st.sampled_from([0, 2, 10, same.FIRST_PAIRS]), label="first pairs"),
+        "FIRST_PAIRS": data.draw(
+            st.sampled_from([0, 2, 10, same.FIRST_PAIRS]), label="first pairs"
+        ),
         "TRY_CONFLICTS": data.draw(st.sampled_from([0, same.TRY_CONFLICTS]), label="tries"),
         "FAILED_TRIES": data.draw(st.sampled_from([1, same.FAILED_TRIES]), label="failed tries"),
     }
@@ -131,7 +147,9 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
         patch.multiple(same, **cores),
         patch.multiple(framed, **sought),
         patch.object(paths_module, "SECONDS", 0.0),
-        patch.multiple(annealing, ANNEALED=((0.5, data.draw(st.integers(1, 20), label="sweeps")),), LAST=2),
+        patch.multiple(
+            annealing, ANNEALED=((0.5, data.draw(st.integers(1, 20), label="sweeps")),), LAST=2
+        ),
         patch.object(FramedEngine, "_charted", charted),
         patch.object(engine.Task, "has_processors", processors),
     ):
@@ -145,14 +163,18 @@ def test_lists_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, off:
     assert found.complete
     if found.cost and expected.cost:
         assert found.bound.dstates == found.cost.dstates
-        assert [getattr(found.cost, name) for name in theory.prefer] == [getattr(expected.cost, name) for name in theory.prefer]
+        assert [getattr(found.cost, name) for name in theory.prefer] == [
+            getattr(expected.cost, name) for name in theory.prefer
+        ]
     for ssh_map in maps[:3]:
         assert check(trace, ssh_map, theory) == ()
 
 
 @settings(max_examples=10)
 @given(framed_traces(), framed_theories(), st.integers(0, 20))
-def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: Theory, sweeps: int) -> None:
+def test_maps_that_a_search_beside_shows_to_be_minimal(
+    trace: Trace, theory: Theory, sweeps: int
+) -> None:
     """From a guess of any quality. Names that do not fit a frame, or have no paths, are no maps; and clingo may need more names than it had."""
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     with (
@@ -172,7 +194,9 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(trace: Trace, theory: The
     assert (found.cost is None) == (expected.cost is None)
     if found.cost and expected.cost:
         assert found.cost in map(Cost.of, expected.maps)
-        assert [getattr(found.cost, name) for name in theory.prefer] == [getattr(expected.cost, name) for name in theory.prefer]
+        assert [getattr(found.cost, name) for name in theory.prefer] == [
+            getattr(expected.cost, name) for name in theory.prefer
+        ]
     assert set(maps) == set(expected.maps)
     assert len(set(maps)) == len(maps)
     assert found.complete
@@ -199,7 +223,9 @@ def test_a_limit_ends_the_search_beside(limit: float) -> None:
 def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, seed: int) -> None:
     """There are several in these mazes, most of which have no paths."""
     walk = maze(side, side, steps=steps, seed=seed, stars=True)
-    expected = solve(walk.trace, Theory.topological(), max_maps=None, speedups=Speedups.without("annealed"))
+    expected = solve(
+        walk.trace, Theory.topological(), max_maps=None, speedups=Speedups.without("annealed")
+    )
     with (
         patch.multiple(framed, SOON=-1.0, Beside=Before),
         patch.object(engine.Task, "has_processors", True),
@@ -214,7 +240,9 @@ def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, 
 
 @settings(max_examples=5)
 @given(framed_traces(), framed_theories(), st.data())
-def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, theory: Theory, data: st.DataObject) -> None:
+def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
+    trace: Trace, theory: Theory, data: st.DataObject
+) -> None:
     """Whether clingo is told what is new, or all of it anew."""
     grown = data.draw(st.sampled_from([1, 1.5, 100]), label="grown")
     charted = data.draw(st.sampled_from([FramedEngine._charted, plainly_charted]), label="charted")
@@ -229,10 +257,14 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(trace: Trace, the
         ),
         patch.object(FramedEngine, "_charted", charted),
     ):
-        mapper = OnlineMapper(first.view or "", theory, star=first.star, time_limit=None, max_maps=None)
+        mapper = OnlineMapper(
+            first.view or "", theory, star=first.star, time_limit=None, max_maps=None
+        )
         for i, (action, step) in enumerate(zip(trace.actions, rest, strict=True)):
             answer = mapper.observe(action, step.view or "", star=step.star)
-            expected = solve(trace.prefix(i + 2), theory.of_steps(0, i + 2), max_maps=None, speedups=PLAIN)
+            expected = solve(
+                trace.prefix(i + 2), theory.of_steps(0, i + 2), max_maps=None, speedups=PLAIN
+            )
             assert answer.status is expected.status
             assert set(answer.maps) == set(expected.maps)
             assert answer.count == expected.count
@@ -244,13 +276,22 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
     trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
     first, *rest = trace.steps
     paths = set()
-    with patch.multiple(same, GROWN=100, MANY=1, AT_A_TIME=5), patch.object(solver, "FEW_STEPS", 10):
+    with (
+        patch.multiple(same, GROWN=100, MANY=1, AT_A_TIME=5),
+        patch.object(solver, "FEW_STEPS", 10),
+    ):
         mapper = OnlineMapper(first.view or "", star=first.star, time_limit=None, max_maps=None)
         for i, (action, step) in enumerate(zip(trace.actions, rest, strict=True)):
             answer = mapper.observe(action, step.view or "", star=step.star)
             if i % 5 == seed or i == len(rest) - 1:
-                expected = solve(trace.prefix(i + 2), max_maps=None, speedups=Speedups.without("sides"))
-                assert (answer.cost, answer.bound.dstates, answer.complete) == (expected.cost, expected.bound.dstates, True)
+                expected = solve(
+                    trace.prefix(i + 2), max_maps=None, speedups=Speedups.without("sides")
+                )
+                assert (answer.cost, answer.bound.dstates, answer.complete) == (
+                    expected.cost,
+                    expected.bound.dstates,
+                    True,
+                )
                 assert set(answer.maps) == set(expected.maps)
             engine = mapper._search and mapper._search._prefixes.engine
             if isinstance(engine, FramedEngine):
@@ -266,7 +307,9 @@ def test_each_speedup_off_alone(seed: int) -> None:
     expected = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without("names"))
     for off in ("", "clique", "core_guided", "sides"):
         with patch.multiple(same, MANY=1, AT_A_TIME=5):
-            found = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without(off))
+            found = solve(
+                trace, Theory.topological(), max_maps=None, speedups=Speedups.without(off)
+            )
         assert set(found.maps) == set(expected.maps), off
         assert found.cost == expected.cost, off
         assert found.bound.dstates == expected.bound.dstates, off
@@ -295,7 +338,10 @@ def test_pairs_that_are_too_many_are_not_listed() -> None:
     trace = maze(3, 3, steps=120, seed=1, stars=True).trace
     chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     assert chart.fitting[-1] == len(chart.fits(range(len(chart.stars)))) > 50
-    with patch.object(same, "SECONDS_A_PAIR", 1000.0), patch.object(FramedChart, "fits", side_effect=AssertionError):
+    with (
+        patch.object(same, "SECONDS_A_PAIR", 1000.0),
+        patch.object(FramedChart, "fits", side_effect=AssertionError),
+    ):
         solution = solve(trace, time_limit=100)
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
     assert check(trace, solution.maps[0], solution.theory) == ()
@@ -305,7 +351,9 @@ def test_nodes_that_one_frame_fits_are_not_apart() -> None:
     """A node for a visit and a way of facing, linked by rotations both ways and by travels."""
     star = [(0, 0, 1, 0), (1, 0, 0, 0), (1, 0, 1, 0), (1, 0, 1, 0)]
     trace = Trace.from_steps(
-        "aabbbb", ["around", "travel", "around", "right", "right"], stars=[*star[:2], *star[2:], (0, 1, 0, 1), (1, 0, 1, 0)]
+        "aabbbb",
+        ["around", "travel", "around", "right", "right"],
+        stars=[*star[:2], *star[2:], (0, 1, 0, 1), (1, 0, 1, 0)],
     )
     chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     assert chart.node_of == (0, 1, 2, 3, 4, 2)
@@ -347,7 +395,9 @@ def test_mazes_are_mapped(seed: int, counts: tuple[int, int, int]) -> None:
     assert (solution.cost.dstates, solution.cost.places, solution.cost.paths) == counts
     assert solution.bound.dstates == counts[0] <= len(set(walk.truth))
     assert solution.certificate
-    proven = check_bound(walk.trace, solution.certificate.to_dict(walk.trace))  # by actions and views alone, of steps rather than nodes
+    proven = check_bound(
+        walk.trace, solution.certificate.to_dict(walk.trace)
+    )  # by actions and views alone, of steps rather than nodes
     assert not proven.faults
     assert proven.dstates + len(proven.refuted) == counts[0]
     for ssh_map in maps:
@@ -360,7 +410,9 @@ def test_pinned_stretches_leave_all_maps(seed: int, pinned: int, stretches: int)
     given: list[tuple[list[int], Sequence[int]]] = []
 
     def rivals(
-        among: Sequence[int], pairs: Sequence[tuple[int, int]], sought: Callable[..., list[int]] = paths_module.pairwise_distinct
+        among: Sequence[int],
+        pairs: Sequence[tuple[int, int]],
+        sought: Callable[..., list[int]] = paths_module.pairwise_distinct,
     ) -> list[int]:
         found = sought(among, pairs)
         assert set(combinations(found, 2)) <= set(pairs)
@@ -378,16 +430,26 @@ def test_what_is_not_told_beforehand_is_found() -> None:
     """Every answer is refused until clingo was told what order and sides forbid; the maps are the same."""
     walk = maze(2, 2, steps=60, seed=1, stars=True)
     expected = solve(walk.trace, Theory.topological(), max_maps=None)
-    for off, kind, asked in (("", FramedSides, "say_of_path"), ("sides", FramedEngine, "_clashing")):
+    for off, kind, asked in (
+        ("", FramedSides, "say_of_path"),
+        ("sides", FramedEngine, "_clashing"),
+    ):
         finding = patch.object(kind, asked, autospec=True, side_effect=getattr(kind, asked))
         with patch.object(FramedEngine, "_charted", plainly_charted), finding as found:
-            maps = solve(walk.trace, Theory.topological(), max_maps=None, speedups=Speedups.without(off)).maps
+            maps = solve(
+                walk.trace, Theory.topological(), max_maps=None, speedups=Speedups.without(off)
+            ).maps
         assert found.called
         assert set(maps) == set(expected.maps)
 
 
 @pytest.mark.parametrize(
-    "theory", [Theory(star="frame"), Theory(star="frame", symmetric_sides=False), Theory(star="frame", boundary="none")]
+    "theory",
+    [
+        Theory(star="frame"),
+        Theory(star="frame", symmetric_sides=False),
+        Theory(star="frame", boundary="none"),
+    ],
 )
 def test_sides_and_streets_say_the_same(theory: Theory) -> None:
     """sides_framed.lp, of one path and visits that are one, against paths_framed.lp, of all paths and settled dstates that may have none."""
@@ -408,11 +470,24 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
         contradicted += len(contrary)
 
         def atoms(name: str, arity: int, control: clingo.Control = control) -> set[tuple[int, ...]]:
-            return {tuple(x.number for x in atom.symbol.arguments) for atom in control.symbolic_atoms.by_signature(name, arity)}
+            return {
+                tuple(x.number for x in atom.symbol.arguments)
+                for atom in control.symbolic_atoms.by_signature(name, arity)
+            }
 
-        nodes = [(node, label, visit, slot) for node, (label, (visit, slot)) in enumerate(zip(labels, chart.facing, strict=True))]
+        nodes = [
+            (node, label, visit, slot)
+            for node, (label, (visit, slot)) in enumerate(zip(labels, chart.facing, strict=True))
+        ]
         beside, segments = atoms("beside", 3), atoms("on_segment", 3)
-        pairs = {(i, j, (t - s - k) % 4) for _, x, i, s in nodes for _, y, j, t in nodes if i < j for k in range(4) if (x, y, k) in beside}
+        pairs = {
+            (i, j, (t - s - k) % 4)
+            for _, x, i, s in nodes
+            for _, y, j, t in nodes
+            if i < j
+            for k in range(4)
+            if (x, y, k) in beside
+        }
         for (dstate,) in atoms("along", 1):
             control = clingo.Control(["--warn=none"])
             control.load(encodings.path("visits"))
@@ -420,12 +495,26 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
             given = [(node, visit, slot) for node, _, visit, slot in nodes]
             leaves = [(visit, *how) for visit, how in chart.leaves.items()]
             control.add("visits", [], facts.visit_facts(0, given, leaves, pairs))
-            control.add("visits", [], facts.turn_facts(0, chart, range(len(chart.stars)), chart.turns(trace)))
+            control.add(
+                "visits",
+                [],
+                facts.turn_facts(0, chart, range(len(chart.stars)), chart.turns(trace)),
+            )
             control.add("visits", [], facts.sides_framed_facts(theory))
             control.add("visits", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
             street = ("path", facts.numbers(*chart.facing[labels.index(dstate)], 0))
-            control.ground([("visits", []), ("more", facts.numbers(0)), ("sides", []), ("paths", facts.numbers(0)), street])
-            allowed = next(engine.asker.answers(lambda _: True, "ignore", 1, control=control), False)
+            control.ground(
+                [
+                    ("visits", []),
+                    ("more", facts.numbers(0)),
+                    ("sides", []),
+                    ("paths", facts.numbers(0)),
+                    street,
+                ]
+            )
+            allowed = next(
+                engine.asker.answers(lambda _: True, "ignore", 1, control=control), False
+            )
             assert not (allowed and dstate in contrary)
             assert allowed or {y for x, y, _ in segments if x == dstate} & set(contrary)
     assert contradicted > 3
@@ -434,7 +523,10 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
 def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
     """Stopped while paths are sought for the fewest dstates, and while the dstates are."""
     walk = maze(3, 3, steps=200, seed=1, stars=True)
-    with patch.object(FramedEngine, "_all_with_paths", side_effect=KeyboardInterrupt), patch.object(engine, "FIRST_PREFIXES", 300):
+    with (
+        patch.object(FramedEngine, "_all_with_paths", side_effect=KeyboardInterrupt),
+        patch.object(engine, "FIRST_PREFIXES", 300),
+    ):
         search = Search(walk.trace, Theory.topological())
         search._prefixes.start = 201
         solution = search.solution(tuple(search))
@@ -470,7 +562,9 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
         engine.grow(len(trace))
         checks = iter(range(1, 10**6))
 
-        def check_once(ahead: float = 0.0, stop: int = stop, checks: Iterator[int] = checks) -> None:
+        def check_once(
+            ahead: float = 0.0, stop: int = stop, checks: Iterator[int] = checks
+        ) -> None:
             if next(checks) == stop:
                 raise LimitError("time limit")
 
@@ -493,7 +587,10 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
     search = Search(walk.trace, Theory.topological(), time_limit=100)
     engine = search._prefixes.engine
     engine.grow(40)
-    with patch.object(engine._visits, "_charted", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
+    with (
+        patch.object(engine._visits, "_charted", side_effect=KeyboardInterrupt),
+        pytest.raises(KeyboardInterrupt),
+    ):
         engine.grow(121)
     assert engine.size == 40
     search._prefixes.start = 121
@@ -507,7 +604,9 @@ def test_ctrl_c_in_the_last_part_of_the_time_leaves_no_engine_to_go_on_with() ->
     """Perhaps clingo was told half of a core: what it would say then of the longer trace may be wrong."""
     trace = maze(3, 3, steps=80, seed=1, stars=True).trace
     search = Search(trace.prefix(70), Theory.topological(), time_limit=100)
-    with patch.object(Prefixes, "minimise", side_effect=[LimitError("time limit"), KeyboardInterrupt]):
+    with patch.object(
+        Prefixes, "minimise", side_effect=[LimitError("time limit"), KeyboardInterrupt]
+    ):
         assert [check(search.trace, ssh_map, search.theory) for ssh_map in search] == [()]
     assert search.stopped == "interrupted"
     later = Search(trace, Theory.topological(), max_maps=None, after=search)
@@ -521,9 +620,15 @@ def test_an_error_leaves_no_engine_to_go_on_with() -> None:
     list(first)
     second = Search(trace.prefix(70), Theory.topological(), after=first)
     assert second._prefixes.engine is first._prefixes.engine
-    with patch.object(VisitLabels, "_best_answer", side_effect=MemoryError), pytest.raises(MemoryError):
+    with (
+        patch.object(VisitLabels, "_best_answer", side_effect=MemoryError),
+        pytest.raises(MemoryError),
+    ):
         list(second)
-    assert Search(trace, Theory.topological(), after=first)._prefixes.engine is not first._prefixes.engine
+    assert (
+        Search(trace, Theory.topological(), after=first)._prefixes.engine
+        is not first._prefixes.engine
+    )
 
 
 def test_maps_of_a_known_cost_are_listed_for_the_whole_trace() -> None:
@@ -540,16 +645,29 @@ def test_maps_of_a_known_cost_are_listed_for_the_whole_trace() -> None:
 
 def places(walk: Walk, chart: FramedChart) -> list[object]:
     """The true place of each visit."""
-    place = {chart.facing[node][0]: state[:2] for node, state in zip(chart.node_of, walk.truth, strict=True) if isinstance(state, tuple)}
+    place = {
+        chart.facing[node][0]: state[:2]
+        for node, state in zip(chart.node_of, walk.truth, strict=True)
+        if isinstance(state, tuple)
+    }
     return list(place.values())
 
 
 @settings(max_examples=50)
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3)), min_size=2, max_size=7), st.data())
-def test_what_fails_to_be_transitive_is_among_the_scattered(states: list[tuple[int, int]], data: st.DataObject) -> None:
+def test_what_fails_to_be_transitive_is_among_the_scattered(
+    states: list[tuple[int, int]], data: st.DataObject
+) -> None:
     """Visits at places, but for some pairs that are left out, turned otherwise, or added."""
-    every = {(i, j): (t - s) % 4 for j, (q, t) in enumerate(states) for i, (p, s) in enumerate(states[:j]) if p == q}
-    two = st.tuples(st.integers(0, len(states) - 2), st.integers(1, len(states) - 1)).filter(lambda pair: pair[0] < pair[1])
+    every = {
+        (i, j): (t - s) % 4
+        for j, (q, t) in enumerate(states)
+        for i, (p, s) in enumerate(states[:j])
+        if p == q
+    }
+    two = st.tuples(st.integers(0, len(states) - 2), st.integers(1, len(states) - 1)).filter(
+        lambda pair: pair[0] < pair[1]
+    )
     every |= data.draw(st.dictionaries(two, st.integers(-1, 3), max_size=2), label="changed")
     pairs = [(*pair, turn) for pair, turn in every.items() if turn >= 0]
     turned: dict[int, dict[int, int]] = {}
@@ -569,7 +687,11 @@ def test_annealing_finds_the_places_of_a_maze(seed: int) -> None:
         guess = next(guess for failed, guess in attempts(chart) if not failed)
     assert guess.sure.all()
     guessed = (guess.states // 4).tolist()
-    assert len(set(zip(guessed, places(walk, chart), strict=True))) == len(set(guessed)) == len(set(places(walk, chart)))
+    assert (
+        len(set(zip(guessed, places(walk, chart), strict=True)))
+        == len(set(guessed))
+        == len(set(places(walk, chart)))
+    )
 
 
 @settings(max_examples=15)
@@ -611,7 +733,9 @@ def node_labels(ssh_map: SSHMap, chart: FramedChart) -> list[int]:
 
 @settings(max_examples=8)
 @given(framed_traces(), framed_theories(), st.data())
-def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: Theory, data: st.DataObject) -> None:
+def test_what_is_told_of_loose_dstates_holds_in_each_map(
+    trace: Trace, theory: Theory, data: st.DataObject
+) -> None:
     """So merging by evidence may keep to it."""
     for ssh_map in solve(trace, theory, max_maps=3, speedups=PLAIN).maps:
         asked = framed_engine(trace, theory)
@@ -623,13 +747,22 @@ def test_what_is_told_of_loose_dstates_holds_in_each_map(trace: Trace, theory: T
         assert told is not None
         apart, one = told
         place = {s.id: s.place for s in ssh_map.dstates}
-        assert all(place[labels[a]] != place[labels[b]] for a, b in zip(*np.nonzero(apart), strict=True))
+        assert all(
+            place[labels[a]] != place[labels[b]] for a, b in zip(*np.nonzero(apart), strict=True)
+        )
         assert all(labels[a] == labels[b] for a, b in one)
 
 
 @settings(max_examples=10)
-@given(framed_traces(), framed_theories(), st.lists(st.integers(-1, 4), min_size=9, max_size=9), st.booleans())
-def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[int], told: bool) -> None:
+@given(
+    framed_traces(),
+    framed_theories(),
+    st.lists(st.integers(-1, 4), min_size=9, max_size=9),
+    st.booleans(),
+)
+def test_any_guess_is_merged_to_a_map(
+    trace: Trace, theory: Theory, guess: list[int], told: bool
+) -> None:
     """Of the causal axioms; and where separate paths fit it, others do."""
     asked = framed_engine(trace, theory)
     chart = asked._chart
@@ -637,11 +770,17 @@ def test_any_guess_is_merged_to_a_map(trace: Trace, theory: Theory, guess: list[
         return
     apart = chart.apart()
     start = guess[: len(chart.seen)]
-    labels = asked._paths.labels_near(chart, apart, start) if told else merged_near(apart, chart.links, start)
+    labels = (
+        asked._paths.labels_near(chart, apart, start)
+        if told
+        else merged_near(apart, chart.links, start)
+    )
     if labels is None:
         return
     assert chart.is_map(labels)
-    assert not any(apart[i, j] for i in range(len(labels)) for j in range(i) if labels[i] == labels[j])
+    assert not any(
+        apart[i, j] for i in range(len(labels)) for j in range(i) if labels[i] == labels[j]
+    )
     singles = asked._paths.has_separate(chart, labels)
     if singles or not told:
         with patch.object(framed, "MANY_DSTATES", 100):
@@ -673,11 +812,16 @@ def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, s
     rivals = [
         (a, b)
         for a, b in combinations(range(max(truth) + 1), 2)
-        if chart.seen[truth.index(a)] == chart.seen[truth.index(b)] and not apart[np.ix_(nodes == a, nodes == b)].any()
+        if chart.seen[truth.index(a)] == chart.seen[truth.index(b)]
+        and not apart[np.ix_(nodes == a, nodes == b)].any()
     ]
     wrong = [[a if label == b else label for label in truth] for a, b in rivals]
-    wrong = [guess for guess in wrong if len(set(kept(apart, chart.links, guess))) < len(set(truth))]
-    without_streets = [guess for guess in wrong if not known.may_fit(chart, kept(apart, chart.links, guess), [])]
+    wrong = [
+        guess for guess in wrong if len(set(kept(apart, chart.links, guess))) < len(set(truth))
+    ]
+    without_streets = [
+        guess for guess in wrong if not known.may_fit(chart, kept(apart, chart.links, guess), [])
+    ]
     assert without_streets
     for guess in without_streets[:2]:
         labels = known.labels_near(chart, apart, guess)
@@ -689,9 +833,19 @@ def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, s
 
 @pytest.mark.parametrize(
     ("limit", "waited", "begins"),
-    [(None, 2.9, False), (None, 3.1, True), (60, 2.9, False), (60, 3.1, True), (10, 0.4, False), (10, 0.6, True), (0.5, 0.4, False)],
+    [
+        (None, 2.9, False),
+        (None, 3.1, True),
+        (60, 2.9, False),
+        (60, 3.1, True),
+        (10, 0.4, False),
+        (10, 0.6, True),
+        (0.5, 0.4, False),
+    ],
 )
-def test_a_guess_begins_sooner_under_a_short_limit(limit: float | None, waited: float, begins: bool) -> None:
+def test_a_guess_begins_sooner_under_a_short_limit(
+    limit: float | None, waited: float, begins: bool
+) -> None:
     """But not where there is no time for one, as at a step of the online mapper."""
     asked = framed_engine(maze(2, 2, steps=20, seed=0, stars=True).trace, Theory.topological())
     asked._visits._visits = set()
@@ -747,7 +901,10 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, mo
             failed.append(wrong)
             yield wrong, guess
 
-    with patch.object(annealing, "ANNEALED", ((0.5, 100),)), patch.object(paths_module, "attempts", counted):
+    with (
+        patch.object(annealing, "ANNEALED", ((0.5, 100),)),
+        patch.object(paths_module, "attempts", counted),
+    ):
         labels = asked._paths.guessed_labels(chart, Watch())
     assert failed[0] > 0
     assert asked._paths.has_separate(chart, labels)

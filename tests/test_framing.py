@@ -64,7 +64,10 @@ def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
     theory = data.draw(theories(trace), label="theory")
     first = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
     expected = solve(trace, theory, max_maps=None, speedups=Speedups.without(SPEEDUPS))
-    with patch.multiple(solver, FRAME_AFTER=-1.0, FEW_STEPS=0), patch.object(prefixes, "FIRST_PREFIX", first):
+    with (
+        patch.multiple(solver, FRAME_AFTER=-1.0, FEW_STEPS=0),
+        patch.object(prefixes, "FIRST_PREFIX", first),
+    ):
         found = solve(trace, theory, max_maps=None, speedups=Speedups.without("names"))
     assert found.status is expected.status
     assert found.complete
@@ -72,7 +75,9 @@ def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
     assert found.count == len(set(found.maps))
     if found.cost and expected.cost:
         priorities = found.theory.priorities
-        assert [getattr(found.cost, name) for name in priorities] == [getattr(expected.cost, name) for name in priorities]
+        assert [getattr(found.cost, name) for name in priorities] == [
+            getattr(expected.cost, name) for name in priorities
+        ]
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
@@ -80,9 +85,15 @@ def test_a_maze_without_stars_has_a_small_map_before_the_proof(theory: Theory) -
     """In the second part of its search it is interrupted at once; the robot was in 32 dstates."""
     walk = maze(3, 3, steps=400, seed=0)
     stages = 2 if row("ways").holds_for(theory.resolve(walk.trace)) else 1
-    with patch.object(Prefixes, "find_minimum", side_effect=[*[StageTimeError] * stages, KeyboardInterrupt]):
+    with patch.object(
+        Prefixes, "find_minimum", side_effect=[*[StageTimeError] * stages, KeyboardInterrupt]
+    ):
         solution = solve(walk.trace, theory)
-    assert (solution.status, solution.stopped, solution.count) == (Status.FEASIBLE, "interrupted", 1)
+    assert (solution.status, solution.stopped, solution.count) == (
+        Status.FEASIBLE,
+        "interrupted",
+        1,
+    )
     assert solution.cost
     assert solution.cost.dstates <= len(set(walk.truth)) == 32
     assert check(walk.trace, solution.maps[0], solution.theory) == ()
@@ -91,7 +102,9 @@ def test_a_maze_without_stars_has_a_small_map_before_the_proof(theory: Theory) -
 def test_a_maze_of_loops_has_a_map_smaller_than_a_sketch() -> None:
     trace = maze(3, 3, steps=400, seed=1, loops=0.5).trace
     sketched = solve(trace, time_limit=1e-9)
-    with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, StageTimeError, KeyboardInterrupt]):
+    with patch.object(
+        Prefixes, "find_minimum", side_effect=[StageTimeError, StageTimeError, KeyboardInterrupt]
+    ):
         found = solve(trace)
     assert found.cost
     assert sketched.cost
@@ -110,16 +123,24 @@ def test_listing_is_not_paused() -> None:
     with patch.object(Prefixes, "minimal_maps", slowly):
         solution = solve(trace, max_maps=None)
     assert solution.complete
-    assert set(solution.maps) == set(solve(trace, max_maps=None, speedups=Speedups.without("framing")).maps)
+    assert set(solution.maps) == set(
+        solve(trace, max_maps=None, speedups=Speedups.without("framing")).maps
+    )
 
 
-@pytest.mark.parametrize("theory", [Theory.topological(), Theory(next_place=True), Theory(all_on_paths=True)], ids=["", "next", "on paths"])
+@pytest.mark.parametrize(
+    "theory",
+    [Theory.topological(), Theory(next_place=True), Theory(all_on_paths=True)],
+    ids=["", "next", "on paths"],
+)
 def test_a_sketch_with_frames_is_smaller(theory: Theory) -> None:
     trace = maze(3, 3, steps=400, seed=0).trace
     first, *rest = trace.steps
     sizes = []
     for sketch in Sketch.all_of(first, theory.resolve(trace)):
-        assert all(sketch.extend(action, step) for action, step in zip(trace.actions, rest, strict=True))
+        assert all(
+            sketch.extend(action, step) for action, step in zip(trace.actions, rest, strict=True)
+        )
         assert check(trace, sketch.map(), theory.resolve(trace)) == ()
         sizes.append(len(sketch.map().dstates))
     framed, homing = sizes[0], sizes[2]
@@ -130,7 +151,10 @@ def test_while_a_robot_drives_the_time_is_clingos() -> None:
     """The sketch is small enough. The robot was in 27 dstates."""
     trace = maze(3, 3, steps=120, seed=0).trace
     mapper = OnlineMapper(trace.steps[0].view or "", time_limit=0.01)
-    with patch.object(framing, "maps_with_frames", side_effect=AssertionError), patch.object(solver, "FRAME_AFTER", -1.0):
+    with (
+        patch.object(framing, "maps_with_frames", side_effect=AssertionError),
+        patch.object(solver, "FRAME_AFTER", -1.0),
+    ):
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):
             answer = mapper.observe(action, step.view or "")
     assert answer.cost
@@ -139,7 +163,9 @@ def test_while_a_robot_drives_the_time_is_clingos() -> None:
 
 
 @pytest.mark.parametrize(
-    "stop", [KeyboardInterrupt(), LimitError("time limit"), LimitError("interrupted")], ids=["ctrl-c", "limit", "interrupt"]
+    "stop",
+    [KeyboardInterrupt(), LimitError("time limit"), LimitError("interrupted")],
+    ids=["ctrl-c", "limit", "interrupt"],
 )
 def test_what_ends_it_leaves_its_last_map_and_no_thread(stop: BaseException) -> None:
     """Its own limit ends it alone; Ctrl-C the whole search."""
@@ -156,7 +182,11 @@ def test_what_ends_it_leaves_its_last_map_and_no_thread(stop: BaseException) -> 
 
     with (
         patch.object(framing, "maps_with_frames", stopped),
-        patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, StageTimeError, LimitError("memory limit")]),
+        patch.object(
+            Prefixes,
+            "find_minimum",
+            side_effect=[StageTimeError, StageTimeError, LimitError("memory limit")],
+        ),
     ):
         maps = tuple(search)
     assert search.stopped == ("memory limit" if str(stop) == "time limit" else "interrupted")
@@ -183,7 +213,10 @@ def test_until_there_is_a_map_it_may_take_twice_as_long() -> None:
         left.append(watch.left())
         raise KeyboardInterrupt
 
-    with patch.object(framing, "maps_with_frames", timed), patch.object(Prefixes, "find_minimum", side_effect=StageTimeError):
+    with (
+        patch.object(framing, "maps_with_frames", timed),
+        patch.object(Prefixes, "find_minimum", side_effect=StageTimeError),
+    ):
         solve(walk.trace, time_limit=1000)
     assert left[1] <= candidates.FRAMING < left[0] <= 2 * candidates.FRAMING
 

@@ -28,7 +28,19 @@ BATCHES = 5  # tests, so that several processes can share the work
 CODES = {0, 1, 2, 10, 20, 30}
 CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f]")
 # Verbs that print no program text.
-ANSWER = {"solve", "check", "show", "theory", "cluster", "train", "learning-curve", "evaluate", "recognise", "simulate", "localize"}
+ANSWER = {
+    "solve",
+    "check",
+    "show",
+    "theory",
+    "cluster",
+    "train",
+    "learning-curve",
+    "evaluate",
+    "recognise",
+    "simulate",
+    "localize",
+}
 
 WORLD = {
     "format": "ssh-world",
@@ -40,9 +52,13 @@ WORLD = {
     "start": [3.4, 1.4, 0],
     "reach": 0.6,
     "route": ["right"],
-    "dstates": [{"name": "x0", "place": "A", "path": "north", "direction": 1, "pose": [3.4, 1.4, 0]}],
+    "dstates": [
+        {"name": "x0", "place": "A", "path": "north", "direction": 1, "pose": [3.4, 1.4, 0]}
+    ],
 }
-YAML = "image: map.pgm\nresolution: 0.5\norigin: [-0.5, -0.5, 0.0]\noccupied_thresh: 0.65\nnegate: 0\n"
+YAML = (
+    "image: map.pgm\nresolution: 0.5\norigin: [-0.5, -0.5, 0.0]\noccupied_thresh: 0.65\nnegate: 0\n"
+)
 
 # What each kind of file is read by. FILE is the damaged one; the others are sound.
 COMMANDS: dict[str, list[str]] = {
@@ -64,10 +80,27 @@ COMMANDS: dict[str, list[str]] = {
         "localize imaged-maps.json FILE --recogniser recogniser.skops",
     ],
     "indexed.jsonl": ["recognise recogniser.skops FILE", "cluster FILE -o - --k 2"],
-    "images.npz": ["recognise recogniser.skops indexed.jsonl", "cluster indexed.jsonl -o out --k 2"],
-    "images.npy": ["recognise recogniser.skops npy.jsonl", "train npy.jsonl imaged-maps.json -o out"],
-    "maps.json": ["show FILE", "show FILE --map 1", "show FILE --dot", "show FILE --svg", "show FILE --graphml"]
-    + 2 * ["check trace.jsonl FILE", "check trace.jsonl FILE --bound", "localize FILE trace.jsonl --trace trace.jsonl --json"],
+    "images.npz": [
+        "recognise recogniser.skops indexed.jsonl",
+        "cluster indexed.jsonl -o out --k 2",
+    ],
+    "images.npy": [
+        "recognise recogniser.skops npy.jsonl",
+        "train npy.jsonl imaged-maps.json -o out",
+    ],
+    "maps.json": [
+        "show FILE",
+        "show FILE --map 1",
+        "show FILE --dot",
+        "show FILE --svg",
+        "show FILE --graphml",
+    ]
+    + 2
+    * [
+        "check trace.jsonl FILE",
+        "check trace.jsonl FILE --bound",
+        "localize FILE trace.jsonl --trace trace.jsonl --json",
+    ],
     "imaged-maps.json": [
         "train imaged.jsonl FILE -o out",
         "evaluate FILE imaged.jsonl --json",
@@ -182,23 +215,39 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sound")
     drive(SQUARE, "a", "E", "TRTRTRTR", stars=True).save(folder / "trace.jsonl")
     views = "abababab"
-    rows = np.array([[1.0, 2.0, 3.0 + (view == "b"), 4.0 + 0.01 * i] for i, view in enumerate(views)])
+    rows = np.array(
+        [[1.0, 2.0, 3.0 + (view == "b"), 4.0 + 0.01 * i] for i, view in enumerate(views)]
+    )
     for name, images in (("imaged", None), ("indexed", "images.npz"), ("npy", "images.npy")):
-        header = {"format": "ssh-trace", "version": 1, "name": name} | ({"images": images} if images else {})
+        header = {"format": "ssh-trace", "version": 1, "name": name} | (
+            {"images": images} if images else {}
+        )
         steps = [
-            {"view": view, "image": i if images else rows[i].tolist(), "action": "travel", "truth": {"dstate": view}}
+            {
+                "view": view,
+                "image": i if images else rows[i].tolist(),
+                "action": "travel",
+                "truth": {"dstate": view},
+            }
             for i, view in enumerate(views)
         ]
         del steps[-1]["action"]
-        (folder / f"{name}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in [header, *steps]))
+        (folder / f"{name}.jsonl").write_text(
+            "".join(json.dumps(line) + "\n" for line in [header, *steps])
+        )
     np.savez_compressed(folder / "images.npz", images=rows)
     np.save(folder / "images.npy", rows)
     (folder / "world.json").write_text(json.dumps(WORLD))
     (folder / "map.yaml").write_text(YAML)
     pixels = np.pad(np.full((6, 8), 254, np.uint8), 1)
-    (folder / "map.pgm").write_bytes(b"P5\n# made for a test\n%d %d\n255\n" % pixels.shape[::-1] + pixels.tobytes())
+    (folder / "map.pgm").write_bytes(
+        b"P5\n# made for a test\n%d %d\n255\n" % pixels.shape[::-1] + pixels.tobytes()
+    )
     with contextlib.chdir(folder):
-        for trace, maps, choice in (("trace", "maps", ""), ("imaged", "imaged-maps", "--theory causal")):
+        for trace, maps, choice in (
+            ("trace", "maps", ""),
+            ("imaged", "imaged-maps", "--theory causal"),
+        ):
             code, out, _ = run(f"solve {trace}.jsonl --json {choice}")
             assert code == 0
             Path(f"{maps}.json").write_text(out)
@@ -225,7 +274,9 @@ def damaged(data: bytes, kind: str, rng: random.Random) -> bytes:
         lines = data.decode().splitlines() if kind.endswith("jsonl") else [data.decode()]
         for _ in range(rng.choice((1, 1, 2))):
             i = rng.randrange(len(lines))
-            with contextlib.suppress(ValueError, RecursionError):  # it was broken by the first damage
+            with contextlib.suppress(
+                ValueError, RecursionError
+            ):  # it was broken by the first damage
                 lines[i] = _json(json.loads(lines[i]), rng)
         return "\n".join(lines).encode("utf-8", "surrogatepass")
     for _ in range(rng.choice((1, 1, 2, 5))):
@@ -241,7 +292,9 @@ def _json(value: Any, rng: random.Random) -> str:
     inside, key = rng.choice(spots)
     change = rng.randrange(7)
     if change > 4 and isinstance(inside[key], int | float):
-        inside[key] = rng.choice((inside[key] + 1, inside[key] - 1, -inside[key], 1000 * inside[key], inside[key] / 7))
+        inside[key] = rng.choice(
+            (inside[key] + 1, inside[key] - 1, -inside[key], 1000 * inside[key], inside[key] / 7)
+        )
     elif change == 0:
         del inside[key]
     elif change == 1 and isinstance(inside, list):
@@ -261,7 +314,13 @@ def _json(value: Any, rng: random.Random) -> str:
 
 def _spots(value: Any) -> Iterator[tuple[Any, Any]]:
     """Each list or object of a JSON value, with each of its indices or keys."""
-    for key, item in list(value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()):
+    for key, item in list(
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    ):
         yield value, key
         yield from _spots(item)
 
@@ -314,7 +373,15 @@ def _renumber(data: bytes, rng: random.Random) -> bytes:
     return data[: spot.start()] + rng.choice(BYTES) + data[spot.end() :]
 
 
-CHANGES: list[Callable[[bytes, random.Random], bytes]] = [_flip, _cut, _drop, _double, _insert, _renumber, _renumber]
+CHANGES: list[Callable[[bytes, random.Random], bytes]] = [
+    _flip,
+    _cut,
+    _drop,
+    _double,
+    _insert,
+    _renumber,
+    _renumber,
+]
 
 
 def cases(batch: int) -> Iterator[tuple[str, str, random.Random]]:
@@ -327,7 +394,9 @@ def cases(batch: int) -> Iterator[tuple[str, str, random.Random]]:
 
 @pytest.mark.filterwarnings("ignore")  # the command line prints what it is warned of
 @pytest.mark.parametrize("batch", range(BATCHES))
-def test_damaged_files_end_as_documented(batch: int, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_files_end_as_documented(
+    batch: int, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     for kind, command, rng in cases(batch):

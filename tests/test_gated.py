@@ -34,7 +34,9 @@ WORLDS: dict[str, nx.Graph] = {
 def drive(world: str, seed: int, steps: int = 24) -> Trace:
     graph = WORLDS[world]
     start = next(iter(graph))
-    trace: Trace = planar.drive(graph, start, next(iter(graph[start])), steps, random.Random(seed), noise=8).trace
+    trace: Trace = planar.drive(
+        graph, start, next(iter(graph[start])), steps, random.Random(seed), noise=8
+    ).trace
     return trace
 
 
@@ -62,7 +64,9 @@ def test_there_is_a_map_of_stars_at_any_angles_when_the_time_is_over(world: str)
 
 def test_evidence_keeps_a_place_from_being_taken_for_another() -> None:
     trace = Trace.from_steps("aba", ["travel", "around"], stars=[[0, 120], [180], [0]])
-    back = Trace.from_steps("abaa", ["travel", "around", "travel"], stars=[[0, 120], [180], [0], [180, 300]])
+    back = Trace.from_steps(
+        "abaa", ["travel", "around", "travel"], stars=[[0, 120], [180], [0], [180, 300]]
+    )
     theory = Theory.topological().resolve(back)
     there = gated_map(back, theory, homing=True)
     assert there is not None
@@ -121,7 +125,9 @@ READ = [
 ]
 
 
-@pytest.mark.parametrize(("level", "body"), [("causal", READ[0]), *(("topological", body) for body in READ)])
+@pytest.mark.parametrize(
+    ("level", "body"), [("causal", READ[0]), *(("topological", body) for body in READ)]
+)
 def test_rules_are_kept_by_those_maps_that_clingo_lists(body: str, level: str) -> None:
     """Of all maps without the rule, those keep it that clingo finds with it."""
     plain = getattr(Theory, level)().replace(prefer=())
@@ -132,9 +138,13 @@ def test_rules_are_kept_by_those_maps_that_clingo_lists(body: str, level: str) -
 
     resolved = theory.resolve(SMALL)
     assert can_be_asked(resolved)
-    assert {ssh_map for ssh_map in maps_of(plain) if keeps_own_rules(SMALL, ssh_map, resolved)} == maps_of(theory)
+    assert {
+        ssh_map for ssh_map in maps_of(plain) if keeps_own_rules(SMALL, ssh_map, resolved)
+    } == maps_of(theory)
 
 
 @pytest.mark.parametrize("body", ["founded(S,t)", "used(H,t)", "violation(deterministic,t)"])
 def test_rules_that_read_what_a_map_does_not_show_are_not_asked(body: str) -> None:
-    assert not can_be_asked(ruled(f"#program step(t).\n:- {body}.", Theory.topological()).resolve(SMALL))
+    assert not can_be_asked(
+        ruled(f"#program step(t).\n:- {body}.", Theory.topological()).resolve(SMALL)
+    )

@@ -52,15 +52,32 @@ def test_a_star_survives_a_round_trip(tmp_path: Path) -> None:
 
 
 def test_what_is_in_quarters() -> None:
-    fits = [(1, 0, 1, 1), (0, 90), (-90, 170, 20), (), ({"bearing": 0, "opposite": 1}, {"bearing": 180})]
-    does_not = [(0, 120), (1, None, 0, 0), (0, 30), ({"bearing": 0, "opposite": 1}, {"bearing": 90}), ({"bearing": 0, "open": None},)]
+    fits = [
+        (1, 0, 1, 1),
+        (0, 90),
+        (-90, 170, 20),
+        (),
+        ({"bearing": 0, "opposite": 1}, {"bearing": 180}),
+    ]
+    does_not = [
+        (0, 120),
+        (1, None, 0, 0),
+        (0, 30),
+        ({"bearing": 0, "opposite": 1}, {"bearing": 90}),
+        ({"bearing": 0, "open": None},),
+    ]
     for star in fits:
         assert Trace.from_steps("a", [], stars=[star]).in_quarters
     for star in does_not:
         assert not Trace.from_steps("a", [], stars=[star]).in_quarters
-    for action in ({"name": "r", "kind": "turn", "bearing": 60}, {"name": "r", "kind": "turn", "turn": "right", "gateway": 1}):
+    for action in (
+        {"name": "r", "kind": "turn", "bearing": 60},
+        {"name": "r", "kind": "turn", "turn": "right", "gateway": 1},
+    ):
         assert not Trace.from_steps("aa", [action], stars=[(0, 90)] * 2).in_quarters
-    assert Trace.from_steps("aa", [{"name": "r", "kind": "turn", "bearing": 95}], stars=[(0, 90)] * 2).in_quarters
+    assert Trace.from_steps(
+        "aa", [{"name": "r", "kind": "turn", "bearing": 95}], stars=[(0, 90)] * 2
+    ).in_quarters
 
 
 def test_what_the_trace_tells_settles_the_star() -> None:
@@ -69,7 +86,10 @@ def test_what_the_trace_tells_settles_the_star() -> None:
         assert Theory(star=star).resolve(square).star == "frame"
         assert Theory(star=star).resolve(bend).star == "gateways"
     assert Theory(star="gateways").resolve(square).star == "gateways"
-    with pytest.raises(TraceError, match=r"step 0: star: expected bearings that fall into different quarters.*take star=gateways"):
+    with pytest.raises(
+        TraceError,
+        match=r"step 0: star: expected bearings that fall into different quarters.*take star=gateways",
+    ):
         Theory(star="pattern").resolve(bend)
 
 
@@ -78,14 +98,26 @@ def test_what_the_trace_tells_settles_the_star() -> None:
     [
         ([0, None], r"star\[1\]: expected a finite number"),
         ([{"bearing": "n"}], r"star\[0\]\.bearing: expected a number of degrees"),
-        ([{"bearing": 0, "width": 2}], r"star\[0\]: expected fields out of bearing, spread, opposite, open, got 'width'"),
+        (
+            [{"bearing": 0, "width": 2}],
+            r"star\[0\]: expected fields out of bearing, spread, opposite, open, got 'width'",
+        ),
         ([{"bearing": 0, "spread": 50}], r"star\[0\]\.spread: expected 0 to 45 degrees"),
         ([{"bearing": 0, "spread": -1}], r"star\[0\]\.spread: expected"),
         ([{"bearing": 0, "open": False}], r"star\[0\]\.open: expected true, or null"),
-        ([{"bearing": 0, "opposite": 1}], r"star\[0\]\.opposite: expected the index of a gateway, 0 to 0"),
+        (
+            [{"bearing": 0, "opposite": 1}],
+            r"star\[0\]\.opposite: expected the index of a gateway, 0 to 0",
+        ),
         ([{"bearing": 0, "opposite": 0}], r"star\[0\]\.opposite: expected another gateway"),
-        ([{"bearing": 0, "opposite": 1}, {"bearing": 90, "opposite": 2}, 200], r"star\[0\]\.opposite: expected another gateway"),
-        ([{"bearing": 10 * k, "open": None} for k in range(7)], "star: expected at most 6 gateways that were not observed"),
+        (
+            [{"bearing": 0, "opposite": 1}, {"bearing": 90, "opposite": 2}, 200],
+            r"star\[0\]\.opposite: expected another gateway",
+        ),
+        (
+            [{"bearing": 10 * k, "open": None} for k in range(7)],
+            "star: expected at most 6 gateways that were not observed",
+        ),
         ("1000", "star: expected a list"),
     ],
 )
@@ -98,10 +130,19 @@ def test_a_malformed_star_is_an_error(star: Any, message: str) -> None:
     ("action", "message"),
     [
         ({"gateway": 0, "turn": "right"}, "action.gateway: expected 1 or more"),
-        ({"gateway": 1, "turn": "around"}, "action.gateway: expected 1 or more, for a turn right or left"),
+        (
+            {"gateway": 1, "turn": "around"},
+            "action.gateway: expected 1 or more, for a turn right or left",
+        ),
         ({"bearing": 5}, "action.bearing: expected degrees of a turn , got 5, which is no turn"),
-        ({"bearing": 60, "turn": "left"}, "action.bearing: expected degrees of a turn left, got 60, which is right"),
-        ({"bearing": 60, "kind": "travel"}, "action.bearing: expected degrees clockwise, for a turn"),
+        (
+            {"bearing": 60, "turn": "left"},
+            "action.bearing: expected degrees of a turn left, got 60, which is right",
+        ),
+        (
+            {"bearing": 60, "kind": "travel"},
+            "action.bearing: expected degrees clockwise, for a turn",
+        ),
         ({"bearing": "x"}, "action.bearing: expected degrees clockwise"),
     ],
 )
@@ -111,11 +152,16 @@ def test_a_malformed_turn_is_an_error(action: dict[str, Any], message: str) -> N
 
 
 def test_gateways_that_could_be_one_are_an_error() -> None:
-    with pytest.raises(TraceError, match="step 0: star: expected gateways that their spreads tell apart, got 0 and 15 degrees"):
+    with pytest.raises(
+        TraceError,
+        match="step 0: star: expected gateways that their spreads tell apart, got 0 and 15 degrees",
+    ):
         solve(Trace.from_steps("a", [], stars=[(0, 15)]))
 
 
-@pytest.mark.parametrize(("bearing", "turn"), [(60, "right"), (-60, "left"), (175, "around"), (300, "left")])
+@pytest.mark.parametrize(
+    ("bearing", "turn"), [(60, "right"), (-60, "left"), (175, "around"), (300, "left")]
+)
 def test_a_bearing_says_which_way_a_turn_goes(bearing: float, turn: str) -> None:
     assert Action("x", "turn", bearing=bearing).turn == turn
 
@@ -134,7 +180,9 @@ gateways = st.builds(
     lambda bearings, spreads, opposite: Frame(
         tuple(sorted(bearings)),
         tuple(spreads[: len(bearings)]),
-        tuple(range(len(bearings)))[1::-1] + (None,) * (len(bearings) - 2) if opposite and len(bearings) > 1 else (None,) * len(bearings),
+        tuple(range(len(bearings)))[1::-1] + (None,) * (len(bearings) - 2)
+        if opposite and len(bearings) > 1
+        else (None,) * len(bearings),
     ),
     st.lists(st.integers(0, 35).map(lambda k: 10 * k), max_size=4, unique=True),
     st.lists(st.sampled_from([0, 10, 25, 90]), min_size=4, max_size=4),
@@ -177,7 +225,15 @@ TURNS: tuple[Any, ...] = (
     {"name": "second", "kind": "turn", "turn": "left", "gateway": 2},
 )
 # The axioms that may be left out: without a heading of its own a dstate would be turned in several ways.
-LEFT_OUT = ("gateway_frame", "gateway_turn", "gateway_dstate", "gateway_path", "gateway_end", "turn_stays", "travel_leaves")
+LEFT_OUT = (
+    "gateway_frame",
+    "gateway_turn",
+    "gateway_dstate",
+    "gateway_path",
+    "gateway_end",
+    "turn_stays",
+    "travel_leaves",
+)
 
 
 @st.composite
@@ -186,7 +242,9 @@ def traces(draw: st.DrawFn) -> Trace:
     shapes = draw(st.lists(st.sampled_from(SHAPES), min_size=1, max_size=2))
     noise = draw(st.sampled_from([0, 0, 7]))
     steps = draw(st.integers(2, 5))
-    actions = draw(st.lists(st.sampled_from(("travel", *TURNS)), min_size=steps - 1, max_size=steps - 1))
+    actions = draw(
+        st.lists(st.sampled_from(("travel", *TURNS)), min_size=steps - 1, max_size=steps - 1)
+    )
     shape, heading, stars = draw(st.sampled_from(shapes)), 0, []
     for action in ("travel", *actions):
         if action == "travel":
@@ -194,11 +252,23 @@ def traces(draw: st.DrawFn) -> Trace:
             heading = draw(st.sampled_from([0, 60, 120, 180]))
         else:
             known = {"right": 60, "left": 300, "around": 180}
-            heading += action["bearing"] if isinstance(action, dict) and "bearing" in action else known.get(str(action), 120)
+            heading += (
+                action["bearing"]
+                if isinstance(action, dict) and "bearing" in action
+                else known.get(str(action), 120)
+            )
         seen = []
         for gateway in shape:
             given_ = dict(gateway) if isinstance(gateway, dict) else {"bearing": gateway}
-            seen.append({**given_, "bearing": (given_["bearing"] - heading + draw(st.sampled_from([-noise, 0, noise]))) % 360})
+            seen.append(
+                {
+                    **given_,
+                    "bearing": (
+                        given_["bearing"] - heading + draw(st.sampled_from([-noise, 0, noise]))
+                    )
+                    % 360,
+                }
+            )
         stars.append(seen)
     views = draw(st.lists(st.sampled_from("aab"), min_size=steps, max_size=steps))
     return Trace.from_steps(views, actions, stars=stars)
@@ -228,14 +298,18 @@ def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.Da
 @given(traces(), st.data())
 def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
     """star=alike: solver and checker against the brute force, which tries all ways to pair gateways; the maps of the bare causal theory are judged by it, too."""
-    theory = Theory.causal().replace(star="alike", prefer=data.draw(st.sampled_from([("dstates",), ()])))
+    theory = Theory.causal().replace(
+        star="alike", prefer=data.draw(st.sampled_from([("dstates",), ()]))
+    )
     _, expected = minimal_maps(trace, theory)
     solution = solve(trace, theory, max_maps=None, time_limit=100)
     assert solution.complete
     assert {key(ssh_map) for ssh_map in solution.maps} == expected
     assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
     _, allowed = minimal_maps(trace, theory.replace(prefer=()))
-    for ssh_map in solve(trace, Theory.causal().replace(prefer=()), max_maps=20, time_limit=100).maps:
+    for ssh_map in solve(
+        trace, Theory.causal().replace(prefer=()), max_maps=20, time_limit=100
+    ).maps:
         assert (check(trace, ssh_map, theory) == ()) == (key(ssh_map) in allowed)
 
 
@@ -244,7 +318,9 @@ def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
 def test_checker_rejects_what_the_brute_force_does_not_find(trace: Trace, left_out: str) -> None:
     """The maps of a theory that lacks an axiom, under the axioms that have it."""
     _, allowed = minimal_maps(trace, GATEWAYS.replace(prefer=()))
-    for ssh_map in solve(trace, GATEWAYS.replace(prefer=(), without=(left_out,)), max_maps=20, time_limit=100).maps:
+    for ssh_map in solve(
+        trace, GATEWAYS.replace(prefer=(), without=(left_out,)), max_maps=20, time_limit=100
+    ).maps:
         if key(ssh_map) not in allowed:
             assert check(trace, ssh_map, GATEWAYS)
 
@@ -253,14 +329,19 @@ def test_an_opening_not_observed_matches_both() -> None:
     """Out and back: behind the robot it is unknown, at first, whether there is a gateway."""
     for back in (0, 1):
         trace = Trace.from_steps(
-            "abca", ["travel", "around", "travel"], stars=[(1, 0, None, 0), (0, 0, 1, 0), (1, 0, 0, 0), (back, 0, 1, 0)]
+            "abca",
+            ["travel", "around", "travel"],
+            stars=[(1, 0, None, 0), (0, 0, 1, 0), (1, 0, 0, 0), (back, 0, 1, 0)],
         )
         cost = solve(trace).cost
         assert cost is not None
         assert cost.places == 2
     contradicted = Trace.from_steps("ab", ["around"], stars=[(1, None, 0, 0), (0, 1, 1, 0)])
     assert solve(contradicted).status is Status.UNSATISFIABLE
-    assert solve(Trace.from_steps("ab", ["around"], stars=[(1, None, 0, 0), (0, 0, 1, 1)])).status is Status.OPTIMAL
+    assert (
+        solve(Trace.from_steps("ab", ["around"], stars=[(1, None, 0, 0), (0, 0, 1, 1)])).status
+        is Status.OPTIMAL
+    )
 
 
 def test_the_axioms_agree_with_frames_of_four_slots() -> None:
@@ -301,7 +382,9 @@ WORLDS: dict[str, tuple[nx.Graph, int, set[object]]] = {
 def test_worlds_of_any_gateways_are_mapped_right(name: str) -> None:
     graph, steps, landmarks = WORLDS[name]
     start = next(iter(graph))
-    tour = drive(graph, start, next(iter(graph[start])), steps, random.Random(0), landmarks=landmarks)
+    tour = drive(
+        graph, start, next(iter(graph[start])), steps, random.Random(0), landmarks=landmarks
+    )
     solution = solve(tour.trace, time_limit=100)
     assert solution.theory.star == "gateways"
     assert solution.status is Status.OPTIMAL
@@ -318,7 +401,10 @@ def test_a_bend_ends_two_paths() -> None:
     tour = drive(planar.hexagon(), 0, 1, 12, random.Random(0))
     trace = tour.trace
     different = [(i, j) for j in range(12) for i in range(j)]
-    theory = Theory(different=different, elsewhere=[(i, j) for i, j in different if tour.truth[i][0] != tour.truth[j][0]])
+    theory = Theory(
+        different=different,
+        elsewhere=[(i, j) for i, j in different if tour.truth[i][0] != tour.truth[j][0]],
+    )
     for without, counts in (((), (12, 6, 6)), (("gateway_end",), (12, 7, 4))):
         solution = solve(trace, theory.replace(without=without), time_limit=100)
         assert solution.cost is not None
@@ -339,12 +425,16 @@ def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> N
 @pytest.mark.parametrize(("spokes", "noise", "unseen"), [(5, 0, False), (6, 9, True)])
 def test_no_axiom_forbids_the_true_map(spokes: int, noise: float, unseen: bool) -> None:
     """Hubs with a ring road: bearings may be off by less than their spread, and gateways behind the robot need not be observed."""
-    tour = drive(planar.wheel(spokes), "hub", 0, 24, random.Random(spokes), noise=noise, unseen=unseen)
+    tour = drive(
+        planar.wheel(spokes), "hub", 0, 24, random.Random(spokes), noise=noise, unseen=unseen
+    )
     pairs = [(i, j) for j in range(24) for i in range(j)]
     same = [(i, j) for i, j in pairs if tour.truth[i] == tour.truth[j]]
     elsewhere = [(i, j) for i, j in pairs if tour.truth[i][0] != tour.truth[j][0]]
     different = [pair for pair in pairs if pair not in same]
-    asserted = Theory(same=same, different=different, elsewhere=elsewhere, prefer=("dstates", "places", "paths"))
+    asserted = Theory(
+        same=same, different=different, elsewhere=elsewhere, prefer=("dstates", "places", "paths")
+    )
     solution = solve(tour.trace, asserted, time_limit=100)
     assert solution.status is Status.OPTIMAL
     assert solution.maps[0].labels == tour.labels
@@ -359,12 +449,17 @@ def test_online_maps_general_stars() -> None:
     assert mapper.theory.star == "gateways"
     for t, action in enumerate(tour.trace.actions, 1):
         step = tour.trace.steps[t]
-        online, whole = mapper.observe(action, step.view or "", star=step.star), solve(tour.trace.prefix(t + 1))
+        online, whole = (
+            mapper.observe(action, step.view or "", star=step.star),
+            solve(tour.trace.prefix(t + 1)),
+        )
         assert (online.status, online.cost) == (whole.status, whole.cost)
         assert set(online.maps) == set(whole.maps)
 
 
-def test_maps_with_headings_in_degrees_survive_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_maps_with_headings_in_degrees_survive_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """What solve prints of a triangle is read by check and show."""
     tour = drive(planar.triangle(), 0, 1, 9, random.Random(0))
     tour.trace.save(tmp_path / "t.jsonl")

@@ -17,7 +17,11 @@ from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
 PLAIN = Speedups.without(SPEEDUPS)
-ARMS = {"corridor": ("around",), "T": ("right", "around", "left"), "plus": ("right", "left", "around", "right")}
+ARMS = {
+    "corridor": ("around",),
+    "T": ("right", "around", "left"),
+    "plus": ("right", "left", "around", "right"),
+}
 
 
 def corridor(landmarks: int, drives: int = 1, alike: int = 0, seed: int = 0) -> Trace:
@@ -43,7 +47,9 @@ def arms(kind: str, length: int) -> Trace:
         for way in ("out", "back"):
             for i in range(length):
                 done.append("travel")
-                seen.append(f"{way} {number} {i}" if way == "out" or i < length - 1 else f"c {number}")
+                seen.append(
+                    f"{way} {number} {i}" if way == "out" or i < length - 1 else f"c {number}"
+                )
             done.append("around" if way == "out" else turn)
             seen.append(f"end {number}" if way == "out" else f"c {number} turned")
     return Trace.from_steps(seen, done)
@@ -54,12 +60,20 @@ CASES = {
         f"corridor of {n}, {drives} drives, {alike} alike": corridor(n, drives, alike)
         for n, drives, alike in ((3, 1, 0), (4, 1, 0), (3, 2, 0), (4, 1, 2), (4, 2, 3))
     },
-    **{f"{kind} of {length}": arms(kind, length) for kind in ARMS for length in (1, 2) if kind != "plus" or length == 1},
+    **{
+        f"{kind} of {length}": arms(kind, length)
+        for kind in ARMS
+        for length in (1, 2)
+        if kind != "plus" or length == 1
+    },
 }
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("prefer", [("dstates", "paths", "places"), ("dstates", "places", "paths"), ("dstates", "places")])
+@pytest.mark.parametrize(
+    "prefer",
+    [("dstates", "paths", "places"), ("dstates", "places", "paths"), ("dstates", "places")],
+)
 def test_the_maps_are_those_of_the_plain_encoding(case: str, prefer: tuple[str, ...]) -> None:
     trace, theory = CASES[case], Theory.topological().replace(prefer=prefer)
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
@@ -72,7 +86,9 @@ def test_the_maps_are_those_of_the_plain_encoding(case: str, prefer: tuple[str, 
 def test_places_on_the_way_back_have_one_home_each() -> None:
     there = [(9, i, i + 1) for i in range(3)]
     back = [(9, 6, 5), (9, 5, 4), (9, 4, 3)]
-    elsewhere = [(i, j) for some in ((0, 1, 2, 3), (6, 5, 4, 3)) for i in some for j in some if i != j]
+    elsewhere = [
+        (i, j) for some in ((0, 1, 2, 3), (6, 5, 4, 3)) for i in some for j in some if i != j
+    ]
     homes = homes_of(Segments([0, 1, 2, 3, 4, 5, 6], elsewhere, there + back, [9], []))
     assert homes is not None
     assert all(len(found) == 1 for found in homes.values())
@@ -80,19 +96,29 @@ def test_places_on_the_way_back_have_one_home_each() -> None:
     assert {frozenset(pair) for pair in ((6, 0), (5, 1), (4, 2), (3,))} <= pairs
 
 
-@pytest.mark.parametrize("elsewhere", [[(0, 0)], [(0, 1), (1, 2), (0, 2), (3, 0), (3, 1), (3, 2), (0, 3), (3, 3)]])
+@pytest.mark.parametrize(
+    "elsewhere", [[(0, 0)], [(0, 1), (1, 2), (0, 2), (3, 0), (3, 1), (3, 2), (0, 3), (3, 3)]]
+)
 def test_places_that_cannot_be_have_no_home(elsewhere: list[tuple[int, int]]) -> None:
     assert homes_of(Segments([0, 1, 2, 3], elsewhere, [], [], [])) is None
 
 
 def test_segments_of_which_none_can_be_one_path_are_as_many_paths() -> None:
-    assert fewest_paths(Segments([], [], [], [0, 1, 2, 3], [(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)])) == 3
+    assert (
+        fewest_paths(
+            Segments([], [], [], [0, 1, 2, 3], [(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)])
+        )
+        == 3
+    )
 
 
 def test_a_long_corridor_needs_no_search_for_places() -> None:
     """Clingo is asked once for the places of forty landmarks, and has no choice."""
     trace = corridor(40)
-    with patch.object(PlacesAndPaths, "_has_paths", side_effect=AssertionError), patch.object(frameless, "BETTERING", 0):
+    with (
+        patch.object(PlacesAndPaths, "_has_paths", side_effect=AssertionError),
+        patch.object(frameless, "BETTERING", 0),
+    ):
         found = solve(trace)
     assert (found.status, found.complete, found.count) == (Status.OPTIMAL, True, 1)
     assert found.cost is not None

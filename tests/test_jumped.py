@@ -31,24 +31,38 @@ NOISE = Odometry(along=0.05, across=0.005, heading=0.002)
 def circuit(steps: int, jumps: tuple[int, ...] = ()) -> Trace:
     """Round and round a square whose corners look alike; the displacements to some steps are wrong."""
     moves = [AWAY if t in jumps else (AHEAD, LEFT)[(t - 1) % 2] for t in range(1, steps)]
-    return Trace.from_steps(["pq"[t % 2] for t in range(steps)], [("travel", "left")[t % 2] for t in range(steps - 1)], displacements=moves)
+    return Trace.from_steps(
+        ["pq"[t % 2] for t in range(steps)],
+        [("travel", "left")[t % 2] for t in range(steps - 1)],
+        displacements=moves,
+    )
 
 
 @st.composite
 def small_traces(draw: st.DrawFn) -> Trace:
     steps = draw(st.integers(3, 7))
-    done = draw(st.lists(st.sampled_from(["travel", "left"]), min_size=steps - 1, max_size=steps - 1))
+    done = draw(
+        st.lists(st.sampled_from(["travel", "left"]), min_size=steps - 1, max_size=steps - 1)
+    )
     right = {"travel": AHEAD, "left": LEFT}
     moves = [draw(st.sampled_from([right[action], right[action], AWAY, None])) for action in done]
-    return Trace.from_steps(draw(st.lists(st.sampled_from("aab"), min_size=steps, max_size=steps)), done, displacements=moves)
+    return Trace.from_steps(
+        draw(st.lists(st.sampled_from("aab"), min_size=steps, max_size=steps)),
+        done,
+        displacements=moves,
+    )
 
 
 @settings(max_examples=5)
 @given(small_traces(), st.booleans(), st.sampled_from([0.4, 1.0, 1.7]))
-def test_minimal_maps_are_the_best_of_all_ways_to_leave_displacements_out(trace: Trace, causal: bool, price: float) -> None:
+def test_minimal_maps_are_the_best_of_all_ways_to_leave_displacements_out(
+    trace: Trace, causal: bool, price: float
+) -> None:
     if not trace.has_displacements:
         return
-    theory = (Theory.causal() if causal else Theory(boundary="none")).replace(displacement="use", jumped=price, prefer=("dstates",))
+    theory = (Theory.causal() if causal else Theory(boundary="none")).replace(
+        displacement="use", jumped=price, prefer=("dstates",)
+    )
     theory = theory.resolve(trace)
     moved = [t for t, step in enumerate(trace.steps) if step.displacement is not None]
     expected: dict[float, set[tuple[tuple[int, ...], tuple[int, ...]]]] = {}
@@ -56,13 +70,17 @@ def test_minimal_maps_are_the_best_of_all_ways_to_leave_displacements_out(trace:
         found = solve(trace.without_displacements_at(jumps), theory.without_faults(), max_maps=None)
         if found.cost:
             cost = round(found.cost.dstates + price * len(jumps), 1)
-            expected.setdefault(cost, set()).update((ssh_map.labels, jumps) for ssh_map in found.maps)
+            expected.setdefault(cost, set()).update(
+                (ssh_map.labels, jumps) for ssh_map in found.maps
+            )
     solution = solve(trace, theory, max_maps=None)
     assert solution.complete
     assert solution.cost is not None
     least = min(expected)
     assert solution.cost.dstates + solution.cost.faults == pytest.approx(least)
-    assert {(m.labels, tuple(fault.step for fault in m.faults)) for m in solution.maps} == expected[least]
+    assert {(m.labels, tuple(fault.step for fault in m.faults)) for m in solution.maps} == expected[
+        least
+    ]
     assert all(check(trace, ssh_map, theory) == () for ssh_map in solution.maps)
 
 
@@ -76,7 +94,10 @@ def test_a_robot_that_was_carried_away_finds_its_circuit_again(speedups: Speedup
     assert [(len(m.dstates), len(m.places)) for m in solution.maps] == [(8, 4)]
     (fault,) = solution.maps[0].faults
     assert fault == Fault(9, "jumped", "25.0 m ahead, 7.0 m left, turned 52 degrees left")
-    assert str(fault) == "the displacement that leads to step 9 is wrong: 25.0 m ahead, 7.0 m left, turned 52 degrees left"
+    assert (
+        str(fault)
+        == "the displacement that leads to step 9 is wrong: 25.0 m ahead, 7.0 m left, turned 52 degrees left"
+    )
     assert SSHMap.from_dict(solution.maps[0].to_dict()).faults == (fault,)
     assert check(trace, solution.maps[0], solution.theory) == ()
 
@@ -98,14 +119,22 @@ def test_the_checker_believes_what_the_map_believes() -> None:
 
 
 @pytest.mark.parametrize(("seed", "jumps"), [(11, 1), (12, 2)])
-def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_truth(seed: int, jumps: int) -> None:
+def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_truth(
+    seed: int, jumps: int
+) -> None:
     chance = random.Random(seed)
     walk = maze(3, 3, steps=60, seed=seed, stars=True, follow=True, odometry=NOISE)
     wrong = sorted(chance.sample(range(20, 45), jumps))
     steps = list(walk.trace.steps)
     for t in wrong:
         steps[t] = replace(
-            steps[t], displacement=(chance.choice((-15, 15)), chance.choice((-15, 15)), chance.uniform(-3, 3)), covariance=None
+            steps[t],
+            displacement=(
+                chance.choice((-15, 15)),
+                chance.choice((-15, 15)),
+                chance.uniform(-3, 3),
+            ),
+            covariance=None,
         )
     trace = replace(walk.trace, steps=tuple(steps))
     true = len(set(walk.truth))
@@ -123,7 +152,11 @@ def test_returns_vote_on_what_displacements_are_wrong(jumps: tuple[int, ...]) ->
 
 def test_what_cannot_be_asked_with_jumps_is_refused() -> None:
     theory = Theory(jumped=2)
-    for ask in (lambda: OnlineMapper("a", theory), lambda: fault_front(circuit(4), theory), lambda: explain(circuit(4), theory)):
+    for ask in (
+        lambda: OnlineMapper("a", theory),
+        lambda: fault_front(circuit(4), theory),
+        lambda: explain(circuit(4), theory),
+    ):
         with pytest.raises(TheoryError, match="jumped: expected"):
             ask()
     with pytest.raises(TheoryError, match="jumped: expected displacements to be used"):

@@ -62,7 +62,9 @@ def metres(scans: tuple[Scan, ...]) -> float:
 
 
 @pytest.mark.parametrize(("at", "is_timed"), [({65}, True), ({30, 60, 100}, False)])
-def test_an_odometer_that_starts_anew_is_cut_there(scans: tuple[Scan, ...], metres: float, at: set[int], is_timed: bool) -> None:
+def test_an_odometer_that_starts_anew_is_cut_there(
+    scans: tuple[Scan, ...], metres: float, at: set[int], is_timed: bool
+) -> None:
     broken = stepwise(scans, lambda i, step: None if i in at else step)
     track, notes = told(broken if is_timed else [replace(scan, time=None) for scan in broken])
     assert (set(track.cuts), track.breaks) == (at, ())
@@ -71,8 +73,12 @@ def test_an_odometer_that_starts_anew_is_cut_there(scans: tuple[Scan, ...], metr
     assert "starts anew from 0" in notes
 
 
-def test_no_displacement_leads_across_a_cut_and_solver_and_checker_agree(scans: tuple[Scan, ...]) -> None:
-    done = import_log(RobotLog(stepwise(scans, lambda i, step: None if i == 65 else step), source="drive"))
+def test_no_displacement_leads_across_a_cut_and_solver_and_checker_agree(
+    scans: tuple[Scan, ...],
+) -> None:
+    done = import_log(
+        RobotLog(stepwise(scans, lambda i, step: None if i == 65 else step), source="drive")
+    )
     (t,) = (t for t, step in enumerate(done.trace.steps) if t and step.displacement is None)
     assert (done.trace.steps[t].extra["cuts"], done.trace.steps[t].covariance) == ([65], None)
     assert not any(step.action.slipped for step in done.trace.steps if step.action)
@@ -81,7 +87,9 @@ def test_no_displacement_leads_across_a_cut_and_solver_and_checker_agree(scans: 
     assert not check(done.trace, solution.maps[0], solution.theory)
 
 
-def test_a_robot_that_is_carried_while_its_odometer_stands_still_is_tracked_by_scans(scans: tuple[Scan, ...], metres: float) -> None:
+def test_a_robot_that_is_carried_while_its_odometer_stands_still_is_tracked_by_scans(
+    scans: tuple[Scan, ...], metres: float
+) -> None:
     track, notes = told(stepwise(scans, lambda i, step: START if 60 <= i < 80 else step))
     assert set(track.cuts) == set(range(60, 80))
     assert track.way[-1] == pytest.approx(metres, abs=8)
@@ -90,7 +98,10 @@ def test_a_robot_that_is_carried_while_its_odometer_stands_still_is_tracked_by_s
 
 def test_a_robot_that_stands_is_not_carried(scans: tuple[Scan, ...]) -> None:
     rng = np.random.default_rng(1)
-    stands = [replace(scans[60], ranges=scans[60].ranges + 0.02 * rng.normal(size=len(scans[60].ranges))) for _ in range(10)]
+    stands = [
+        replace(scans[60], ranges=scans[60].ranges + 0.02 * rng.normal(size=len(scans[60].ranges)))
+        for _ in range(10)
+    ]
     assert unknown_steps(RobotLog((*scans[:60], *stands, *scans[60:]))) == Unknown()
 
 
@@ -101,7 +112,9 @@ def test_a_robot_that_was_carried_unseen_is_mapped_as_two_ways(scans: tuple[Scan
     assert done.track.breaks == (60,)
     assert "The scans show nothing of what was seen before, once" in done.notes[0]
     (t,) = (t for t, step in enumerate(done.trace.steps) if t and step.displacement is None)
-    assert [i for i, step in enumerate(done.trace.steps) if step.action and step.action.slipped] == [t - 1]
+    assert [
+        i for i, step in enumerate(done.trace.steps) if step.action and step.action.slipped
+    ] == [t - 1]
     solution = solve(done.trace)
     assert solution.maps
     assert not check(done.trace, solution.maps[0], solution.theory)
@@ -112,17 +125,32 @@ def test_a_pause_in_which_the_robot_drove_on_is_no_jump(scans: tuple[Scan, ...])
 
 
 @pytest.mark.parametrize(("unit", "count"), [("millimetres", 1000.0), ("centimetres", 100.0)])
-def test_odometry_in_another_unit_is_read_in_it(scans: tuple[Scan, ...], metres: float, unit: str, count: float) -> None:
-    track, notes = told(by(scans, [(count * x, count * y, heading) for x, y, heading in (scan.odometry for scan in scans)]))
+def test_odometry_in_another_unit_is_read_in_it(
+    scans: tuple[Scan, ...], metres: float, unit: str, count: float
+) -> None:
+    track, notes = told(
+        by(
+            scans,
+            [
+                (count * x, count * y, heading)
+                for x, y, heading in (scan.odometry for scan in scans)
+            ],
+        )
+    )
     assert track.way[-1] == pytest.approx(metres, abs=3)
     assert f"It is read as {unit}" in notes
 
 
 @pytest.mark.parametrize("share", [None, 0.3])
-def test_poses_of_two_sources_that_alternate_are_those_of_one(scans: tuple[Scan, ...], metres: float, share: float | None) -> None:
+def test_poses_of_two_sources_that_alternate_are_those_of_one(
+    scans: tuple[Scan, ...], metres: float, share: float | None
+) -> None:
     draw = random.Random(1)
     other = [i % 2 == 1 if share is None else draw.random() < share for i in range(len(scans))]
-    poses = [moved((20.0, 14.0, 1.0), scan.odometry) if is_other else scan.odometry for scan, is_other in zip(scans, other, strict=True)]
+    poses = [
+        moved((20.0, 14.0, 1.0), scan.odometry) if is_other else scan.odometry
+        for scan, is_other in zip(scans, other, strict=True)
+    ]
     track, notes = told(by(scans, poses))
     assert track.way[-1] == pytest.approx(metres, abs=8)
     assert "The poses of several sources alternate in the odometry" in notes
@@ -130,7 +158,10 @@ def test_poses_of_two_sources_that_alternate_are_those_of_one(scans: tuple[Scan,
 
 def test_poses_that_alternate_nearby_are_said(scans: tuple[Scan, ...]) -> None:
     draw = random.Random(1)
-    poses = [moved((1.0, 0.8, 0.05), scan.odometry) if draw.random() < 0.5 else scan.odometry for scan in scans]
+    poses = [
+        moved((1.0, 0.8, 0.05), scan.odometry) if draw.random() < 0.5 else scan.odometry
+        for scan in scans
+    ]
     assert "The odometry goes to and fro" in told(by(scans, poses))[1]
 
 
@@ -142,13 +173,21 @@ def test_a_log_that_is_not_in_order_is_said_to_be(scans: tuple[Scan, ...], block
     assert "The odometry jumps" in notes or "The usual step between two scans is" in notes
 
 
-def test_a_drive_that_is_broken_all_over_is_an_error(scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_that_is_broken_all_over_is_an_error(
+    scans: tuple[Scan, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(importing, "MOST_BREAKS", -1.0)
-    with pytest.raises(LogError, match="expected a log of one drive, got 60 scans of which 0 show nothing"):
+    with pytest.raises(
+        LogError, match="expected a log of one drive, got 60 scans of which 0 show nothing"
+    ):
         import_log(RobotLog(scans[:60], source="drive"))
 
 
-def test_scans_that_turn_otherwise_than_the_odometer_are_said(scans: tuple[Scan, ...], metres: float) -> None:
-    track, notes = told(stepwise(scans, lambda i, step: (step[0], step[1], step[2] + (2.0 if i == 70 else 0.0))))
+def test_scans_that_turn_otherwise_than_the_odometer_are_said(
+    scans: tuple[Scan, ...], metres: float
+) -> None:
+    track, notes = told(
+        stepwise(scans, lambda i, step: (step[0], step[1], step[2] + (2.0 if i == 70 else 0.0)))
+    )
     assert "Scans turn otherwise than the odometry, once: at scan 70" in notes
     assert track.way[-1] == pytest.approx(metres, abs=3)

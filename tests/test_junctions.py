@@ -30,7 +30,12 @@ from ssh_abduction.cli import main
 from ssh_abduction.evaluation import evaluate
 from ssh_abduction.solver import Status
 
-SHIPPED = {"triangle": (12, 3, 3), "three-ways": (16, 5, 4), "five-ways": (20, 6, 5), "six-ways": (18, 7, 3)}
+SHIPPED = {
+    "triangle": (12, 3, 3),
+    "three-ways": (16, 5, 4),
+    "five-ways": (20, 6, 5),
+    "six-ways": (18, 7, 3),
+}
 FIVE = World.named("five-ways")
 REACH = 0.8
 
@@ -65,18 +70,30 @@ def exact_panorama(world: World, pose: tuple[float, float, float]) -> np.ndarray
 
 @settings(max_examples=5)
 @given(st.integers(0, 8), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-3, 3))
-def test_a_panorama_shows_the_streets_and_where_they_meet(shape: int, dx: float, dy: float, heading: float) -> None:
+def test_a_panorama_shows_the_streets_and_where_they_meet(
+    shape: int, dx: float, dy: float, heading: float
+) -> None:
     """From anywhere near the fixed point: streets to a degree, the fixed point to two centimetres."""
     shapes: tuple[tuple[float, ...], ...] = (
         *((0, 60), (0, 120), (0, 90, 180), (0, 120, 240), (0, 60, 180)),
         *((0, 90, 180, 270), (0, 72, 144, 216, 288), (0, 60, 120, 180, 240, 300), (0, 135)),
     )
-    world = World("w", np.vstack([_segments(p) for p in drawn(streets(*shapes[shape]), REACH, ("hub", 0))["polygons"]]))
+    world = World(
+        "w",
+        np.vstack(
+            [_segments(p) for p in drawn(streets(*shapes[shape]), REACH, ("hub", 0))["polygons"]]
+        ),
+    )
     place = Place.of(exact_panorama(world, (dx, dy, heading)), REACH, 8.0)
     seen = sorted(math.degrees(street.bearing + heading) % 360 for street in place.streets)
     assert len(seen) == len(shapes[shape])
     assert (
-        max(abs(math.remainder(a - b, 360)) for a, b in zip(sorted((s + 10) % 360 for s in seen), np.add(shapes[shape], 10), strict=True))
+        max(
+            abs(math.remainder(a - b, 360))
+            for a, b in zip(
+                sorted((s + 10) % 360 for s in seen), np.add(shapes[shape], 10), strict=True
+            )
+        )
         < 1
     )
     assert place.fixed is not None
@@ -88,7 +105,10 @@ def _segments(polygon: list[list[float]]) -> np.ndarray:
 
 
 def test_a_street_that_goes_straight_on_is_no_place() -> None:
-    world = World("w", np.vstack([_segments(p) for p in drawn(streets(0, 175), REACH, ("hub", 0))["polygons"]]))
+    world = World(
+        "w",
+        np.vstack([_segments(p) for p in drawn(streets(0, 175), REACH, ("hub", 0))["polygons"]]),
+    )
     assert Place.of(exact_panorama(world, (0.1, 0.1, 0.3)), REACH, 8.0).fixed is None
     nothing = Place.of(np.full(360, 8.0), REACH, 8.0)
     assert (nothing.streets, nothing.fixed) == ((), None)
@@ -96,11 +116,17 @@ def test_a_street_that_goes_straight_on_is_no_place() -> None:
 
 @settings(max_examples=5)
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-0.03, 0.03), st.integers(0, 10**6))
-def test_the_compass_tells_how_the_robot_is_turned(heading: float, turn: float, error: float, seed: int) -> None:
+def test_the_compass_tells_how_the_robot_is_turned(
+    heading: float, turn: float, error: float, seed: int
+) -> None:
     """Odometry is off by up to 3 % of the turn; the images know better than to half a degree."""
     around = exact_panorama(FIVE, (0.1, 0.2, heading))
-    image = Laser().scan(FIVE, np.array([[0.1, 0.2, heading + turn]]), np.random.default_rng(seed))[0]
-    assert compass(around, image, turn * (1 + error), turn) == pytest.approx(turn, abs=math.radians(0.5))
+    image = Laser().scan(FIVE, np.array([[0.1, 0.2, heading + turn]]), np.random.default_rng(seed))[
+        0
+    ]
+    assert compass(around, image, turn * (1 + error), turn) == pytest.approx(
+        turn, abs=math.radians(0.5)
+    )
 
 
 def test_a_panorama_is_what_is_around() -> None:
@@ -128,18 +154,24 @@ def test_a_panorama_is_what_is_around() -> None:
         (streets(0, 50, 135, 180, 270), (0, "hub")),
     ],
 )
-def test_the_robot_comes_to_every_dstate(tmp_path: Path, graph: nx.Graph, start: tuple[object, object]) -> None:
+def test_the_robot_comes_to_every_dstate(
+    tmp_path: Path, graph: nx.Graph, start: tuple[object, object]
+) -> None:
     """A route along all streets, both ways. Every step is near a true dstate, and the star has its streets to two degrees."""
     world = world_of(tmp_path, graph, start, angles="any")
     trace = simulate(world, seed=3)
     true = {dstate.name: dstate.pose for dstate in world.dstates}
-    assert {dstate.name.partition(" ")[0] for dstate in world.dstates} == {step.truth["dstate"].partition(" ")[0] for step in trace.steps}
+    assert {dstate.name.partition(" ")[0] for dstate in world.dstates} == {
+        step.truth["dstate"].partition(" ")[0] for step in trace.steps
+    }
     for step in trace.steps:
         x, y, heading = between(true[step.truth["dstate"]], step.truth["pose"])
         assert math.hypot(x, y) < 0.025
         assert abs(heading) < math.radians(1.5)
         here, facing = step.truth["place"], math.degrees(true[step.truth["dstate"]][2])
-        ways = [math.degrees(d.pose[2]) for d in world.dstates if d.place == here and " to " in d.name]
+        ways = [
+            math.degrees(d.pose[2]) for d in world.dstates if d.place == here and " to " in d.name
+        ]
         expected = sorted((facing - way + 5) % 360 for way in ways)
         assert step.star is not None
         assert sorted((float(b) + 5) % 360 for b in step.star) == pytest.approx(expected, abs=2)  # type: ignore[arg-type]
@@ -152,7 +184,9 @@ def test_displacements_are_as_good_as_their_covariances_say() -> None:
     squares = []
     for before, after in zip(trace.steps, trace.steps[1:], strict=False):
         assert after.displacement is not None
-        error = np.subtract(after.displacement, between(true[before.truth["dstate"]], true[after.truth["dstate"]]))
+        error = np.subtract(
+            after.displacement, between(true[before.truth["dstate"]], true[after.truth["dstate"]])
+        )
         error[2] = math.remainder(error[2], math.tau)
         if before.action and before.action.kind == "travel":
             squares.append(error @ np.linalg.solve(np.array(after.covariance), error) / 3)
@@ -188,7 +222,10 @@ def test_control_never_reads_the_true_pose() -> None:
 @pytest.mark.parametrize(
     ("route", "message"),
     [
-        (["travel", "travel"], r"travel at \(.*\): expected a free way ahead, got a wall; change the route"),
+        (
+            ["travel", "travel"],
+            r"travel at \(.*\): expected a free way ahead, got a wall; change the route",
+        ),
         (["travel", "right"], r"right at \(.*\): expected a street to the right, got none"),
     ],
 )
@@ -199,19 +236,32 @@ def test_what_cannot_be_driven(tmp_path: Path, route: list[str], message: str) -
 
 def test_a_start_that_is_no_place(tmp_path: Path) -> None:
     with pytest.raises(
-        SimulatorError, match=r"start at .*: expected a place, where streets meet or end, got a street that goes straight on"
+        SimulatorError,
+        match=r"start at .*: expected a place, where streets meet or end, got a street that goes straight on",
     ):
         simulate(world_of(tmp_path, streets(0, 60, length=8), ("hub", 0), start=[4, 0, 0]))
-    with pytest.raises(SimulatorError, match=r"expected a street, about 0\.8 m wide, got none; give another reach"):
+    with pytest.raises(
+        SimulatorError, match=r"expected a street, about 0\.8 m wide, got none; give another reach"
+    ):
         simulate(world_of(tmp_path, streets(0, 60), ("hub", 0), reach=0.4))
 
 
 def test_walls_tell_which_control_laws_hold(tmp_path: Path) -> None:
     assert World.named("notched-rectangle").angles == World.named("taylor-hall").angles == "right"
     assert all(World.named(name).angles == "any" for name in SHIPPED)
-    assert world_of(tmp_path, streets(20, 110, 200), ("hub", 0)).angles == "right"  # turned as a whole
+    assert (
+        world_of(tmp_path, streets(20, 110, 200), ("hub", 0)).angles == "right"
+    )  # turned as a whole
     column = [[1, 0], [1.1, 0.1], [1, 0.2], [0.9, 0.1]]
-    assert world_of(tmp_path, streets(0, 90), ("hub", 0), polygons=[[[0, 0], [9, 0], [9, 9], [0, 9]], column]).angles == "right"
+    assert (
+        world_of(
+            tmp_path,
+            streets(0, 90),
+            ("hub", 0),
+            polygons=[[[0, 0], [9, 0], [9, 9], [0, 9]], column],
+        ).angles
+        == "right"
+    )
     assert world_of(tmp_path, streets(0, 90), ("hub", 0), angles="any").angles == "any"
 
 
@@ -224,8 +274,13 @@ def test_images_at_even_distances() -> None:
 # --- maps
 
 
-@pytest.mark.parametrize(("name", "tours", "seed"), [("triangle", 2, 1), ("three-ways", 1, 3), ("five-ways", 1, 4), ("six-ways", 1, 5)])
-def test_the_true_map_is_found_from_what_was_simulated(name: str, tours: int, seed: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "tours", "seed"),
+    [("triangle", 2, 1), ("three-ways", 1, 3), ("five-ways", 1, 4), ("six-ways", 1, 5)],
+)
+def test_the_true_map_is_found_from_what_was_simulated(
+    name: str, tours: int, seed: int, tmp_path: Path
+) -> None:
     """simulate, cluster and solve, as a user would: one minimal map, and it is the true one."""
     run, views = str(tmp_path / "run.jsonl"), str(tmp_path / "views.jsonl")
     assert main(["simulate", name, "--tours", str(tours), "--seed", str(seed), "-o", run]) == 0

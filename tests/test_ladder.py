@@ -15,7 +15,9 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Odometry
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder
 
-SQUARE = Trace.from_steps("ab" * 4 + "a", ["travel", "right"] * 4, displacements=[(10, 0, 0), (0, 0, -1.5708)] * 4)
+SQUARE = Trace.from_steps(
+    "ab" * 4 + "a", ["travel", "right"] * 4, displacements=[(10, 0, 0), (0, 0, -1.5708)] * 4
+)
 
 
 @cache
@@ -32,7 +34,13 @@ def climbed() -> tuple[Rung, ...]:
 def test_displacements_make_the_true_map_of_aces3_the_only_minimal_one() -> None:
     rungs = {rung.name: rung for rung in climbed()}
     assert list(rungs) == ["views", "+ star", "+ pairs", "+ geometry", "+ planarity"]
-    assert [rung.solution.cost.dstates for rung in rungs.values() if rung.solution.cost] == [19, 19, 22, 22, 22]
+    assert [rung.solution.cost.dstates for rung in rungs.values() if rung.solution.cost] == [
+        19,
+        19,
+        22,
+        22,
+        22,
+    ]
     assert [rung.rank for rung in rungs.values()] == [None, None, 1, 1, 1]
     assert [rung.solution.count for rung in rungs.values()][2:] == [1, 1, 1]
     assert [rung.solution.theory.star for rung in rungs.values()] == ["none", *["frame"] * 4]
@@ -40,14 +48,27 @@ def test_displacements_make_the_true_map_of_aces3_the_only_minimal_one() -> None
 
 def test_what_a_trace_does_not_have_is_no_rung() -> None:
     trace = aces3().trace.prefix(8)
-    assert [rung.name for rung in ladder(trace.without_displacements(), max_maps=1)] == ["views", "+ star", "+ planarity"]
-    causal = {rung.name: rung.solution.theory.star for rung in ladder(trace, Theory.causal(), max_maps=1)}
-    assert causal == {"views": "none", "+ star": "alike", "+ pairs": "alike", "+ geometry": "alike"}  # planarity is about places
+    assert [rung.name for rung in ladder(trace.without_displacements(), max_maps=1)] == [
+        "views",
+        "+ star",
+        "+ planarity",
+    ]
+    causal = {
+        rung.name: rung.solution.theory.star for rung in ladder(trace, Theory.causal(), max_maps=1)
+    }
+    assert causal == {
+        "views": "none",
+        "+ star": "alike",
+        "+ pairs": "alike",
+        "+ geometry": "alike",
+    }  # planarity is about places
 
 
 def test_what_is_solved_already_is_its_rung() -> None:
     known = solve(SQUARE)
-    assert [rung.name for rung in ladder(SQUARE, known=known) if rung.solution is known] == ["+ geometry"]
+    assert [rung.name for rung in ladder(SQUARE, known=known) if rung.solution is known] == [
+        "+ geometry"
+    ]
 
 
 def test_a_ladder_that_is_interrupted_ends_with_the_rungs_so_far() -> None:
@@ -64,7 +85,9 @@ def test_a_ladder_that_is_interrupted_ends_with_the_rungs_so_far() -> None:
 
 def test_where_faults_are_allowed_planarity_is_no_rung() -> None:
     trace = Trace.from_steps("aba", ["travel", "travel"])
-    assert [rung.name for rung in ladder(trace, Theory.topological().replace(misread=1.5))] == ["views"]
+    assert [rung.name for rung in ladder(trace, Theory.topological().replace(misread=1.5))] == [
+        "views"
+    ]
 
 
 def test_the_shell_prints_a_row_a_rung(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -78,4 +101,8 @@ def test_the_shell_prints_a_row_a_rung(tmp_path: Path, capsys: pytest.CaptureFix
     assert rows[3].split()[:8] == ["+", "geometry", "1", "22", "9", "6", "map", "1"]
     SQUARE.save(path)
     assert main(["ladder", str(path), "--json", "--theory", "causal", "-n", "1"]) == 0
-    assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == ["views", "+ pairs", "+ geometry"]
+    assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == [
+        "views",
+        "+ pairs",
+        "+ geometry",
+    ]

@@ -38,7 +38,9 @@ def mapped(edges: Streets) -> SSHMap:
                 line = [place]
                 while ahead in edges[line[-1]]:
                     line.append(edges[line[-1]][ahead])
-                course |= {(p, ahead): (len(lines), 1) for p in line} | {(p, back): (len(lines), -1) for p in line}
+                course |= {(p, ahead): (len(lines), 1) for p in line} | {
+                    (p, back): (len(lines), -1) for p in line
+                }
                 lines.append(line)
     ids = {place: i for i, place in enumerate(edges)}
     dstates = tuple(DState(i, f"v{i}", ids[p], *course[p, h]) for (p, h), i in number.items())
@@ -47,7 +49,9 @@ def mapped(edges: Streets) -> SSHMap:
         for (p, h), i in number.items()
         for name, k in (("right", 1), ("left", 3))
     ]
-    travels = [(i, "travel", number[edges[p][h], h]) for (p, h), i in number.items() if h in edges[p]]
+    travels = [
+        (i, "travel", number[edges[p][h], h]) for (p, h), i in number.items() if h in edges[p]
+    ]
     paths = tuple(MapPath(i, tuple(ids[p] for p in line)) for i, line in enumerate(lines))
     return SSHMap(tuple(range(len(faced))), dstates, (*turns, *travels), tuple(ids.values()), paths)
 
@@ -81,28 +85,45 @@ def crossings(ssh_map: SSHMap, found: Layout) -> list[tuple[tuple[int, int], tup
 
 def check(ssh_map: SSHMap, found: Layout, turns: Mapping[str, float] | None = None) -> None:
     """Places are apart, paths straight with their dstates facing along, and turns go to their side."""
-    assert min((math.dist(*pair) for pair in combinations(found.places.values(), 2)), default=1.0) > 0.9
+    assert (
+        min((math.dist(*pair) for pair in combinations(found.places.values(), 2)), default=1.0)
+        > 0.9
+    )
     for path in ssh_map.paths:
         points = np.array([found.places[p] for p in path.order])
         if len(points) > 1:
             ways = np.diff(points, axis=0)
-            assert np.allclose(ways / np.linalg.norm(ways, axis=1)[:, None], ways[0] / np.linalg.norm(ways[0]), atol=1e-6)
+            assert np.allclose(
+                ways / np.linalg.norm(ways, axis=1)[:, None],
+                ways[0] / np.linalg.norm(ways[0]),
+                atol=1e-6,
+            )
             for s in ssh_map.dstates:
                 if s.path == path.id:
                     heading = found.dstates[s.id][2]
                     assert heading is not None
                     assert s.direction is not None
-                    assert np.allclose((math.cos(heading), math.sin(heading)), s.direction * ways[0] / np.linalg.norm(ways[0]), atol=1e-6)
+                    assert np.allclose(
+                        (math.cos(heading), math.sin(heading)),
+                        s.direction * ways[0] / np.linalg.norm(ways[0]),
+                        atol=1e-6,
+                    )
     known = {"right": 90.0, "left": -90.0, "around": 180.0} | dict(turns or {})
     for s, action, x in ssh_map.links:
         if action in known:
             before, after = found.dstates[s][2], found.dstates[x][2]
             assert before is not None
             assert after is not None
-            assert abs(math.remainder(before - after - math.radians(known[action]), math.tau)) < math.radians(46)
+            assert abs(
+                math.remainder(before - after - math.radians(known[action]), math.tau)
+            ) < math.radians(46)
 
 
-@pytest.mark.parametrize("world", [TWO_BLOCKS, SQUARE, TEE, PLUS, COMB], ids=["two blocks", "square", "tee", "plus", "comb"])
+@pytest.mark.parametrize(
+    "world",
+    [TWO_BLOCKS, SQUARE, TEE, PLUS, COMB],
+    ids=["two blocks", "square", "tee", "plus", "comb"],
+)
 def test_true_maps_are_drawn_true(world: Streets) -> None:
     ssh_map = mapped(world)
     found = layout(ssh_map)
@@ -145,30 +166,45 @@ def test_angles_may_be_any() -> None:
     """A triangle that the robot drives round, turning right by 120 degrees; then a map whose places know the degrees."""
     dstates = tuple(DState(i, f"v{i}", (i + 1) // 2 % 3, i // 2, 1) for i in range(6))
     links = tuple((i, "travel" if i % 2 == 0 else "turn", (i + 1) % 6) for i in range(6))
-    triangle = SSHMap(tuple(range(6)), dstates, links, (0, 1, 2), tuple(MapPath(i, (i, (i + 1) % 3)) for i in range(3)))
+    triangle = SSHMap(
+        tuple(range(6)),
+        dstates,
+        links,
+        (0, 1, 2),
+        tuple(MapPath(i, (i, (i + 1) % 3)) for i in range(3)),
+    )
     found = layout(triangle, {"turn": 120})
     check(triangle, found, {"turn": 120})
     sides = [math.dist(*pair) for pair in combinations(found.places.values(), 2)]
     assert sides == pytest.approx([1, 1, 1])
     (ax, ay), (bx, by), (cx, cy) = (found.places[p] for p in range(3))
     assert (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) < 0  # clockwise
-    told = replace(triangle, dstates=tuple(replace(s, heading=120 * (s.id % 2 == 0)) for s in dstates))
+    told = replace(
+        triangle, dstates=tuple(replace(s, heading=120 * (s.id % 2 == 0)) for s in dstates)
+    )
     assert np.allclose(list(layout(told).places.values()), list(found.places.values()))
 
 
 def test_streets_that_no_straight_path_holds_are_straight_one_by_one() -> None:
     """A square is driven round, and a map with few paths joins its north and its south side to one path, which would have to turn back."""
     square = mapped(SQUARE)
-    north, south = (next(path for path in square.paths if path.id == square.dstates[4 * place + 1].path) for place in (0, 3))
+    north, south = (
+        next(path for path in square.paths if path.id == square.dstates[4 * place + 1].path)
+        for place in (0, 3)
+    )
     dstates = tuple(replace(s, path=north.id) if s.path == south.id else s for s in square.dstates)
     others = tuple(path for path in square.paths if path not in (north, south))
-    ssh_map = replace(square, dstates=dstates, paths=(MapPath(north.id, north.order + south.order), *others))
+    ssh_map = replace(
+        square, dstates=dstates, paths=(MapPath(north.id, north.order + south.order), *others)
+    )
     found = layout(ssh_map)
     corners = {tuple(round(x) for x in spot) for spot in found.places.values()}
     assert len(corners) == 4
-    assert [math.dist(found.places[p], found.places[q]) for path in square.paths for p, q in pairwise(path.order)] == pytest.approx(
-        [1.0] * 4
-    )
+    assert [
+        math.dist(found.places[p], found.places[q])
+        for path in square.paths
+        for p, q in pairwise(path.order)
+    ] == pytest.approx([1.0] * 4)
 
 
 def test_poses_are_taken_as_they_are() -> None:
@@ -184,11 +220,18 @@ def test_poses_are_taken_as_they_are() -> None:
 
 def test_parts_that_nothing_connects_are_side_by_side() -> None:
     square = mapped(SQUARE)
-    far = [replace(s, id=s.id + 16, place=(s.place or 0) + 4, path=(s.path or 0) + 4) for s in square.dstates]
+    far = [
+        replace(s, id=s.id + 16, place=(s.place or 0) + 4, path=(s.path or 0) + 4)
+        for s in square.dstates
+    ]
     links = [(s + 16, action, x + 16) for s, action, x in square.links]
     paths = [MapPath(p.id + 4, tuple(q + 4 for q in p.order)) for p in square.paths]
     both = replace(
-        square, dstates=(*square.dstates, *far), links=(*square.links, *links), places=tuple(range(8)), paths=(*square.paths, *paths)
+        square,
+        dstates=(*square.dstates, *far),
+        links=(*square.links, *links),
+        places=tuple(range(8)),
+        paths=(*square.paths, *paths),
     )
     found = layout(both)
     check(both, found)
@@ -209,12 +252,18 @@ def test_the_graph_of_places_has_positions_and_streets() -> None:
     assert {(frozenset((p, q)), data["path"]) for p, q, data in graph.edges(data=True)} == {
         (frozenset(path.order), path.id) for path in ssh_map.paths
     }
-    assert all(data["travelled"] and data["order"] == 0 and "metres" not in data for _, _, data in graph.edges(data=True))
+    assert all(
+        data["travelled"] and data["order"] == 0 and "metres" not in data
+        for _, _, data in graph.edges(data=True)
+    )
     assert nx.get_node_attributes(graph, "pos") == layout(ssh_map).places
     assert graph.nodes[1]["dstates"] == tuple(s.id for s in ssh_map.dstates if s.place == 1)
-    metric = replace(ssh_map, fit=Fit(1.0, 1, 0.5, poses=tuple(Pose(3.0 * (s.place or 0), 0.5, 1.0) for s in ssh_map.dstates))).to_networkx(
-        "places"
-    )
+    metric = replace(
+        ssh_map,
+        fit=Fit(
+            1.0, 1, 0.5, poses=tuple(Pose(3.0 * (s.place or 0), 0.5, 1.0) for s in ssh_map.dstates)
+        ),
+    ).to_networkx("places")
     assert metric.graph["metric"] is True
     assert {data["metres"] for _, _, data in metric.edges(data=True)} == {3.0, 9.0}
 
@@ -222,7 +271,9 @@ def test_the_graph_of_places_has_positions_and_streets() -> None:
 def test_a_map_knows_the_place_of_a_step() -> None:
     trace = drive(*TOURS["square"])
     (ssh_map,) = solve(trace).maps
-    assert [ssh_map.place_of(step) for step in range(len(trace))] == [ssh_map.dstates[label].place for label in ssh_map.labels]
+    assert [ssh_map.place_of(step) for step in range(len(trace))] == [
+        ssh_map.dstates[label].place for label in ssh_map.labels
+    ]
     for step in (-1, len(trace), 0.5, True):
         with pytest.raises(MapError, match=f"step: expected 0 to {len(trace) - 1}, got"):
             ssh_map.place_of(step)  # type: ignore[arg-type]
@@ -231,11 +282,22 @@ def test_a_map_knows_the_place_of_a_step() -> None:
 def test_faults_are_marked_and_views_stay_text() -> None:
     square = mapped(SQUARE)
     doubted = replace(square, faults=(Fault(3, "misread", "<script>alert(1)</script>", "v3"),))
-    marks = [g for g in ET.fromstring(doubted.to_svg()).iter("{http://www.w3.org/2000/svg}g") if g.attrib.get("class") == "fault"]
-    assert [next(iter(g)).text for g in marks] == ["the view at step 3 is misread: <script>alert(1)</script>, expected v3"]
+    marks = [
+        g
+        for g in ET.fromstring(doubted.to_svg()).iter("{http://www.w3.org/2000/svg}g")
+        if g.attrib.get("class") == "fault"
+    ]
+    assert [next(iter(g)).text for g in marks] == [
+        "the view at step 3 is misread: <script>alert(1)</script>, expected v3"
+    ]
     assert "<script" not in doubted.to_svg()
     assert 'class="fault"' not in square.to_svg()
-    posed = replace(doubted, fit=Fit(1.0, 1, 0.5, poses=tuple(Pose(3.0 * (s.place or 0), 0.5, 1.0) for s in square.dstates)))
+    posed = replace(
+        doubted,
+        fit=Fit(
+            1.0, 1, 0.5, poses=tuple(Pose(3.0 * (s.place or 0), 0.5, 1.0) for s in square.dstates)
+        ),
+    )
     assert posed.to_svg().count('class="fault"') == 1
 
 
@@ -247,7 +309,10 @@ def test_the_axes_of_matplotlib_hold_what_is_drawn() -> None:
     ssh_map = mapped(SQUARE)
     _, ax = pyplot.subplots()
     assert ssh_map.plot(ax) is ax
-    assert {text.get_text() for text in ax.texts} == {*map(str, ssh_map.places), *(f"x{s.id}" for s in ssh_map.dstates)}
+    assert {text.get_text() for text in ax.texts} == {
+        *map(str, ssh_map.places),
+        *(f"x{s.id}" for s in ssh_map.dstates),
+    }
     assert solve(drive(*TOURS["square"]), Theory.causal()).maps[0].plot().texts
     pyplot.close("all")
 
@@ -258,13 +323,17 @@ def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None
     ssh_map = mapped(SQUARE)
     with pytest.raises(MapError, match="expected pandas, got none; install"):
         ssh_map.to_pandas()
-    with pytest.raises(MapError, match=r"expected matplotlib, got none; install 'ssh-abduction\[plot\]'"):
+    with pytest.raises(
+        MapError, match=r"expected matplotlib, got none; install 'ssh-abduction\[plot\]'"
+    ):
         ssh_map.plot()
 
 
 def test_a_table_has_a_row_for_each_step() -> None:
     pytest.importorskip("pandas")
-    trace = Trace.load(Path(__file__).parent.parent / "examples" / "notched-rectangle.jsonl").prefix(20)
+    trace = Trace.load(
+        Path(__file__).parent.parent / "examples" / "notched-rectangle.jsonl"
+    ).prefix(20)
     (ssh_map,) = solve(trace).maps
     table = ssh_map.to_pandas()
     assert list(table["dstate"]) == list(ssh_map.labels)

@@ -35,9 +35,25 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import Step
 from ssh_abduction.data.errors import TraceError
-from ssh_abduction.evaluation.paper.claims import EXPERIMENTS, Run, claims, measure, one_to_one, outcome, rate, summary, true_dstates
+from ssh_abduction.evaluation.paper.claims import (
+    EXPERIMENTS,
+    Run,
+    claims,
+    measure,
+    one_to_one,
+    outcome,
+    rate,
+    summary,
+    true_dstates,
+)
 from ssh_abduction.learning import learner as learner_module
-from ssh_abduction.learning.learner import AmbiguousMapWarning, BootstrapLearner, LearnerError, RunnerUpWarning, labels_of
+from ssh_abduction.learning.learner import (
+    AmbiguousMapWarning,
+    BootstrapLearner,
+    LearnerError,
+    RunnerUpWarning,
+    labels_of,
+)
 from ssh_abduction.learning.runner_up import runner_up, second_map, with_runner_up
 
 VIEWS_ALONE = Theory.topological().replace(star="none")
@@ -68,24 +84,36 @@ def hall() -> Trace:
     return simulate(World.named("taylor-hall"), tours=3, seed=500)
 
 
-def test_the_notched_rectangle_is_learnt_from_its_images_alone(run: Trace, learnt: BootstrapLearner) -> None:
+def test_the_notched_rectangle_is_learnt_from_its_images_alone(
+    run: Trace, learnt: BootstrapLearner
+) -> None:
     learner = learnt
     assert learner.clusterer_.k_ == 4
     assert learner.views_[0] == learner.views_[4]
     assert learner.labels_[0] != learner.labels_[4]
-    assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (8, 4, 4)
+    assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (
+        8,
+        4,
+        4,
+    )
     assert one_to_one(learner.labels_, true_dstates(run))
     assert check(run.with_views(learner.views_.tolist()), learner.map_, VIEWS_ALONE) == ()
     again = simulate(World.named("notched-rectangle"), tours=3, seed=501)
     meaning = dict(zip(true_dstates(run), learner.labels_, strict=True))
-    recognised = learner.predict(images_of(again)) == [meaning[name] for name in true_dstates(again)]
+    recognised = learner.predict(images_of(again)) == [
+        meaning[name] for name in true_dstates(again)
+    ]
     assert recognised.mean() > 0.9
 
 
 def test_the_hall_is_learnt_with_the_openings_seen(hall: Trace) -> None:
     learner = BootstrapLearner().fit(hall)
     assert learner.clusterer_.k_ == 10
-    assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (20, 7, 4)
+    assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (
+        20,
+        7,
+        4,
+    )
     assert one_to_one(learner.labels_, true_dstates(hall))
 
 
@@ -111,7 +139,9 @@ def test_where_maps_disagree_nothing_is_learnt_unless_one_is_chosen() -> None:
     trace = Trace.from_steps("abbab", ["travel", "around", "right", "right"])
     solution = solve(trace, VIEWS_ALONE, max_maps=None)
     assert solution.count > 1
-    with pytest.warns(AmbiguousMapWarning, match=f"{solution.count} minimal maps remain, and agree on"):
+    with pytest.warns(
+        AmbiguousMapWarning, match=f"{solution.count} minimal maps remain, and agree on"
+    ):
         labels = labels_of(solution.maps)
     assert labels.tolist() == [0, 1, 2, 3, -1]
     for t in np.flatnonzero(labels >= 0):
@@ -160,40 +190,84 @@ def test_the_learner_is_an_estimator(run: Trace, hall: Trace) -> None:
         learner.score(images_of(run))
     with pytest.raises(LearnerError, match="y: expected 96 dstates, one an image"):
         learner.score(run, [1, 2])
-    broken = replace(other, steps=(other.steps[0], replace(other.steps[1], image=other.steps[3].image), *other.steps[2:]))
-    with pytest.raises(LearnerError, match="expected some steps whose dstate the map tells, got none"):
+    broken = replace(
+        other,
+        steps=(
+            other.steps[0],
+            replace(other.steps[1], image=other.steps[3].image),
+            *other.steps[2:],
+        ),
+    )
+    with pytest.raises(
+        LearnerError, match="expected some steps whose dstate the map tells, got none"
+    ):
         learner.score(broken)
     with pytest.raises(TraceError, match="traces: expected a Trace, or a list of them, got"):
         BootstrapLearner().fit("run.jsonl")  # type: ignore[arg-type]
-    assert cross_val_score(BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)), [run, other, other], cv=3).min() > 0.85
+    assert (
+        cross_val_score(
+            BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)),
+            [run, other, other],
+            cv=3,
+        ).min()
+        > 0.85
+    )
 
 
 def test_several_traces_share_views_and_a_map(run: Trace) -> None:
     short = simulate(World.named("notched-rectangle"), tours=2, seed=503)
     late = replace(short, steps=short.steps[3:])  # begins at x3
     learner = BootstrapLearner(VIEWS_ALONE).fit([late, run, short])
-    assert one_to_one(learner.labels_, np.concatenate([true_dstates(t) for t in (late, run, short)]))
-    assert (learner.solution_.steps, len(learner.labels_)) == (len(run), len(run) + len(short) + len(late))
-    broken = replace(short, steps=(short.steps[0], replace(short.steps[1], image=short.steps[3].image), *short.steps[2:]))
-    with pytest.warns(AmbiguousMapWarning, match="trace 1: the map of the longest trace does not tell where any of its 16 steps is"):
+    assert one_to_one(
+        learner.labels_, np.concatenate([true_dstates(t) for t in (late, run, short)])
+    )
+    assert (learner.solution_.steps, len(learner.labels_)) == (
+        len(run),
+        len(run) + len(short) + len(late),
+    )
+    broken = replace(
+        short,
+        steps=(
+            short.steps[0],
+            replace(short.steps[1], image=short.steps[3].image),
+            *short.steps[2:],
+        ),
+    )
+    with pytest.warns(
+        AmbiguousMapWarning,
+        match="trace 1: the map of the longest trace does not tell where any of its 16 steps is",
+    ):
         learner = BootstrapLearner(VIEWS_ALONE).fit([run, broken])
     assert learner.labels_.tolist()[len(run) - 1 :] == [7] + [-1] * 16
     narrow = replace(short, steps=tuple(replace(s, image=s.image[:90]) for s in short.steps))
-    with pytest.raises(PerceptionError, match="trace 1: image: expected 180 ranges, as trace 0 has, got 90"):
+    with pytest.raises(
+        PerceptionError, match="trace 1: image: expected 180 ranges, as trace 0 has, got 90"
+    ):
         BootstrapLearner().fit([run, narrow])
 
 
 @pytest.mark.parametrize(
     "clusterer",
-    [GaussianMixture(4, covariance_type="spherical", random_state=0), AgglomerativeClustering(n_clusters=None, distance_threshold=6.0)],
+    [
+        GaussianMixture(4, covariance_type="spherical", random_state=0),
+        AgglomerativeClustering(n_clusters=None, distance_threshold=6.0),
+    ],
 )
 def test_clusterers_of_others_make_the_views(run: Trace, clusterer: Any) -> None:
     assert one_to_one(BootstrapLearner(VIEWS_ALONE, clusterer).fit(run).labels_, true_dstates(run))
 
 
 def test_an_image_that_is_noise_is_not_learnt_from(run: Trace) -> None:
-    odd = replace(run, steps=(*run.steps[:-1], replace(run.steps[-1], image=tuple(0.7 * r for r in run.steps[-1].image))))
-    with pytest.warns(ImageWarning, match=r"1 of 96 images are like those of no view.*\(image 95\)"):
+    odd = replace(
+        run,
+        steps=(
+            *run.steps[:-1],
+            replace(run.steps[-1], image=tuple(0.7 * r for r in run.steps[-1].image)),
+        ),
+    )
+    with pytest.warns(
+        ImageWarning, match=r"1 of 96 images are like those of no view.*\(image 95\)"
+    ):
         learner = BootstrapLearner(VIEWS_ALONE, DBSCAN(eps=1.5), time_limit=100).fit(odd)
     assert (learner.views_[-1], learner.confidence_[-1], learner.labels_[-1]) == (-1, 0, -1)
     assert (learner.labels_[:-1] >= 0).all()
@@ -211,26 +285,40 @@ def test_the_beams_that_tell_corners_apart_see_the_notch(run: Trace) -> None:
         found = telling_features(images, truth, f"x{i}", f"x{i + 4}")
         assert found.recognised == 1
         here = truth == f"x{i}"
-        (ranges,), (x, y, heading) = Laser(noise=0).exact(World.named("notched-rectangle"), poses[here][:1]), poses[here][0]
+        (ranges,), (x, y, heading) = (
+            Laser(noise=0).exact(World.named("notched-rectangle"), poses[here][:1]),
+            poses[here][0],
+        )
         for method, shares in found.methods.items():
             beam = int(shares.argmax())
-            at = x + ranges[beam] * np.cos(heading + BEARINGS[beam]), y + ranges[beam] * np.sin(heading + BEARINGS[beam])
+            at = (
+                x + ranges[beam] * np.cos(heading + BEARINGS[beam]),
+                y + ranges[beam] * np.sin(heading + BEARINGS[beam]),
+            )
             assert 2.45 < at[0] < 3.95, (i, method, at)
             assert at[1] < 0.01, (i, method, at)
 
 
-def test_the_shell_tells_what_tells_dstates_apart(run: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_shell_tells_what_tells_dstates_apart(
+    run: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     views, maps = tmp_path / "views.jsonl", tmp_path / "maps.json"
     learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)).fit(run)
     run.with_views(learner.views_.tolist()).save(views)
     maps.write_text(json.dumps(learner.map_.to_dict()))
     assert main(["tell-apart", str(views), str(maps), "--plot", str(tmp_path / "beams.png")]) == 0
     out = capsys.readouterr().out.splitlines()
-    assert [line.split()[:3] for line in out[1:]] == [[f"{i},", str(i + 4), "1.000"] for i in range(4)]
+    assert [line.split()[:3] for line in out[1:]] == [
+        [f"{i},", str(i + 4), "1.000"] for i in range(4)
+    ]
     assert (tmp_path / "beams.png").read_bytes().startswith(b"\x89PNG")
     assert main(["tell-apart", str(views), str(maps), "--dstates", "0,1", "--json"]) == 0
     (told,) = json.loads(capsys.readouterr().out)
-    assert (told["dstates"], len(told["margin"]), sum(told["linear"])) == ([0, 1], 180, pytest.approx(1))
+    assert (told["dstates"], len(told["margin"]), sum(told["linear"])) == (
+        [0, 1],
+        180,
+        pytest.approx(1),
+    )
     assert main(["tell-apart", str(views), str(maps), "--dstates", "0,99"]) == 1
     assert "expected at least two images of 99, got 0" in capsys.readouterr().err
     with pytest.raises(SystemExit):
@@ -247,23 +335,40 @@ def large_room() -> Trace:
     world = World.named("notched-rectangle")
     walls = world.segments.copy()
     walls[walls > 0] *= 1.1
-    trace = simulate(replace(world, segments=walls, start=(3.8, 1.6, 0.0), dstates=()), tours=8, seed=500, stars=False)
-    return replace(trace.without_displacements(), steps=tuple(replace(s, displacement=None) for s in trace.steps))
+    trace = simulate(
+        replace(world, segments=walls, start=(3.8, 1.6, 0.0), dstates=()),
+        tours=8,
+        seed=500,
+        stars=False,
+    )
+    return replace(
+        trace.without_displacements(),
+        steps=tuple(replace(s, displacement=None) for s in trace.steps),
+    )
 
 
 def test_another_map_of_the_runner_up_is_said(large_room: Trace) -> None:
-    with pytest.warns(RunnerUpWarning, match="2 views may be too few: 4 also separate .* another map, of 8 dstates instead of 6; cluster"):
+    with pytest.warns(
+        RunnerUpWarning,
+        match="2 views may be too few: 4 also separate .* another map, of 8 dstates instead of 6; cluster",
+    ):
         learner = BootstrapLearner().fit(large_room)
-    assert (learner.clusterer_.k_, learner.clusterer_.runner_up_, len(learner.map_.dstates)) == (2, 4, 6)
+    assert (learner.clusterer_.k_, learner.clusterer_.runner_up_, len(learner.map_.dstates)) == (
+        2,
+        4,
+        6,
+    )
     with pytest.warns(RunnerUpWarning, match="4 views may be too many: 2 also separate"):
-        trimmed = BootstrapLearner(clusterer=ViewClusterer(by="trimmed", k_max=6, random_state=0)).fit(large_room)
+        trimmed = BootstrapLearner(
+            clusterer=ViewClusterer(by="trimmed", k_max=6, random_state=0)
+        ).fit(large_room)
     assert len(trimmed.map_.dstates) == 8
 
 
-def test_the_shell_says_it_too(large_room: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = (
-        "ssh-abduction: warning: 2 views may be too few: 4 also separate the images well, and give another map, of 8 dstates instead of 6"
-    )
+def test_the_shell_says_it_too(
+    large_room: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = "ssh-abduction: warning: 2 views may be too few: 4 also separate the images well, and give another map, of 8 dstates instead of 6"
     run, views = str(tmp_path / "run.jsonl"), str(tmp_path / "views.jsonl")
     large_room.save(run)
     assert main(["cluster", run, "-o", views, "--k-max", "6"]) == 0
@@ -274,7 +379,9 @@ def test_the_shell_says_it_too(large_room: Trace, tmp_path: Path, capsys: pytest
     assert main(["solve", views]) == 0
     assert capsys.readouterr().err.startswith(said)
     assert main(["solve", views, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["warnings"][0].startswith(said[len("ssh-abduction: warning: ") :])
+    assert json.loads(capsys.readouterr().out)["warnings"][0].startswith(
+        said[len("ssh-abduction: warning: ") :]
+    )
     assert main(["solve", views, "--time-limit", "0.1"]) in {0, 10}  # no time for it
     assert capsys.readouterr().err == ""
     assert main(["cluster", views, "-o", views, "--k", "4"]) == 0
@@ -287,17 +394,26 @@ def test_a_runner_up_is_whole_or_wrong() -> None:
     assert runner_up(trace) is None
     other = with_runner_up(trace, "abc")
     assert runner_up(other) == replace(
-        trace.with_views("abc"), steps=tuple(replace(s, view=v) for s, v in zip(other.steps, "abc", strict=True))
+        trace.with_views("abc"),
+        steps=tuple(replace(s, view=v) for s, v in zip(other.steps, "abc", strict=True)),
     )
     assert with_runner_up(other, None) == trace
     half = replace(trace, steps=(other.steps[0], *trace.steps[1:]))
-    with pytest.raises(TraceError, match="step 1: runner_up: expected a view, as other steps have one"):
+    with pytest.raises(
+        TraceError, match="step 1: runner_up: expected a view, as other steps have one"
+    ):
         runner_up(half)
     wrong = replace(trace, steps=tuple(replace(s, extra={"runner_up": 1.5}) for s in trace.steps))
-    with pytest.raises(TraceError, match=r"runner_up: views\[0\]: expected a text or an integer, got 1.5"):
+    with pytest.raises(
+        TraceError, match=r"runner_up: views\[0\]: expected a text or an integer, got 1.5"
+    ):
         runner_up(wrong)
-    assert second_map(with_runner_up(trace, "xyx"), solve(trace).maps) is None  # other names of the same views
-    found = second_map(with_runner_up(trace, "aaa"), solve(trace, Theory.causal()).maps, Theory.causal())
+    assert (
+        second_map(with_runner_up(trace, "xyx"), solve(trace).maps) is None
+    )  # other names of the same views
+    found = second_map(
+        with_runner_up(trace, "aaa"), solve(trace, Theory.causal()).maps, Theory.causal()
+    )
     assert found is not None
     assert found.sentence.startswith(
         "2 views may be too many: 1 also separate the images well, and give another map, of 1 dstates instead of 2"
@@ -309,7 +425,11 @@ def test_a_runner_up_is_whole_or_wrong() -> None:
 
 def test_images_from_a_sidecar_file(run: Trace, tmp_path: Path) -> None:
     table = images_of(run)
-    indexed = replace(run, images="scans.npz", steps=tuple(replace(step, image=i) for i, step in enumerate(run.steps)))
+    indexed = replace(
+        run,
+        images="scans.npz",
+        steps=tuple(replace(step, image=i) for i, step in enumerate(run.steps)),
+    )
     indexed.save(tmp_path / "run.jsonl")
     np.savez(tmp_path / "scans.npz", images=table)
     np.testing.assert_array_equal(images_of(Trace.load(tmp_path / "run.jsonl")), table)
@@ -324,23 +444,48 @@ def test_images_from_a_sidecar_file(run: Trace, tmp_path: Path) -> None:
         images_of(Trace.load(tmp_path / "run.jsonl"))
 
 
-def test_clustering_into_another_folder_keeps_the_images(run: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_clustering_into_another_folder_keeps_the_images(
+    run: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     np.savez(tmp_path / "scans.npz", images=images_of(run))
-    indexed = replace(run, images="scans.npz", steps=tuple(replace(step, image=i) for i, step in enumerate(run.steps)))
+    indexed = replace(
+        run,
+        images="scans.npz",
+        steps=tuple(replace(step, image=i) for i, step in enumerate(run.steps)),
+    )
     indexed.save(tmp_path / "run.jsonl")
     (tmp_path / "views").mkdir()
-    assert main(["cluster", str(tmp_path / "run.jsonl"), "-o", str(tmp_path / "views" / "v.jsonl"), "--k", "4"]) == 0
+    assert (
+        main(
+            [
+                "cluster",
+                str(tmp_path / "run.jsonl"),
+                "-o",
+                str(tmp_path / "views" / "v.jsonl"),
+                "--k",
+                "4",
+            ]
+        )
+        == 0
+    )
     capsys.readouterr()
-    np.testing.assert_array_equal(images_of(Trace.load(tmp_path / "views" / "v.jsonl")), images_of(run))
+    np.testing.assert_array_equal(
+        images_of(Trace.load(tmp_path / "views" / "v.jsonl")), images_of(run)
+    )
 
 
 def test_what_was_replaced_is_said_in_one_line(tmp_path: Path) -> None:
     table = np.array([[1.0, np.inf, 2.0], [1.0, 1.0, np.nan], [3.0, 1.0, 0.0], [3.0, 1.1, 1.0]])
     np.save(tmp_path / "scans.npy", table)
-    steps = [Step(image=i, action=Trace.from_steps("ab", ["travel"]).actions[0] if i < 3 else None) for i in range(4)]
+    steps = [
+        Step(image=i, action=Trace.from_steps("ab", ["travel"]).actions[0] if i < 3 else None)
+        for i in range(4)
+    ]
     Trace(tuple(steps), images="scans.npy").save(tmp_path / "run.jsonl")
     words = ["cluster", str(tmp_path / "run.jsonl"), "-o", str(tmp_path / "v.jsonl")]
-    done = subprocess.run([sys.executable, "-m", "ssh_abduction", *words], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "ssh_abduction", *words], capture_output=True, text=True, check=True
+    )
     assert done.stderr == (
         "ssh-abduction: warning: 3 of 12 ranges were replaced: 1 infinite and 1 missing (NaN) are taken as nothing seen, "
         "1 of zero or less as 0.05 m\n"
@@ -349,8 +494,13 @@ def test_what_was_replaced_is_said_in_one_line(tmp_path: Path) -> None:
 
 def test_images_that_cannot_be_a_table() -> None:
     uneven = Trace((Step(image=(1.0, 2.0), action=None),))
-    steps = (replace(uneven.steps[0], action=Trace.from_steps("ab", ["travel"]).actions[0]), Step(image=(1.0,)))
-    with pytest.raises(PerceptionError, match="step 1: image: expected 2 ranges, as the first has, got 1"):
+    steps = (
+        replace(uneven.steps[0], action=Trace.from_steps("ab", ["travel"]).actions[0]),
+        Step(image=(1.0,)),
+    )
+    with pytest.raises(
+        PerceptionError, match="step 1: image: expected 2 ranges, as the first has, got 1"
+    ):
         images_of(Trace(steps))
     with pytest.raises(PerceptionError, match="step 0: image: expected one, got none"):
         images_of(Trace.from_steps("ab", ["travel"]))
@@ -362,12 +512,21 @@ def test_poor_images_are_counted_or_refused() -> None:
     action = Trace.from_steps("ab", ["travel"]).actions[0]
 
     def trace_of(*images: tuple[float, ...]) -> Trace:
-        return Trace(tuple(Step(image=image, action=action if i < len(images) - 1 else None) for i, image in enumerate(images)))
+        return Trace(
+            tuple(
+                Step(image=image, action=action if i < len(images) - 1 else None)
+                for i, image in enumerate(images)
+            )
+        )
 
     with pytest.warns(ImageWarning, match="2 of 12 ranges were replaced"):
-        BootstrapLearner(Theory.causal()).fit(trace_of((1.0, 0.0, 2.0), (1.0, 1.0, 2.0), (3.0, 1.0, 0.0), (3.0, 1.1, 1.0)))
+        BootstrapLearner(Theory.causal()).fit(
+            trace_of((1.0, 0.0, 2.0), (1.0, 1.0, 2.0), (3.0, 1.0, 0.0), (3.0, 1.1, 1.0))
+        )
     with pytest.warns(ImageWarning, match="images are equal"):
-        assert BootstrapLearner(Theory.causal()).fit(trace_of((1.0, 2.0), (1.0, 2.0), (1.0, 2.0))).views_.tolist() == [0, 0, 0]
+        assert BootstrapLearner(Theory.causal()).fit(
+            trace_of((1.0, 2.0), (1.0, 2.0), (1.0, 2.0))
+        ).views_.tolist() == [0, 0, 0]
     with pytest.raises(ValueError, match="minimum of 2"):
         BootstrapLearner(Theory.causal()).fit(trace_of((1.0, 2.0)))
 
@@ -381,7 +540,11 @@ def test_the_claims_are_those_of_the_paper() -> None:
         assert str(e.views) in papers
         assert f"{e.dstates}, {e.places}, {e.paths}" in papers
         assert "100 %" in papers
-    (higher,) = (c for c in claims("taylor-hall") if c.text.startswith("higher k would still have been free of variability"))
+    (higher,) = (
+        c
+        for c in claims("taylor-hall")
+        if c.text.startswith("higher k would still have been free of variability")
+    )
     assert (higher.paper, higher.ours) == ("above 10", False)
 
 
@@ -395,7 +558,9 @@ def test_recognition_by_poor_labels_is_poor(run: Trace) -> None:
 
 
 def test_outcomes_differ_over_notch_and_spread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=10))
+    monkeypatch.setitem(
+        EXPERIMENTS, "notched-rectangle", replace(EXPERIMENTS["notched-rectangle"], tours=10)
+    )
     good, blurred, bare = outcome(0.03, 0.5), outcome(0.03, 8), outcome(0.0, 0.5)
     assert (good.k, good.right) == (4, True)
     assert good.rate > 0.99
@@ -407,31 +572,98 @@ def test_outcomes_differ_over_notch_and_spread(monkeypatch: pytest.MonkeyPatch) 
 # The shell
 
 
-def test_from_simulation_to_recognition_in_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_simulation_to_recognition_in_the_shell(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     def path(name: str) -> str:
         return str(tmp_path / name)
 
-    assert main(["simulate", "notched-rectangle", "--tours", "10", "--seed", "3", "-o", path("run.jsonl")]) == 0
+    assert (
+        main(
+            [
+                "simulate",
+                "notched-rectangle",
+                "--tours",
+                "10",
+                "--seed",
+                "3",
+                "-o",
+                path("run.jsonl"),
+            ]
+        )
+        == 0
+    )
     assert "80 images of notched rectangle" in capsys.readouterr().out
-    assert main(["cluster", path("run.jsonl"), "-o", path("views.jsonl"), "--k-max", "8", "--plot", path("fig.png")]) == 0
+    assert (
+        main(
+            [
+                "cluster",
+                path("run.jsonl"),
+                "-o",
+                path("views.jsonl"),
+                "--k-max",
+                "8",
+                "--plot",
+                path("fig.png"),
+            ]
+        )
+        == 0
+    )
     out = capsys.readouterr().out
     assert "4 views of 80 images" in out
     assert out.splitlines()[0].split() == ["k", "M", "trimmed", "U"]
     assert (tmp_path / "fig.png").read_bytes().startswith(b"\x89PNG")
     assert main(["solve", path("views.jsonl"), "--json"]) == 0
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)
-    assert main(["train", path("views.jsonl"), path("maps.json"), "-o", path("recogniser.skops")]) == 0
+    assert (
+        main(["train", path("views.jsonl"), path("maps.json"), "-o", path("recogniser.skops")]) == 0
+    )
     assert "8 dstates learnt from 80 images" in capsys.readouterr().out
     assert main(["evaluate", path("maps.json"), path("views.jsonl")]) == 0
     told = capsys.readouterr().out
-    assert told.startswith("map 1 is the true one, of 1 map\nthe truth, told at 80 of 80 steps: 8 dstates, 4 places, 4 paths; 14 % of")
-    assert main(["learning-curve", path("views.jsonl"), path("maps.json"), "--json", "--plot", path("curve.png")]) == 0
+    assert told.startswith(
+        "map 1 is the true one, of 1 map\nthe truth, told at 80 of 80 steps: 8 dstates, 4 places, 4 paths; 14 % of"
+    )
+    assert (
+        main(
+            [
+                "learning-curve",
+                path("views.jsonl"),
+                path("maps.json"),
+                "--json",
+                "--plot",
+                path("curve.png"),
+            ]
+        )
+        == 0
+    )
     curve = json.loads(capsys.readouterr().out)
     assert curve["sizes"][-1] == 80
     assert curve["mean"][-1] > 0.8
     assert main(["learning-curve", path("views.jsonl"), path("maps.json")]) == 0
-    assert capsys.readouterr().out.splitlines()[0].split() == ["images", "recognised", "worst", "fold", "best", "fold"]
-    assert main(["simulate", "notched-rectangle", "--tours", "2", "--seed", "4", "-o", path("other.jsonl")]) == 0
+    assert capsys.readouterr().out.splitlines()[0].split() == [
+        "images",
+        "recognised",
+        "worst",
+        "fold",
+        "best",
+        "fold",
+    ]
+    assert (
+        main(
+            [
+                "simulate",
+                "notched-rectangle",
+                "--tours",
+                "2",
+                "--seed",
+                "4",
+                "-o",
+                path("other.jsonl"),
+            ]
+        )
+        == 0
+    )
     capsys.readouterr()
     assert main(["recognise", path("recogniser.skops"), path("other.jsonl"), "--json"]) == 0
     labels = json.loads(capsys.readouterr().out)
@@ -440,7 +672,9 @@ def test_from_simulation_to_recognition_in_the_shell(tmp_path: Path, capsys: pyt
     assert capsys.readouterr().out.splitlines()[0].split() == ["step", "dstate"]
 
 
-def test_traces_go_through_pipes(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_traces_go_through_pipes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is said of them is said on standard error."""
     assert main(["simulate", "notched-rectangle", "--tours", "10", "--seed", "3", "-o", "-"]) == 0
     driven = capsys.readouterr()
@@ -454,23 +688,43 @@ def test_traces_go_through_pipes(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert len(set(Trace.load(path).views)) == 4
 
 
-def test_errors_of_the_wings_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_of_the_wings_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trace = tmp_path / "t.jsonl"
     Trace.from_steps("ab", ["travel"]).save(trace)
     one = tmp_path / "one.jsonl"
     Trace((Step(image=(1.0, 2.0)),)).save(one)
     (tmp_path / "cut.skops").write_bytes(b"PK\x03\x04")
-    (tmp_path / "maps.json").write_text(json.dumps(solve(Trace.from_steps("a", [])).maps[0].to_dict()))
+    (tmp_path / "maps.json").write_text(
+        json.dumps(solve(Trace.from_steps("a", [])).maps[0].to_dict())
+    )
     for words, message in [
         (
             ["simulate", "atlantis", "-o", str(tmp_path / "x")],
             "world: expected one of cluttered, curved, doors, five-ways, notched-rectangle, six-ways, taylor-hall",
         ),
-        (["simulate", "notched-rectangle", "--tours", "0", "-o", str(tmp_path / "x")], "tours: expected a whole number from 1 to 100,000"),
-        (["simulate", "notched-rectangle", "--route", "travel,travel", "-o", str(tmp_path / "x")], "expected a free way ahead, got a wall"),
+        (
+            ["simulate", "notched-rectangle", "--tours", "0", "-o", str(tmp_path / "x")],
+            "tours: expected a whole number from 1 to 100,000",
+        ),
+        (
+            [
+                "simulate",
+                "notched-rectangle",
+                "--route",
+                "travel,travel",
+                "-o",
+                str(tmp_path / "x"),
+            ],
+            "expected a free way ahead, got a wall",
+        ),
         (["cluster", str(trace), "-o", str(tmp_path / "x")], "image: expected one, got none"),
         (["cluster", str(one), "-o", str(tmp_path / "x")], "minimum of 2 is required"),
-        (["train", str(trace), str(tmp_path / "maps.json"), "-o", str(tmp_path / "x")], "expected labels for the 2 steps"),
+        (
+            ["train", str(trace), str(tmp_path / "maps.json"), "-o", str(tmp_path / "x")],
+            "expected labels for the 2 steps",
+        ),
         (["recognise", str(tmp_path / "cut.skops"), str(trace)], "expected a .skops file"),
         (["reproduce", "taylor-hall", "--seeds", "x"], "--seeds: expected numbers"),
     ]:
@@ -482,55 +736,113 @@ def test_errors_of_the_wings_are_one_line(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_reproduce_writes_the_page_and_all_that_made_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, measured: Run
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    measured: Run,
 ) -> None:
     """With few circuits, so that it is quick; the claims themselves are measured by `reproduce`, over 20 seeds."""
     monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
     known = {("notched-rectangle", 500): measured}
-    monkeypatch.setattr("ssh_abduction.evaluation.paper.report.measure", lambda *asked: known[asked])
-    words = ["reproduce", "notched-rectangle", "--seeds", "500", "--jobs", "1", "--no-outcomes", "-o", str(tmp_path)]
+    monkeypatch.setattr(
+        "ssh_abduction.evaluation.paper.report.measure", lambda *asked: known[asked]
+    )
+    words = [
+        "reproduce",
+        "notched-rectangle",
+        "--seeds",
+        "500",
+        "--jobs",
+        "1",
+        "--no-outcomes",
+        "-o",
+        str(tmp_path),
+    ]
     assert main(words) == 0
     out = capsys.readouterr().out
     assert "k chosen by M" in out
     assert "report.html" in out
     made = {p.name for p in tmp_path.iterdir()}
-    assert {"report.html", "claims.json", "runs.json", "configuration.json", "run.jsonl", "world.png", "views.png", "quality.png"} <= made
+    assert {
+        "report.html",
+        "claims.json",
+        "runs.json",
+        "configuration.json",
+        "run.jsonl",
+        "world.png",
+        "views.png",
+        "quality.png",
+    } <= made
     assert {"learning.png", "spread.png", "map.svg", "map.png", "map-with-openings.png"} <= made
     page = (tmp_path / "report.html").read_text()
     for name in ("world.png", "learning.png", "map.svg"):
         assert f'src="{name}"' in page
-    assert [f"Figure {number}: " in page for number in (1, 2, 3, 4, 5)] == [False, True, True, True, False]
-    assert "the paper's room has its notch at a corner; here it is a recess in a wall" in html.unescape(page)
-    assert page.count("class='ours'") == sum(claim.ours for claim in claims("notched-rectangle")) == 5
+    assert [f"Figure {number}: " in page for number in (1, 2, 3, 4, 5)] == [
+        False,
+        True,
+        True,
+        True,
+        False,
+    ]
+    assert (
+        "the paper's room has its notch at a corner; here it is a recess in a wall"
+        in html.unescape(page)
+    )
+    assert (
+        page.count("class='ours'") == sum(claim.ours for claim in claims("notched-rectangle")) == 5
+    )
     assert "ours: errors do not add up" in out
     configuration = json.loads((tmp_path / "configuration.json").read_text())
     assert configuration["seeds"] == [500]
     assert configuration["versions"]["clingo"]
     claimed = json.loads((tmp_path / "claims.json").read_text())
     assert all(row["seeds"] == 1 for row in claimed)
-    monkeypatch.setattr("ssh_abduction.evaluation.paper.report._draw", lambda *_: None)  # once is enough
+    monkeypatch.setattr(
+        "ssh_abduction.evaluation.paper.report._draw", lambda *_: None
+    )  # once is enough
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["claims"] == claimed
 
 
 def test_a_summary_counts_the_seeds_in_which_a_claim_holds(measured: Run) -> None:
     good = measured
-    bad = replace(good, seed=1, k=5, uncertainty={**good.uncertainty, 5: 0.9}, cost={"dstates": 9, "places": 4, "paths": 4}, right=False)
+    bad = replace(
+        good,
+        seed=1,
+        k=5,
+        uncertainty={**good.uncertainty, 5: 0.9},
+        cost={"dstates": 9, "places": 4, "paths": 4},
+        right=False,
+    )
     table = {row["claim"]: row for row in summary("notched-rectangle", [good, bad])}
     assert table["U at that k"]["holds"] == 1
-    assert table["dstates, places, paths, from the views alone"]["here"] == {"500": "8, 4, 4", "1": "9, 4, 4"}
+    assert table["dstates, places, paths, from the views alone"]["here"] == {
+        "500": "8, 4, 4",
+        "1": "9, 4, 4",
+    }
     assert table["labels from the views alone are the true dstates"]["holds"] == 1
 
 
 @pytest.mark.parametrize("kind", ["person", "random"])
 def test_bad_images_are_disbelieved_where_views_may_be_misread(kind: str) -> None:
     trace = simulate(World.named("notched-rectangle"), tours=8, seed=503)
-    images, bad, rng = images_of(trace).copy(), [9, 30, 44], np.random.default_rng(0)  # one of twenty
+    images, bad, rng = (
+        images_of(trace).copy(),
+        [9, 30, 44],
+        np.random.default_rng(0),
+    )  # one of twenty
     for i in bad:
         images[i] = (
-            np.minimum(images[i], np.where(abs(np.arange(180) - 90) < 20, 0.4, np.inf)) if kind == "person" else rng.uniform(0.1, 8, 180)
+            np.minimum(images[i], np.where(abs(np.arange(180) - 90) < 20, 0.4, np.inf))
+            if kind == "person"
+            else rng.uniform(0.1, 8, 180)
         )
-    spoilt = replace(trace, steps=tuple(replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)))
+    spoilt = replace(
+        trace,
+        steps=tuple(
+            replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)
+        ),
+    )
     with pytest.warns(ImageWarning, match="3 of 64 images are like those of no view"):
         learner = BootstrapLearner(Theory.topological().replace(misread=1.5)).fit(spoilt)
     assert one_to_one(np.array(learner.map_.labels), true_dstates(trace))
@@ -538,26 +850,43 @@ def test_bad_images_are_disbelieved_where_views_may_be_misread(kind: str) -> Non
     assert {fault.step for fault in learner.map_.faults} <= set(bad)
     other = simulate(World.named("notched-rectangle"), tours=2, seed=504)
     without = BootstrapLearner().fit(trace)
-    meaning = dict(zip(true_dstates(trace), zip(learner.map_.labels, without.labels_, strict=True), strict=True))
+    meaning = dict(
+        zip(
+            true_dstates(trace), zip(learner.map_.labels, without.labels_, strict=True), strict=True
+        )
+    )
     names = np.array([meaning[name] for name in true_dstates(other)])
-    assert np.mean(learner.predict(other) == names[:, 0]) >= 0.98 * np.mean(without.predict(other) == names[:, 1])
-    assert learner.clusterer_.predict(ReciprocalTransformer().fit_transform(images))[bad].tolist() == [-1, -1, -1]
+    assert np.mean(learner.predict(other) == names[:, 0]) >= 0.98 * np.mean(
+        without.predict(other) == names[:, 1]
+    )
+    assert learner.clusterer_.predict(ReciprocalTransformer().fit_transform(images))[
+        bad
+    ].tolist() == [-1, -1, -1]
 
 
 def test_bad_images_are_named_where_no_fault_is_allowed() -> None:
     trace = simulate(World.named("notched-rectangle"), tours=4, seed=503)
     images = images_of(trace).copy()
     images[9] = np.random.default_rng(0).uniform(0.1, 8, 180)
-    spoilt = replace(trace, steps=tuple(replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)))
+    spoilt = replace(
+        trace,
+        steps=tuple(
+            replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)
+        ),
+    )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         learner = BootstrapLearner(time_limit=1)
-        with contextlib.suppress(LearnerError):  # with openings and displacements there may be no map at all
+        with contextlib.suppress(
+            LearnerError
+        ):  # with openings and displacements there may be no map at all
             learner.fit(spoilt)
     assert any("(image 9" in str(w.message) for w in caught)
 
 
 def test_who_is_isolated_is_a_number_above_one(run: Trace) -> None:
     for wrong in (1, -3.0, math.nan, "far"):
-        with pytest.raises(PerceptionError, match="isolated: expected a number of more than 1, or None"):
+        with pytest.raises(
+            PerceptionError, match="isolated: expected a number of more than 1, or None"
+        ):
             ViewClusterer(isolated=wrong).fit(images_of(run))  # type: ignore[arg-type]

@@ -83,8 +83,13 @@ def test_what_ends_grounding_is_raised_as_it_is() -> None:
     assert caught.value is error
 
 
-@pytest.mark.parametrize(("seconds", "mebibytes", "reason"), [(200.0, 0.0, "time limit"), (0.0, 200.0, "memory limit"), (0.0, 0.0, None)])
-def test_what_would_go_beyond_a_limit_is_not_begun(seconds: float, mebibytes: float, reason: str | None) -> None:
+@pytest.mark.parametrize(
+    ("seconds", "mebibytes", "reason"),
+    [(200.0, 0.0, "time limit"), (0.0, 200.0, "memory limit"), (0.0, 0.0, None)],
+)
+def test_what_would_go_beyond_a_limit_is_not_begun(
+    seconds: float, mebibytes: float, reason: str | None
+) -> None:
     watch = Watch(100.0, peak_memory() + 100)
     watch.use_reserve()
     watch.start()
@@ -106,7 +111,9 @@ def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "case", list(cases(6, seed=1, longest=300, seconds=(0.5, 1))), ids=lambda case: f"{case.family}, {len(case.trace)} steps"
+    "case",
+    list(cases(6, seed=1, longest=300, seconds=(0.5, 1))),
+    ids=lambda case: f"{case.family}, {len(case.trace)} steps",
 )
 @POSIX
 def test_limits_hold_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
@@ -117,10 +124,23 @@ def test_limits_hold_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
 
 
 @POSIX
-def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(noisy: Path, tmp_path: Path) -> None:
+def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(
+    noisy: Path, tmp_path: Path
+) -> None:
     rules = tmp_path / "own.lp"
-    rules.write_text("n(1..400). large(X,Y,Z) :- n(X), n(Y), n(Z).\n#program step(t).\n:- same(I,t), large(I,I,I).")  # 64 million atoms
-    command = [sys.executable, "-m", "ssh_abduction", "solve", str(noisy), f"--rules={rules}", "--time-limit=1", "--json"]
+    rules.write_text(
+        "n(1..400). large(X,Y,Z) :- n(X), n(Y), n(Z).\n#program step(t).\n:- same(I,t), large(I,I,I)."
+    )  # 64 million atoms
+    command = [
+        sys.executable,
+        "-m",
+        "ssh_abduction",
+        "solve",
+        str(noisy),
+        f"--rules={rules}",
+        "--time-limit=1",
+        "--json",
+    ]
     done = subprocess.run(command, capture_output=True, timeout=SOON, check=False)
     assert (done.returncode, json.loads(done.stdout)["stopped"]) == (30, "time limit")
 
@@ -129,22 +149,45 @@ def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(noisy: Path, tm
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_who_is_interrupted_prints_what_is_known(number: int, code: int, noisy: Path) -> None:
     command = [sys.executable, "-m", "ssh_abduction", "-v", "solve", "--json", str(noisy)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stderr
-        assert any("progress: prefix" in line for line in process.stderr)  # the search is under way, and will not end by itself
+        assert any(
+            "progress: prefix" in line for line in process.stderr
+        )  # the search is under way, and will not end by itself
         process.send_signal(number)
         out, _ = process.communicate(timeout=SOON)
     assert process.returncode == code
     printed = json.loads(out)
-    assert (printed["status"], printed["stopped"], len(printed["maps"])) == ("feasible", "interrupted", 1)
+    assert (printed["status"], printed["stopped"], len(printed["maps"])) == (
+        "feasible",
+        "interrupted",
+        1,
+    )
 
 
 @POSIX
-def test_who_is_interrupted_prints_what_is_known_of_two_traces_at_a_time(noisy: Path, tmp_path: Path) -> None:
+def test_who_is_interrupted_prints_what_is_known_of_two_traces_at_a_time(
+    noisy: Path, tmp_path: Path
+) -> None:
     quick = tmp_path / "quick.jsonl"
     rectangle(8).save(quick)
-    command = [sys.executable, "-m", "ssh_abduction", "solve", "--json", str(quick), str(noisy), str(noisy), "--jobs", "2"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "ssh_abduction",
+        "solve",
+        "--json",
+        str(quick),
+        str(noisy),
+        str(noisy),
+        "--jobs",
+        "2",
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout
         assert json.loads(process.stdout.readline())["status"] == "optimal"
         process.send_signal(signal.SIGTERM)
@@ -152,7 +195,11 @@ def test_who_is_interrupted_prints_what_is_known_of_two_traces_at_a_time(noisy: 
     assert process.returncode == 143
     for line in out.splitlines():
         printed = json.loads(line)
-        assert (printed["status"], printed["stopped"], len(printed["maps"])) == ("feasible", "interrupted", 1)
+        assert (printed["status"], printed["stopped"], len(printed["maps"])) == (
+            "feasible",
+            "interrupted",
+            1,
+        )
 
 
 @POSIX
@@ -165,9 +212,13 @@ def test_who_is_interrupted_prints_what_is_known_of_two_traces_at_a_time(noisy: 
         (0, 0, signal.SIGTERM, "interrupted"),
     ],
 )
-def test_the_guard_speaks_while_clingo_does_not_listen(limit: float, memory: float, number: int | None, why: str) -> None:
+def test_the_guard_speaks_while_clingo_does_not_listen(
+    limit: float, memory: float, number: int | None, why: str
+) -> None:
     command = [sys.executable, "-c", DEAF, str(limit), str(memory)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stderr
         assert process.stderr.readline() == "ready\n"
         time.sleep(0.2)
@@ -177,7 +228,9 @@ def test_the_guard_speaks_while_clingo_does_not_listen(limit: float, memory: flo
     assert (out, process.returncode) == (f"begun, known: {why}", 10)
 
 
-def test_a_snapshot_waits_for_the_sketch_that_is_under_way(noisy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_snapshot_waits_for_the_sketch_that_is_under_way(
+    noisy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     begun = threading.Event()
     sketches = []
     attempts = Candidates._attempts
@@ -208,7 +261,9 @@ def test_that_there_is_no_map_is_complete_in_a_snapshot_too() -> None:
 @POSIX
 def test_who_is_interrupted_ends_though_nobody_reads_what_is_printed() -> None:
     program = DEAF[: DEAF.index("    control")].replace('"begun, "', '"much" * 10**6')
-    with subprocess.Popen([sys.executable, "-c", program, "0", "0"], stdout=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", program, "0", "0"], stdout=subprocess.PIPE
+    ) as process:
         assert process.stdout
         assert process.stdout.read(4) == b"much"
         time.sleep(0.5)
@@ -220,7 +275,10 @@ def test_an_explanation_can_be_stopped_while_it_grounds() -> None:
     trace = rectangle(40)
     asked = iter([False, False, True])
     with pytest.raises(Interrupted):
-        Axioms(Piece.of(trace, Theory.topological().resolve(trace), range(len(trace))), lambda: next(asked))
+        Axioms(
+            Piece.of(trace, Theory.topological().resolve(trace), range(len(trace))),
+            lambda: next(asked),
+        )
 
 
 def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:
@@ -248,18 +306,24 @@ def test_answers_of_workers() -> None:
     assert sorted(workers.answers(sleep, tasks, 2, lambda: False, None, 1.0)) == [0, 1, 2, 3, 4]
 
 
-def test_a_worker_that_vanishes_or_is_late_loses_its_task_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_vanishes_or_is_late_loses_its_task_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(workers, "STARTING", 0.5)
     path = str(tmp_path / "pid")
     assert list(workers.answers(vanish, [(7, path), (8, path)], 1, lambda: False, None, 1.0)) == [
         workers.Lost(7, False),
         workers.Lost(8, False),
     ]
-    assert list(workers.answers(stay, [(9, path)], 1, lambda: False, 0.1, 1.0)) == [workers.Lost(9, True)]
+    assert list(workers.answers(stay, [(9, path)], 1, lambda: False, 0.1, 1.0)) == [
+        workers.Lost(9, True)
+    ]
 
 
 def test_what_is_given_up_is_answered_and_nothing_begins() -> None:
-    answers = workers.answers(sleep, [(0, 0.0), (1, 1000.0), (2, 0.0)], 1, lambda: bool(found), None, 20.0)
+    answers = workers.answers(
+        sleep, [(0, 0.0), (1, 1000.0), (2, 0.0)], 1, lambda: bool(found), None, 20.0
+    )
     found: list[object] = []
     found += [next(answers)]
     assert found + list(answers) in ([0, 1], [0])
@@ -269,7 +333,9 @@ def test_what_is_given_up_is_answered_and_nothing_begins() -> None:
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "pid"
     program = f"from ssh_abduction.solver.asp import workers; from test_limits import stay; list(workers.answers(stay, [(0, {str(path)!r})], 1, bool, None, 1.0))"
-    with subprocess.Popen([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    ) as parent:
         while not (path.exists() and path.read_text()):
             assert parent.poll() is None
             time.sleep(0.01)
@@ -316,19 +382,37 @@ def with_view(step: int) -> tuple[list[int], list[int]]:
         (*with_view(120), 120),
         (*with_view(30), 30),
         (*with_view(5), None),
-        (VIEWS[:120] + VIEWS[121:], ACTIONS[:120] + ACTIONS[121:], 120),  # a step left out of the log
-        (VIEWS[:120] + VIEWS[119:], ACTIONS[:120] + ACTIONS[119:], 120),  # a step that is there twice
+        (
+            VIEWS[:120] + VIEWS[121:],
+            ACTIONS[:120] + ACTIONS[121:],
+            120,
+        ),  # a step left out of the log
+        (
+            VIEWS[:120] + VIEWS[119:],
+            ACTIONS[:120] + ACTIONS[119:],
+            120,
+        ),  # a step that is there twice
         (list(range(30)), [0] * 29, None),  # all is new
         ([0] * 40 + [1], [0] * 40, None),  # a long corridor, and its end
     ],
 )
-def test_noise_is_told_from_circuits_and_from_what_is_new(views: list[int], actions: list[int], step: int | None) -> None:
+def test_noise_is_told_from_circuits_and_from_what_is_new(
+    views: list[int], actions: list[int], step: int | None
+) -> None:
     noise = noise_in(views, actions)
     assert (noise and noise.step) == step
 
 
 def test_a_warning_names_the_step(noisy: Path) -> None:
-    command = [sys.executable, "-m", "ssh_abduction", "solve", str(noisy), "--json", "--theory=causal"]
+    command = [
+        sys.executable,
+        "-m",
+        "ssh_abduction",
+        "solve",
+        str(noisy),
+        "--json",
+        "--theory=causal",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     last = len(Trace.load(noisy)) - 1
     (warning,) = json.loads(done.stdout)["warnings"]
@@ -355,7 +439,9 @@ def test_noise_is_told_where_the_search_is_stopped_after_a_minimal_map_is_known(
     assert noise.step == 40
 
 
-def test_a_certificate_without_words_is_checked_along_the_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_certificate_without_words_is_checked_along_the_trace(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
     with_words = solve(trace, Theory.causal()).certificate
     assert with_words is not None

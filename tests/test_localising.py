@@ -76,7 +76,12 @@ def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> N
             assert dstate.place is not None
             assert dstate.heading is not None
             at.setdefault(visit, 4 * dstate.place + (dstate.heading - slot) % 4)
-        if any(chart.misfits[(at[i] - at[j]) % 4, i, j] for i in at for j in at if at[i] // 4 == at[j] // 4):
+        if any(
+            chart.misfits[(at[i] - at[j]) % 4, i, j]
+            for i in at
+            for j in at
+            if at[i] // 4 == at[j] // 4
+        ):
             continue  # what came later tells them apart
         found = located(chart, at)
         if found.missed:
@@ -117,7 +122,11 @@ def test_the_beginning_of_a_long_trace_is_guessed(seed: int, steps: int, guesses
 
     asked = Paths(walk.trace, FRAMED)
     fewer_sweeps = patch.object(annealing, "ANNEALED", ((0.5, 700),))
-    with fewer_sweeps, patch.object(paths_module, "FIRST_PAIRS", 300), patch.object(Paths, "_guessed", counted):
+    with (
+        fewer_sweeps,
+        patch.object(paths_module, "FIRST_PAIRS", 300),
+        patch.object(Paths, "_guessed", counted),
+    ):
         found = asked.guessed_labels(chart, Watch())
     assert guessed[0] < len(chart.stars) / 2
     assert len(guessed) == guesses
@@ -144,8 +153,14 @@ def test_what_is_tracked_is_true() -> None:
     assert max(states) > max(states[:60])
     found = tracked(chart, dict(enumerate(states[:60])))
     assert found[:60] == states[:60]
-    elsewhere = [i for i, state in enumerate(states) if state // 4 not in {known // 4 for known in states[:60]}]
-    assert sum(a == b for a, b in zip(found, states, strict=True)) > 0.8 * (len(states) - len(elsewhere))
+    elsewhere = [
+        i
+        for i, state in enumerate(states)
+        if state // 4 not in {known // 4 for known in states[:60]}
+    ]
+    assert sum(a == b for a, b in zip(found, states, strict=True)) > 0.8 * (
+        len(states) - len(elsewhere)
+    )
     assert any(found[i] == -1 for i in elsewhere)
 
 

@@ -20,20 +20,24 @@ from worlds import rectangle
 
 from perception.errors import PerceptionError
 from perception.likelihood import ImageLikelihood
-from perception.recognition import PlaceRecognizer, recogniser
+from perception.recognition import PlaceRecogniser, recogniser
 from perception.store import save
 from ssh_abduction import Localiser, SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import LocaliserError, MapError, Step, TraceError
 from ssh_abduction.data.maps import DState
 from ssh_abduction.online import Belief, Chances
-from ssh_abduction.online.localize import COLLAPSED, Verdict
+from ssh_abduction.online.localiser import COLLAPSED, Verdict
 
 Array = np.ndarray[Any, Any]
 
 
-def map_of(views: Sequence[Any], links: Sequence[tuple[int, str, int]], labels: Sequence[int] = (0,)) -> SSHMap:
-    return SSHMap(tuple(labels), tuple(DState(i, view) for i, view in enumerate(views)), tuple(links))
+def map_of(
+    views: Sequence[Any], links: Sequence[tuple[int, str, int]], labels: Sequence[int] = (0,)
+) -> SSHMap:
+    return SSHMap(
+        tuple(labels), tuple(DState(i, view) for i, view in enumerate(views)), tuple(links)
+    )
 
 
 def true_map(truth: Sequence[object], trace: Trace) -> SSHMap:
@@ -41,10 +45,18 @@ def true_map(truth: Sequence[object], trace: Trace) -> SSHMap:
     number: dict[object, int] = {}
     labels = [number.setdefault(x, len(number)) for x in truth]
     views = [trace.steps[labels.index(x)].view for x in range(len(number))]
-    return map_of(views, sorted({(x, a.name, y) for x, a, y in zip(labels, trace.actions, labels[1:], strict=False)}), labels)
+    return map_of(
+        views,
+        sorted(
+            {(x, a.name, y) for x, a, y in zip(labels, trace.actions, labels[1:], strict=False)}
+        ),
+        labels,
+    )
 
 
-def drive(ssh_map: SSHMap, steps: int, seed: int, kidnapped: int | None = None) -> tuple[Trace, list[int]]:
+def drive(
+    ssh_map: SSHMap, steps: int, seed: int, kidnapped: int | None = None
+) -> tuple[Trace, list[int]]:
     """A random walk along the links of a map, and where the robot is. At step `kidnapped` it is not where the link leads, but at a dstate that looks different."""
     chance = random.Random(seed)
     leads: dict[int, list[tuple[str, int]]] = {}
@@ -54,7 +66,13 @@ def drive(ssh_map: SSHMap, steps: int, seed: int, kidnapped: int | None = None) 
     for step in range(1, steps):
         action, there = chance.choice(leads[at[-1]])
         if step == kidnapped:
-            there = chance.choice([s.id for s in ssh_map.dstates if s.id in leads and s.view != ssh_map.dstates[there].view])
+            there = chance.choice(
+                [
+                    s.id
+                    for s in ssh_map.dstates
+                    if s.id in leads and s.view != ssh_map.dstates[there].view
+                ]
+            )
         if there not in leads:
             break
         actions.append(action)
@@ -65,21 +83,33 @@ def drive(ssh_map: SSHMap, steps: int, seed: int, kidnapped: int | None = None) 
 # a filter written out from the equations
 
 
-def filtered(ssh_map: SSHMap, trace: Trace, chances: Chances, labelled: Trace | None = None) -> list[tuple[Array, float]]:
+def filtered(
+    ssh_map: SSHMap, trace: Trace, chances: Chances, labelled: Trace | None = None
+) -> list[tuple[Array, float]]:
     """Equations 1 to 4 as dense tables over the dstates, and the two kinds of nowhere, strange and akin, as the last two. The belief after each step, and p(o) / q(o) by the belief before."""
     n = len(ssh_map.dstates)
     steps = range(0) if labelled is None else range(len(labelled))
     prior = np.array([(1 - chances.unmapped) / n] * n + [chances.unmapped / 2] * 2)
 
     def f_view(view: Any, x: int) -> float:
-        visits = [t for t in steps if ssh_map.labels[t] == x and labelled and labelled.steps[t].view is not None]
+        visits = [
+            t
+            for t in steps
+            if ssh_map.labels[t] == x and labelled and labelled.steps[t].view is not None
+        ]
         if not visits:
             return float(ssh_map.dstates[x].view == view)
-        return sum(labelled.steps[t].view == view for t in visits) / len(visits) if labelled else 0.0
+        return (
+            sum(labelled.steps[t].view == view for t in visits) / len(visits) if labelled else 0.0
+        )
 
     def f_action(y: int, x: int, action: str) -> float | None:
         if labelled:
-            after = [ssh_map.labels[t + 1] for t in steps[:-1] if ssh_map.labels[t] == x and labelled.actions[t].name == action]
+            after = [
+                ssh_map.labels[t + 1]
+                for t in steps[:-1]
+                if ssh_map.labels[t] == x and labelled.actions[t].name == action
+            ]
             if after:
                 return after.count(y) / len(after)
         ends = [there for here, name, there in set(ssh_map.links) if (here, name) == (x, action)]
@@ -98,16 +128,20 @@ def filtered(ssh_map: SSHMap, trace: Trace, chances: Chances, labelled: Trace | 
         if not sum(alike.values()):
             return broad(view)
         number = sum(alike.values()) ** 2 / sum(w**2 for w in alike.values())
-        mean = sum(w * sum((f_action(y, x, str(action)) or 0) * f_view(view, y) for y in range(n)) for x, w in alike.items()) / sum(
-            alike.values()
-        )
+        mean = sum(
+            w * sum((f_action(y, x, str(action)) or 0) * f_view(view, y) for y in range(n))
+            for x, w in alike.items()
+        ) / sum(alike.values())
         return (number * n / (n + 1) * mean + broad(view)) / (number + 1)
 
     def observed(before: Any, action: str | None, view: Any) -> Array:
         if view is None:
             return np.ones(n + 2)
         q = broad(view)
-        return np.array([(1 - chances.misread) * f_view(view, x) + chances.misread * q for x in range(n)] + [q, akin(before, action, view)])
+        return np.array(
+            [(1 - chances.misread) * f_view(view, x) + chances.misread * q for x in range(n)]
+            + [q, akin(before, action, view)]
+        )
 
     def moved(action: str) -> Array:
         """x' by x."""
@@ -115,7 +149,11 @@ def filtered(ssh_map: SSHMap, trace: Trace, chances: Chances, labelled: Trace | 
         for x in range(n):
             for y in range(n + 2):
                 led = f_action(y, x, action)
-                table[y, x] = prior[y] if led is None else (1 - chances.slipped) * led + chances.slipped * prior[y]
+                table[y, x] = (
+                    prior[y]
+                    if led is None
+                    else (1 - chances.slipped) * led + chances.slipped * prior[y]
+                )
         for nowhere in (n, n + 1):
             table[:n, nowhere] = chances.reentered / n
             table[nowhere, nowhere] = 1 - chances.reentered
@@ -154,21 +192,38 @@ def random_case(seed: int) -> tuple[SSHMap, Trace, Trace]:
     chance = random.Random(seed)
     n = chance.randint(1, 5)
     views = [chance.choice("abc") for _ in range(n)]
-    links = {(x, chance.choice("st")): chance.randrange(n) for x in range(n) for _ in range(chance.randint(0, 2))}
+    links = {
+        (x, chance.choice("st")): chance.randrange(n)
+        for x in range(n)
+        for _ in range(chance.randint(0, 2))
+    }
     labels = [chance.randrange(n) for _ in range(chance.randint(1, 12))]
     seen = [views[x] if chance.random() < 0.8 else chance.choice("abcd") for x in labels]
     labelled = Trace.from_steps(seen, [chance.choice("st") for _ in labels[1:]])
-    other = [Step(chance.choice(["a", "b", "c", "d", None]), None) for _ in range(chance.randint(1, 8))]
+    other = [
+        Step(chance.choice(["a", "b", "c", "d", None]), None) for _ in range(chance.randint(1, 8))
+    ]
     done = Trace.from_steps("a" * len(other), [chance.choice("stu") for _ in other[1:]])
-    trace = Trace(tuple(Step(s.view or (None if i else "a"), d.action) for i, (s, d) in enumerate(zip(other, done, strict=True))))
-    return map_of(views, [(x, action, y) for (x, action), y in links.items()], labels), labelled, trace
+    trace = Trace(
+        tuple(
+            Step(s.view or (None if i else "a"), d.action)
+            for i, (s, d) in enumerate(zip(other, done, strict=True))
+        )
+    )
+    return (
+        map_of(views, [(x, action, y) for (x, action), y in links.items()], labels),
+        labelled,
+        trace,
+    )
 
 
 @pytest.mark.parametrize("seed", range(60))
 def test_beliefs_are_those_of_a_filter_written_out_from_the_equations(seed: int) -> None:
     ssh_map, labelled, trace = random_case(seed)
     chance = random.Random(seed)
-    chances = chance.choice([Chances(), Chances.none(), Chances(*(chance.random() for _ in range(4)))])
+    chances = chance.choice(
+        [Chances(), Chances.none(), Chances(*(chance.random() for _ in range(4)))]
+    )
     assert_as_filtered(Localiser(ssh_map, chances=chances), trace)
     assert_as_filtered(Localiser(ssh_map, trace=labelled, chances=chances), trace, labelled)
 
@@ -189,7 +244,11 @@ def test_a_trace_estimates_the_zeros_and_ones_of_its_map(seed: int) -> None:
             moved: dict[int, float] = {}
             for x, w in weight.items():
                 # An action without a link may lead anywhere.
-                ends = [leads[x, other.actions[t - 1].name]] if (x, other.actions[t - 1].name) in leads else range(len(ssh_map.dstates))
+                ends = (
+                    [leads[x, other.actions[t - 1].name]]
+                    if (x, other.actions[t - 1].name) in leads
+                    else range(len(ssh_map.dstates))
+                )
                 for y in ends:
                     moved[y] = moved.get(y, 0) + w / len(ends)
             weight = moved
@@ -205,7 +264,9 @@ def test_what_a_labelled_trace_says_is_counted() -> None:
     labelled = Trace.from_steps("abcbaa", ["on", "back", "on", "back", "on"])
     localiser = Localiser(ssh_map, trace=labelled, chances=Chances.none())
     assert localiser.start("c").probabilities.tolist() == [1, 0]
-    assert localiser.update(localiser.start("c"), "on").probabilities == pytest.approx([1 / 3, 2 / 3])
+    assert localiser.update(localiser.start("c"), "on").probabilities == pytest.approx(
+        [1 / 3, 2 / 3]
+    )
     both = localiser.update(localiser.start("c"), "on", "a")
     assert both.probabilities.tolist() == [1, 0]
     assert both.normaliser == pytest.approx(3 / 4 * 1 / 3 / ((3 / 4) / 3))
@@ -242,7 +303,9 @@ def test_one_misread_view_is_forgiven() -> None:
     assert beliefs[25].verdict is Verdict.LOCATED
 
 
-def test_dstates_that_nothing_tells_apart_stay_so_and_a_robot_is_found_where_it_is_as_sure_as_before() -> None:
+def test_dstates_that_nothing_tells_apart_stay_so_and_a_robot_is_found_where_it_is_as_sure_as_before() -> (
+    None
+):
     """Opposite corners of the notched rectangle look alike, and what follows them does."""
     (ssh_map,) = solve(rectangle(40), Theory.topological()).maps
     views = [f"v{i % 4}" for i in range(9)] + [f"v{i % 4}" for i in range(3, 10)]
@@ -319,7 +382,9 @@ def test_probabilities_sum_to_one_over_a_long_run() -> None:
 # images
 
 
-def pictures(dstates: int, each: int, seed: int, beams: int = 12, noise: float = 0.03) -> tuple[Array, Array]:
+def pictures(
+    dstates: int, each: int, seed: int, beams: int = 12, noise: float = 0.03
+) -> tuple[Array, Array]:
     """Ranges as noisy images of places, and their places."""
     places = np.random.default_rng(7).uniform(0.5, 6, (dstates, beams))
     at = np.tile(np.arange(dstates), each)
@@ -341,8 +406,11 @@ def test_an_image_of_nothing_is_recognised_as_nothing() -> None:
 
 def test_densities_of_images_are_those_of_a_gaussian_about_the_nearest_image() -> None:
     images, at = pictures(3, 5, seed=1, beams=4)
-    likelihood = ImageLikelihood.of(PlaceRecognizer().fit(images, at))
-    squares = [min(float(((a - b) ** 2).sum()) for j, b in enumerate(images) if at[j] == at[i] and j != i) for i, a in enumerate(images)]
+    likelihood = ImageLikelihood.of(PlaceRecogniser().fit(images, at))
+    squares = [
+        min(float(((a - b) ** 2).sum()) for j, b in enumerate(images) if at[j] == at[i] and j != i)
+        for i, a in enumerate(images)
+    ]
     mean, k = np.mean(squares), 2 * np.mean(squares) ** 2 / np.var(squares)
     k = min(max(k, 1), 4)
     assert (likelihood.within, likelihood.dimensions) == pytest.approx((mean, k))
@@ -351,9 +419,13 @@ def test_densities_of_images_are_those_of_a_gaussian_about_the_nearest_image() -
     def density(square: float, variance: float) -> float:
         return math.exp(-square / (2 * variance)) * (2 * math.pi * variance) ** (-k / 2)
 
-    places = [density(min(((image - b) ** 2).sum() for b in images[at == x]), mean / k) for x in range(3)]
+    places = [
+        density(min(((image - b) ** 2).sum() for b in images[at == x]), mean / k) for x in range(3)
+    ]
     centre = images.mean(axis=0)
-    novel = density(((image - centre) ** 2).sum(), np.mean(((images - centre) ** 2).sum(axis=1)) / k)
+    novel = density(
+        ((image - centre) ** 2).sum(), np.mean(((images - centre) ** 2).sum(axis=1)) / k
+    )
     (ratios,) = likelihood.ratios([image])
     assert ratios == pytest.approx(np.array(places) * 4 / (sum(places) + novel))
 
@@ -363,7 +435,10 @@ def test_a_localiser_reads_images() -> None:
     images, at = pictures(5, 8, seed=1)
     ring = map_of(["v"] * 6, [(i, "on", (i + 1) % 6) for i in range(6)])
     looks = [0, 1, 2, 3, 4, 2]
-    learnt, labels = np.concatenate([images, images[at == 2]]), np.concatenate([at, np.full((at == 2).sum(), 5)])
+    learnt, labels = (
+        np.concatenate([images, images[at == 2]]),
+        np.concatenate([at, np.full((at == 2).sum(), 5)]),
+    )
     localiser = Localiser(ring, recogniser().fit(learnt, labels))
     route = [5, 0, 1, 2, 3, 4, 5, 0, 1, 4, 5, 0, 1]  # carried from 1 to 4 at step 9
     fresh, places = pictures(5, 4, seed=9)
@@ -378,19 +453,28 @@ def test_a_localiser_reads_images() -> None:
     assert [b.dstate for b in beliefs[9:]] == [4, 5, 0, 1]
     stepwise = localiser.start(image=shown[0])
     assert stepwise.probabilities == pytest.approx(beliefs[0].probabilities)
-    assert localiser.update(stepwise, "on", image=shown[1]).probabilities == pytest.approx(beliefs[1].probabilities)
+    assert localiser.update(stepwise, "on", image=shown[1]).probabilities == pytest.approx(
+        beliefs[1].probabilities
+    )
     lost = list(localiser.beliefs(_imaged([np.full(12, 0.3 + t) for t in range(4)])))
     assert [b.dstate for b in lost] == [None] * 4
 
 
 def _imaged(images: Sequence[Array]) -> Trace:
     actions = Trace.from_steps("v" * len(images), ["on"] * (len(images) - 1)).steps
-    return Trace(tuple(Step(image=tuple(map(float, image)), action=step.action) for image, step in zip(images, actions, strict=True)))
+    return Trace(
+        tuple(
+            Step(image=tuple(map(float, image)), action=step.action)
+            for image, step in zip(images, actions, strict=True)
+        )
+    )
 
 
 def test_of_a_dstate_without_images_images_say_nothing() -> None:
     images, at = pictures(2, 8, seed=1)
-    localiser = Localiser(map_of("vvv", []), recogniser().fit(images, at), chances=Chances(unmapped=0.1))
+    localiser = Localiser(
+        map_of("vvv", []), recogniser().fit(images, at), chances=Chances(unmapped=0.1)
+    )
     belief = localiser.start(image=np.full(12, 40.0))
     assert belief.probabilities[2] / belief.nowhere == pytest.approx(0.3 / 0.1)
     assert localiser.start(image=images[0]).likeliest == 0
@@ -407,26 +491,94 @@ IMAGES, AT = pictures(3, 4, seed=1)
     ("make", "error", "message"),
     [
         (lambda: Localiser("map"), MapError, "expected an SSHMap, got 'map'"),  # type: ignore[arg-type]
-        (lambda: Localiser(map_of("", [])), MapError, r"dstates: expected the ids 0, 1, 2, …, got \[\]"),
-        (lambda: Localiser(map_of("ab", [(0, "on", 7)])), MapError, "expected dstates 0 to 1 in labels and links, got 7"),
-        (lambda: Localiser(RING, trace=rectangle(5)), MapError, "labels: expected 6, one for each step of the trace, got 3"),
+        (
+            lambda: Localiser(map_of("", [])),
+            MapError,
+            r"dstates: expected the ids 0, 1, 2, …, got \[\]",
+        ),
+        (
+            lambda: Localiser(map_of("ab", [(0, "on", 7)])),
+            MapError,
+            "expected dstates 0 to 1 in labels and links, got 7",
+        ),
+        (
+            lambda: Localiser(RING, trace=rectangle(5)),
+            MapError,
+            "labels: expected 6, one for each step of the trace, got 3",
+        ),
         (lambda: Localiser(RING, trace="t"), TraceError, "expected a Trace, got 't'"),  # type: ignore[arg-type]
-        (lambda: Localiser(RING, chances=0.1), LocaliserError, "chances: expected Chances, got 0.1"),  # type: ignore[arg-type]
-        (lambda: Chances(misread=1.5), LocaliserError, "misread: expected a probability from 0 to 1, got 1.5"),
-        (lambda: Chances(slipped=math.nan), LocaliserError, "slipped: expected a probability from 0 to 1, got nan"),
+        (
+            lambda: Localiser(RING, chances=0.1),
+            LocaliserError,
+            "chances: expected Chances, got 0.1",
+        ),  # type: ignore[arg-type]
+        (
+            lambda: Chances(misread=1.5),
+            LocaliserError,
+            "misread: expected a probability from 0 to 1, got 1.5",
+        ),
+        (
+            lambda: Chances(slipped=math.nan),
+            LocaliserError,
+            "slipped: expected a probability from 0 to 1, got nan",
+        ),
         (lambda: Chances(unmapped="x"), LocaliserError, "unmapped: expected a probability"),  # type: ignore[arg-type]
-        (lambda: Localiser(RING, KNeighborsClassifier()), PerceptionError, "expected a PlaceRecognizer, or a pipeline that ends with one"),
-        (lambda: Localiser(RING, recogniser().fit(IMAGES, AT + 1)), LocaliserError, "expected the dstates 0 to 2 of the map as labels"),
-        (lambda: Localiser(RING, recogniser().fit(IMAGES[:3], AT[:3])), PerceptionError, "expected two images of some place"),
-        (lambda: Localiser(RING, PlaceRecognizer().fit(1e200 * IMAGES, AT)), PerceptionError, "numbers too large to square"),
-        (lambda: Localiser(RING, recogniser()), PerceptionError, "expected one that has learnt, got a new one"),
-        (lambda: list(Localiser(RING).beliefs(_imaged(IMAGES))), TraceError, "view: expected the views of the map, got images only"),
+        (
+            lambda: Localiser(RING, KNeighborsClassifier()),
+            PerceptionError,
+            "expected a PlaceRecogniser, or a pipeline that ends with one",
+        ),
+        (
+            lambda: Localiser(RING, recogniser().fit(IMAGES, AT + 1)),
+            LocaliserError,
+            "expected the dstates 0 to 2 of the map as labels",
+        ),
+        (
+            lambda: Localiser(RING, recogniser().fit(IMAGES[:3], AT[:3])),
+            PerceptionError,
+            "expected two images of some place",
+        ),
+        (
+            lambda: Localiser(RING, PlaceRecogniser().fit(1e200 * IMAGES, AT)),
+            PerceptionError,
+            "numbers too large to square",
+        ),
+        (
+            lambda: Localiser(RING, recogniser()),
+            PerceptionError,
+            "expected one that has learnt, got a new one",
+        ),
+        (
+            lambda: list(Localiser(RING).beliefs(_imaged(IMAGES))),
+            TraceError,
+            "view: expected the views of the map, got images only",
+        ),
         (lambda: list(Localiser(RING).beliefs("t")), TraceError, "expected a Trace"),  # type: ignore[arg-type]
-        (lambda: Localiser(RING).start(image=IMAGES[0]), LocaliserError, "expected a view, as the localiser has no recogniser"),
-        (lambda: Localiser(RING).start(view=1.5), TraceError, "view: expected a text or an integer, got 1.5"),  # type: ignore[arg-type]
-        (lambda: Localiser(RING).update("b", "on", "a"), LocaliserError, "belief: expected one over 3 dstates, got 'b'"),  # type: ignore[arg-type]
-        (lambda: Localiser(RING).update(Belief(np.ones(2) / 2, 0.0), "on", "a"), LocaliserError, "expected one over 3 dstates"),
-        (lambda: Localiser(RING).update(Localiser(RING).prior, 3, "a"), TraceError, "action: expected a name"),  # type: ignore[arg-type]
+        (
+            lambda: Localiser(RING).start(image=IMAGES[0]),
+            LocaliserError,
+            "expected a view, as the localiser has no recogniser",
+        ),
+        (
+            lambda: Localiser(RING).start(view=1.5),
+            TraceError,
+            "view: expected a text or an integer, got 1.5",
+        ),  # type: ignore[arg-type]
+        (
+            lambda: Localiser(RING).update("b", "on", "a"),
+            LocaliserError,
+            "belief: expected one over 3 dstates, got 'b'",
+        ),  # type: ignore[arg-type]
+        (
+            lambda: Localiser(RING).update(Belief(np.ones(2) / 2, 0.0), "on", "a"),
+            LocaliserError,
+            "expected one over 3 dstates",
+        ),
+        (
+            lambda: Localiser(RING).update(Localiser(RING).prior, 3, "a"),
+            TraceError,
+            "action: expected a name",
+        ),  # type: ignore[arg-type]
     ],
 )
 def test_bad_input_is_said(make: Any, error: type[Exception], message: str) -> None:
@@ -449,7 +601,7 @@ def test_a_bad_image_is_said(image: Any, message: str) -> None:
 
 def test_an_image_that_is_not_finite_is_said() -> None:
     with pytest.raises(PerceptionError, match="expected finite numbers"):
-        Localiser(RING, PlaceRecognizer().fit(IMAGES, AT)).start(image=np.full(12, np.nan))
+        Localiser(RING, PlaceRecogniser().fit(IMAGES, AT)).start(image=np.full(12, np.nan))
 
 
 # the shell
@@ -477,9 +629,33 @@ def test_localize_in_the_shell(files: Path, capsys: pytest.CaptureFixture[str]) 
     head, columns, *rows = capsys.readouterr().out.splitlines()
     assert "lost at step" in head
     assert "the belief collapsed at step 15" in head
-    assert columns.split() == ["step", "action", "seen", "dstate", "probability", "nowhere", "entropy", "normaliser"]
+    assert columns.split() == [
+        "step",
+        "action",
+        "seen",
+        "dstate",
+        "probability",
+        "nowhere",
+        "entropy",
+        "normaliser",
+    ]
     assert len(rows) == 30
-    assert main(["localize", maps, other, "--trace", str(files / "mapped.jsonl"), "--zero-one", "--misread", "0.2", "--json"]) == 0
+    assert (
+        main(
+            [
+                "localize",
+                maps,
+                other,
+                "--trace",
+                str(files / "mapped.jsonl"),
+                "--zero-one",
+                "--misread",
+                "0.2",
+                "--json",
+            ]
+        )
+        == 0
+    )
     told = json.loads(capsys.readouterr().out)
     assert told["chances"] == {"misread": 0.2, "slipped": 0.0, "unmapped": 0.0, "reentered": 1.0}
 
@@ -489,22 +665,34 @@ def test_localize_takes_one_of_several_maps_and_says_so(
     files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     several = files / "several.json"
-    several.write_text(json.dumps({"maps": [SSHMap.load(files / "maps.json").to_dict(), RING.to_dict()]}))
+    several.write_text(
+        json.dumps({"maps": [SSHMap.load(files / "maps.json").to_dict(), RING.to_dict()]})
+    )
     other = (files / "other.jsonl").read_bytes()
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(other)))
     assert main(["localize", str(several), "-"]) == 0
-    assert "several.json: the first of 2 maps is taken; choose one with --map" in capsys.readouterr().err
+    assert (
+        "several.json: the first of 2 maps is taken; choose one with --map"
+        in capsys.readouterr().err
+    )
     assert main(["localize", str(several), str(files / "other.jsonl"), "--map", "2", "--json"]) == 0
     told = capsys.readouterr()
     assert (json.loads(told.out)["map"], json.loads(told.out)["dstates"], told.err) == (2, 3, "")
 
 
-def test_localize_reads_images_and_recognise_says_nowhere(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_localize_reads_images_and_recognise_says_nowhere(
+    files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     RING.save(files / "ring.json")
     save(recogniser().fit(IMAGES, AT), files / "r.skops")
     fresh, _ = pictures(3, 1, seed=5)
     _imaged([*fresh, fresh[0], np.full(12, 0.2), np.full(12, 20.0)]).save(files / "images.jsonl")
-    words = [str(files / "ring.json"), str(files / "images.jsonl"), "--recogniser", str(files / "r.skops")]
+    words = [
+        str(files / "ring.json"),
+        str(files / "images.jsonl"),
+        "--recogniser",
+        str(files / "r.skops"),
+    ]
     assert main(["localize", *words, "--json"]) == 0
     beliefs = json.loads(capsys.readouterr().out)["beliefs"]
     assert [b["dstate"] for b in beliefs[:4]] == [0, 1, 2, 0]
@@ -515,18 +703,32 @@ def test_localize_reads_images_and_recognise_says_nowhere(files: Path, capsys: p
     assert capsys.readouterr().out.splitlines()[-1].split() == ["5", "nowhere"]
 
 
-def test_localize_says_what_is_wrong_in_one_line(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_localize_says_what_is_wrong_in_one_line(
+    files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     maps, other = str(files / "maps.json"), str(files / "other.jsonl")
     (files / "none.json").write_text('{"maps": []}')
     _imaged(IMAGES).save(files / "images.jsonl")
     save(recogniser().fit(IMAGES, AT + 20), files / "r.skops")
     for words, message in [
-        ([str(files / "none.json"), other], "none.json: maps: expected one to localise in, got none"),
+        (
+            [str(files / "none.json"), other],
+            "none.json: maps: expected one to localise in, got none",
+        ),
         ([maps, other, "--map", "2"], "--map: expected 1 to 1, got 2"),
         ([maps, other, "--misread", "2"], "misread: expected a probability from 0 to 1, got 2.0"),
-        ([maps, other, "--trace", other], "maps.json: map: labels: expected 30, one for each step of the trace"),
-        ([maps, str(files / "images.jsonl")], "images.jsonl: view: expected the views of the map, got images only"),
-        ([maps, str(files / "images.jsonl"), "--recogniser", str(files / "r.skops")], "r.skops: recogniser: expected the dstates 0 to"),
+        (
+            [maps, other, "--trace", other],
+            "maps.json: map: labels: expected 30, one for each step of the trace",
+        ),
+        (
+            [maps, str(files / "images.jsonl")],
+            "images.jsonl: view: expected the views of the map, got images only",
+        ),
+        (
+            [maps, str(files / "images.jsonl"), "--recogniser", str(files / "r.skops")],
+            "r.skops: recogniser: expected the dstates 0 to",
+        ),
         ([maps, other, "--recogniser", maps], "expected a .skops file"),
         ([other, maps], "other.jsonl: expected a file of maps, got a trace"),
     ]:

@@ -43,7 +43,24 @@ REAL = Path(__file__).parents[2] / "shared" / "data" / "logs"
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Most of a tour through the hallway, as a CARMEN log: into both side hallways, and out of them again."""
     path = tmp_path_factory.mktemp("logs") / "hall.log"
-    assert main(["simulate", "taylor-hall", "--as", "carmen", "--every", "0.5", "--seed", "1", "-q", "-o", str(path)]) == 0
+    assert (
+        main(
+            [
+                "simulate",
+                "taylor-hall",
+                "--as",
+                "carmen",
+                "--every",
+                "0.5",
+                "--seed",
+                "1",
+                "-q",
+                "-o",
+                str(path),
+            ]
+        )
+        == 0
+    )
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:LINES]))
     return path
 
@@ -53,7 +70,21 @@ def runs(hall: Path) -> Path:
     """What `map` writes of it, and of a log that cannot be read."""
     bad = hall.with_name("bad.log")
     bad.write_text("nothing\n")
-    assert main(["map", str(hall), str(bad), "-o", str(hall.parent / "runs"), "--no-ladder", "--time-limit", "1000"]) == 1
+    assert (
+        main(
+            [
+                "map",
+                str(hall),
+                str(bad),
+                "-o",
+                str(hall.parent / "runs"),
+                "--no-ladder",
+                "--time-limit",
+                "1000",
+            ]
+        )
+        == 1
+    )
     return hall.parent / "runs"
 
 
@@ -84,15 +115,25 @@ def test_a_drive_becomes_a_trace_of_the_places_it_passed(runs: Path) -> None:
         assert (action.kind == "turn") == (visits[i] == visits[i + 1])
     # What the robot took for its way agrees with where it was: within a few standard deviations of the displacement.
     for i, (before, after) in enumerate(zip(trace.steps[:-1], trace.steps[1:], strict=True)):
-        error = np.array(between(between(before.truth["pose"], after.truth["pose"]), after.displacement))
+        error = np.array(
+            between(between(before.truth["pose"], after.truth["pose"]), after.displacement)
+        )
         covariance = np.array(trace.covariance(i + 1))
         assert error @ np.linalg.solve(covariance, error) < 30
 
 
 def test_the_map_of_a_drive_joins_what_is_one_place(runs: Path) -> None:
     folder = runs / "hall"
-    assert {path.name for path in folder.iterdir()} == {"trace.jsonl", "maps.json", "page.html", "report.html", "run.json"}
-    (judged,) = evaluate_visits(Solution.load(folder / "maps.json").maps[:1], Trace.load(folder / "trace.jsonl")).maps
+    assert {path.name for path in folder.iterdir()} == {
+        "trace.jsonl",
+        "maps.json",
+        "page.html",
+        "report.html",
+        "run.json",
+    }
+    (judged,) = evaluate_visits(
+        Solution.load(folder / "maps.json").maps[:1], Trace.load(folder / "trace.jsonl")
+    ).maps
     assert (judged.places.precision, judged.places.recall) == (1.0, 1.0)
     run = json.loads((folder / "run.json").read_text())
     assert set(run["seconds"]) >= {"track", "places", "trace", "views", "maps"}
@@ -101,9 +142,14 @@ def test_the_map_of_a_drive_joins_what_is_one_place(runs: Path) -> None:
 
 def test_corrected_poses_are_not_read(hall: Path) -> None:
     log = RobotLog(read_log(hall).scans[:60], source="x")
-    blind = tuple(Scan(scan.ranges, scan.laser, scan.odometry, None, scan.time, scan.line) for scan in log.scans)
+    blind = tuple(
+        Scan(scan.ranges, scan.laser, scan.odometry, None, scan.time, scan.line)
+        for scan in log.scans
+    )
     seen, unseen = (import_log(RobotLog(scans, source="x")).trace for scans in (log.scans, blind))
-    assert [(s.view, s.star, s.displacement, s.action) for s in seen] == [(s.view, s.star, s.displacement, s.action) for s in unseen]
+    assert [(s.view, s.star, s.displacement, s.action) for s in seen] == [
+        (s.view, s.star, s.displacement, s.action) for s in unseen
+    ]
     assert not any(step.truth for step in unseen)
 
 
@@ -113,10 +159,18 @@ def test_a_log_of_a_robot_that_stands_or_passes_nothing_is_an_error() -> None:
     still = [Scan(corridor, laser, (0.0, 0.0, 0.0))] * 3
     with pytest.raises(LogError, match="expected a robot that drives"):
         import_log(RobotLog(tuple(still), source="still.log"))
-    blind = [replace(scan, ranges=np.full(181, value)) for scan, value in zip(still, (0.0, 30.0, np.nan), strict=True)]
-    with pytest.raises(LogError, match="expected scans that meet walls, got 3 in which no beam meets anything"):
+    blind = [
+        replace(scan, ranges=np.full(181, value))
+        for scan, value in zip(still, (0.0, 30.0, np.nan), strict=True)
+    ]
+    with pytest.raises(
+        LogError, match="expected scans that meet walls, got 3 in which no beam meets anything"
+    ):
         import_log(RobotLog(tuple(blind), source="blind.log"))
-    onward = [Scan(np.where(corridor >= 30, np.inf, corridor), laser, (0.5 * i, 0.0, 0.0)) for i in range(30)]
+    onward = [
+        Scan(np.where(corridor >= 30, np.inf, corridor), laser, (0.5 * i, 0.0, 0.0))
+        for i in range(30)
+    ]
     with pytest.raises(LogError, match="expected a way past junctions, corners or dead ends"):
         import_log(RobotLog(tuple(onward), source="corridor.log"))
 
@@ -132,9 +186,14 @@ def test_waves_go_around_walls() -> None:
     assert math.isinf(distances(room, seed, 1.0)[10, 35])
 
 
-def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(hall: Path, runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(
+    hall: Path, runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     bad = hall.with_name("bad.log")
-    assert main(["map", str(hall), str(bad), "-o", str(runs), "--no-ladder", "--time-limit", "1000"]) == 1
+    assert (
+        main(["map", str(hall), str(bad), "-o", str(runs), "--no-ladder", "--time-limit", "1000"])
+        == 1
+    )
     told = capsys.readouterr()
     assert f"{hall}: done already, in {runs / 'hall'}" in told.out
     assert f"{bad}: expected a robot's log" in told.out
@@ -154,7 +213,12 @@ def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(hall: Path, runs
     ],
 )
 def test_flags_are_laid_over_the_theory_that_suits_the_walls(
-    hall: Path, flags: list[str], star: str, boundary: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    hall: Path,
+    flags: list[str],
+    star: str,
+    boundary: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     trace = replace(Trace.from_steps("ab", ["travel"]), extra={"right_angles": False})
 
@@ -162,7 +226,11 @@ def test_flags_are_laid_over_the_theory_that_suits_the_walls(
         raise AbductionError(f"star={theory.star}, boundary={theory.boundary}")
 
     monkeypatch.setattr(
-        log_maps, "import_log", lambda *_: SimpleNamespace(trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={}, notes=())
+        log_maps,
+        "import_log",
+        lambda *_: SimpleNamespace(
+            trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={}, notes=()
+        ),
     )
     monkeypatch.setattr(log_maps.LogMapping, "solve", solve)
     small = hall.with_name("first.log")
@@ -175,10 +243,20 @@ def test_a_log_has_a_twentieth_of_its_drive_to_be_mapped_in_less_what_the_import
     laser = Laser(-1.0, 1.0, 3, 30.0)
     timed = tuple(Scan(np.ones(3), laser, (0.1 * i, 0.0, 0.0), time=2.0 * i) for i in range(51))
     track = Track(np.array([scan.odometry for scan in timed]), np.zeros((51, 3, 3)))
-    imported = Imported(Trace.from_steps("aa", ["travel"]), track, Scale(1.0, 5.0), (), {"track": 0.5, "places": 1.0})
-    assert seconds_left(RobotLog(timed, source="timed.log"), imported) == pytest.approx(100 / 20 - 1.5)
+    imported = Imported(
+        Trace.from_steps("aa", ["travel"]),
+        track,
+        Scale(1.0, 5.0),
+        (),
+        {"track": 0.5, "places": 1.0},
+    )
+    assert seconds_left(RobotLog(timed, source="timed.log"), imported) == pytest.approx(
+        100 / 20 - 1.5
+    )
     untimed = tuple(replace(scan, time=None) for scan in timed)
-    assert seconds_left(RobotLog(untimed, source="untimed.log"), imported) == pytest.approx(5.0 / SPEED / 20 - 1.5)
+    assert seconds_left(RobotLog(untimed, source="untimed.log"), imported) == pytest.approx(
+        5.0 / SPEED / 20 - 1.5
+    )
 
 
 @pytest.mark.parametrize(
@@ -202,17 +280,31 @@ def test_what_cannot_be_is_said_before_a_log_is_read(
 def test_a_log_whose_stars_no_map_fits_is_mapped_without(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ahead the way is open, and still at the robot's right once it has turned around."""
     trace = replace(
-        Trace.from_steps("aba", ["travel", "around"], stars=[(1, 0, 0, 0), (0, 0, 1, 0), (0, 1, 0, 0)]), extra={"right_angles": True}
+        Trace.from_steps(
+            "aba", ["travel", "around"], stars=[(1, 0, 0, 0), (0, 0, 1, 0), (0, 1, 0, 0)]
+        ),
+        extra={"right_angles": True},
     )
-    imported = SimpleNamespace(trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={}, notes=())
+    imported = SimpleNamespace(
+        trace=trace, track=SimpleNamespace(way=[1.0]), visits=(), seconds={}, notes=()
+    )
     monkeypatch.setattr(log_maps, "import_log", lambda *_: imported)
     log = RobotLog((Scan(np.ones(3), Laser(-1.0, 1.0, 3, 30.0), (0.0, 0.0, 0.0)),), source="x")
-    done, asked = map_log(log, with_ladder=False), map_log(log, choices={"star": "frame"}, with_ladder=False)
-    assert (done.solution.status, done.solution.theory.star, done.notes) == (Status.OPTIMAL, "none", (log_maps.NO_STARS,))
+    done, asked = (
+        map_log(log, with_ladder=False),
+        map_log(log, choices={"star": "frame"}, with_ladder=False),
+    )
+    assert (done.solution.status, done.solution.theory.star, done.notes) == (
+        Status.OPTIMAL,
+        "none",
+        (log_maps.NO_STARS,),
+    )
     assert (asked.solution.status, asked.notes) == (Status.UNSATISFIABLE, ())
 
 
-def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_runs_are_compared(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder, other = runs / "hall", tmp_path / "other"
     shutil.copytree(folder, other)
     assert main(["compare", str(folder), str(other)]) == 0
@@ -225,14 +317,18 @@ def test_two_runs_are_compared(runs: Path, tmp_path: Path, capsys: pytest.Captur
     assert "scale.radius: " in capsys.readouterr().out
     assert main(["compare", str(folder), str(other), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told == {"runs": {"scale.radius": [pytest.approx(5.6, abs=1), 9.0]}}  # and no more, as their traces differ
+    assert told == {
+        "runs": {"scale.radius": [pytest.approx(5.6, abs=1), 9.0]}
+    }  # and no more, as their traces differ
     assert main(["compare", str(folder), str(folder), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["runs"] == {}
     assert told["count"] == len(told["others"]["both"])
 
 
-def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(hall: Path, tmp_path: Path) -> None:
+def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_alone(
+    hall: Path, tmp_path: Path
+) -> None:
     question = MapQuestion(None, {}, {}, None, None, None, 1000.0, 1, False)
     small = tmp_path / "small.log"
     small.write_text("\n".join(hall.read_text().splitlines()[:100]) + "\n")
@@ -245,14 +341,34 @@ def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_al
 
 @pytest.mark.skipif(not REAL.exists(), reason="real logs are not part of the project")
 def test_the_building_of_the_paper_comes_out_of_its_raw_log() -> None:
-    done = map_log(read_log(REAL / "aces-corrected.log.gz"), Theory.topological(), with_ladder=False)
+    done = map_log(
+        read_log(REAL / "aces-corrected.log.gz"), Theory.topological(), with_ladder=False
+    )
     columns, rows = {"W": -20.0, "C": -1.0, "E": 22.5}, {"N": -0.5, "M": -19.0, "S": -39.0}
-    first = {step.extra["visit"]: step.truth["pose"] for step in reversed(done.imported.trace.steps)}
+    first = {
+        step.extra["visit"]: step.truth["pose"] for step in reversed(done.imported.trace.steps)
+    }
     at = [
         min(rows, key=lambda r: abs(rows[r] - y)) + min(columns, key=lambda c: abs(columns[c] - x))
         for x, y, _ in map(first.get, sorted(first))
     ]
-    assert at == ["NC", "NE", "ME", "SE", "SC", "SW", "MW", "NW", "NC", "MC", "SC", "MC", "MW", "MC", "ME"]
+    assert at == [
+        "NC",
+        "NE",
+        "ME",
+        "SE",
+        "SC",
+        "SW",
+        "MW",
+        "NW",
+        "NC",
+        "MC",
+        "SC",
+        "MC",
+        "MW",
+        "MC",
+        "ME",
+    ]
     assert (done.solution.count, done.solution.cost.places, done.solution.cost.paths) == (1, 9, 6)
 
 
@@ -265,23 +381,48 @@ def test_the_building_of_the_paper_comes_out_of_its_raw_log() -> None:
         ([0.0, 5.0, 5.2, 9.0], [0.0, 5.0, 9.0]),  # in and out by one door
         ([5.0, 5.8, 5.0], [5.0]),  # a narrow part behind the first door of a log
         ([0.0, 5.0, 5.8, 5.1, 9.0], [0.0, 5.0, 9.0]),  # and behind another one
-        ([0.0, 5.0, 6.2, 5.1, 9.0], [0.0, 5.0, 6.2, 5.1, 9.0]),  # another door, a little farther behind it
+        (
+            [0.0, 5.0, 6.2, 5.1, 9.0],
+            [0.0, 5.0, 6.2, 5.1, 9.0],
+        ),  # another door, a little farther behind it
     ],
 )
-def test_passes_through_one_door_in_a_row_are_one_visit(middles: list[float], expected: list[float]) -> None:
+def test_passes_through_one_door_in_a_row_are_one_visit(
+    middles: list[float], expected: list[float]
+) -> None:
     """The doors are in a line, each wider than the one before it, so that the first of those that are one door says where its middle is."""
     track = Track(np.array([(x, 0.0, 0.0) for x in range(20)], dtype=float), np.zeros((20, 3, 3)))
-    doors = [Door(2 * k + 1, np.array([x, 0.0]), 1.0 + k / 100, 2.0 * k) for k, x in enumerate(middles)]
+    doors = [
+        Door(2 * k + 1, np.array([x, 0.0]), 1.0 + k / 100, 2.0 * k) for k, x in enumerate(middles)
+    ]
     visits = visits_of(track, doors)
     assert [float(visit.middle[0]) for visit in visits] == expected
     assert all(before.end <= after.begin for before, after in itertools.pairwise(visits))
     assert [visit.arrived is None for visit in visits] == [k == 0 for k in range(len(visits))]
-    assert [visit.left is None for visit in visits] == [k == len(visits) - 1 for k in range(len(visits))]
+    assert [visit.left is None for visit in visits] == [
+        k == len(visits) - 1 for k in range(len(visits))
+    ]
 
 
 @pytest.mark.parametrize("command", [["import"], ["map"]])
-def test_doors_have_no_scale(hall: Path, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*command, str(hall), "-o", str(hall.with_name("none")), "--places", "doors", "--radius", "5"]) == 1
+def test_doors_have_no_scale(
+    hall: Path, command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(
+            [
+                *command,
+                str(hall),
+                "-o",
+                str(hall.with_name("none")),
+                "--places",
+                "doors",
+                "--radius",
+                "5",
+            ]
+        )
+        == 1
+    )
     assert "--radius: expected none with --places doors, got 5" in capsys.readouterr().err
 
 
@@ -289,8 +430,16 @@ def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> 
     """A robot drives around four rooms in a ring."""
     middles = {room: middle for room, middle in MIDDLES.items() if room != "closet"}
     drive = record_plan(plan_of(tmp_path, xml(DOORS[:4], middles=middles)), seed=1, metres=50)
-    done = map_log(RobotLog(tuple(scans_of(drive)), source="ring"), max_maps=1, time_limit=60, with_ladder=False)
-    passed = [door for door, _ in itertools.groupby(crossing["door"] for crossing in drive.truth["crossings"])]
+    done = map_log(
+        RobotLog(tuple(scans_of(drive)), source="ring"),
+        max_maps=1,
+        time_limit=60,
+        with_ladder=False,
+    )
+    passed = [
+        door
+        for door, _ in itertools.groupby(crossing["door"] for crossing in drive.truth["crossings"])
+    ]
     assert done.imported.scale.doors
     assert len(done.imported.visits) == len(passed)
     trace, (best, *_) = done.imported.trace, done.solution.maps

@@ -33,7 +33,9 @@ def test_the_comb_is_found_with_stars_and_paths_first() -> None:
     """The stand-in for Taylor Hall: 20 dstates, 7 places, 4 paths."""
     graph = the_map("comb", Theory.circumscriptive()).to_networkx("topological")
     truth = nx.Graph([(p, "main") for p in ("P1", "P2", "P3", "P4")])
-    truth.add_edges_from([("P1", "s1"), ("D1", "s1"), ("P2", "s2"), ("D2", "s2"), ("P4", "s4"), ("D3", "s4")])
+    truth.add_edges_from(
+        [("P1", "s1"), ("D1", "s1"), ("P2", "s2"), ("D2", "s2"), ("P4", "s4"), ("D3", "s4")]
+    )
     assert nx.is_isomorphic(graph, truth)
 
 
@@ -42,7 +44,9 @@ def test_the_causal_graph_has_an_edge_a_link() -> None:
     graph = ssh_map.to_networkx()
     assert {(s, data["action"], x) for s, x, data in graph.edges(data=True)} == set(ssh_map.links)
     assert graph.nodes[0]["view"] == ssh_map.dstates[0].view
-    assert nx.parse_graphml(ssh_map.to_graphml(), node_type=int, force_multigraph=True).number_of_edges() == len(ssh_map.links)
+    assert nx.parse_graphml(
+        ssh_map.to_graphml(), node_type=int, force_multigraph=True
+    ).number_of_edges() == len(ssh_map.links)
     with pytest.raises(MapError, match="level: expected"):
         ssh_map.to_networkx("metrical")  # type: ignore[arg-type]
 
@@ -67,10 +71,16 @@ def test_maps_survive_files(tmp_path: Path) -> None:
         ({"paths": [{"id": 0, "order": [0, 1, 0]}]}, "paths[0].order: expected each place once"),
         ({"links": [[0, "travel", 77]]}, "links[0]: expected [dstate, action name, dstate]"),
         ({"places": []}, "places: expected every id that is used, got none for [0, 1]"),
-        ({"paths": [{"id": 3, "order": []}]}, "paths: expected every id that is used, got none for [0]"),
+        (
+            {"paths": [{"id": 3, "order": []}]},
+            "paths: expected every id that is used, got none for [0]",
+        ),
         ({"dstates": [{"id": 1, "view": "a"}]}, "dstates: expected the ids 0, 1, 2"),
         ({"dstates": [{"id": 0}]}, "dstates[0].view: expected a text or an integer"),
-        ({"dstates": [{"id": 0, "view": "a", "path": 0}]}, "dstates[0].direction: expected 1 or -1 where there is a path"),
+        (
+            {"dstates": [{"id": 0, "view": "a", "path": 0}]},
+            "dstates[0].direction: expected 1 or -1 where there is a path",
+        ),
     ],
 )
 def test_malformed_maps(change: dict[str, object], message: str) -> None:
@@ -106,13 +116,20 @@ def test_turns_right_go_round_clockwise_on_the_page() -> None:
     (ssh_map,) = solve(rectangle(16)).maps
     at = positions(svg(ssh_map))
     corners = [at[str(p)] for p in range(4)]
-    area = sum(ax * by - bx * ay for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True))
+    area = sum(
+        ax * by - bx * ay
+        for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True)
+    )
     assert area > 0  # y grows downwards
 
 
 @pytest.mark.parametrize("world", [SQUARE, TEE, streets(("a", "E", "b"))])
 def test_every_map_can_be_drawn(world: Streets) -> None:
-    for theory in (Theory.causal(), Theory.topological(), Theory.topological().replace(boundary="none")):
+    for theory in (
+        Theory.causal(),
+        Theory.topological(),
+        Theory.topological().replace(boundary="none"),
+    ):
         for ssh_map in solve(drive(world, min(world), min(world[min(world)]), "TATA"), theory).maps:
             ET.fromstring(svg(ssh_map))
 

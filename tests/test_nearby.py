@@ -63,9 +63,13 @@ def test_from_any_guess_to_a_minimal_map(trace: Trace, data: st.DataObject) -> N
     trace = trace.without_displacements()
     if len(trace) == 1:
         return
-    guess = data.draw(st.lists(st.integers(-1, 4), min_size=len(trace), max_size=len(trace)), label="guess")
+    guess = data.draw(
+        st.lists(st.integers(-1, 4), min_size=len(trace), max_size=len(trace)), label="guess"
+    )
     searched = nearby_search(trace)
-    with patch.object(nearby, "CONFLICTS", data.draw(st.sampled_from([1, nearby.CONFLICTS]), label="conflicts")):
+    with patch.object(
+        nearby, "CONFLICTS", data.draw(st.sampled_from([1, nearby.CONFLICTS]), label="conflicts")
+    ):
         found = list(searched.fewer(guess))
     fewest = solve(trace, CAUSAL, speedups=PLAIN).cost
     assert fewest
@@ -79,16 +83,22 @@ def test_from_any_guess_to_a_minimal_map(trace: Trace, data: st.DataObject) -> N
 
 @settings(max_examples=15)
 @given(machines(), st.booleans(), st.integers(0, 10_000), st.data())
-def test_a_search_beside_another_changes_no_answer(trace: Trace, beside: bool, cores: int, data: st.DataObject) -> None:
+def test_a_search_beside_another_changes_no_answer(
+    trace: Trace, beside: bool, cores: int, data: st.DataObject
+) -> None:
     """In a thread or before; from any guess, right or wrong."""
     expected = solve(trace, CAUSAL, max_maps=None, speedups=PLAIN)
-    guess = data.draw(st.lists(st.integers(-1, 3), min_size=len(trace), max_size=len(trace)), label="guess")
+    guess = data.draw(
+        st.lists(st.integers(-1, 3), min_size=len(trace), max_size=len(trace)), label="guess"
+    )
     most = data.draw(st.sampled_from([0, 1, 3]), label="most")
     turned = Mock(side_effect=lambda _, __, size: Mock(node_of=range(size)))
     with (
         patch.object(solver, "FEW_STEPS", 0),
         patch.object(engine, "FIRST_PREFIXES", len(trace)),
-        patch.multiple(named, PATIENCE=0, CORES=cores, TRIES=data.draw(st.integers(1, 3), label="tries")),
+        patch.multiple(
+            named, PATIENCE=0, CORES=cores, TRIES=data.draw(st.integers(1, 3), label="tries")
+        ),
         patch.object(named, "annealed", lambda *_, **__: Mock(labels=lambda _: guess)),
         patch.object(named.Chart, "turned", turned),
         patch.object(engine.Task, "has_processors", beside),
@@ -97,7 +107,11 @@ def test_a_search_beside_another_changes_no_answer(trace: Trace, beside: bool, c
     assert found.status is Status.OPTIMAL
     assert found.bound == expected.bound
     assert set(found.maps) <= set(expected.maps)
-    assert found.count == len(set(found.maps)) == (min(most, expected.count) if most else expected.count)
+    assert (
+        found.count
+        == len(set(found.maps))
+        == (min(most, expected.count) if most else expected.count)
+    )
     assert found.complete == (not most or expected.count <= most)
 
 
@@ -105,9 +119,19 @@ def test_a_search_beside_another_changes_no_answer(trace: Trace, beside: bool, c
 def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> None:
     """Then names may still be fewer than dstates: what is at a rest is no map."""
     trace = moore(7, 2, steps=60, seed=seed).trace
-    with patch.multiple(named, PATIENCE=1, GUESSES=1), patch.object(annealing, "STEPS", ((0.75, 100),)):
+    with (
+        patch.multiple(named, PATIENCE=1, GUESSES=1),
+        patch.object(annealing, "STEPS", ((0.75, 100),)),
+    ):
         some, every = (
-            solve(trace, CAUSAL, max_maps=most, time_limit=60, speedups=Speedups.without("clique,threads,prefixes")) for most in (5, 100)
+            solve(
+                trace,
+                CAUSAL,
+                max_maps=most,
+                time_limit=60,
+                speedups=Speedups.without("clique,threads,prefixes"),
+            )
+            for most in (5, 100)
         )
     assert some.count == min(5, every.count)
     assert set(some.maps) <= set(every.maps) or every.count == 100
@@ -121,7 +145,13 @@ def either_or(parts: int) -> Trace:
     views, actions = ["hall"], list[str]()
     for part in range(parts):
         p, c, d, e, f = (f"{name}{part}" for name in "pcdef")
-        tours = (f"A x {p} t {c}", f"A x {p} w {e}", f"B z {p} t {c}", f"B z {p} w {f}", f"{p} t {d}")
+        tours = (
+            f"A x {p} t {c}",
+            f"A x {p} w {e}",
+            f"B z {p} t {c}",
+            f"B z {p} w {f}",
+            f"{p} t {d}",
+        )
         for tour, text in enumerate(tours):
             words = text.split()
             actions += [f"to {part} {tour}", *words[1::2], "back"]
@@ -140,7 +170,9 @@ def test_all_ways_are_listed_whichever_views_need_more_names() -> None:
     assert searched.bound == expected.cost.dstates
     watch = Watch(100.0)
     watch.start()
-    assert {tuple(labels) for labels in searched.listed(watch)} == {ssh_map.labels for ssh_map in expected.maps}
+    assert {tuple(labels) for labels in searched.listed(watch)} == {
+        ssh_map.labels for ssh_map in expected.maps
+    }
 
 
 def test_a_causal_maze_is_guessed_by_its_turns() -> None:
@@ -187,7 +219,11 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
     limited = solver.Search(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"))
     truth = {state: number for number, state in enumerate(dict.fromkeys(walk.truth))}
     with (
-        patch.object(named, "annealed", lambda *_, **__: Mock(labels=lambda chart: _labels_of(chart, walk.truth, truth))),
+        patch.object(
+            named,
+            "annealed",
+            lambda *_, **__: Mock(labels=lambda chart: _labels_of(chart, walk.truth, truth)),
+        ),
         patch.object(NearbySearch, "_asked", stop),
         patch.multiple(named, PATIENCE=1, CORES=1, Beside=Awaited),
         patch.object(engine.Task, "has_processors", beside),
@@ -195,7 +231,12 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
         solution = limited.solution(tuple(limited))
     assert solution.stopped == "interrupted"
     assert solution.cost
-    assert solution.cost.dstates == best[0] <= len(truth) < len(set(Log(walk.trace, CAUSAL).merged())) / 2
+    assert (
+        solution.cost.dstates
+        == best[0]
+        <= len(truth)
+        < len(set(Log(walk.trace, CAUSAL).merged())) / 2
+    )
     assert check(walk.trace, solution.maps[0], CAUSAL) == ()
 
 
@@ -217,7 +258,9 @@ def test_where_clingo_would_prepare_for_too_long_the_search_beside_goes_on() -> 
         patch.object(engine.Task, "has_processors", True),
         patch.object(named.NamedLabels, "_check_ahead", stop),
     ):
-        solution = solve(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"), max_maps=1, time_limit=100)
+        solution = solve(
+            walk.trace, CAUSAL, speedups=Speedups.without("prefixes"), max_maps=1, time_limit=100
+        )
     assert stopped
     assert solution.status is Status.OPTIMAL
     assert solution.cost == expected
@@ -238,7 +281,10 @@ def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
         begun.append((self._task.watch.has_reserve, self._known.best is None))
         raise LimitError("time limit")
 
-    with patch.object(solver.Search, "_salvage", side_effect=AssertionError), patch.object(Prefixes, "minimise", stop):
+    with (
+        patch.object(solver.Search, "_salvage", side_effect=AssertionError),
+        patch.object(Prefixes, "minimise", stop),
+    ):
         solution = solve(trace, time_limit=1000)
     assert begun == [(False, True)]
     assert solution.stopped == "time limit"
@@ -302,8 +348,12 @@ def fewest_dstates(trace: Trace) -> int:
     return cost.dstates
 
 
-@pytest.mark.parametrize(("first", "guessed", "goes_on"), [(1200, 0, True), (20, 0, False), (20, 1601, True)])
-def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(first: int, guessed: int, goes_on: bool) -> None:
+@pytest.mark.parametrize(
+    ("first", "guessed", "goes_on"), [(1200, 0, True), (20, 0, False), (20, 1601, True)]
+)
+def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
+    first: int, guessed: int, goes_on: bool
+) -> None:
     """Of 1,200 steps in a maze of 9 cells the map holds to the end, and of 300 or 600 it lacks links; of 20 and 40 steps it is of no use, but where
     the trace is not too long all of it is guessed then.
     """
@@ -332,7 +382,10 @@ def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
         given.append(len(self._links))
 
     expected = solve(walk.trace, CAUSAL)
-    with patch.multiple(named, AT_ONCE=500, PATIENCE=10, MORE_LINKS=50), patch.object(named.NamedLabels, "add", counted):
+    with (
+        patch.multiple(named, AT_ONCE=500, PATIENCE=10, MORE_LINKS=50),
+        patch.object(named.NamedLabels, "add", counted),
+    ):
         found = solve(walk.trace, CAUSAL)
     assert found.status is expected.status is Status.OPTIMAL
     assert found.cost == expected.cost
@@ -350,6 +403,8 @@ def test_of_a_long_trace_as_much_is_taken_as_adds_to_the_clique() -> None:
         assert long.next_size(10) == size
         long._named.size = size
         assert long.next_size(size) == min(2 * size, 3001)
-    sizes = [len(Chart.of_steps(log, steps).continuations.clique()) for steps in (size // 2, size, 3001)]
+    sizes = [
+        len(Chart.of_steps(log, steps).continuations.clique()) for steps in (size // 2, size, 3001)
+    ]
     assert sizes[0] < sizes[1] == sizes[2]
     assert size < 3001

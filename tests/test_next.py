@@ -24,11 +24,25 @@ ACES = str(ROOT / "examples" / "aces3-route.jsonl")
 ACTIONS = ("a", "b", "c")
 
 
-def machine(chance: random.Random, states: int, views: int, known: float = 0.8, actions: int = 2, rare: bool = False) -> SSHMap:
+def machine(
+    chance: random.Random,
+    states: int,
+    views: int,
+    known: float = 0.8,
+    actions: int = 2,
+    rare: bool = False,
+) -> SSHMap:
     """A map of one step with random links, of which some are not known. With `rare`, but one dstate looks different."""
-    shown = [int(s == states - 1) if rare else chance.randrange(views) if s else 0 for s in range(states)]
+    shown = [
+        int(s == states - 1) if rare else chance.randrange(views) if s else 0 for s in range(states)
+    ]
     dstates = tuple(DState(s, f"v{view}") for s, view in enumerate(shown))
-    links = tuple((s, action, chance.randrange(states)) for s in range(states) for action in ACTIONS[:actions] if chance.random() < known)
+    links = tuple(
+        (s, action, chance.randrange(states))
+        for s in range(states)
+        for action in ACTIONS[:actions]
+        if chance.random() < known
+    )
     return SSHMap((0,), dstates, links)
 
 
@@ -64,8 +78,13 @@ def test_two_rivals_are_told_apart_by_the_fewest_actions() -> None:
     for seed in range(200):
         chance = random.Random(seed)
         actions, states = chance.choice([(1, 5), (2, 3)])
-        one, other = (machine(chance, states, 2, chance.choice([0.8, 1.0]), actions, rare=True) for _ in range(2))
-        expected = shortest([one, other], states**2)  # a longer word comes to a pair of dstates twice
+        one, other = (
+            machine(chance, states, 2, chance.choice([0.8, 1.0]), actions, rare=True)
+            for _ in range(2)
+        )
+        expected = shortest(
+            [one, other], states**2
+        )  # a longer word comes to a pair of dstates twice
         experiment = next_experiment([one, other])
         lengths.append(expected or 0)
         if expected is None:
@@ -79,7 +98,10 @@ def test_two_rivals_are_told_apart_by_the_fewest_actions() -> None:
         assert second is not None
         assert first[:-1] == second[:-1]
         assert first[-1] != second[-1]
-        assert [[seen.view for seen in said.seen] for said in experiment.predictions] == [first, second]
+        assert [[seen.view for seen in said.seen] for said in experiment.predictions] == [
+            first,
+            second,
+        ]
     assert lengths.count(0) > 20
     assert max(lengths) == 4
 
@@ -99,7 +121,9 @@ def path(plan: Plan, end: Plan) -> Iterator[tuple[str, ...]]:
     """The actions that lead to the end of a plan."""
     while plan is not end:
         yield plan.actions
-        (plan,) = (branch.plan for branch in plan.branches if set(end.rivals) <= set(branch.plan.rivals))
+        (plan,) = (
+            branch.plan for branch in plan.branches if set(end.rivals) <= set(branch.plan.rivals)
+        )
 
 
 def moved(ssh_map: SSHMap, words: Sequence[str]) -> SSHMap:
@@ -126,7 +150,9 @@ def least_worst(maps: Sequence[SSHMap]) -> int:
                     for i, here in left:
                         there = ends[i][here, action]
                         parts.setdefault(maps[i].dstates[there].view, set()).add((i, there))
-                    best = min(best, max(least(frozenset(part), length - 1) for part in parts.values()))
+                    best = min(
+                        best, max(least(frozenset(part), length - 1) for part in parts.values())
+                    )
             known[left, length] = best
         return known[left, length]
 
@@ -154,7 +180,11 @@ def test_a_plan_for_many_leaves_what_cannot_be_told_apart_and_hardly_ever_more()
 def test_rivals_that_predict_the_same_are_merged() -> None:
     one = machine(random.Random(1), 4, 2, 1.0)
     renamed = replace(one, dstates=one.dstates)
-    other = next(m for m in (machine(random.Random(k), 4, 2, 1.0) for k in range(2, 50)) if shortest([one, m], 6))
+    other = next(
+        m
+        for m in (machine(random.Random(k), 4, 2, 1.0) for k in range(2, 50))
+        if shortest([one, m], 6)
+    )
     experiment = next_experiment([one, renamed, other])
     assert experiment.alike == ((1, 2), (3,))
     assert experiment.worst == 2
@@ -165,7 +195,9 @@ def test_rivals_that_predict_the_same_are_merged() -> None:
 def with_paths(courses: Sequence[int]) -> SSHMap:
     """A corridor of three places, of which each is on one of these paths."""
     dstates = tuple(DState(s, "abc"[s], s, courses[s], 1) for s in range(3))
-    orders = tuple(MapPath(h, tuple(s for s in range(3) if courses[s] == h)) for h in dict.fromkeys(courses))
+    orders = tuple(
+        MapPath(h, tuple(s for s in range(3) if courses[s] == h)) for h in dict.fromkeys(courses)
+    )
     return SSHMap((0, 1, 2), dstates, ((0, "travel", 1), (1, "travel", 2)), (0, 1, 2), orders)
 
 
@@ -191,9 +223,15 @@ def test_stars_are_predicted_beside_views() -> None:
     trace = Trace.from_steps(views, actions, stars=stars)
     dstates = tuple(DState(s, "v", s, 0, 1) for s in range(3))
     links = ((0, "travel", 1), (1, "travel", 2), (2, "around", 0))
-    maps = [SSHMap((0, 1, 2), dstates, links, (0, 1, 2)), SSHMap((0, 1, 2), dstates, (*links[:2], (2, "around", 1)), (0, 1, 2))]
+    maps = [
+        SSHMap((0, 1, 2), dstates, links, (0, 1, 2)),
+        SSHMap((0, 1, 2), dstates, (*links[:2], (2, "around", 1)), (0, 1, 2)),
+    ]
     assert next_experiment(maps, trace).actions == ("around",)
-    assert [str(said.seen[0]) for said in next_experiment(maps, trace).predictions] == ["v (open: ahead)", "v (open: ahead, back)"]
+    assert [str(said.seen[0]) for said in next_experiment(maps, trace).predictions] == [
+        "v (open: ahead)",
+        "v (open: ahead, back)",
+    ]
     without = next_experiment(maps, trace, theory=Theory(star="none"))
     assert without.plan.actions == ("around", "travel", "travel") or without.worst == 2
 
@@ -208,13 +246,17 @@ def test_stars_that_could_be_one_are_no_difference() -> None:
     for bearing, differs in ((75.0, False), (100.0, True)):
         trace = Trace.from_steps("vvv", [{"name": "go"}] * 2, stars=stars(bearing))
         for theory in (Theory.causal().replace(star="alike"), None):
-            assert (next_experiment(maps, trace, theory=theory).plan.actions == ("back",)) == differs
+            assert (
+                next_experiment(maps, trace, theory=theory).plan.actions == ("back",)
+            ) == differs
 
 
 def framed(headings: Sequence[int]) -> tuple[SSHMap, list[Seen]]:
     """Dstates at one place, each with its heading, and its star turned to it."""
     openings = (True, False, False, True)
-    dstates = tuple(DState(i, f"v{heading}", 0, None, None, heading) for i, heading in enumerate(headings))
+    dstates = tuple(
+        DState(i, f"v{heading}", 0, None, None, heading) for i, heading in enumerate(headings)
+    )
     looks = [Seen(s.view, openings[s.heading or 0 :] + openings[: s.heading or 0]) for s in dstates]
     return SSHMap(tuple(range(len(headings))), dstates, (), (0,)), looks
 
@@ -222,13 +264,20 @@ def framed(headings: Sequence[int]) -> tuple[SSHMap, list[Seen]]:
 def test_a_frame_tells_the_end_of_turns() -> None:
     ssh_map, looks = framed([0, 1])
     says = Consequences(ssh_map, links_of(ssh_map, 0), looks, None)
-    turn = {action.name: action for action in Trace.from_steps("aaaa", ["right", "around", "left"]).actions}
+    turn = {
+        action.name: action
+        for action in Trace.from_steps("aaaa", ["right", "around", "left"]).actions
+    }
     assert (says.of(0, turn["right"]).how, says.of(0, turn["right"]).dstate) == ("implied", 1)
     assert says.of(1, turn["left"]).dstate == 0
     assert says.of(0, turn["around"]).seen == Seen(None, (False, True, True, False))
-    assert not says.of(1, turn["right"]).clashes(says.of(0, turn["around"]))  # both know where they would face
+    assert not says.of(1, turn["right"]).clashes(
+        says.of(0, turn["around"])
+    )  # both know where they would face
     assert says.of(0, turn["right"]).clashes(says.of(0, turn["around"]))
-    weak = Consequences(ssh_map, links_of(ssh_map, 0), looks, Theory(star="frame", without=("turn_rotates",)))
+    weak = Consequences(
+        ssh_map, links_of(ssh_map, 0), looks, Theory(star="frame", without=("turn_rotates",))
+    )
     assert weak.of(0, turn["right"]).how == "open"
 
 
@@ -238,7 +287,11 @@ def test_a_path_tells_what_comes_next() -> None:
     looks = [Seen(s.view) for s in bare.dstates]
     says = Consequences(bare, links_of(bare, 0), looks, None)
     (travel,) = Trace.from_steps("ab", ["travel"]).actions
-    assert [(says.of(s, travel).how, says.of(s, travel).dstate) for s in range(3)] == [("expected", 1), ("expected", 2), ("open", None)]
+    assert [(says.of(s, travel).how, says.of(s, travel).dstate) for s in range(3)] == [
+        ("expected", 1),
+        ("expected", 2),
+        ("open", None),
+    ]
     assert not says.of(0, travel).clashes(says.of(1, travel))  # expectations refute nobody
 
 
@@ -266,7 +319,9 @@ def test_what_comes_of_an_untried_action_leaves_the_rivals_that_said_so(seen: st
     (kept,) = (said.rivals for said in untried.expects if said.says.seen == Seen(seen))
     after = solve(Trace.from_steps([*views, seen], [*actions, *untried.way, untried.action]))
     assert [m.labels[:5] for m in after.maps] == [solution.maps[rival - 1].labels for rival in kept]
-    assert [[s.place for s in m.dstates] for m in after.maps] == [[s.place for s in solution.maps[rival - 1].dstates] for rival in kept]
+    assert [[s.place for s in m.dstates] for m in after.maps] == [
+        [s.place for s in solution.maps[rival - 1].dstates] for rival in kept
+    ]
 
 
 def test_what_one_map_leaves_untried_is_the_nearest() -> None:
@@ -318,10 +373,22 @@ def test_limits_leave_a_plan_that_says_so() -> None:
     [
         ([], "maps: expected at least one"),
         (["no map"], r"maps\[0\]: expected an SSHMap, got 'no map'"),
-        ([SSHMap((0,), (DState(0, "v"),), ()), SSHMap((0, 0), (DState(0, "v"),), ((0, "a", 0),))], r"maps\[1\]: labels: expected 1"),
-        ([SSHMap((0, 0), (DState(0, "v"),), ((0, "a", 0),))], r"maps\[0\]: labels: expected 1, one for each step of the trace"),
+        (
+            [
+                SSHMap((0,), (DState(0, "v"),), ()),
+                SSHMap((0, 0), (DState(0, "v"),), ((0, "a", 0),)),
+            ],
+            r"maps\[1\]: labels: expected 1",
+        ),
+        (
+            [SSHMap((0, 0), (DState(0, "v"),), ((0, "a", 0),))],
+            r"maps\[0\]: labels: expected 1, one for each step of the trace",
+        ),
         ([SSHMap((0,), (DState(0, "w"),), ())], r"maps\[0\]: dstates\[0\].view: expected 'v'"),
-        ([SSHMap((0,), (DState(0, "v"), DState(1, "v")), ((0, "a", 0), (0, "a", 1)))], r"links: expected one dstate that 'a' leads to"),
+        (
+            [SSHMap((0,), (DState(0, "v"), DState(1, "v")), ((0, "a", 0), (0, "a", 1)))],
+            r"links: expected one dstate that 'a' leads to",
+        ),
     ],
 )
 def test_maps_that_do_not_fit_are_refused(maps: list[SSHMap], message: str) -> None:
@@ -340,7 +407,9 @@ def machines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[str, s
     return str(trace), str(maps)
 
 
-def test_the_shell_prints_what_python_says(machines: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_shell_prints_what_python_says(
+    machines: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["next", *machines, "--json"]) == 0
     trace = Trace.load(machines[0])
     expected: Experiment = next_experiment(solve(trace, Theory.causal(), max_maps=None), trace)
@@ -351,25 +420,37 @@ def test_the_shell_prints_what_python_says(machines: tuple[str, str], capsys: py
     assert "the plan\n" in out
 
 
-def test_the_shell_says_of_which_maps_it_knows_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_shell_says_of_which_maps_it_knows_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["solve", ACES, "-n", "2", "--json"]) == 0
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)
     assert main(["next", ACES, str(tmp_path / "maps.json")]) == 0
     said = capsys.readouterr()
     assert "these 2 maps are not known to be all minimal ones" in said.err
-    assert said.out.startswith("2 maps predict the same along all links, as they have the same dstates")
+    assert said.out.startswith(
+        "2 maps predict the same along all links, as they have the same dstates"
+    )
 
 
-def test_errors_of_the_shell_are_one_line(machines: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_of_the_shell_are_one_line(
+    machines: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trace, maps = machines
     none = tmp_path / "none.json"
     none.write_text('{"maps": []}')
     for words, message in [
-        ([ACES, maps], f"{maps}: maps[0]: labels: expected 23, one for each step of the trace, got 41; solve this trace"),
+        (
+            [ACES, maps],
+            f"{maps}: maps[0]: labels: expected 23, one for each step of the trace, got 41; solve this trace",
+        ),
         ([maps, trace], f"{maps}:1: header: expected a trace, got maps"),
         ([trace, trace], f"{trace}: expected maps, got a trace"),
         ([trace, str(none)], f"{none}: maps: expected one to seek an experiment for, got none"),
-        ([trace, maps, "--time-limit", "0"], "--time-limit: expected a number of seconds above 0, got 0.0"),
+        (
+            [trace, maps, "--time-limit", "0"],
+            "--time-limit: expected a number of seconds above 0, got 0.0",
+        ),
     ]:
         assert main(["next", *words]) == 1, words
         captured = capsys.readouterr()

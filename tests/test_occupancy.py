@@ -39,12 +39,16 @@ def cell(pixel: Pixel, alpha: float, negate: bool, occupied: float, free: float,
     return -1 if mode == "trinary" else round(100 * (occupancy - free) / (occupied - free))
 
 
-def borders(walls: np.ndarray[Any, Any], resolution: float, origin: tuple[float, float, float]) -> set[frozenset[tuple[int, int]]]:
+def borders(
+    walls: np.ndarray[Any, Any], resolution: float, origin: tuple[float, float, float]
+) -> set[frozenset[tuple[int, int]]]:
     """Walls as sides of cells: each the two corners that it joins, counted in cells from the lower left one."""
     x, y, yaw = origin
     found = set()
     for wall in walls:
-        ends = [((p - x) + 1j * (q - y)) * np.exp(-1j * yaw) / resolution for p, q in wall.reshape(2, 2)]
+        ends = [
+            ((p - x) + 1j * (q - y)) * np.exp(-1j * yaw) / resolution for p, q in wall.reshape(2, 2)
+        ]
         start, end = (complex(round(z.real), round(z.imag)) for z in ends)
         assert np.allclose(ends, [start, end], atol=1e-6)
         steps = round(abs(end - start))
@@ -87,7 +91,9 @@ def saved(folder: Path, text: str | bytes, image: np.ndarray[Any, Any] | None = 
         "---\n" + HEAD + ORIGIN + TAIL + "...\n",
         "{image: map.pgm, resolution: 0.5, origin: [-1, 2, 0], negate: 0, occupied_thresh: 0.65, free_thresh: 0.196}",
         '"image": "map.pgm"\n\'resolution\': "0.5"\n' + ORIGIN + TAIL,
-        "image:    map.pgm   # a comment\nresolution: 5e-1\n" + ORIGIN + "negate: false\noccupied_thresh: .65\nfree_thresh: 1.96e-1",
+        "image:    map.pgm   # a comment\nresolution: 5e-1\n"
+        + ORIGIN
+        + "negate: false\noccupied_thresh: .65\nfree_thresh: 1.96e-1",
         HEAD + "origin: &here [-1.0, 2.0, 0]\n" + TAIL + "mode: trinary\n",
     ],
 )
@@ -96,7 +102,10 @@ def test_yaml_is_read_by_a_parser(text: str | bytes, tmp_path: Path) -> None:
     assert borders(walls, 0.5, (-1.0, 2.0, 0.0)) == sides((GREY < 89).tolist())
 
 
-@pytest.mark.parametrize("name", ["floor #1.pgm", "floor: 1.pgm", "2020-01-01", "on", "sub/map.pgm", "étage.png", "'.bmp"])
+@pytest.mark.parametrize(
+    "name",
+    ["floor #1.pgm", "floor: 1.pgm", "2020-01-01", "on", "sub/map.pgm", "étage.png", "'.bmp"],
+)
 def test_the_image_is_named_seen_from_the_yaml_file(name: str, tmp_path: Path) -> None:
     image = tmp_path / name
     image.parent.mkdir(exist_ok=True)
@@ -110,10 +119,19 @@ def test_the_image_is_named_seen_from_the_yaml_file(name: str, tmp_path: Path) -
 @pytest.mark.parametrize("negate", [False, True])
 @pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
 @pytest.mark.parametrize("kind", ["L", "1", "LA", "P", "P with alpha", "RGB", "RGBA", "I;16"])
-def test_pixels_become_walls_by_the_rules_of_map_server(kind: str, mode: str, negate: bool, yaw: float, tmp_path: Path) -> None:
+def test_pixels_become_walls_by_the_rules_of_map_server(
+    kind: str, mode: str, negate: bool, yaw: float, tmp_path: Path
+) -> None:
     if mode == "raw" and negate:
-        with pytest.raises(SimulatorError, match="negate: expected 0 in mode raw, where map_server and nav2_map_server disagree"):
-            read_occupancy(saved(tmp_path, HEAD + ORIGIN + TAIL.replace("negate: 0", "negate: 1") + "mode: raw"))
+        with pytest.raises(
+            SimulatorError,
+            match="negate: expected 0 in mode raw, where map_server and nav2_map_server disagree",
+        ):
+            read_occupancy(
+                saved(
+                    tmp_path, HEAD + ORIGIN + TAIL.replace("negate: 0", "negate: 1") + "mode: raw"
+                )
+            )
         return
     rng = np.random.default_rng(7)
     if kind == "I;16":
@@ -122,12 +140,19 @@ def test_pixels_become_walls_by_the_rules_of_map_server(kind: str, mode: str, ne
         pixels = (table[:, :, None] / 257).tolist()
     else:
         base, _, clear = kind.partition(" ")
-        source = Image.fromarray(rng.choice([0, 40, 60, 100, 140, 200, 255], (9, 7, 4)).astype(np.uint8))
+        source = Image.fromarray(
+            rng.choice([0, 40, 60, 100, 140, 200, 255], (9, 7, 4)).astype(np.uint8)
+        )
         image = source.convert("RGB").quantize(12) if base == "P" else source.convert(base)
         if clear:
             image.info["transparency"] = bytes([255, 128, 0, 255])
-        pixels = np.asarray(image.convert("RGBA" if clear or base in ("LA", "RGBA") else "RGB")).tolist()
-    image.save(tmp_path / "map.png", **({"transparency": image.info["transparency"]} if "transparency" in image.info else {}))
+        pixels = np.asarray(
+            image.convert("RGBA" if clear or base in ("LA", "RGBA") else "RGB")
+        ).tolist()
+    image.save(
+        tmp_path / "map.png",
+        **({"transparency": image.info["transparency"]} if "transparency" in image.info else {}),
+    )
     path = saved(
         tmp_path,
         f"image: map.png\nresolution: 0.25\norigin: [3.0, -2.0, {yaw}]\nnegate: {int(negate)}\n"
@@ -156,7 +181,10 @@ def test_pixels_become_walls_by_the_rules_of_map_server(kind: str, mode: str, ne
             return
         _, walls = read_occupancy(path)
     assert borders(walls, 0.25, (3.0, -2.0, yaw)) == sides(occupied)
-    assert [f"{between:,} of 63 cells are between free and occupied" in str(warning.message) for warning in said] == [True] * bool(between)
+    assert [
+        f"{between:,} of 63 cells are between free and occupied" in str(warning.message)
+        for warning in said
+    ] == [True] * bool(between)
 
 
 def test_a_map_with_yaw_is_turned_about_its_lower_left_corner(tmp_path: Path) -> None:
@@ -167,45 +195,86 @@ def test_a_map_with_yaw_is_turned_about_its_lower_left_corner(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("resolution: 0.1\n" + ORIGIN + TAIL, "image: expected the path of an image, seen from the YAML file, got none"),
+        (
+            "resolution: 0.1\n" + ORIGIN + TAIL,
+            "image: expected the path of an image, seen from the YAML file, got none",
+        ),
         ("image:\nresolution: 0.1\n" + ORIGIN + TAIL, "image: expected the path"),
         ("image: [a, b]\nresolution: 0.1\n" + ORIGIN + TAIL, "image: expected the path"),
-        ("image: map.pgm\n" + ORIGIN + TAIL, "resolution: expected metres a pixel, above 0, got none"),
-        ("image: map.pgm\nresolution: no\n" + ORIGIN + TAIL, "resolution: expected metres a pixel, above 0, got 'no'"),
+        (
+            "image: map.pgm\n" + ORIGIN + TAIL,
+            "resolution: expected metres a pixel, above 0, got none",
+        ),
+        (
+            "image: map.pgm\nresolution: no\n" + ORIGIN + TAIL,
+            "resolution: expected metres a pixel, above 0, got 'no'",
+        ),
         ("image: map.pgm\nresolution: -1\n" + ORIGIN + TAIL, "resolution: expected"),
         ("image: map.pgm\nresolution: .nan\n" + ORIGIN + TAIL, "resolution: expected"),
-        ("image: map.pgm\nresolution: 999999\n" + ORIGIN + TAIL, "resolution: expected a map of at most 1,000,000 m"),
-        (HEAD + TAIL, r"origin: expected \[x, y, yaw\] in metres and radians, of at most 1,000,000, got none"),
+        (
+            "image: map.pgm\nresolution: 999999\n" + ORIGIN + TAIL,
+            "resolution: expected a map of at most 1,000,000 m",
+        ),
+        (
+            HEAD + TAIL,
+            r"origin: expected \[x, y, yaw\] in metres and radians, of at most 1,000,000, got none",
+        ),
         (HEAD + "origin: [1, 2]\n" + TAIL, r"origin: expected \[x, y, yaw\]"),
         (HEAD + "origin: [1, 2, x]\n" + TAIL, r"origin: expected \[x, y, yaw\]"),
         (HEAD + "origin: [1, 2, .inf]\n" + TAIL, r"origin: expected \[x, y, yaw\]"),
         (HEAD + "origin: 3\n" + TAIL, r"origin: expected \[x, y, yaw\]"),
-        (HEAD + "origin: {x: 1, y: 2}\n" + TAIL, "an object or a nested list as 'origin' in line 3"),
+        (
+            HEAD + "origin: {x: 1, y: 2}\n" + TAIL,
+            "an object or a nested list as 'origin' in line 3",
+        ),
         (HEAD + "origin: [[1, 2, 3]]\n" + TAIL, "an object or a nested list as 'origin' in line 3"),
         (HEAD + ORIGIN + TAIL + "resolution: 0.1\n", "'resolution' twice, again in line 7"),
-        (HEAD + ORIGIN + TAIL + "mode: rawest\n", "mode: expected trinary, scale or raw, got 'rawest'"),
+        (
+            HEAD + ORIGIN + TAIL + "mode: rawest\n",
+            "mode: expected trinary, scale or raw, got 'rawest'",
+        ),
         (HEAD + ORIGIN + TAIL + "mode: [raw]\n", "mode: expected trinary, scale or raw"),
         (HEAD + ORIGIN + "negate: 2\n", "negate: expected 0 or 1, got '2'"),
-        (HEAD + ORIGIN + "occupied_thresh: 65\n", "occupied_thresh: expected a threshold from 0 to 1, got '65'"),
+        (
+            HEAD + ORIGIN + "occupied_thresh: 65\n",
+            "occupied_thresh: expected a threshold from 0 to 1, got '65'",
+        ),
         (HEAD + ORIGIN + "free_thresh: -0.1\n", "free_thresh: expected a threshold from 0 to 1"),
-        (HEAD + ORIGIN + "mode: scale\nfree_thresh: 0.1\n", "occupied_thresh: expected a threshold from 0 to 1, got none"),
+        (
+            HEAD + ORIGIN + "mode: scale\nfree_thresh: 0.1\n",
+            "occupied_thresh: expected a threshold from 0 to 1, got none",
+        ),
         (
             HEAD + ORIGIN + "mode: scale\nfree_thresh: 0.7\noccupied_thresh: 0.6\n",
             r"free_thresh: expected less than occupied_thresh \(0.6\)",
         ),
-        ("image: no.pgm\nresolution: 1\n" + ORIGIN + TAIL, "image: .*no.pgm: expected a PGM, PNG or BMP image: No such file"),
-        ('image: "a\\0b"\nresolution: 1\n' + ORIGIN + TAIL, "image: .*expected a PGM, PNG or BMP image: .*null"),
-        ("image: map.yaml\nresolution: 1\n" + ORIGIN + TAIL, "image: .*map.yaml: expected a PGM, PNG or BMP image, got b'image"),
+        (
+            "image: no.pgm\nresolution: 1\n" + ORIGIN + TAIL,
+            "image: .*no.pgm: expected a PGM, PNG or BMP image: No such file",
+        ),
+        (
+            'image: "a\\0b"\nresolution: 1\n' + ORIGIN + TAIL,
+            "image: .*expected a PGM, PNG or BMP image: .*null",
+        ),
+        (
+            "image: map.yaml\nresolution: 1\n" + ORIGIN + TAIL,
+            "image: .*map.yaml: expected a PGM, PNG or BMP image, got b'image",
+        ),
         ("", "no fields in it"),
         ("- 1\n- 2\n", "no fields in it"),
-        ("a: b: c\n", "expected the YAML file of an occupancy map, got none: mapping values are not allowed"),
+        (
+            "a: b: c\n",
+            "expected the YAML file of an occupancy map, got none: mapping values are not allowed",
+        ),
         ("image: map.pgm\n--- \nimage: map.pgm\n", "expected a single document"),
         ("[" * 5000, "expected the YAML file of an occupancy map, got none"),
         (b"image: \xff\n", "expected the YAML file of an occupancy map, got none"),
         (b"image: a\0b\n", "expected the YAML file of an occupancy map, got none"),
     ],
 )
-def test_what_is_wrong_in_a_map_is_named_with_its_file(text: str | bytes, message: str, tmp_path: Path) -> None:
+def test_what_is_wrong_in_a_map_is_named_with_its_file(
+    text: str | bytes, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(SimulatorError, match=f"map.yaml: .*{message}"):
         read_occupancy(saved(tmp_path, text))
 
@@ -236,7 +305,10 @@ def test_images_that_are_damaged_are_refused(image: bytes, message: str, tmp_pat
 
 
 def test_a_field_that_is_misspelt_is_named(tmp_path: Path) -> None:
-    with pytest.warns(SimulatorWarning, match="got others, which are not read: 'free_threshold, occupied_threshold'"):
+    with pytest.warns(
+        SimulatorWarning,
+        match="got others, which are not read: 'free_threshold, occupied_threshold'",
+    ):
         read_occupancy(saved(tmp_path, HEAD + ORIGIN + TAIL.replace("thresh:", "threshold:")))
 
 
@@ -244,7 +316,13 @@ def test_a_field_that_is_misspelt_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("white", [1, 100, 255, 1000, 65535])
 def test_white_of_a_pgm_is_what_its_head_says(white: int, body: str, tmp_path: Path) -> None:
     table = np.where(GREY < 89, 0, white)
-    pixels = " ".join(map(str, table.ravel())).encode() if body == "text" else table.astype("u1" if white < 256 else ">u2").tobytes()
+    pixels = (
+        " ".join(map(str, table.ravel())).encode()
+        if body == "text"
+        else table.astype("u1" if white < 256 else ">u2").tobytes()
+    )
     path = saved(tmp_path, HEAD + ORIGIN + TAIL, None)
-    (tmp_path / "map.pgm").write_bytes(b"P%d\n# drawn by hand\n4 4\n%d\n" % (2 if body == "text" else 5, white) + pixels)
+    (tmp_path / "map.pgm").write_bytes(
+        b"P%d\n# drawn by hand\n4 4\n%d\n" % (2 if body == "text" else 5, white) + pixels
+    )
     assert borders(read_occupancy(path)[1], 0.5, (-1.0, 2.0, 0.0)) == sides((GREY < 89).tolist())

@@ -37,12 +37,22 @@ NO_TIME = 1e-9  # seconds: every search is stopped before it begins
 
 
 def follow(
-    trace: Trace, theory: Theory, limit: float | None = None, maps: int = 0, speedups: Speedups | None = None
+    trace: Trace,
+    theory: Theory,
+    limit: float | None = None,
+    maps: int = 0,
+    speedups: Speedups | None = None,
 ) -> tuple[OnlineMapper, list[Solution]]:
     """The mapper at the end of a trace, and its answers after each step."""
     first, *rest = trace.steps
     mapper = OnlineMapper(
-        first.view or "", theory, star=first.star, odometry=trace.odometry, time_limit=limit, max_maps=maps, speedups=speedups or Speedups()
+        first.view or "",
+        theory,
+        star=first.star,
+        odometry=trace.odometry,
+        time_limit=limit,
+        max_maps=maps,
+        speedups=speedups or Speedups(),
     )
     answers = [mapper.solution]
     for action, step in zip(trace.actions, rest, strict=True):
@@ -51,7 +61,13 @@ def follow(
 
 
 def observed(mapper: OnlineMapper, action: Action, step: Step) -> Solution:
-    return mapper.observe(action, step.view or "", star=step.star, displacement=step.displacement, covariance=step.covariance)
+    return mapper.observe(
+        action,
+        step.view or "",
+        star=step.star,
+        displacement=step.displacement,
+        covariance=step.covariance,
+    )
 
 
 def agree(trace: Trace, theory: Theory) -> None:
@@ -77,7 +93,10 @@ def test_after_every_step_the_answer_is_that_of_solving_anew(data: st.DataObject
 
 @pytest.mark.parametrize("name", ["deterministic", "one_place", "travel_leaves"])
 def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
-    agree(Trace.from_steps("abaabb", ["travel", "around", "travel", "right", "travel"]), Theory(without=(name,)))
+    agree(
+        Trace.from_steps("abaabb", ["travel", "around", "travel", "right", "travel"]),
+        Theory(without=(name,)),
+    )
 
 
 @settings(max_examples=5)
@@ -85,7 +104,12 @@ def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
 def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
     theory = data.draw(theories(trace), label="theory").resolve(trace)
-    _, answers = follow(trace, theory, maps=2, speedups=Speedups(prefixes=data.draw(st.booleans(), label="prefixes")))
+    _, answers = follow(
+        trace,
+        theory,
+        maps=2,
+        speedups=Speedups(prefixes=data.draw(st.booleans(), label="prefixes")),
+    )
     for i, answer in enumerate(answers):
         anew = solve(trace.prefix(i + 1), theory.of_steps(0, i + 1), max_maps=None)
         assert answer.status is anew.status
@@ -98,14 +122,25 @@ def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
 def test_a_bound_is_known_where_more_maps_of_a_known_cost_are_asked_for() -> None:
     """Where clingo is given the whole trace at each step, too."""
     actions = "RRRRRVTRRVRRCRCRTRTVRV"
-    named = {"R": "right", "T": "travel", "V": Action("veer", "turn", "right"), "C": Action("creep", "travel")}
+    named = {
+        "R": "right",
+        "T": "travel",
+        "V": Action("veer", "turn", "right"),
+        "C": Action("creep", "travel"),
+    }
     trace = Trace.from_steps("00110010110010101010110", [named[action] for action in actions])
     mapper, answers = follow(trace, Theory.causal(), speedups=Speedups.without("prefixes"))
-    assert [answer.bound.dstates for answer in answers] == [answer.cost.dstates for answer in answers if answer.cost]
+    assert [answer.bound.dstates for answer in answers] == [
+        answer.cost.dstates for answer in answers if answer.cost
+    ]
     assert mapper.searches > 1
 
 
-@pytest.mark.parametrize("theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()], ids=["causal", "dstates", "paths"])
+@pytest.mark.parametrize(
+    "theory",
+    [Theory.causal(), Theory.topological(), Theory.circumscriptive()],
+    ids=["causal", "dstates", "paths"],
+)
 def test_circuits_are_replayed(theory: Theory) -> None:
     mapper, answers = follow(rectangle(800), theory)
     assert answers[-1].maps == solve(rectangle(800), theory).maps
@@ -132,8 +167,12 @@ def test_a_mapper_says_how_far_it_is() -> None:
 @settings(max_examples=25)
 @given(st.data())
 def test_sketches_are_consistent(data: st.DataObject) -> None:
-    trace = data.draw(traces(max_steps=14), label="trace").without_displacements()  # what evidence says, a sketch does not know
-    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory").resolve(trace)
+    trace = data.draw(
+        traces(max_steps=14), label="trace"
+    ).without_displacements()  # what evidence says, a sketch does not know
+    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory").resolve(
+        trace
+    )
     sketch = data.draw(st.sampled_from(Sketch.all_of(trace.steps[0], theory)), label="sketch")
     for i, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True)):
         assert check(trace.prefix(i + 1), sketch.map(), theory) == ()
@@ -166,9 +205,18 @@ def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
 @settings(max_examples=13)
 @given(st.data())
 def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> None:
-    trace = data.draw(traces(max_steps=10), label="trace").without_displacements()  # what evidence says, a sketch does not know
-    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory").resolve(trace)
-    draft(trace, theory, data.draw(st.integers(1, len(trace)), label="known"), data.draw(st.integers(0, 4), label="which"))
+    trace = data.draw(
+        traces(max_steps=10), label="trace"
+    ).without_displacements()  # what evidence says, a sketch does not know
+    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory").resolve(
+        trace
+    )
+    draft(
+        trace,
+        theory,
+        data.draw(st.integers(1, len(trace)), label="known"),
+        data.draw(st.integers(0, 4), label="which"),
+    )
 
 
 @pytest.mark.parametrize("stars", [False, True])
@@ -176,8 +224,12 @@ def test_a_map_goes_on_through_a_maze(stars: bool) -> None:
     doubts: list[bool] = []
     for seed in range(5):
         trace = maze(3, 3, steps=90, seed=seed, loops=0.5, stars=True).trace
-        trace = trace if stars else Trace.from_steps([step.view or "" for step in trace], trace.actions)
-        doubts += draft(trace, Theory.topological().resolve(trace), 12 + 4 * seed if stars else 6 + seed, seed)
+        trace = (
+            trace if stars else Trace.from_steps([step.view or "" for step in trace], trace.actions)
+        )
+        doubts += draft(
+            trace, Theory.topological().resolve(trace), 12 + 4 * seed if stars else 6 + seed, seed
+        )
     assert {*doubts} == {True, False}
 
 
@@ -189,7 +241,11 @@ def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) ->
     mapper, answers = follow(trace, theory, limit=NO_TIME)
     for i, answer in enumerate(answers):
         assert answer.status in (Status.FEASIBLE, Status.UNKNOWN)
-        assert (answer.complete, answer.stopped, answer.count) == (False, "time limit", answer.status is Status.FEASIBLE)
+        assert (answer.complete, answer.stopped, answer.count) == (
+            False,
+            "time limit",
+            answer.status is Status.FEASIBLE,
+        )
         for ssh_map in answer.maps:
             assert check(trace.prefix(i + 1), ssh_map, theory) == ()
     mapper._limit, mapper._next_search = None, 0
@@ -209,14 +265,18 @@ def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
     mapper._limit = NO_TIME
     bound = 0
     for i in range(half, len(trace)):
-        answer = mapper.observe(trace.actions[i - 1], trace.steps[i].view or "", star=trace.steps[i].star)
+        answer = mapper.observe(
+            trace.actions[i - 1], trace.steps[i].view or "", star=trace.steps[i].star
+        )
         best = solve(trace.prefix(i + 1), theory).cost
         assert best is not None
         assert answer.cost is not None
         assert answer.bound.dstates is not None
         assert bound <= answer.bound.dstates <= best.dstates <= answer.cost.dstates
         assert check(trace.prefix(i + 1), answer.maps[0], theory) == ()
-        assert answer.status is Status.FEASIBLE or (answer.status is Status.OPTIMAL and best == answer.cost)
+        assert answer.status is Status.FEASIBLE or (
+            answer.status is Status.OPTIMAL and best == answer.cost
+        )
         bound = answer.bound.dstates
     assert mapper.solution.status is Status.FEASIBLE
     assert mapper.searches <= half + (len(trace) - half) // 2 + 1  # not one a step
@@ -224,15 +284,23 @@ def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
 
 def explore(trace: Trace, mapper: OnlineMapper) -> list[Solution]:
     rest = trace.steps[len(mapper.trace) :]
-    return [observed(mapper, action, step) for action, step in zip(trace.actions[len(mapper.trace) - 1 :], rest, strict=True)]
+    return [
+        observed(mapper, action, step)
+        for action, step in zip(trace.actions[len(mapper.trace) - 1 :], rest, strict=True)
+    ]
 
 
 def test_maps_are_guessed_while_the_robot_drives() -> None:
     """Without time for clingo. The guess is made for some of the steps; its map goes on."""
     walk = maze(4, 4, steps=140, seed=1, stars=True)
     trace = walk.trace
-    with patch.object(guessing, "has_processors", lambda _: True), patch.object(online, "GUESSED", 120):
-        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, time_limit=NO_TIME)
+    with (
+        patch.object(guessing, "has_processors", lambda _: True),
+        patch.object(online, "GUESSED", 120),
+    ):
+        mapper = OnlineMapper(
+            trace.steps[0].view or "", star=trace.steps[0].star, time_limit=NO_TIME
+        )
         explore(trace.prefix(125), mapper)
         assert mapper._guess is not None
         assert mapper._guess.map() is not None  # waits for it
@@ -240,7 +308,11 @@ def test_maps_are_guessed_while_the_robot_drives() -> None:
     for i, answer in enumerate(answers, 126):
         assert answer.status is Status.FEASIBLE
         assert check(trace.prefix(i), answer.maps[0], mapper.theory) == ()
-    assert len(answers[0].maps[0].dstates) <= 1.2 * len(set(walk.truth)) < len(mapper._sketches[0].sketch.map().dstates)
+    assert (
+        len(answers[0].maps[0].dstates)
+        <= 1.2 * len(set(walk.truth))
+        < len(mapper._sketches[0].sketch.map().dstates)
+    )
 
 
 def test_a_map_that_is_contradicted_is_mended() -> None:
@@ -252,7 +324,11 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
         first = 25 + 5 * seed
         known = solve(trace.prefix(first), theory, max_maps=1).maps[0]
         predicted = Log(trace, theory).replay(known.labels).labels
-        for steps in (min(len(predicted), len(trace)), min(len(predicted) + 1, len(trace)), min(len(predicted) + 20, len(trace))):
+        for steps in (
+            min(len(predicted), len(trace)),
+            min(len(predicted) + 1, len(trace)),
+            min(len(predicted) + 20, len(trace)),
+        ):
             found = guessing.mended_map(trace.prefix(steps), theory, known, Speedups())
             if found is None:
                 without += 1
@@ -261,7 +337,9 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
             if steps == len(predicted):
                 assert found.labels == predicted
             contradicted += len(found.dstates) > len(known.dstates)
-            assert len(found.dstates) < len(Chart.framed(trace.prefix(steps), Log(trace.prefix(steps), theory)).seen)
+            assert len(found.dstates) < len(
+                Chart.framed(trace.prefix(steps), Log(trace.prefix(steps), theory)).seen
+            )
     assert without < 3 < contradicted
 
 
@@ -269,7 +347,12 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
 def test_nothing_is_guessed_where_that_is_switched_off(off: str) -> None:
     trace = maze(2, 2, steps=60, seed=0, stars=True).trace
     with patch.object(online, "GUESSED", 10):
-        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, time_limit=NO_TIME, speedups=Speedups.without(off))
+        mapper = OnlineMapper(
+            trace.steps[0].view or "",
+            star=trace.steps[0].star,
+            time_limit=NO_TIME,
+            speedups=Speedups.without(off),
+        )
         explore(trace, mapper)
     assert mapper._guess is None
 
@@ -298,7 +381,11 @@ assert mapper._guess and not mapper._guess.done()
 """
     folder = Path(__file__).parent.parent / "benchmarks"
     done = subprocess.run(
-        [sys.executable, "-c", program], check=False, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, timeout=100
+        [sys.executable, "-c", program],
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(folder)},
+        capture_output=True,
+        timeout=100,
     )
     assert (done.returncode, done.stderr) == (0, b"")
 
@@ -308,7 +395,12 @@ def test_what_cannot_be_leaves_no_map() -> None:
     assert mapper.observe("around", "b", star=[0, 0, 1, 0]).status is Status.OPTIMAL
     for view in ("a", "c", "a"):
         solution = mapper.observe("around", view, star=[1, 0, 0, 0])
-    assert (solution.status, solution.maps, solution.cost, solution.complete) == (Status.UNSATISFIABLE, (), None, True)
+    assert (solution.status, solution.maps, solution.cost, solution.complete) == (
+        Status.UNSATISFIABLE,
+        (),
+        None,
+        True,
+    )
     assert solution.steps == 5
 
 
@@ -316,7 +408,12 @@ def test_what_cannot_be_leaves_no_map() -> None:
     ("action", "view", "star", "message"),
     [
         ("jump", "a", [1, 0, 0, 0], r"step 1: action\.kind: expected"),
-        ({"name": "travel", "kind": "turn", "turn": "left"}, "a", [1, 0, 0, 0], "step 1: action: 'travel' has kind turn"),
+        (
+            {"name": "travel", "kind": "turn", "turn": "left"},
+            "a",
+            [1, 0, 0, 0],
+            "step 1: action: 'travel' has kind turn",
+        ),
         ({"name": "travel", "kind": "walk"}, "a", [1, 0, 0, 0], r"action\.kind: expected"),
         ("travel", "a", None, "step 2: star: expected one"),
         ("travel", "a", [0, 10], "step 2: star: expected bearings"),
@@ -324,23 +421,38 @@ def test_what_cannot_be_leaves_no_map() -> None:
         ("travel", None, [1, 0, 0, 0], "step 2: view: expected"),
     ],
 )
-def test_a_step_that_does_not_fit_changes_nothing(action: object, view: object, star: object, message: str) -> None:
-    mapper, other = (follow(Trace.from_steps("ab", ["travel"], stars=[(1, 0, 0, 0)] * 2), Theory())[0] for _ in range(2))
+def test_a_step_that_does_not_fit_changes_nothing(
+    action: object, view: object, star: object, message: str
+) -> None:
+    mapper, other = (
+        follow(Trace.from_steps("ab", ["travel"], stars=[(1, 0, 0, 0)] * 2), Theory())[0]
+        for _ in range(2)
+    )
     before, searches = mapper.solution, mapper.searches
     with pytest.raises(TraceError, match=message):
         mapper.observe(action, view, star=star)  # type: ignore[arg-type]
     assert (mapper.solution, mapper.trace, mapper.searches) == (before, other.trace, searches)
     again, expected = (m.observe("around", "b", star=[0, 0, 1, 0]) for m in (mapper, other))
-    assert (again.maps, again.status, again.bound) == (expected.maps, expected.status, expected.bound)
+    assert (again.maps, again.status, again.bound) == (
+        expected.maps,
+        expected.status,
+        expected.bound,
+    )
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         ({"displacement": (1.0, 2.0)}, "step 2: displacement: expected"),
-        ({"displacement": (1.0, math.nan, 0.0)}, r"step 2: displacement\[1\]: expected a finite number"),
+        (
+            {"displacement": (1.0, math.nan, 0.0)},
+            r"step 2: displacement\[1\]: expected a finite number",
+        ),
         ({"displacement": (10_000.0, 0.0, 0.0)}, "step 2: displacement: expected metres"),
-        ({"covariance": np.eye(3)}, "step 2: covariance: expected a displacement that it belongs to"),
+        (
+            {"covariance": np.eye(3)},
+            "step 2: covariance: expected a displacement that it belongs to",
+        ),
         (
             {"displacement": (1.0, 0.0, 0.0), "covariance": np.diag([1.0, 1.0, -1.0])},
             "step 2: covariance: expected a positive definite matrix",
@@ -354,24 +466,50 @@ def test_a_displacement_that_is_none_changes_nothing(given: dict[str, Any], mess
     with pytest.raises(TraceError, match=message):
         mapper.observe("travel", "a", **given)
     assert (mapper.solution, mapper.trace, mapper.theory) == (before, other.trace, other.theory)
-    again, expected = (m.observe("travel", "a", displacement=(1.0, 0.0, 0.0), covariance=np.eye(3)) for m in (mapper, other))
-    assert (again.maps, again.status, again.theory) == (expected.maps, expected.status, expected.theory)
+    again, expected = (
+        m.observe("travel", "a", displacement=(1.0, 0.0, 0.0), covariance=np.eye(3))
+        for m in (mapper, other)
+    )
+    assert (again.maps, again.status, again.theory) == (
+        expected.maps,
+        expected.status,
+        expected.theory,
+    )
     with pytest.raises(TraceError, match=r"odometry\.along: expected a number"):
         OnlineMapper("a", odometry={"along": -1})
 
 
 @pytest.mark.parametrize(
-    ("theory", "stars", "steps"), [(Theory(), True, 24), (Theory(), False, 16), (Theory.causal(), False, 24), (Theory(joint=1), True, 16)]
+    ("theory", "stars", "steps"),
+    [
+        (Theory(), True, 24),
+        (Theory(), False, 16),
+        (Theory.causal(), False, 24),
+        (Theory(joint=1), True, 16),
+    ],
 )
-def test_the_trace_settles_displacements_as_it_grows(theory: Theory, stars: bool, steps: int) -> None:
+def test_the_trace_settles_displacements_as_it_grows(
+    theory: Theory, stars: bool, steps: int
+) -> None:
     """The first displacement comes late, and one is missing; the number of returns that may be true doubles several times."""
     trace = maze(2, 2, steps=steps, seed=3, stars=stars, odometry=Odometry(along=0.02)).trace
     missing = {1, 2, 3, steps // 2}
-    trace = replace(trace, steps=tuple(replace(step, displacement=None) if t in missing else step for t, step in enumerate(trace)))
+    trace = replace(
+        trace,
+        steps=tuple(
+            replace(step, displacement=None) if t in missing else step
+            for t, step in enumerate(trace)
+        ),
+    )
     _, answers = follow(trace, theory)
     for i in (0, 3, 4, *range(5, steps + 1, 3)):
         answer, anew = answers[i], solve(trace.prefix(i + 1), theory, max_maps=None)
-        assert (answer.theory, answer.status, answer.complete, answer.bound) == (anew.theory, anew.status, True, anew.bound)
+        assert (answer.theory, answer.status, answer.complete, answer.bound) == (
+            anew.theory,
+            anew.status,
+            True,
+            anew.bound,
+        )
         assert set(answer.maps) == set(anew.maps)
         assert {name: said["pairs"] for name, said in answer.evidence.items()} == {
             name: said["pairs"] for name, said in anew.evidence.items()
@@ -410,7 +548,12 @@ def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
         patch.object(online, "GUESSED", 25),
         patch.object(annealing, "ANNEALED", ((0.5, 50),)),
     ):
-        mapper = OnlineMapper(trace.steps[0].view or "", star=trace.steps[0].star, odometry=trace.odometry, time_limit=NO_TIME)
+        mapper = OnlineMapper(
+            trace.steps[0].view or "",
+            star=trace.steps[0].star,
+            odometry=trace.odometry,
+            time_limit=NO_TIME,
+        )
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):
             answer = observed(mapper, action, step)
             assert answer.status is Status.FEASIBLE
@@ -431,10 +574,17 @@ def test_the_first_step_settles_the_stars() -> None:
         plain.observe("travel", "b", star=[1, 0, 0, 0])
     with pytest.raises(TheoryError, match="star: expected a trace with stars"):
         OnlineMapper("a", Theory(star="pattern"))
-    assert OnlineMapper("a", Theory(star="none"), time_limit=None).observe("travel", "b", star=[1, 0, 0, 0]).count == 1
+    assert (
+        OnlineMapper("a", Theory(star="none"), time_limit=None)
+        .observe("travel", "b", star=[1, 0, 0, 0])
+        .count
+        == 1
+    )
 
 
 def test_the_same_steps_give_the_same_answers() -> None:
     trace = drive(*TOURS["plus"], stars=False)
-    first, second = ([(a.maps, a.cost, a.prefix) for a in follow(trace, Theory())[1]] for _ in range(2))
+    first, second = (
+        [(a.maps, a.cost, a.prefix) for a in follow(trace, Theory())[1]] for _ in range(2)
+    )
     assert first == second

@@ -41,7 +41,11 @@ FORGETFUL = Rules(
     "forgetful.lp",
     "% @axiom(forgetful) No dstate is seen twice more than 10 steps apart.\n#program step(t).\nviolation(forgetful,t) :- same(I,t), t-I > 10.",
 )
-THEORIES = {"causal": Theory.causal(), "topological": Theory.topological(), "circumscriptive": Theory.circumscriptive()}
+THEORIES = {
+    "causal": Theory.causal(),
+    "topological": Theory.topological(),
+    "circumscriptive": Theory.circumscriptive(),
+}
 
 
 def with_toy(toy: Toy, theory: Theory) -> Theory:
@@ -54,7 +58,11 @@ def with_toy(toy: Toy, theory: Theory) -> Theory:
 @given(data=st.data())
 def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.DataObject) -> None:
     """In one go and step by step, against the brute force; with first prefixes so short that replay would overlook it."""
-    theory = with_toy(toy, THEORIES[name]) if toy.causal or name != "causal" else with_toy(TOYS[0], THEORIES[name])
+    theory = (
+        with_toy(toy, THEORIES[name])
+        if toy.causal or name != "causal"
+        else with_toy(TOYS[0], THEORIES[name])
+    )
     allows = TOYS[0].allows if toy.rules not in theory.rules else toy.allows
     trace = data.draw(traces(max_steps=6), label="trace")
     mapper: OnlineMapper | None = None
@@ -65,13 +73,26 @@ def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.Dat
             if mapper is None:
                 first = trace.steps[0]
                 assert first.view is not None
-                mapper = OnlineMapper(first.view, theory, star=first.star, odometry=trace.odometry, time_limit=None, max_maps=None)
+                mapper = OnlineMapper(
+                    first.view,
+                    theory,
+                    star=first.star,
+                    odometry=trace.odometry,
+                    time_limit=None,
+                    max_maps=None,
+                )
                 online = mapper.solution
             else:
                 step, before = trace.steps[steps - 1], trace.steps[steps - 2].action
                 assert step.view is not None
                 assert before is not None
-                online = mapper.observe(before, step.view, star=step.star, displacement=step.displacement, covariance=step.covariance)
+                online = mapper.observe(
+                    before,
+                    step.view,
+                    star=step.star,
+                    displacement=step.displacement,
+                    covariance=step.covariance,
+                )
             for solution in (online, solve(prefix, theory, max_maps=None)):
                 assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
                 assert {key(ssh_map) for ssh_map in solution.maps} == expected
@@ -115,7 +136,9 @@ def wider(own_encodings: Path) -> type[Theory]:
     return Wider
 
 
-def test_an_axiom_put_into_the_encodings_and_the_theory_alone_is_obeyed(wider: type[Theory]) -> None:
+def test_an_axiom_put_into_the_encodings_and_the_theory_alone_is_obeyed(
+    wider: type[Theory],
+) -> None:
     trace = Trace.load(EXAMPLES / "notched-rectangle.jsonl").prefix(24)
     causal = wider.causal().replace(forgetful=True)
     solution = solve(trace, causal)
@@ -129,8 +152,12 @@ def test_an_axiom_put_into_the_encodings_and_the_theory_alone_is_obeyed(wider: t
     assert mapper.solution.cost.dstates == 16
 
 
-@pytest.mark.parametrize(("speedup", "theory"), [("visits", Theory(star="frame")), ("ways", Theory(star="none"))])
-def test_what_a_shared_encoding_no_longer_keeps_switches_off_both_that_share_it(own_encodings: Path, speedup: str, theory: Theory) -> None:
+@pytest.mark.parametrize(
+    ("speedup", "theory"), [("visits", Theory(star="frame")), ("ways", Theory(star="none"))]
+)
+def test_what_a_shared_encoding_no_longer_keeps_switches_off_both_that_share_it(
+    own_encodings: Path, speedup: str, theory: Theory
+) -> None:
     assert row(speedup).holds_for(theory)
     shared = own_encodings / "fast" / "paths.lp"
     shared.write_text(shared.read_text().replace("path_order_total ", ""))
@@ -139,7 +166,9 @@ def test_what_a_shared_encoding_no_longer_keeps_switches_off_both_that_share_it(
     assert not row(speedup).holds_for(theory)
 
 
-def test_a_file_of_the_working_directory_is_not_taken_for_an_encoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_of_the_working_directory_is_not_taken_for_an_encoding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As clingo's own `#include` would."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "paths.lp").write_text(":- not never.")
@@ -154,7 +183,9 @@ def test_a_field_that_nothing_speaks_for_switches_off_what_is_exact_for_known_ax
     class Wider(Theory):
         penalty: float | None = None
 
-    exact = [speedup for speedup in TABLE if speedup.keeps is not None and speedup.suits(Theory.causal())]
+    exact = [
+        speedup for speedup in TABLE if speedup.keeps is not None and speedup.suits(Theory.causal())
+    ]
     assert {speedup.name for speedup in exact} >= {"prefixes", "named dstates"}
     assert all(speedup.holds_for(Wider.causal()) for speedup in exact)
     assert not any(speedup.holds_for(Wider.causal().replace(penalty=1.5)) for speedup in exact)
@@ -172,7 +203,9 @@ def test_every_switch_has_a_row_and_every_row_a_switch() -> None:
 def test_what_rests_on_an_axiom_is_off_without_it(axiom: str) -> None:
     resting = [speedup for speedup in TABLE if axiom in speedup.rests_on]
     assert len(resting) > 5
-    assert not any(speedup.holds_for(Theory.causal().replace(without=(axiom,))) for speedup in resting)
+    assert not any(
+        speedup.holds_for(Theory.causal().replace(without=(axiom,))) for speedup in resting
+    )
 
 
 @dataclass(frozen=True)
@@ -246,7 +279,9 @@ def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.
     counts, expected = minimal_maps(trace, theory.resolve(trace), allows)
     with (
         patch.object(judging, "evidence_of", lambda _: (NoLongReturns(),)),
-        patch.object(prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 8]), label="first prefix")),
+        patch.object(
+            prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 8]), label="first prefix")
+        ),
         patch.multiple(search, FEW_STEPS=0, FRAME_AFTER=-1.0),
     ):
         asked = Search(trace, theory, max_maps=None, speedups=Speedups.without("framing"))
@@ -269,7 +304,10 @@ def test_an_explanation_names_assertions_and_own_axioms() -> None:
     said = explain(trace, Theory.topological().replace(same=[(0, 1)]))
     assert said
     assert {"asserted", "functional_view"} == set(said.axioms)
-    rules = Rules("own.lp", "% @axiom(new) All dstates are seen again.\n#program step(t).\nviolation(new,t) :- t > 0, not same(0,t).")
+    rules = Rules(
+        "own.lp",
+        "% @axiom(new) All dstates are seen again.\n#program step(t).\nviolation(new,t) :- t > 0, not same(0,t).",
+    )
     said = explain(trace, Theory.topological().replace(rules=[rules]))
     assert said
     assert "new" in said.axioms
@@ -278,7 +316,10 @@ def test_an_explanation_names_assertions_and_own_axioms() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (":- same(I,T), T-I > 10.", r"own\.lp:1: same: expected in a program part of steps, .* #program step\(t\)\."),
+        (
+            ":- same(I,T), T-I > 10.",
+            r"own\.lp:1: same: expected in a program part of steps, .* #program step\(t\)\.",
+        ),
         ("far :- act(0,A).", r"own\.lp:1: act: expected in a program part of steps"),
         ("#program step(t).\n:- same(I,t) t > 3.", r"own\.lp:2:\d+-\d+: error: syntax error"),
         ("#program step(t).\n:- same(I,t), X > 3.", r"own\.lp:2.*unsafe"),
@@ -286,25 +327,46 @@ def test_an_explanation_names_assertions_and_own_axioms() -> None:
             "#program step(t).\nviolation(odd,t) :- same(I,t).",
             r"own\.lp:2: violation\(odd,…\): expected a sentence for it; write % @axiom\(odd\)",
         ),
-        ("#program step(t).\n:- sameplace(I,t).", r"own\.lp:2: sameplace: expected an atom that this theory has, .*same_place"),
-        ("#program step(t).\nsame(0,t) :- act(t-1,A).", r"own\.lp:2: expected a rule that reads same, got one that defines it"),
-        ("#program steps(t).\n:- same(I,t).", r"own\.lp:1: expected a program part base, step\(t\) or check\(t\)"),
-        ("#program step(t).\n:- not same_place(5,15).", r"own\.lp:2: not same_place\(5,15\): expected to be asked at a step"),
+        (
+            "#program step(t).\n:- sameplace(I,t).",
+            r"own\.lp:2: sameplace: expected an atom that this theory has, .*same_place",
+        ),
+        (
+            "#program step(t).\nsame(0,t) :- act(t-1,A).",
+            r"own\.lp:2: expected a rule that reads same, got one that defines it",
+        ),
+        (
+            "#program steps(t).\n:- same(I,t).",
+            r"own\.lp:1: expected a program part base, step\(t\) or check\(t\)",
+        ),
+        (
+            "#program step(t).\n:- not same_place(5,15).",
+            r"own\.lp:2: not same_place\(5,15\): expected to be asked at a step",
+        ),
         ("#minimize { 1,I : same(I,3) }.", r"own\.lp:1: expected rules, got"),
         ("#show same/2.", r"own\.lp:1: expected rules, got #show"),
         (
             "#program step(t).\n:- same(@first(1),t).",
             r"own\.lp:2: expected what clingo works out by itself, got @first\(1\), a function of Python's",
         ),
-        ("#program step(t).\n:- same(I,t,5).", r"own\.lp:2: same\(I,t,5\): expected 2 arguments, got 3"),
+        (
+            "#program step(t).\n:- same(I,t,5).",
+            r"own\.lp:2: same\(I,t,5\): expected 2 arguments, got 3",
+        ),
         (
             "% @axiom(odd) Mine.\n#program step(t).\nviolation(odd) :- same(0,t).",
             r"own\.lp:3: violation\(odd\): expected 2 arguments, got 1",
         ),
-        ('#include "other.lp".\n', r"own\.lp: expected rules, got #include of other\.lp; give that file, too"),
+        (
+            '#include "other.lp".\n',
+            r"own\.lp: expected rules, got #include of other\.lp; give that file, too",
+        ),
         ("#external own(1).", r"own\.lp:1: expected rules, got #external"),
         ("#script (python)\n#end.", r"own\.lp:1: expected rules, got #script"),
-        ("% @axiom(deterministic) Mine.\n", r"own\.lp: @axiom\(deterministic\): expected a name that no other axiom has"),
+        (
+            "% @axiom(deterministic) Mine.\n",
+            r"own\.lp: @axiom\(deterministic\): expected a name that no other axiom has",
+        ),
     ],
 )
 def test_rules_that_could_never_be_read_say_how_to_write_them(
@@ -337,7 +399,9 @@ def test_rules_of_any_editor_are_read(data: bytes, tmp_path: Path) -> None:
     assert [axiom.name for axiom in theory.rules[0].axioms] == ["near"]
     assert len(solve(Trace.from_steps("abab", ["travel"] * 3), theory).maps[0].dstates) == 2
     apart = Trace.from_steps("a" + "b" * 11 + "a", ["travel"] * 12, displacements=[(1, 0, 0)] * 12)
-    assert solve(apart, theory, displacement="none").maps[0].labels[-1] != 0  # so the rule is read, and no part of a comment
+    assert (
+        solve(apart, theory, displacement="none").maps[0].labels[-1] != 0
+    )  # so the rule is read, and no part of a comment
 
 
 @pytest.mark.parametrize(
@@ -387,7 +451,10 @@ def test_what_is_no_text_is_no_rules() -> None:
         solve(Trace.from_steps("aa", ["travel"]), rules=[Rules("a\\1.lp", "a :- b(.")])
 
 
-@pytest.mark.parametrize(("text", "where"), [("#program step(t).\n:- same(I,t), X > 3.", "b.lp:2"), ("#const n = 2.", "b.lp:1")])
+@pytest.mark.parametrize(
+    ("text", "where"),
+    [("#program step(t).\n:- same(I,t), X > 3.", "b.lp:2"), ("#const n = 2.", "b.lp:1")],
+)
 def test_of_several_files_of_rules_the_wrong_one_is_named(text: str, where: str) -> None:
     rules = [Rules("a.lp", "#const n = 1."), Rules("b.lp", text)]
     for files in (rules, rules[::-1]) if "same" in text else (rules,):
@@ -396,18 +463,30 @@ def test_of_several_files_of_rules_the_wrong_one_is_named(text: str, where: str)
 
 
 @pytest.mark.parametrize("words", ["solve T", "solve T --jobs 1", "check T M"])
-def test_a_step_that_the_trace_does_not_have_is_an_error(words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_step_that_the_trace_does_not_have_is_an_error(
+    words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trace = Trace.from_steps("aa", ["travel"])
     trace.save(tmp_path / "T")
     solve(trace).maps[0].save(tmp_path / "M")
-    assert main([*(str(tmp_path / word) if word in "TM" else word for word in words.split()), "--same=0,2"]) == 1
+    assert (
+        main(
+            [
+                *(str(tmp_path / word) if word in "TM" else word for word in words.split()),
+                "--same=0,2",
+            ]
+        )
+        == 1
+    )
     captured = capsys.readouterr()
     assert "same (--same): expected steps from 0 to 1, got 0,2" in captured.out + captured.err
     with pytest.raises(TheoryError, match="expected steps from 0 to 1, got 0,2"):
         solve(trace, same=[(0, 2)])
 
 
-def test_a_file_of_rules_without_end_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_of_rules_without_end_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("ssh_abduction.theory.rules.LARGEST", 100)
     (tmp_path / "own.lp").write_text("% long\n" * 100)
     with pytest.raises(TheoryError, match="cannot be read: expected at most"):
@@ -416,7 +495,8 @@ def test_a_file_of_rules_without_end_is_an_error(tmp_path: Path, monkeypatch: py
 
 def test_rules_may_read_facts_and_atoms_of_their_own() -> None:
     rules = Rules(
-        "own.lp", "#const most = 1.\nlimit(most).\nfar(I,T) :- pair(I,T).\npair(0,2).\n#program step(t).\n:- far(I,t), same(I,t), limit(1)."
+        "own.lp",
+        "#const most = 1.\nlimit(most).\nfar(I,T) :- pair(I,T).\npair(0,2).\n#program step(t).\n:- far(I,t), same(I,t), limit(1).",
     )
     assert (
         solve(Trace.from_steps("aaa", ["right", "right"]), rules=[rules]).cost
@@ -473,6 +553,8 @@ def test_what_is_asserted_is_told_to_the_engine_with_names() -> None:
     theory = Theory.causal().replace(different=[(0, 2), (0, 4), (2, 4)])
     with patch.object(CausalEngine, "grow", noted):
         solution = solve(trace, theory, speedups=Speedups.without("prefixes"))
-    assert cliques[-1] == 5  # steps 0, 2 and 4, and so 1 and 3, from which the same action leads to two of these
+    assert (
+        cliques[-1] == 5
+    )  # steps 0, 2 and 4, and so 1 and 3, from which the same action leads to two of these
     assert solution.cost == solve(trace, theory, speedups=Speedups.without(SPEEDUPS)).cost
     assert check(trace, solution.maps[0], theory) == ()

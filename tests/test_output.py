@@ -31,9 +31,15 @@ TRACE = rectangle(8)
 WRITERS: dict[str, Callable[[Path], object]] = {
     "trace": TRACE.save,
     "map": solve(TRACE).maps[0].save,
-    "recogniser": lambda path: store.save(recogniser().fit(np.array([[1.0, 2.0], [2.0, 1.0]]), [0, 1]), path),
+    "recogniser": lambda path: store.save(
+        recogniser().fit(np.array([[1.0, 2.0], [2.0, 1.0]]), [0, 1]), path
+    ),
 }
-READERS: dict[str, Callable[[Path], object]] = {"trace": Trace.load, "map": SSHMap.load, "recogniser": store.load}
+READERS: dict[str, Callable[[Path], object]] = {
+    "trace": Trace.load,
+    "map": SSHMap.load,
+    "recogniser": store.load,
+}
 
 each_writer = pytest.mark.parametrize("kind", WRITERS)
 
@@ -92,7 +98,9 @@ def test_a_file_is_replaced_whole_and_keeps_its_permissions(kind: str, tmp_path:
     assert len(list(tmp_path.iterdir())) == 2  # no draft is left behind
 
 
-def test_a_draft_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_draft_that_fails_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -104,27 +112,49 @@ def test_a_draft_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
     assert [other.read_bytes() for other in tmp_path.iterdir()] == [b"old"]
 
 
-def test_a_closed_pipe_and_a_ring_of_links_are_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_closed_pipe_and_a_ring_of_links_are_errors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
     for place in (tmp_path / "a", tmp_path, tmp_path / "none" / "x"):
-        assert main(["simulate", "notched-rectangle", "--route", "around,around", "-o", str(place)]) == 1
+        assert (
+            main(["simulate", "notched-rectangle", "--route", "around,around", "-o", str(place)])
+            == 1
+        )
         err = capsys.readouterr().err
         assert err.startswith(f"ssh-abduction: {place}: cannot write the trace: ")
         assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(
-    "words", ["simulate notched-rectangle", "cluster x", "train x y", "reproduce notched-rectangle --seeds 0", "learning-curve x y --plot"]
+    "words",
+    [
+        "simulate notched-rectangle",
+        "cluster x",
+        "train x y",
+        "reproduce notched-rectangle --seeds 0",
+        "learning-curve x y --plot",
+    ],
 )
 def test_no_name_is_no_file(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main([*words.split(), *([] if words.endswith("--plot") else ["-o"]), ""])
-    assert "expected the name of a file or folder, got ''" in capsys.readouterr().err or words.endswith("--plot")
+    assert (
+        "expected the name of a file or folder, got ''" in capsys.readouterr().err
+        or words.endswith("--plot")
+    )
 
 
 @pytest.mark.parametrize(
-    "words", ["train x y -o=--", "learning-curve x y --folds=--", "show x --map=--", "solve x --rules=--", "check x y --prefer=--"]
+    "words",
+    [
+        "train x y -o=--",
+        "learning-curve x y --folds=--",
+        "show x --map=--",
+        "solve x --rules=--",
+        "check x y --prefer=--",
+    ],
 )
 def test_two_dashes_are_no_value(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
@@ -132,9 +162,13 @@ def test_two_dashes_are_no_value(words: str, capsys: pytest.CaptureFixture[str])
     assert "expected a value, got '--'" in capsys.readouterr().err
 
 
-def test_every_verb_that_writes_writes_into_a_pipe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_verb_that_writes_writes_into_a_pipe(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / "run.jsonl"
-    assert main(["simulate", "notched-rectangle", "--tours", "2", "--no-stars", "-o", str(run)]) == 0
+    assert (
+        main(["simulate", "notched-rectangle", "--tours", "2", "--no-stars", "-o", str(run)]) == 0
+    )
     views = tmp_path / "views.jsonl"
     assert main(["cluster", str(run), "--k", "4", "-o", str(views)]) == 0
     capsys.readouterr()
@@ -163,7 +197,10 @@ def test_every_verb_that_writes_writes_into_a_pipe(tmp_path: Path, capsys: pytes
 def learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
     """The words of `learning-curve` for a small trace with images and its map."""
     lines = [{"format": "ssh-trace", "version": 1}]
-    lines += [{"view": "ab"[i % 2], "image": [1.0 + i % 2, 2.0 + i / 100], "action": "travel"} for i in range(8)]
+    lines += [
+        {"view": "ab"[i % 2], "image": [1.0 + i % 2, 2.0 + i / 100], "action": "travel"}
+        for i in range(8)
+    ]
     del lines[-1]["action"]
     (tmp_path / "t.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert main(["solve", str(tmp_path / "t.jsonl"), "--theory", "causal", "--json"]) == 0
@@ -172,7 +209,10 @@ def learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
 
 
 def test_matplotlib_is_looked_for_before_anything_is_done(
-    tmp_path: Path, learnt: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    learnt: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     load = builtins.__import__
 
@@ -193,18 +233,37 @@ def test_matplotlib_is_looked_for_before_anything_is_done(
         assert main(words) == 1
         captured = capsys.readouterr()
         assert captured.out == ""
-        assert captured.err == "ssh-abduction: plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'\n"
+        assert (
+            captured.err
+            == "ssh-abduction: plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'\n"
+        )
         assert not never.exists()
     assert main(learnt) == 0
 
 
-def test_a_picture_that_fails_loses_nothing(tmp_path: Path, learnt: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_picture_that_fails_loses_nothing(
+    tmp_path: Path, learnt: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([*learnt, "--json", "--plot", str(tmp_path / "none" / "x.png")]) == 1
     captured = capsys.readouterr()
     assert json.loads(captured.out)["folds"] == 2
     assert captured.err.count("\n") == 1
     clustered = tmp_path / "views.jsonl"
-    assert main(["cluster", learnt[1], "--k", "2", "-o", str(clustered), "--plot", str(tmp_path / "none" / "x.png")]) == 1
+    assert (
+        main(
+            [
+                "cluster",
+                learnt[1],
+                "--k",
+                "2",
+                "-o",
+                str(clustered),
+                "--plot",
+                str(tmp_path / "none" / "x.png"),
+            ]
+        )
+        == 1
+    )
     assert Trace.load(clustered)
     assert "chosen" in capsys.readouterr().out
 
@@ -220,14 +279,28 @@ def test_a_reproduction_writes_its_data_before_it_draws(
     monkeypatch.setattr(report, "measure", lambda name, seed: type("Run", (), {"seed": seed}))
     monkeypatch.setattr(report, "to_dict", lambda run: {"seed": run.seed})
     monkeypatch.setattr(
-        report, "summary", lambda *_: [{"claim": "c", "ours": False, "paper": "p", "here": {"0": "x"}, "holds": 1, "seeds": 1}]
+        report,
+        "summary",
+        lambda *_: [
+            {"claim": "c", "ours": False, "paper": "p", "here": {"0": "x"}, "holds": 1, "seeds": 1}
+        ],
     )
     monkeypatch.setattr(report, "_draw", fails)
-    assert main(["reproduce", "taylor-hall", "--seeds", "0", "--jobs", "1", "-o", str(tmp_path)]) == 1
+    assert (
+        main(["reproduce", "taylor-hall", "--seeds", "0", "--jobs", "1", "-o", str(tmp_path)]) == 1
+    )
     captured = capsys.readouterr()
     assert "1 of 1" in captured.out
-    assert captured.err == f"ssh-abduction: {tmp_path}: cannot be written: No space left on device; make room\n"
-    assert {path.name for path in tmp_path.iterdir()} == {"claims.json", "runs.json", "configuration.json", "report.html"}
+    assert (
+        captured.err
+        == f"ssh-abduction: {tmp_path}: cannot be written: No space left on device; make room\n"
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "claims.json",
+        "runs.json",
+        "configuration.json",
+        "report.html",
+    }
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals")
@@ -237,7 +310,9 @@ def test_json_goes_to_its_file_while_progress_shows_on_a_terminal(tmp_path: Path
     ours, theirs = pty.openpty()
     with (tmp_path / "maps.json").open("wb") as file:
         command = [sys.executable, "-m", "ssh_abduction", "solve", ACES, "--json"]
-        done = subprocess.run(command, stdout=file, stderr=theirs, env={**os.environ, "TERM": "xterm"}, check=False)
+        done = subprocess.run(
+            command, stdout=file, stderr=theirs, env={**os.environ, "TERM": "xterm"}, check=False
+        )
     os.close(theirs)
     os.close(ours)
     assert done.returncode == 0
@@ -303,7 +378,16 @@ SCRIPT = "-c import~sys;from~ssh_abduction.__main__~import~run;sys.exit(run())"
 @pytest.mark.parametrize(
     ("program", "module"),
     [
-        *(("-m ssh_abduction", module) for module in ("ssh_abduction.cli", "argparse", "clingo", "numpy.linalg", "sklearn.base")),
+        *(
+            ("-m ssh_abduction", module)
+            for module in (
+                "ssh_abduction.cli",
+                "argparse",
+                "clingo",
+                "numpy.linalg",
+                "sklearn.base",
+            )
+        ),
         *((SCRIPT, module) for module in ("ssh_abduction.cli", "ssh_abduction.cli.train", "numpy")),
     ],
 )
@@ -311,14 +395,27 @@ def test_ctrl_c_while_modules_load_is_quiet(program: str, module: str, tmp_path:
     (tmp_path / "sitecustomize.py").write_text(CTRL_C_AT.format(module=module))
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
     words = [word.replace("~", " ") for word in program.split(" ")]
-    command = [sys.executable, *words, "simulate", "notched-rectangle", "--route", "around,around", "-o", str(tmp_path / "out")]
+    command = [
+        sys.executable,
+        *words,
+        "simulate",
+        "notched-rectangle",
+        "--route",
+        "around,around",
+        "-o",
+        str(tmp_path / "out"),
+    ]
     if module.startswith("sklearn"):
         command[-6:] = ["recognise", str(tmp_path / "none"), ACES]
-    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
-def test_what_would_steer_a_terminal_is_escaped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_would_steer_a_terminal_is_escaped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     strange = "\x1b[31m\x9bred\u202e"
     trace, maps = tmp_path / f"{strange}.jsonl", tmp_path / "maps.json"
     go = {"name": f"go{strange}", "kind": "travel"}
@@ -328,15 +425,35 @@ def test_what_would_steer_a_terminal_is_escaped(tmp_path: Path, capsys: pytest.C
     maps.write_text(capsys.readouterr().out)
     missing = tmp_path / f"none{strange}"
     for words in (
-        *(["solve", str(trace)], ["solve", str(trace), str(trace)], ["check", str(trace), str(maps)], ["check", ACES, str(maps)]),
-        *(["show", str(maps)], ["show", str(maps), "--dot"], ["show", str(maps), "--svg"], ["show", str(maps), "--graphml"]),
-        *(["solve", str(missing)], ["show", str(missing)], ["recognise", str(missing), ACES], ["simulate", f"{missing}.json", "-o", "x"]),
-        *(["cluster", str(trace), "-o", str(missing)], ["simulate", "notched-rectangle", "--route", "around,around", "-o", str(missing)]),
+        *(
+            ["solve", str(trace)],
+            ["solve", str(trace), str(trace)],
+            ["check", str(trace), str(maps)],
+            ["check", ACES, str(maps)],
+        ),
+        *(
+            ["show", str(maps)],
+            ["show", str(maps), "--dot"],
+            ["show", str(maps), "--svg"],
+            ["show", str(maps), "--graphml"],
+        ),
+        *(
+            ["solve", str(missing)],
+            ["show", str(missing)],
+            ["recognise", str(missing), ACES],
+            ["simulate", f"{missing}.json", "-o", "x"],
+        ),
+        *(
+            ["cluster", str(trace), "-o", str(missing)],
+            ["simulate", "notched-rectangle", "--route", "around,around", "-o", str(missing)],
+        ),
     ):
         main(words)
         captured = capsys.readouterr()
         for text in (captured.out, captured.err):
-            assert not set(strange[0] + strange[5] + strange[-1]) & set(text.replace("\u202e", "") if words[0] == "show" else text), words
+            assert not set(strange[0] + strange[5] + strange[-1]) & set(
+                text.replace("\u202e", "") if words[0] == "show" else text
+            ), words
     for words in (["solve", ACES, f"--{strange}"], [strange]):
         with pytest.raises(SystemExit):
             main(words)
@@ -354,7 +471,9 @@ def test_what_cannot_be_printed_is_named(tmp_path: Path) -> None:
             check=False,
         )
     assert done.returncode == 1
-    assert done.stderr.decode().endswith("standard output: cannot be written: No space left on device; make room\n")
+    assert done.stderr.decode().endswith(
+        "standard output: cannot be written: No space left on device; make room\n"
+    )
 
 
 @pytest.mark.parametrize("name", ["", "a\0b"])

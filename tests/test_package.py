@@ -23,46 +23,88 @@ ROOT = Path(__file__).parent.parent
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the wheel puts into site-packages."""
     built, unpacked = tmp_path_factory.mktemp("built"), tmp_path_factory.mktemp("site")
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(built)], cwd=ROOT, check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(built)],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+    )
     (wheel,) = built.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(unpacked)
     return unpacked
 
 
-def test_the_wheel_holds_the_encodings_the_examples_and_the_wings(installed: Path, tmp_path: Path) -> None:
+def test_the_wheel_holds_the_encodings_the_examples_and_the_wings(
+    installed: Path, tmp_path: Path
+) -> None:
     for folder in ("encodings", "examples"):
-        assert {p.name for p in (ROOT / folder).rglob("*.*")} == {p.name for p in (installed / "ssh_abduction" / folder).rglob("*.*")}
+        assert {p.name for p in (ROOT / folder).rglob("*.*")} == {
+            p.name for p in (installed / "ssh_abduction" / folder).rglob("*.*")
+        }
     assert (installed / "ssh_abduction/py.typed").exists()
-    assert {p.name for p in installed.iterdir() if not p.name.endswith(".dist-info")} == {"ssh_abduction", "perception", "simulator"}
+    assert {p.name for p in installed.iterdir() if not p.name.endswith(".dist-info")} == {
+        "ssh_abduction",
+        "perception",
+        "simulator",
+    }
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import ssh_abduction; from ssh_abduction import *; from ssh_abduction.theory import encodings;"
         "assert ssh_abduction.__file__.startswith(sys.argv[1]) and str(encodings.folder()).startswith(sys.argv[1]);"
         "print(solve(Trace.from_steps('aba', ['travel', 'around'])).cost.dstates)"
     )
-    done = subprocess.run([sys.executable, "-c", program, str(installed)], cwd=tmp_path, check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(installed)],
+        cwd=tmp_path,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     assert done.stdout == "3\n"
 
 
-def test_the_first_commands_of_the_readme_run_where_the_wheel_is_installed(installed: Path, tmp_path: Path) -> None:
-    lines, output = re.findall(r"```sh\n(.*?)```.*?```\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[0]
+def test_the_first_commands_of_the_readme_run_where_the_wheel_is_installed(
+    installed: Path, tmp_path: Path
+) -> None:
+    lines, output = re.findall(
+        r"```sh\n(.*?)```.*?```\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL
+    )[0]
     assert "examples/" in lines
     command = re.sub(
-        r"^ssh-abduction", f"{shlex.quote(sys.executable)} -m ssh_abduction", f"ssh-abduction examples -q\n{lines}", flags=re.MULTILINE
+        r"^ssh-abduction",
+        f"{shlex.quote(sys.executable)} -m ssh_abduction",
+        f"ssh-abduction examples -q\n{lines}",
+        flags=re.MULTILINE,
     )
     environment = {**os.environ, "PYTHONPATH": str(installed)}
-    done = subprocess.run(command, shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        command,
+        shell=True,
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     said, _, shown = done.stdout.partition("\n")
-    assert (said.startswith(f"{len(list((ROOT / 'examples').glob('*.*')))} examples in examples: "), shown) == (True, output)
+    assert (
+        said.startswith(f"{len(list((ROOT / 'examples').glob('*.*')))} examples in examples: "),
+        shown,
+    ) == (True, output)
 
 
-def test_examples_that_somebody_changed_are_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_examples_that_somebody_changed_are_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "deep" / "copies"
     assert main(["examples", "-o", str(folder)]) == main(["examples", "-o", str(folder)]) == 0
     (folder / "demo.py").write_text("mine")
     (folder / "adventure.py").unlink()
     assert main(["examples", "-o", str(folder)]) == 1
-    assert "demo.py: expected no file, or the example of this name, got another one; nothing was copied" in capsys.readouterr().err
+    assert (
+        "demo.py: expected no file, or the example of this name, got another one; nothing was copied"
+        in capsys.readouterr().err
+    )
     assert (folder / "demo.py").read_text() == "mine"
     assert not (folder / "adventure.py").exists()
 

@@ -57,7 +57,9 @@ def content(route: Trace, rivals: Solution) -> dict[str, Any]:
     return content_of(rivals, route)
 
 
-def test_overview_counts_the_maps_that_have_each_place(route: Trace, rivals: Solution, content: dict[str, Any]) -> None:
+def test_overview_counts_the_maps_that_have_each_place(
+    route: Trace, rivals: Solution, content: dict[str, Any]
+) -> None:
     overview = content["overview"]
     told = {tuple(node["steps"]): node["maps"] for node in overview["nodes"]}
     counted: dict[tuple[int, ...], int] = {}
@@ -71,7 +73,9 @@ def test_overview_counts_the_maps_that_have_each_place(route: Trace, rivals: Sol
     driven = {tuple(sorted((t, t + 1))) for t in range(len(route) - 1)}
     for a, b, count, agreeing in overview["streets"]:
         here, there = (overview["nodes"][k]["steps"] for k in (a, b))
-        assert any(tuple(sorted(pair)) in driven for pair in product(here, there))  # orders of paths alone make no street
+        assert any(
+            tuple(sorted(pair)) in driven for pair in product(here, there)
+        )  # orders of paths alone make no street
         assert agreeing <= count <= 4
 
 
@@ -86,7 +90,12 @@ def hostile() -> tuple[Solution, Trace]:
 
 def test_page_is_one_file_that_loads_nothing_and_keeps_texts_as_texts() -> None:
     solution, trace = hostile()
-    text_of_page = view_page(solution, trace, run=trace[:3], beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace[:3])).html
+    text_of_page = view_page(
+        solution,
+        trace,
+        run=trace[:3],
+        beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace[:3]),
+    ).html
     for text in [*HOSTILE, "<b>", "\u2028"]:
         assert text not in text_of_page
     assert text_of_page.count("<script") == text_of_page.count("</script>") == 2
@@ -97,7 +106,10 @@ def test_page_is_one_file_that_loads_nothing_and_keeps_texts_as_texts() -> None:
 
 def test_ranges_are_drawn_at_the_bearings_that_the_header_says() -> None:
     images = [(1.0, float("inf"), 2.0, float("nan")), (4.0, 1.0, 2.0, 4.0)]
-    steps = tuple(Step("v", image=image, action=Action("on") if k == 0 else None) for k, image in enumerate(images))
+    steps = tuple(
+        Step("v", image=image, action=Action("on") if k == 0 else None)
+        for k, image in enumerate(images)
+    )
     trace = Trace(steps, extra={"beams": {"first": -30, "step": 20}})
     drawn = drawn_images(trace)
     assert drawn is not None
@@ -106,16 +118,24 @@ def test_ranges_are_drawn_at_the_bearings_that_the_header_says() -> None:
     assert first[1] == ALPHABET[-1]  # nothing came back: as far as is drawn
     assert first[3] == LOST
     assert ALPHABET.index(first[2]) == pytest.approx(2 * ALPHABET.index(first[0]), abs=1)
-    assert [beams_of(Trace(steps), count) for count in (180, 181, 361)] == [(-89.5, 1.0), (-90.0, 1.0), (-90.0, 0.5)]
+    assert [beams_of(Trace(steps), count) for count in (180, 181, 361)] == [
+        (-89.5, 1.0),
+        (-90.0, 1.0),
+        (-90.0, 0.5),
+    ]
     with pytest.raises(TraceError, match="go round once at most"):
         drawn_images(replace(trace, extra={"beams": {"first": 0, "step": 200}}))
 
 
-def test_images_of_a_sidecar_file_and_panoramas_are_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_of_a_sidecar_file_and_panoramas_are_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shape = [2, 3, 1]
     np.savez(tmp_path / "images.npz", images=np.arange(12).reshape(2, 6) * 20)
     steps = (Step("a", Action("on"), image=1), Step("b", image=0))
-    trace = Trace(steps, images="images.npz", extra={"panorama": shape}, source=str(tmp_path / "trace.jsonl"))
+    trace = Trace(
+        steps, images="images.npz", extra={"panorama": shape}, source=str(tmp_path / "trace.jsonl")
+    )
     drawn = drawn_images(trace)
     assert drawn is not None
     assert (drawn["kind"], drawn["rows"], drawn["columns"]) == ("panorama", 2, 3)
@@ -132,10 +152,16 @@ def test_images_of_a_sidecar_file_and_panoramas_are_shown(tmp_path: Path, monkey
 def test_beliefs_are_those_of_the_localiser_in_each_rival() -> None:
     trace = Trace.from_steps("abcbabcb", ["on"] * 7)
     solution = solve(trace, Theory.causal())
-    found = view_page(solution, trace, run=trace, beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace)).content
+    found = view_page(
+        solution, trace, run=trace, beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace)
+    ).content
     (replayed,) = found["replays"]
-    assert list(replayed["beliefs"]) == [str(number) for number in dict.fromkeys(told["labeling"] for told in found["maps"])]
-    for (verdict, nowhere, likely), belief in zip(replayed["beliefs"]["0"], Localiser(solution.maps[0]).beliefs(trace), strict=True):
+    assert list(replayed["beliefs"]) == [
+        str(number) for number in dict.fromkeys(told["labeling"] for told in found["maps"])
+    ]
+    for (verdict, nowhere, likely), belief in zip(
+        replayed["beliefs"]["0"], Localiser(solution.maps[0]).beliefs(trace), strict=True
+    ):
         assert verdict == belief.verdict.value
         assert nowhere == pytest.approx(belief.nowhere, abs=1e-3)
         assert likely[0] == [belief.likeliest, pytest.approx(belief.probability, abs=1e-3)]
@@ -146,12 +172,22 @@ def test_beliefs_are_those_of_the_localiser_in_each_rival() -> None:
 
 
 def test_colours_can_be_told_apart_by_the_colour_blind_and_from_the_paper() -> None:
-    light, dark = re.findall(r":root \{([^}]*)\}", (Path(html.__file__).parent / "page.css").read_text())
+    light, dark = re.findall(
+        r":root \{([^}]*)\}", (Path(html.__file__).parent / "page.css").read_text()
+    )
     for theme in (light, dark):
         found = {name: linear(colour) for name, colour in re.findall(r"--(\w+): (#\w+)", theme)}
-        bright = {name: float(colour @ [0.2126, 0.7152, 0.0722]) + 0.05 for name, colour in found.items()}
+        bright = {
+            name: float(colour @ [0.2126, 0.7152, 0.0722]) + 0.05 for name, colour in found.items()
+        }
         drawn = [name for name in found if name not in ("paper", "panel", "rule")]
-        assert min(max(bright[name] / bright["paper"], bright["paper"] / bright[name]) for name in drawn) > 3
+        assert (
+            min(
+                max(bright[name] / bright["paper"], bright["paper"] / bright[name])
+                for name in drawn
+            )
+            > 3
+        )
         assert max(bright["ink"] / bright["paper"], bright["paper"] / bright["ink"]) > 12
         for together in (["few", "half", "most", "soft"], [f"path{k}" for k in range(6)]):
             for seen in DEFICIENT.values():
@@ -162,8 +198,16 @@ def test_colours_can_be_told_apart_by_the_colour_blind_and_from_the_paper() -> N
 # What the eye makes of linear red, green and blue: as all see, and without one kind of cone (Machado, Oliveira & Fernandes 2009, severity 1).
 DEFICIENT = {
     "none": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
-    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]],
+    "protanopia": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "deuteranopia": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.01182, 0.04294, 0.968881],
+    ],
 }
 
 
@@ -174,7 +218,9 @@ def linear(colour: str) -> Any:
 
 
 def cielab(rgb: Any) -> Any:
-    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    to_xyz = np.array(
+        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    )
     x, y, z = np.cbrt(np.maximum(to_xyz @ np.clip(rgb, 0, 1) / [0.9505, 1, 1.089], 0.0005))
     return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
@@ -185,8 +231,16 @@ def test_flags_of_a_theory_make_it_again() -> None:
     for theory in (
         Theory.topological(),
         Theory.causal(),
-        Theory.topological().replace(misread=1.5, boundary="none", same=((0, 4), (1, 5)), different=((2, 3),), symmetric_sides=False),
-        Theory.topological().replace(without=("side_of_branch",), prefer=("dstates", "places"), joint=1, reject=0.01),
+        Theory.topological().replace(
+            misread=1.5,
+            boundary="none",
+            same=((0, 4), (1, 5)),
+            different=((2, 3),),
+            symmetric_sides=False,
+        ),
+        Theory.topological().replace(
+            without=("side_of_branch",), prefer=("dstates", "places"), joint=1, reject=0.01
+        ),
     ):
         assert theory_of(parser.parse_args(flags_of(theory))) == theory
 
@@ -196,11 +250,30 @@ def test_page_of_many_maps_of_500_dstates_in_metres_is_small() -> None:
     rng, places, maps = np.random.default_rng(0), 250, []
     for _ in range(DRAWN // 500 + 10):
         of_place = rng.integers(31, size=places).tolist()
-        dstates = tuple(DState(i, f"v{i % 40}", i // 2, of_place[i // 2], 1 if i % 2 else -1) for i in range(2 * places))
-        paths = tuple(MapPath(h, tuple(p for p in range(places) if of_place[p] == h)) for h in range(31))
+        dstates = tuple(
+            DState(i, f"v{i % 40}", i // 2, of_place[i // 2], 1 if i % 2 else -1)
+            for i in range(2 * places)
+        )
+        paths = tuple(
+            MapPath(h, tuple(p for p in range(places) if of_place[p] == h)) for h in range(31)
+        )
         at = rng.normal(size=(500, 3)) + [[5 * (i // 2 % 16), 5 * (i // 32), 0] for i in range(500)]
-        fit = Fit(1.0, 1, 0.5, poses=tuple(Pose(x, y, heading, (0.1, 0.02, 0.05)) for x, y, heading in at.tolist()))
-        maps.append(SSHMap(tuple(range(500)), dstates, tuple((i, "on", i + 1) for i in range(499)), tuple(range(places)), paths, fit=fit))
+        fit = Fit(
+            1.0,
+            1,
+            0.5,
+            poses=tuple(Pose(x, y, heading, (0.1, 0.02, 0.05)) for x, y, heading in at.tolist()),
+        )
+        maps.append(
+            SSHMap(
+                tuple(range(500)),
+                dstates,
+                tuple((i, "on", i + 1) for i in range(499)),
+                tuple(range(places)),
+                paths,
+                fit=fit,
+            )
+        )
     found = view_page(maps)
     assert sum("layout" in told for told in found.content["maps"]) == DRAWN // 500
     assert len(found.content["layouts"][0]["ellipses"]) == places
@@ -212,7 +285,9 @@ def test_trace_of_other_maps_is_refused(rivals: Solution, route: Trace) -> None:
         view_page(rivals, route[:5])
 
 
-def test_view_writes_a_page_with_beliefs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_view_writes_a_page_with_beliefs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trace = Trace.from_steps("abcbabcb", ["on"] * 7)
     maps, run, page = (str(tmp_path / name) for name in ("maps.json", "it's.jsonl", "page.html"))
     solve(trace, Theory.causal()).save(maps)
@@ -226,7 +301,10 @@ def test_view_writes_a_page_with_beliefs(tmp_path: Path, capsys: pytest.CaptureF
     assert shown["replays"][0]["beliefs"]["0"] == again["replays"][0]["beliefs"]["0"]
     assert shown["flags"] == " --theory causal"
     assert shown["trace"] == f"'{tmp_path}/it'\"'\"'s.jsonl'"
-    for wrong, said in ((["--serve"], "expected the trace that was mapped"), (["--belief", maps], "beliefs: expected a list")):
+    for wrong, said in (
+        (["--serve"], "expected the trace that was mapped"),
+        (["--belief", maps], "beliefs: expected a list"),
+    ):
         assert main(["view", maps, *([run] if wrong[1:] else []), *wrong, "--no-open"]) == 1
         assert said in capsys.readouterr().err
 
@@ -236,19 +314,33 @@ def test_what_assumptions_cost_is_what_an_explanation_says() -> None:
     solution = solve(trace, max_maps=None)
     known = assumptions(Listing.of(solution), trace, Theory(), seconds=1000)
     assert known == {pair: explain_pair(trace, *pair, max_maps=None).assuming for pair in known}
-    assert {text for told in known.values() for text in told.values()} > {"no map satisfies the axioms"}
-    agreed = {(i, j) for j in range(4) for i in range(j) if len({m.labels[i] == m.labels[j] for m in solution.maps}) == 1}
+    assert {text for told in known.values() for text in told.values()} > {
+        "no map satisfies the axioms"
+    }
+    agreed = {
+        (i, j)
+        for j in range(4)
+        for i in range(j)
+        if len({m.labels[i] == m.labels[j] for m in solution.maps}) == 1
+    }
     assert known.keys() == agreed
     assert assumptions(Listing.of(solution), trace, Theory(), seconds=1e-9) == {}
 
 
 def shown_in(page: str) -> Any:
-    return json.loads(Path(page).read_text().partition('<script type="application/json" id="content">')[2].partition("</script>")[0])
+    return json.loads(
+        Path(page)
+        .read_text()
+        .partition('<script type="application/json" id="content">')[2]
+        .partition("</script>")[0]
+    )
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[PageServer]:
-    with PageServer(Listing.of(solve(CORRIDOR, Theory.causal())), CORRIDOR, Theory.causal()) as served:
+    with PageServer(
+        Listing.of(solve(CORRIDOR, Theory.causal())), CORRIDOR, Theory.causal()
+    ) as served:
         thread = threading.Thread(target=served.serve_forever, args=(0.05,))
         thread.start()
         yield served
@@ -256,7 +348,9 @@ def server() -> Iterator[PageServer]:
         thread.join()
 
 
-def asked(server: PageServer, method: str, path: str, body: Any = None, **headers: str) -> tuple[int, bytes]:
+def asked(
+    server: PageServer, method: str, path: str, body: Any = None, **headers: str
+) -> tuple[int, bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=100)
     text = None if body is None else json.dumps(body)
     connection.request(method, path, text, {"Content-Type": "application/json", **headers})
@@ -278,7 +372,9 @@ def test_server_answers_only_who_knows_its_token_from_this_computer(server: Page
     assert asked(server, "POST", own + "solve", {"same": "x" * 200_000}) == (403, b"")
 
 
-@pytest.mark.parametrize("length", ["9" * 5000, "-1", "", "+2", " ", "2.0", "0x2", "²", "٢", "2\r\nContent-Length: 3"])
+@pytest.mark.parametrize(
+    "length", ["9" * 5000, "-1", "", "+2", " ", "2.0", "0x2", "²", "٢", "2\r\nContent-Length: 3"]
+)
 def test_a_length_that_is_none_is_refused(server: PageServer, length: str) -> None:
     own = server.url.partition(str(server.port))[2]
     with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
@@ -287,7 +383,9 @@ def test_a_length_that_is_none_is_refused(server: PageServer, length: str) -> No
         assert connection.recv(100).startswith(b"HTTP/1.0 403")
 
 
-def test_question_whose_asker_is_gone_is_given_up(server: PageServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_question_whose_asker_is_gone_is_given_up(
+    server: PageServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     own = server.url.partition(str(server.port))[2]
     monkeypatch.setattr("ssh_abduction.page.answers.solved", sleep)
     with socket.create_connection(("127.0.0.1", server.port)) as connection:
@@ -313,8 +411,13 @@ def until(happened: Callable[[], bool]) -> None:
 def test_server_solves_under_what_is_assumed_and_explains(server: PageServer) -> None:
     own = server.url.partition(str(server.port))[2]
     told = json.loads(asked(server, "POST", own + "solve", {"different": [[0, 4]]})[1])
-    assert told["text"] == solve(CORRIDOR, Theory.causal().replace(different=((0, 4),)), max_maps=100).headline
-    assert not any(entry["labels"][0] == entry["labels"][4] for entry in told["content"]["labelings"])
+    assert (
+        told["text"]
+        == solve(CORRIDOR, Theory.causal().replace(different=((0, 4),)), max_maps=100).headline
+    )
+    assert not any(
+        entry["labels"][0] == entry["labels"][4] for entry in told["content"]["labelings"]
+    )
     why = json.loads(asked(server, "POST", own + "explain", {"pair": [0, 4]})[1])
     assert "steps 0 and 4 are one dstate in every minimal map" in why["text"]
     assert why["assuming"] == {"same": "costs nothing: 4 dstates", "different": "5 dstates, not 4"}
@@ -374,12 +477,19 @@ class Shown:
 
     @property
     def complaints(self) -> list[str]:
-        return [entry["message"] for entry in self.browser.get_log("browser") if "favicon" not in entry["message"]]
+        return [
+            entry["message"]
+            for entry in self.browser.get_log("browser")
+            if "favicon" not in entry["message"]
+        ]
 
 
 def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, Any]) -> None:
     file = tmp_path / "page.html"
-    assuming = {"texts": ["no map satisfies the axioms", "costs nothing, as it holds in every map"], "pairs": {"0,1": [0, 1]}}
+    assuming = {
+        "texts": ["no map satisfies the axioms", "costs nothing, as it holds in every map"],
+        "pairs": {"0,1": [0, 1]},
+    }
     Page({**content, "assuming": assuming}).save(file)
     page = Shown(browser, file.as_uri())
     assert (
@@ -407,27 +517,39 @@ def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, An
     )
     assert "more than the 19 dstates" in page["costs"].text
     browser.set_window_size(500, 900)
-    assert browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth")
+    assert browser.execute_script(
+        "return document.documentElement.scrollWidth <= window.innerWidth"
+    )
     browser.set_window_size(1280, 900)
     assert page.complaints == []
 
 
 def test_hostile_texts_stay_texts_in_the_browser(browser: Any, tmp_path: Path) -> None:
     solution, trace = hostile()
-    view_page(solution, trace, run=trace[:3], beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace[:3])).save(tmp_path / "page.html")
+    view_page(
+        solution,
+        trace,
+        run=trace[:3],
+        beliefs=lambda ssh_map: Localiser(ssh_map).beliefs(trace[:3]),
+    ).save(tmp_path / "page.html")
     page = Shown(browser, (tmp_path / "page.html").as_uri())
     assert EVIL in page["seen"].text  # an alert would have made this an error
     assert EVIL in page["which"].get_attribute("textContent")
     browser.execute_script("chooseReplay(1); setStep(1); pick(0); pick(1)")
     assert EVIL in page["wrong"].text
-    assert browser.execute_script("return document.querySelectorAll('script, iframe, img, b').length") == 2
+    assert (
+        browser.execute_script("return document.querySelectorAll('script, iframe, img, b').length")
+        == 2
+    )
     assert page.complaints == []
 
 
 def test_assuming_and_explaining_in_the_browser(browser: Any, server: PageServer) -> None:
     page = Shown(browser, server.url)
     page.choose(0, 1)
-    page.until("answer", "different dstates in every map")  # which is asked as soon as two are chosen
+    page.until(
+        "answer", "different dstates in every map"
+    )  # which is asked as soon as two are chosen
     assert "no map satisfies the axioms" in page["costs"].text
     page.browser.execute_script(
         "for (const [id, t] of [['first', 0], ['later', 4]]) $(id).value = t; $('later').dispatchEvent(new Event('change'))"

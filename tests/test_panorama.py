@@ -45,7 +45,9 @@ def test_the_transformer_keeps_the_rules_of_scikit_learn(estimator: Any, check: 
     check(estimator)
 
 
-def test_walls_stand_as_high_as_the_laser_says_that_they_are_near(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_walls_stand_as_high_as_the_laser_says_that_they_are_near(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(Paint, "texture", lambda self, key: np.array([0.9] * 13 + [0.0] * 36))
     monkeypatch.setattr("simulator.panorama.ACROSS", 1)
     world, pose = World.named("taylor-hall"), (13.0, 0.2, 0.3)
@@ -65,7 +67,9 @@ def test_walls_stand_as_high_as_the_laser_says_that_they_are_near(monkeypatch: p
 def test_a_turn_of_the_robot_turns_the_panorama() -> None:
     camera = Camera(noise=0, hours=(20.0, 20.0))
     rng = np.random.default_rng(0)
-    first, turned = (camera.shot(ROOM, (3.0, 0.8, math.radians(degrees)), rng, 20.0) for degrees in (10.0, 50.0))
+    first, turned = (
+        camera.shot(ROOM, (3.0, 0.8, math.radians(degrees)), rng, 20.0) for degrees in (10.0, 50.0)
+    )
     differences = np.abs(np.roll(first, 20, axis=1).astype(int) - turned)
     assert (differences > 1).mean() < 0.01  # rays that meet the edge of a stripe
     assert np.abs(first.astype(int) - turned).mean() > 5
@@ -80,12 +84,20 @@ def test_what_is_in_the_middle_of_a_panorama_is_ahead() -> None:
 
 
 def test_repeated_textures_make_opposite_corners_look_alike_and_unique_ones_do_not() -> None:
-    rectangle = replace(ROOM, segments=np.array([[0, 0, 4, 0], [4, 0, 4, 2], [4, 2, 0, 2], [0, 2, 0, 0]], float))
+    rectangle = replace(
+        ROOM, segments=np.array([[0, 0, 4, 0], [4, 0, 4, 2], [4, 2, 0, 2], [0, 2, 0, 0]], float)
+    )
     rng, poses = np.random.default_rng(0), ((3.4, 1.4, -math.pi / 2), (0.6, 0.6, math.pi / 2))
     for repeated in (True, False):
-        a, b = (Camera(paint=Paint(2, repeated), noise=0).shot(rectangle, pose, rng, 20.0).astype(int) for pose in poses)
+        a, b = (
+            Camera(paint=Paint(2, repeated), noise=0).shot(rectangle, pose, rng, 20.0).astype(int)
+            for pose in poses
+        )
         assert (np.abs(a - b).max() <= 1) == repeated
-    a, b = (Camera(paint=Paint(2, repeated=True), noise=0).shot(rectangle, pose, rng, 12.0).astype(int) for pose in poses)
+    a, b = (
+        Camera(paint=Paint(2, repeated=True), noise=0).shot(rectangle, pose, rng, 12.0).astype(int)
+        for pose in poses
+    )
     assert np.abs(a - b).mean() > 5  # the sun is at one side
 
 
@@ -109,7 +121,10 @@ def test_the_sun_is_brightest_at_noon_and_reddest_when_it_is_low() -> None:
 def test_a_camera_makes_up_for_brightness_by_its_exposure() -> None:
     rng = np.random.default_rng(0)
     by = {
-        exposure: [float(Camera(exposure=exposure, noise=0).shot(ROOM, ROOM.start, rng, hour).mean()) for hour in (9.0, 23.0)]
+        exposure: [
+            float(Camera(exposure=exposure, noise=0).shot(ROOM, ROOM.start, rng, hour).mean())
+            for hour in (9.0, 23.0)
+        ]
         for exposure in (0.0, 0.5, 1.0)
     }
     ratios = [day / night for day, night in by.values()]
@@ -122,13 +137,21 @@ def test_features_do_not_change_with_the_light() -> None:
     rng = np.random.default_rng(0)
     images = rng.uniform(5, 250, (4, 12 * 60 * 3))
     made = PanoramaTransformer(SMALL.shape, floor=0).fit(images)
-    assert np.allclose(made.transform(images), made.transform((images.reshape(4, -1, 3) * [0.9, 0.5, 0.2]).reshape(4, -1)))
+    assert np.allclose(
+        made.transform(images),
+        made.transform((images.reshape(4, -1, 3) * [0.9, 0.5, 0.2]).reshape(4, -1)),
+    )
     poses = [s.pose for s in ROOM.dstates]
     hours = (7.0, 10.0, 13.0, 16.0, 19.0)
     camera = replace(SMALL, paint=Paint(5))
-    table = np.array([camera.shot(ROOM, pose, rng, hour).ravel() for pose in poses for hour in hours], float)
+    table = np.array(
+        [camera.shot(ROOM, pose, rng, hour).ravel() for pose in poses for hour in hours], float
+    )
     of = np.repeat(np.arange(len(poses)), len(hours))
-    for features, parted in ((PanoramaTransformer(SMALL.shape), True), (FunctionTransformer(), False)):
+    for features, parted in (
+        (PanoramaTransformer(SMALL.shape), True),
+        (FunctionTransformer(), False),
+    ):
         x = features.fit_transform(table)
         distances = np.linalg.norm(x[:, None] - x, axis=2)
         same = of[:, None] == of
@@ -139,9 +162,13 @@ def test_patches_that_do_not_divide_a_panorama_are_smaller() -> None:
     image = np.arange(5 * 7, dtype=float).reshape(1, -1)
     made = PanoramaTransformer((5, 7, 1), patch=(3, 4), floor=1.0).fit_transform(image)
     table = image.reshape(5, 7)
-    means = np.array([[table[:3, :4].mean(), table[:3, 4:].mean()], [table[3:, :4].mean(), table[3:, 4:].mean()]])
+    means = np.array(
+        [[table[:3, :4].mean(), table[:3, 4:].mean()], [table[3:, :4].mean(), table[3:, 4:].mean()]]
+    )
     logs = np.log(means + 1)
-    assert np.allclose(made, [[*(logs[0, ::-1] - logs[0]), *(logs[1, ::-1] - logs[1]), *(logs[1] - logs[0])]])
+    assert np.allclose(
+        made, [[*(logs[0, ::-1] - logs[0]), *(logs[1, ::-1] - logs[1]), *(logs[1] - logs[0])]]
+    )
 
 
 @pytest.mark.parametrize(
@@ -161,9 +188,13 @@ def test_bad_settings_are_named(settings: dict[str, Any], message: str) -> None:
 def test_bad_images_and_headers_are_named(run: Trace) -> None:
     with pytest.raises(PerceptionError, match="images: expected values of 0 or more, got -3"):
         PanoramaTransformer().fit([[1.0, 2.0]]).transform([[1.0, -3.0]])
-    with pytest.raises(PerceptionError, match=r"panorama: expected 3 whole numbers of at least 1, got \[24, 180\]"):
+    with pytest.raises(
+        PerceptionError, match=r"panorama: expected 3 whole numbers of at least 1, got \[24, 180\]"
+    ):
         features_of(replace(run, extra={"panorama": [24, 180]}))
-    with pytest.raises(PerceptionError, match="trace 1: image: expected one of the kind that trace 0 has"):
+    with pytest.raises(
+        PerceptionError, match="trace 1: image: expected one of the kind that trace 0 has"
+    ):
         BootstrapLearner(VIEWS_ALONE).fit([run, replace(run, extra={})])
 
 
@@ -196,17 +227,25 @@ def test_the_loop_has_the_true_map_over_a_day_where_views_of_raw_pixels_cannot(r
     clusterer = ViewClusterer(k_max=12, n_init=3, random_state=0)
     learner = BootstrapLearner(VIEWS_ALONE, clusterer).fit(run)
     assert one_to_one(learner.labels_, true_dstates(run))
-    assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (8, 4, 4)
+    assert (len(learner.map_.dstates), len(learner.map_.places), len(learner.map_.paths)) == (
+        8,
+        4,
+        4,
+    )
     later = simulate(ROOM, tours=2, seed=501, camera=replace(SMALL, hours=(19.0, 8.0)))
     assert learner.score(later) == 1
     raw = clusterer.fit(images_of(run) / 255)
-    assert uncertainty_coefficient(raw.labels_, true_dstates(run)) < 0.9  # dstates have several views, so no map of these is the true one
+    assert (
+        uncertainty_coefficient(raw.labels_, true_dstates(run)) < 0.9
+    )  # dstates have several views, so no map of these is the true one
 
 
 @pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
 def test_any_clusterer_plugs_in(run: Trace) -> None:
     part = replace(run, steps=(*run.steps[8:23], replace(run.steps[23], action=None)))
-    learner = BootstrapLearner(VIEWS_ALONE, AgglomerativeClustering(4, linkage="average")).fit([run, part])
+    learner = BootstrapLearner(VIEWS_ALONE, AgglomerativeClustering(4, linkage="average")).fit(
+        [run, part]
+    )
     assert one_to_one(learner.labels_, np.concatenate([true_dstates(run), true_dstates(run)[8:24]]))
 
 
@@ -217,12 +256,18 @@ def test_a_recogniser_of_panoramas_is_stored(run: Trace, tmp_path: Path) -> None
 
 
 @pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
-def test_panoramas_in_the_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_panoramas_in_the_shell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     drive = "simulate notched-rectangle --tours 2 --images panoramas --textures repeated --paint-seed 5 --hours 8,18 --no-stars"
     assert main([*drive.split(), "-o", "run.jsonl"]) == 0
     trace = Trace.load("run.jsonl")
-    assert (trace.images, trace.extra["panorama"], trace.steps[3].image) == ("run.npz", [24, 180, 3], 3)
+    assert (trace.images, trace.extra["panorama"], trace.steps[3].image) == (
+        "run.npz",
+        [24, 180, 3],
+        3,
+    )
     camera = Camera(paint=Paint(5, repeated=True), hours=(8.0, 18.0))
     inline = simulate(ROOM, 2, stars=False, camera=camera)
     assert np.array_equal(images_of(trace), images_of(inline))
@@ -242,11 +287,22 @@ def test_panoramas_in_the_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     [
         ("--hours 7,19", "--hours: expected --images panoramas beside it"),
         ("--textures unique", "--textures: expected --images panoramas beside it"),
-        ("--images panoramas --hours noon", "--hours: expected two hours with a comma between them, as 7,19, got 'noon'"),
-        ("--images panoramas --hours 7,nan", "camera.hours: expected a number from 0 to 24, got nan"),
+        (
+            "--images panoramas --hours noon",
+            "--hours: expected two hours with a comma between them, as 7,19, got 'noon'",
+        ),
+        (
+            "--images panoramas --hours 7,nan",
+            "camera.hours: expected a number from 0 to 24, got nan",
+        ),
     ],
 )
-def test_bad_options_are_named(options: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["simulate", "notched-rectangle", *options.split(), "-o", str(tmp_path / "x.jsonl")]) == 1
+def test_bad_options_are_named(
+    options: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(["simulate", "notched-rectangle", *options.split(), "-o", str(tmp_path / "x.jsonl")])
+        == 1
+    )
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

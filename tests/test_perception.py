@@ -33,16 +33,24 @@ from perception import quality, store, views
 from perception.confidence import confidence, nearest_views, warn_of_doubts
 from perception.errors import ImageWarning, PerceptionError
 from perception.features import strongest, telling_features
-from perception.quality import cluster_quality, cluster_spread, spanning_tree, trimmed_quality, uncertainty_coefficient
+from perception.quality import (
+    cluster_quality,
+    cluster_spread,
+    spanning_tree,
+    trimmed_quality,
+    uncertainty_coefficient,
+)
 from perception.reciprocal import ReciprocalTransformer
-from perception.recognition import PlaceRecognizer, learning_curve, recogniser
+from perception.recognition import PlaceRecogniser, learning_curve, recogniser
 from perception.views import ViewClusterer, as_view_clusterer
 from ssh_abduction.data.errors import AbductionError
 
 Images = np.ndarray[Any, Any]
 
 
-def blobs(clusters: int, each: int, beams: int = 8, spread: float = 0.1, seed: int = 0) -> tuple[Images, Images]:
+def blobs(
+    clusters: int, each: int, beams: int = 8, spread: float = 0.1, seed: int = 0
+) -> tuple[Images, Images]:
     """Images around well separated centres, and the number of the centre of each."""
     rng = np.random.default_rng(seed)
     centres = 3 * np.eye(max(beams, clusters))[:clusters, :beams] + np.arange(clusters)[:, None]
@@ -59,7 +67,7 @@ def plain_quality(images: Images, labels: Images) -> float:
 @parametrize_with_checks(
     [
         ReciprocalTransformer(),
-        PlaceRecognizer(),
+        PlaceRecogniser(),
         ViewClusterer(n_init=1, k_max=6),
         ViewClusterer(k=3, n_init=1),
         ViewClusterer(clusterer=AgglomerativeClustering(), k_max=6),
@@ -81,7 +89,10 @@ def test_reciprocals_are_of_metres_and_clipped_at_the_floor() -> None:
 def test_what_is_no_range_is_replaced_and_counted_once() -> None:
     images = [[np.inf, np.nan, np.inf], [0.0, -1.0, -np.inf]]
     transformer = ReciprocalTransformer(0.5).fit(images)
-    with pytest.warns(ImageWarning, match=r"6 of 6 ranges were replaced: 2 infinite and 1 missing.*3 of zero or less") as caught:
+    with pytest.warns(
+        ImageWarning,
+        match=r"6 of 6 ranges were replaced: 2 infinite and 1 missing.*3 of zero or less",
+    ) as caught:
         assert transformer.transform(images).tolist() == [[0, 0, 0], [2, 2, 2]]
     assert len(caught) == 1
 
@@ -106,10 +117,22 @@ def test_errors_of_perception_are_the_packages() -> None:
 
 
 @settings(max_examples=20)
-@given(st.integers(0, 2**32 - 1), st.integers(2, 60), st.integers(1, 6), st.integers(2, 5), st.sampled_from(["normal", "grid", "offset"]))
-def test_quality_is_the_ratio_over_all_pairs(seed: int, count: int, beams: int, clusters: int, kind: str) -> None:
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(2, 60),
+    st.integers(1, 6),
+    st.integers(2, 5),
+    st.sampled_from(["normal", "grid", "offset"]),
+)
+def test_quality_is_the_ratio_over_all_pairs(
+    seed: int, count: int, beams: int, clusters: int, kind: str
+) -> None:
     rng = np.random.default_rng(seed)
-    images = rng.normal(size=(count, beams)) if kind != "grid" else rng.integers(0, 4, (count, beams)).astype(float)
+    images = (
+        rng.normal(size=(count, beams))
+        if kind != "grid"
+        else rng.integers(0, 4, (count, beams)).astype(float)
+    )
     images = images + 1e5 if kind == "offset" else images
     labels = rng.integers(clusters, size=count)
     distances, same = squareform(pdist(images)), labels[:, None] == labels
@@ -118,31 +141,54 @@ def test_quality_is_the_ratio_over_all_pairs(seed: int, count: int, beams: int, 
     elif distances[~same].min() == 0:
         expected = 0.0
     else:
-        expected = distances[~same].min() / distances[same].max() if distances[same].max() > 0 else math.inf
+        expected = (
+            distances[~same].min() / distances[same].max()
+            if distances[same].max() > 0
+            else math.inf
+        )
     assert cluster_quality(images, labels) == pytest.approx(expected, rel=1e-9, nan_ok=True)
-    assert cluster_quality(images, labels, spanning_tree(images)) == pytest.approx(expected, rel=1e-9, nan_ok=True)
+    assert cluster_quality(images, labels, spanning_tree(images)) == pytest.approx(
+        expected, rel=1e-9, nan_ok=True
+    )
 
 
 @pytest.mark.parametrize(("cell", "block"), [(2, 3), (7, 16), (quality.CELL, quality.BLOCK)])
 @pytest.mark.parametrize("scale", [1e-120, 1.0, 1e120])
-def test_cells_and_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch, cell: int, block: int, scale: float) -> None:
+def test_cells_and_blocks_change_nothing(
+    monkeypatch: pytest.MonkeyPatch, cell: int, block: int, scale: float
+) -> None:
     monkeypatch.setattr(quality, "CELL", cell)
     monkeypatch.setattr(quality, "BLOCK", block)
     images = blobs(5, 60, beams=20, spread=0.5)[0] * scale
     tree, labels = spanning_tree(images), np.random.default_rng(1).integers(4, size=300)
-    shortest = minimum_spanning_tree(squareform(pdist(images / scale))).sum()  # scipy takes tiny lengths for no edge
+    shortest = minimum_spanning_tree(
+        squareform(pdist(images / scale))
+    ).sum()  # scipy takes tiny lengths for no edge
     assert tree.lengths.sum() == pytest.approx(scale * shortest, rel=1e-12, abs=0)
-    assert cluster_quality(images, labels) == pytest.approx(plain_quality(images, labels), rel=1e-12, abs=0)
-    assert cluster_quality(images, labels, tree) == pytest.approx(plain_quality(images, labels), rel=1e-12, abs=0)
+    assert cluster_quality(images, labels) == pytest.approx(
+        plain_quality(images, labels), rel=1e-12, abs=0
+    )
+    assert cluster_quality(images, labels, tree) == pytest.approx(
+        plain_quality(images, labels), rel=1e-12, abs=0
+    )
 
 
 def test_near_images_far_from_others_are_compared_exactly() -> None:
     # Squared distances of 1e-14 beside norms of 1e6 drown in the rounding of |a|² + |b|² - 2ab.
     rng = np.random.default_rng(0)
-    images = np.concatenate([1e3 + 1e-7 * rng.normal(size=(40, 12)), -1e3 + 1e-7 * rng.normal(size=(40, 12))])
+    images = np.concatenate(
+        [1e3 + 1e-7 * rng.normal(size=(40, 12)), -1e3 + 1e-7 * rng.normal(size=(40, 12))]
+    )
     tree, labels = spanning_tree(images), rng.integers(3, size=80)
-    assert np.allclose(tree.lengths, np.sort(minimum_spanning_tree(squareform(pdist(images))).data), rtol=1e-9, atol=0)
-    assert tree.separation(labels) == pytest.approx(squareform(pdist(images))[labels[:, None] != labels].min(), rel=1e-9, abs=0)
+    assert np.allclose(
+        tree.lengths,
+        np.sort(minimum_spanning_tree(squareform(pdist(images))).data),
+        rtol=1e-9,
+        atol=0,
+    )
+    assert tree.separation(labels) == pytest.approx(
+        squareform(pdist(images))[labels[:, None] != labels].min(), rel=1e-9, abs=0
+    )
     assert cluster_spread(images, np.arange(80) // 40) == pytest.approx(
         max(pdist(images[:40]).max(), pdist(images[40:]).max()), rel=1e-9, abs=0
     )
@@ -153,7 +199,9 @@ def test_a_tree_serves_every_labeling() -> None:
     tree = spanning_tree(images)
     for k in (2, 5, 30):
         labels = KMeans(k, n_init=1, random_state=0).fit(images).labels_
-        assert cluster_quality(images, labels, tree) == pytest.approx(plain_quality(images, labels), rel=1e-12, abs=0)
+        assert cluster_quality(images, labels, tree) == pytest.approx(
+            plain_quality(images, labels), rel=1e-12, abs=0
+        )
 
 
 def test_quality_where_it_degenerates() -> None:
@@ -200,7 +248,11 @@ def test_trimmed_quality_is_the_ratio_of_quantiles() -> None:
     images, truth = blobs(4, 10, spread=0.4, seed=3)
     distances = squareform(pdist(images))
     for trim in (0.0, 0.1, 0.5):
-        gaps = [np.quantile(distances[truth == a][:, truth == b], trim) for a in range(4) for b in range(a)]
+        gaps = [
+            np.quantile(distances[truth == a][:, truth == b], trim)
+            for a in range(4)
+            for b in range(a)
+        ]
         widths = [np.quantile(pdist(images[truth == a]), 1 - trim) for a in range(4)]
         assert trimmed_quality(images, truth, trim) == pytest.approx(min(gaps) / max(widths))
     assert trimmed_quality(images, truth, 0) == pytest.approx(cluster_quality(images, truth))
@@ -217,8 +269,12 @@ def test_trimmed_quality_where_it_degenerates(monkeypatch: pytest.MonkeyPatch) -
     assert trimmed_quality(images, [0, 0, 1, 2]) == math.inf
     many, truth = blobs(3, 100)
     monkeypatch.setattr(quality, "SAMPLE", 60)
-    assert trimmed_quality(many, truth) == pytest.approx(trimmed_quality(*blobs(3, 20)), rel=0.3)  # of a sample
-    assert trimmed_quality(many, ~np.isin(np.arange(300), quality.sampled(300))) == 0  # a cluster that the sample does not hold
+    assert trimmed_quality(many, truth) == pytest.approx(
+        trimmed_quality(*blobs(3, 20)), rel=0.3
+    )  # of a sample
+    assert (
+        trimmed_quality(many, ~np.isin(np.arange(300), quality.sampled(300))) == 0
+    )  # a cluster that the sample does not hold
 
 
 def test_one_lost_beam_changes_m_and_not_trimmed_m() -> None:
@@ -257,7 +313,11 @@ def test_k_is_where_the_quality_peaks() -> None:
     assert found.k_ == 5
     assert adjusted_rand_score(truth, found.labels_) == 1
     assert list(found.quality_) == list(range(2, 21))
-    assert found.quality_[5] == max(found.quality_.values()) == pytest.approx(plain_quality(images, found.labels_))
+    assert (
+        found.quality_[5]
+        == max(found.quality_.values())
+        == pytest.approx(plain_quality(images, found.labels_))
+    )
     assert found.cluster_centers_.shape == (5, 8)
     assert (found.predict(images) == found.labels_).all()
     nearest = np.linalg.norm(images[:, None] - found.cluster_centers_, axis=2).argmin(axis=1)
@@ -272,14 +332,25 @@ def test_the_runner_up_is_what_trimmed_m_likes_about_as_well() -> None:
         images = np.concatenate([rng.normal(c, 0.1, (15, 6)) for c in (0, gap, 8, 8 + gap)])
         found[gap] = ViewClusterer(k_max=6, random_state=0).fit(images)
     assert [(f.k_, f.runner_up_) for f in found.values()] == [(2, None), (2, 4), (2, 4), (4, None)]
-    assert found[0.5].trimmed_[2] > 3 * found[0.5].trimmed_[4] > 3 * 2.3  # four are well apart, too, though two are much farther
+    assert (
+        found[0.5].trimmed_[2] > 3 * found[0.5].trimmed_[4] > 3 * 2.3
+    )  # four are well apart, too, though two are much farther
     assert found[1.1].runner_up_labels_ is found[1.1].labels_by_k_[4]
-    assert found[1.1].labels_by_k_.keys() == found[1.1].trimmed_.keys() == found[1.1].quality_.keys()
+    assert (
+        found[1.1].labels_by_k_.keys() == found[1.1].trimmed_.keys() == found[1.1].quality_.keys()
+    )
     spoilt = images.copy()
-    spoilt[0, 0] += 4  # one beam of one image, as far off as the next cluster: M makes a view of that image
-    by = {by: ViewClusterer(k_max=6, by=by, random_state=0).fit(spoilt).k_ for by in ("M", "trimmed")}
+    spoilt[0, 0] += (
+        4  # one beam of one image, as far off as the next cluster: M makes a view of that image
+    )
+    by = {
+        by: ViewClusterer(k_max=6, by=by, random_state=0).fit(spoilt).k_ for by in ("M", "trimmed")
+    }
     assert by == {"M": 5, "trimmed": 4}
-    assert (ViewClusterer(k=3).fit(images).runner_up_, ViewClusterer(clusterer=DBSCAN(eps=1.0)).fit(images).runner_up_) == (None, None)
+    assert (
+        ViewClusterer(k=3).fit(images).runner_up_,
+        ViewClusterer(clusterer=DBSCAN(eps=1.0)).fit(images).runner_up_,
+    ) == (None, None)
     with pytest.raises(PerceptionError, match='by: expected "M" or "trimmed", got \'U\''):
         ViewClusterer(by="U").fit(images)
 
@@ -344,9 +415,15 @@ def test_mixtures_and_thresholds_plug_in(clusterer: Any, tried: list[int]) -> No
     images, truth = blobs(4, 15)
     found = ViewClusterer(clusterer=clusterer, k_max=6, random_state=0).fit(images)
     assert (found.k_, list(found.quality_)) == (4, tried)
-    assert adjusted_rand_score(truth, found.labels_) == adjusted_rand_score(truth, found.predict(images + 0.01)) == 1
+    assert (
+        adjusted_rand_score(truth, found.labels_)
+        == adjusted_rand_score(truth, found.predict(images + 0.01))
+        == 1
+    )
     assert found.score(images) == pytest.approx(plain_quality(images, truth))
-    assert found.score(images + 0.3 * np.random.default_rng(0).normal(size=images.shape)) < found.score(images)
+    assert found.score(
+        images + 0.3 * np.random.default_rng(0).normal(size=images.shape)
+    ) < found.score(images)
     assert not hasattr(clusterer, "labels_")
     assert not hasattr(clusterer, "means_")
 
@@ -357,16 +434,27 @@ def test_a_given_clusterer_becomes_one_of_views() -> None:
     assert as_view_clusterer(DBSCAN(eps=1.0)).fit(images).k_ == 4
     same = ViewClusterer(k=2)
     assert as_view_clusterer(same) is same
-    with pytest.raises(PerceptionError, match="clusterer: expected a scikit-learn clusterer, such as DBSCAN"):
+    with pytest.raises(
+        PerceptionError, match="clusterer: expected a scikit-learn clusterer, such as DBSCAN"
+    ):
         as_view_clusterer("k-means")
-    with pytest.raises(PerceptionError, match="k: AgglomerativeClustering finds the number of clusters itself"):
-        ViewClusterer(k=3, clusterer=AgglomerativeClustering(n_clusters=None, distance_threshold=1.0)).fit(images)
+    with pytest.raises(
+        PerceptionError, match="k: AgglomerativeClustering finds the number of clusters itself"
+    ):
+        ViewClusterer(
+            k=3, clusterer=AgglomerativeClustering(n_clusters=None, distance_threshold=1.0)
+        ).fit(images)
 
 
 def test_components_that_stay_empty_are_no_views() -> None:
-    images = np.repeat(np.arange(6.0)[:, None] // 2 * 5, 10, axis=0) + np.random.default_rng(0).normal(0, 0.1, (60, 2))
+    images = np.repeat(np.arange(6.0)[:, None] // 2 * 5, 10, axis=0) + np.random.default_rng(
+        0
+    ).normal(0, 0.1, (60, 2))
     found = ViewClusterer(
-        clusterer=BayesianGaussianMixture(random_state=0, weight_concentration_prior=1e-3, covariance_type="spherical"), k_max=5
+        clusterer=BayesianGaussianMixture(
+            random_state=0, weight_concentration_prior=1e-3, covariance_type="spherical"
+        ),
+        k_max=5,
     ).fit(images)
     assert found.k_ == 3
     assert all(len(set(labels.tolist())) == k for k, labels in found.labels_by_k_.items())
@@ -384,7 +472,9 @@ def test_confidence_is_that_of_the_own_centre_against_the_next() -> None:
         own, next_ = far[truth[i]], min(far[c] for c in range(3) if c != truth[i])
         assert sure[i] == pytest.approx(next_**2 / (own**2 + next_**2))
     assert sure.min() > 0.98
-    between = np.vstack([images, (images[truth == 0].mean(axis=0) + images[truth == 1].mean(axis=0)) / 2])
+    between = np.vstack(
+        [images, (images[truth == 0].mean(axis=0) + images[truth == 1].mean(axis=0)) / 2]
+    )
     assert confidence(between, [*truth, 0])[-1] == pytest.approx(0.5, abs=0.03)
     assert ViewClusterer(k=3, random_state=0).fit(images).confidence_.tolist() == sure.tolist()
 
@@ -399,7 +489,9 @@ def test_confidence_where_nothing_tells() -> None:
     assert confidence(np.ones((4, 2)), [0, 0, 1, 1]).tolist() == [0.5] * 4  # all images are equal
     with pytest.raises(PerceptionError, match="expected 36 whole numbers, one an image"):
         confidence(images, truth[1:])
-    with pytest.raises(PerceptionError, match="expected some that are in a cluster, got 36 that are noise"):
+    with pytest.raises(
+        PerceptionError, match="expected some that are in a cluster, got 36 that are noise"
+    ):
         nearest_views(images, [-1] * 36)
 
 
@@ -411,11 +503,15 @@ def test_doubtful_images_and_views_are_said() -> None:
     for index, label, certain in ((7, 9, 0.99), (8, 1, 0.6), (9, -1, 0.0)):
         labels, trust = truth.copy(), sure.copy()
         labels[index], trust[index] = label, certain
-        with pytest.warns(ImageWarning, match=rf"1 of 60 images are like those of no view.*\(image {index}\)"):
+        with pytest.warns(
+            ImageWarning, match=rf"1 of 60 images are like those of no view.*\(image {index}\)"
+        ):
             warn_of_doubts(labels, trust, 3.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_doubts([0, 1, 2, 2, 0, 3], [0.99, 0.5, 0.99, 0.99, 0.99, 0.5], 3.0)  # nearly all of it was seen once
+        warn_of_doubts(
+            [0, 1, 2, 2, 0, 3], [0.99, 0.5, 0.99, 0.99, 0.99, 0.5], 3.0
+        )  # nearly all of it was seen once
     with pytest.warns(ImageWarning, match=r"views overlap \(M is 0\.40, below 1\)"):
         warn_of_doubts(truth, sure, 0.4)
 
@@ -466,7 +562,9 @@ def test_images_that_are_not_finite_need_the_transformer() -> None:
     with pytest.raises(ValueError, match="infinity"):
         ViewClusterer().fit(images)
     with pytest.warns(ImageWarning, match="5 of 240"):
-        labels = make_pipeline(ReciprocalTransformer(), ViewClusterer(random_state=0)).fit_predict(images)
+        labels = make_pipeline(ReciprocalTransformer(), ViewClusterer(random_state=0)).fit_predict(
+            images
+        )
     assert len(labels) == 30
 
 
@@ -476,17 +574,22 @@ def test_images_that_are_not_finite_need_the_transformer() -> None:
 def test_the_nearest_image_names_the_place() -> None:
     images, truth = blobs(4, 10)
     places = np.array(["north", "east", "south", "west"])[truth]
-    model = PlaceRecognizer().fit(images, places)
+    model = PlaceRecogniser().fit(images, places)
     assert model.predict(images + 0.01).tolist() == places.tolist()
     assert model.classes_.tolist() == sorted(set(places))
     assert (model.predict_proba(images).sum(axis=1) == 1).all()
-    with pytest.raises(PerceptionError, match="n_neighbors: expected a whole number from 1 to the 40 images, got 41"):
-        PlaceRecognizer(41).fit(images, places)
+    with pytest.raises(
+        PerceptionError,
+        match="n_neighbors: expected a whole number from 1 to the 40 images, got 41",
+    ):
+        PlaceRecogniser(41).fit(images, places)
 
 
 def test_a_learning_curve_rises_to_certainty() -> None:
     images, truth = blobs(4, 30, spread=0.05)
-    curve = learning_curve(1 / (0.5 + np.abs(images)), truth, sizes=[1, 2, 4, 40, 120], random_state=0)
+    curve = learning_curve(
+        1 / (0.5 + np.abs(images)), truth, sizes=[1, 2, 4, 40, 120], random_state=0
+    )
     assert (curve.sizes, curve.folds, curve.untested) == ((1, 2, 4, 40, 120), 10, ())
     assert curve.mean[-1] == curve.lowest[-1] == 1
     assert curve.mean[0] < 0.3
@@ -497,14 +600,22 @@ def test_a_learning_curve_rises_to_certainty() -> None:
 def test_a_learning_curve_never_tests_on_what_it_learned() -> None:
     # Every image is unlike all others, so that only an image itself could tell its label.
     rng = np.random.default_rng(0)
-    curve = learning_curve(rng.uniform(1, 5, (400, 30)), rng.integers(20, size=400), sizes=[400], random_state=0)
+    curve = learning_curve(
+        rng.uniform(1, 5, (400, 30)), rng.integers(20, size=400), sizes=[400], random_state=0
+    )
     assert curve.mean[0] < 0.15
 
 
 def test_places_seen_once_are_learned_and_not_tested() -> None:
     images, truth = blobs(3, 10)
     labels = np.append(truth, 3)
-    curve = learning_curve(np.abs(np.append(images, [[9.0] * 8], axis=0)) + 0.5, labels, sizes=[31], folds=5, random_state=0)
+    curve = learning_curve(
+        np.abs(np.append(images, [[9.0] * 8], axis=0)) + 0.5,
+        labels,
+        sizes=[31],
+        folds=5,
+        random_state=0,
+    )
     assert curve.untested == (3,)
     assert curve.mean == (1.0,)
 
@@ -547,7 +658,10 @@ def test_the_feature_that_differs_tells_two_apart() -> None:
     assert telling_features(images[:, [0, 1, 3]], labels, 3, 8).recognised == 1
     assert telling_features(images, labels, 3, 5).recognised < 0.8
     assert strongest(found.permutation) == "1"
-    assert (strongest([0.2, 0.2, 0.0, 0.15, 0.2, 0.25], 0.8), strongest([0.0, 0.0])) == ("0–1, 4–5", "–")
+    assert (strongest([0.2, 0.2, 0.0, 0.15, 0.2, 0.25], 0.8), strongest([0.0, 0.0])) == (
+        "0–1, 4–5",
+        "–",
+    )
     same = telling_features(np.ones((4, 3)), [0, 0, 1, 1], 0, 1)
     assert [shares.tolist() for shares in same.methods.values()] == [[0, 0, 0]] * 3
 
@@ -560,7 +674,9 @@ def test_the_feature_that_differs_tells_two_apart() -> None:
         ([0, 1], (0, 1), "labels: expected 4, one an image"),
     ],
 )
-def test_dstates_that_cannot_be_compared(labels: list[int], pair: tuple[int, int], message: str) -> None:
+def test_dstates_that_cannot_be_compared(
+    labels: list[int], pair: tuple[int, int], message: str
+) -> None:
     with pytest.raises(PerceptionError, match=message):
         telling_features(np.eye(4), labels, *pair)
 
@@ -573,7 +689,14 @@ def fitted() -> Any:
     return recogniser().fit(1 / (1 + np.abs(images)), np.array(["a", "b", "c"])[truth])
 
 
-@pytest.mark.parametrize("model", [ReciprocalTransformer(), ViewClusterer(random_state=0), ViewClusterer(clusterer=DBSCAN(eps=1.0))])
+@pytest.mark.parametrize(
+    "model",
+    [
+        ReciprocalTransformer(),
+        ViewClusterer(random_state=0),
+        ViewClusterer(clusterer=DBSCAN(eps=1.0)),
+    ],
+)
 def test_fitted_estimators_pickle_and_clone(model: Any) -> None:
     images = np.abs(blobs(3, 10)[0]) + 1
     model.fit(images)
@@ -597,7 +720,9 @@ def test_a_recogniser_comes_back_from_its_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("clusterer", [None, AgglomerativeClustering()])
 def test_views_come_back_from_their_file(tmp_path: Path, clusterer: Any) -> None:
     images = blobs(3, 10)[0]
-    model = make_pipeline(ReciprocalTransformer(0.5), ViewClusterer(clusterer=clusterer, random_state=0)).fit(np.abs(images) + 1)
+    model = make_pipeline(
+        ReciprocalTransformer(0.5), ViewClusterer(clusterer=clusterer, random_state=0)
+    ).fit(np.abs(images) + 1)
     store.save(model, tmp_path / "a.skops")
     held = store.load(tmp_path / "a.skops")
     assert held.classes == ()
@@ -621,20 +746,35 @@ def test_hostile_and_damaged_files_run_nothing(tmp_path: Path) -> None:
     schema = zipfile.ZipFile(good).read("schema.json").decode()
     hostile: dict[str, bytes] = {
         "pickle": pickle.dumps(Trap(mark)),
-        "partial": skops.io.dumps({"format": store.FORMAT, "model": functools.partial(os.mkdir, str(mark))}),
-        "function": skops.io.dumps({"format": store.FORMAT, "model": FunctionTransformer(os.mkdir)}),
+        "partial": skops.io.dumps(
+            {"format": store.FORMAT, "model": functools.partial(os.mkdir, str(mark))}
+        ),
+        "function": skops.io.dumps(
+            {"format": store.FORMAT, "model": FunctionTransformer(os.mkdir)}
+        ),
         "cut": whole[: len(whole) // 2],
         "empty": b"",
         "text": b"{}",
         "another object": skops.io.dumps([1, 2]),
-        "no classes": skops.io.dumps({"format": store.FORMAT, "version": 1, "model": PlaceRecognizer()}),
-        "no model": skops.io.dumps({"format": store.FORMAT, "version": 1, "model": "os", "classes": [], "versions": {}}),
-        "another version": skops.io.dumps({"format": store.FORMAT, "version": 99, "model": PlaceRecognizer()}),
+        "no classes": skops.io.dumps(
+            {"format": store.FORMAT, "version": 1, "model": PlaceRecogniser()}
+        ),
+        "no model": skops.io.dumps(
+            {"format": store.FORMAT, "version": 1, "model": "os", "classes": [], "versions": {}}
+        ),
+        "another version": skops.io.dumps(
+            {"format": store.FORMAT, "version": 99, "model": PlaceRecogniser()}
+        ),
     }
     for name, changed in (
         ("no schema", None),
         ("broken schema", "{"),
-        ("another type", schema.replace("PlaceRecognizer", "Popen").replace("perception.recognition", "subprocess")),
+        (
+            "another type",
+            schema.replace("PlaceRecogniser", "Popen").replace(
+                "perception.recognition", "subprocess"
+            ),
+        ),
         ("another loader", schema.replace('"ObjectNode"', '"ReduceNode"')),
     ):
         path = tmp_path / "made"
@@ -669,7 +809,10 @@ def test_files_that_are_not_there(tmp_path: Path) -> None:
 
 def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(PerceptionError, match="expected a model of types that can be read back"):
-        store.save(make_pipeline(FunctionTransformer(functools.partial(os.mkdir, "x"))), tmp_path / "a.skops")
+        store.save(
+            make_pipeline(FunctionTransformer(functools.partial(os.mkdir, "x"))),
+            tmp_path / "a.skops",
+        )
     assert not os.listdir(tmp_path)
 
 
@@ -678,7 +821,12 @@ def test_what_could_not_be_read_is_not_written(tmp_path: Path) -> None:
 
 def test_the_benchmark_runs() -> None:
     script = Path(__file__).parent.parent / "benchmarks" / "images.py"
-    done = subprocess.run([sys.executable, script, "search", "dstates", "60"], check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, script, "search", "dstates", "60"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     assert "60 images" in done.stdout
 
 

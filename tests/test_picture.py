@@ -27,7 +27,9 @@ SQUARE = [(10.0, 0.3, 0.02), (0.0, 0.0, math.pi / 2)] * 4
 def surveyed(theory: str = "topological") -> SSHMap:
     """The map of a square that the robot drove round once, turning left at each corner."""
     trace = Trace.from_steps("abcdefgha", ["travel", "left"] * 4, displacements=SQUARE)
-    return solve(trace, {"topological": Theory.topological, "causal": Theory.causal}[theory]()).maps[0]
+    return solve(
+        trace, {"topological": Theory.topological, "causal": Theory.causal}[theory]()
+    ).maps[0]
 
 
 def grid(side: int, apart: float = 8.0) -> SSHMap:
@@ -35,20 +37,43 @@ def grid(side: int, apart: float = 8.0) -> SSHMap:
     draw, dstates, poses = random.Random(1), [], []
     for place in range(side * side):
         x, y = place % side, place // side
-        at = (apart * x + draw.gauss(0, 0.3), apart * y + draw.gauss(0, 0.3)) if place else (0.0, 0.0)
+        at = (
+            (apart * x + draw.gauss(0, 0.3), apart * y + draw.gauss(0, 0.3))
+            if place
+            else (0.0, 0.0)
+        )
         for quarter in range(4):
             path = y if quarter % 2 == 0 else side + x
-            dstates.append(DState(len(dstates), f"view {len(dstates)}", place, path, 1 if quarter < 2 else -1))
-            poses.append(Pose(*at, math.remainder(quarter * math.pi / 2, math.tau), (0.01 * x, 0.002 * (x - y), 0.02 * y)))
+            dstates.append(
+                DState(len(dstates), f"view {len(dstates)}", place, path, 1 if quarter < 2 else -1)
+            )
+            poses.append(
+                Pose(
+                    *at,
+                    math.remainder(quarter * math.pi / 2, math.tau),
+                    (0.01 * x, 0.002 * (x - y), 0.02 * y),
+                )
+            )
     rows = [MapPath(y, tuple(y * side + x for x in range(side))) for y in range(side)]
     columns = [MapPath(side + x, tuple(y * side + x for y in range(side))) for x in range(side)]
     east = [(4 * p, "travel", 4 * p + 4) for p in range(side * side) if p % side < side - 1]
-    return SSHMap((0,), tuple(dstates), tuple(east), tuple(range(side * side)), (*rows, *columns), fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))
+    return SSHMap(
+        (0,),
+        tuple(dstates),
+        tuple(east),
+        tuple(range(side * side)),
+        (*rows, *columns),
+        fit=Fit(1.0, 1, 0.5, poses=tuple(poses)),
+    )
 
 
 def dots(picture: str) -> dict[str, tuple[float, float]]:
     """Where the dots are, by what they stand for."""
-    groups = [group for group in ET.fromstring(picture).iter(f"{SVG}g") if group.find(f"{SVG}circle") is not None]
+    groups = [
+        group
+        for group in ET.fromstring(picture).iter(f"{SVG}g")
+        if group.find(f"{SVG}circle") is not None
+    ]
     return {
         str(group.findtext(f"{SVG}title")): (float(circle.attrib["cx"]), float(circle.attrib["cy"]))
         for group in groups
@@ -66,7 +91,9 @@ def test_dots_are_where_the_dstates_are(theory: str) -> None:
     ssh_map = surveyed(theory)
     assert ssh_map.fit is not None
     found = dots(svg(ssh_map))
-    names = [f"place {s.place}" if s.place is not None else f"dstate {s.id}" for s in ssh_map.dstates]
+    names = [
+        f"place {s.place}" if s.place is not None else f"dstate {s.id}" for s in ssh_map.dstates
+    ]
     assert set(found) == set(names)
     metres = np.array([(pose.x, -pose.y) for pose in ssh_map.fit.poses])  # y is down on the page
     drawn = np.array([found[name] for name in names])
@@ -79,11 +106,16 @@ def test_the_bar_is_as_long_as_it_says() -> None:
     ssh_map = grid(4, apart=8.0)
     picture = svg(ssh_map)
     (metres,) = (float(found) for found in re.findall(r">([0-9.]+) m<", picture))
-    left, right = (float(found) for found in re.findall(r'<path d="M([-0-9.]+),[-0-9.]+ v10 m0,-5 H([-0-9.]+) ', picture)[0])
+    left, right = (
+        float(found)
+        for found in re.findall(r'<path d="M([-0-9.]+),[-0-9.]+ v10 m0,-5 H([-0-9.]+) ', picture)[0]
+    )
     at = dots(picture)
     assert ssh_map.fit is not None
     across = ssh_map.fit.poses[4 * 3].x - ssh_map.fit.poses[0].x
-    assert (right - left) / metres == pytest.approx((at["place 3"][0] - at["place 0"][0]) / across, rel=0.01)
+    assert (right - left) / metres == pytest.approx(
+        (at["place 3"][0] - at["place 0"][0]) / across, rel=0.01
+    )
 
 
 def test_arrows_point_where_the_dstates_face() -> None:
@@ -91,9 +123,15 @@ def test_arrows_point_where_the_dstates_face() -> None:
     assert ssh_map.fit is not None
     turned = {}
     for group in ET.fromstring(svg(ssh_map)).iter(f"{SVG}g"):
-        if (number := re.match(r"dstate (\d+):", str(group.findtext(f"{SVG}title")))) and (arrow := group.find(f"{SVG}path")) is not None:
-            turned[int(number[1])] = float(re.findall(r"rotate\(([-0-9.]+)\)", arrow.attrib["transform"])[0])
-    assert turned == pytest.approx({s: -math.degrees(pose.heading) for s, pose in enumerate(ssh_map.fit.poses)}, abs=0.1)
+        if (number := re.match(r"dstate (\d+):", str(group.findtext(f"{SVG}title")))) and (
+            arrow := group.find(f"{SVG}path")
+        ) is not None:
+            turned[int(number[1])] = float(
+                re.findall(r"rotate\(([-0-9.]+)\)", arrow.attrib["transform"])[0]
+            )
+    assert turned == pytest.approx(
+        {s: -math.degrees(pose.heading) for s, pose in enumerate(ssh_map.fit.poses)}, abs=0.1
+    )
 
 
 def test_ellipses_have_the_axes_of_the_covariance() -> None:
@@ -101,8 +139,13 @@ def test_ellipses_have_the_axes_of_the_covariance() -> None:
     assert ssh_map.fit is not None
     picture = svg(ssh_map)
     at = dots(picture)
-    scale = math.dist(at["place 0"], at["place 2"]) / math.hypot(ssh_map.fit.poses[8].x, ssh_map.fit.poses[8].y)
-    found = {(float(e.attrib["cx"]), float(e.attrib["cy"])): e.attrib for e in ET.fromstring(picture).iter(f"{SVG}ellipse")}
+    scale = math.dist(at["place 0"], at["place 2"]) / math.hypot(
+        ssh_map.fit.poses[8].x, ssh_map.fit.poses[8].y
+    )
+    found = {
+        (float(e.attrib["cx"]), float(e.attrib["cy"])): e.attrib
+        for e in ET.fromstring(picture).iter(f"{SVG}ellipse")
+    }
     assert at["place 0"] not in found
     assert len(found) == 8
     for place in range(1, 9):
@@ -110,13 +153,17 @@ def test_ellipses_have_the_axes_of_the_covariance() -> None:
         values, vectors = np.linalg.eigh([[xx, xy], [xy, yy]])
         drawn = found[at[f"place {place}"]]
         assert float(drawn["rx"]) == pytest.approx(2 * scale * math.sqrt(values[1]), abs=0.1)
-        assert float(drawn["ry"]) == pytest.approx(2 * scale * math.sqrt(max(0.0, values[0])), abs=0.1)
+        assert float(drawn["ry"]) == pytest.approx(
+            2 * scale * math.sqrt(max(0.0, values[0])), abs=0.1
+        )
         angle = math.radians(-float(re.findall(r"rotate\(([-0-9.]+) ", drawn["transform"])[0]))
         assert abs(vectors[:, 1] @ (math.cos(angle), math.sin(angle))) == pytest.approx(1, abs=1e-3)
 
 
 @pytest.mark.parametrize(
-    "ssh_map", [surveyed(), surveyed("causal"), grid(2), grid(9), grid(3, apart=0.02)], ids=["square", "causal", "four", "many", "near"]
+    "ssh_map",
+    [surveyed(), surveyed("causal"), grid(2), grid(9), grid(3, apart=0.02)],
+    ids=["square", "causal", "four", "many", "near"],
 )
 def test_nothing_lies_outside_the_page(ssh_map: SSHMap) -> None:
     picture = svg(ssh_map)
@@ -128,10 +175,17 @@ def test_nothing_lies_outside_the_page(ssh_map: SSHMap) -> None:
             x, y = float(mark.attrib["x"]), float(mark.attrib["y"])
             inside += [(x - wide, y), (x + wide, y)]
         elif mark.tag in (f"{SVG}circle", f"{SVG}ellipse"):
-            x, y, far = (float(mark.attrib[name]) for name in ("cx", "cy", "r" if mark.tag == f"{SVG}circle" else "ry"))
+            x, y, far = (
+                float(mark.attrib[name])
+                for name in ("cx", "cy", "r" if mark.tag == f"{SVG}circle" else "ry")
+            )
             inside += [(x - far, y - far), (x + far, y + far)]
         elif "M0,0" not in mark.attrib.get("d", "M0,0") and "transform" not in mark.attrib:
-            inside += [(float(x), float(y)) for x, y in re.findall(r"([-0-9.]+),([-0-9.]+)", mark.attrib["d"]) if float(x)]
+            inside += [
+                (float(x), float(y))
+                for x, y in re.findall(r"([-0-9.]+),([-0-9.]+)", mark.attrib["d"])
+                if float(x)
+            ]
     assert len(inside) > 10
     assert all(left <= x <= right and top <= y <= bottom for x, y in inside)
     assert max(right - left, bottom - top) < 2600
@@ -145,7 +199,9 @@ def test_labels_do_not_overlap() -> None:
             wide = 0.3 * size * len(str(mark.text))
             boxes.append((x - wide, y - size / 2, x + wide, y + size / 2))
         for i, (left, top, right, bottom) in enumerate(boxes):
-            assert all(right <= l or r <= left or bottom <= t or b <= top for l, t, r, b in boxes[:i])  # noqa: E741
+            assert all(
+                right <= l or r <= left or bottom <= t or b <= top for l, t, r, b in boxes[:i]
+            )  # noqa: E741
 
 
 def test_each_place_of_a_large_map_is_named() -> None:
@@ -162,13 +218,17 @@ def test_maps_without_poses_are_drawn_as_before() -> None:
     assert svg(replace(without, fit=Fit(1.0, 1, 0.5))) == before
     assert svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) != before
     other = next(s.id for s in without.dstates if s.place != without.dstates[0].place)
-    poses[other] = Pose(0.0, 0.0, 0.0)  # a part of the map which no displacement connects with the rest has poses of its own
+    poses[other] = Pose(
+        0.0, 0.0, 0.0
+    )  # a part of the map which no displacement connects with the rest has poses of its own
     assert svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) == before
     poses[other] = Pose(1e300, 0.0, 0.0)
     assert svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) == before
 
 
-def test_the_file_is_written_where_it_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_file_is_written_where_it_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     surveyed().save(tmp_path / "maps.json")
     assert main(["show", str(tmp_path / "maps.json"), "--svg", str(tmp_path / "map.svg")]) == 0
     assert capsys.readouterr().out == ""
@@ -176,7 +236,9 @@ def test_the_file_is_written_where_it_is_asked_for(tmp_path: Path, capsys: pytes
     written = (tmp_path / "map.svg").read_text()
     assert written == capsys.readouterr().out
     assert "place 3" in written
-    assert main(["show", str(tmp_path / "maps.json"), "--svg", str(tmp_path / "no" / "map.svg")]) == 1
+    assert (
+        main(["show", str(tmp_path / "maps.json"), "--svg", str(tmp_path / "no" / "map.svg")]) == 1
+    )
     assert "cannot write the picture" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         main(["show", str(tmp_path / "other.json"), "--svg", str(tmp_path / "maps.json")])

@@ -47,9 +47,17 @@ def scrambled(graph: nx.Graph, rng: random.Random) -> dict[object, list[object]]
 
 def ends_of(rotation: dict[object, list[object]]) -> dict[object, tuple[int, ...]]:
     """The same with ends of edges in place of neighbours."""
-    number = {edge: i for i, edge in enumerate({frozenset((v, w)) for v, around in rotation.items() for w in around})}
+    number = {
+        edge: i
+        for i, edge in enumerate(
+            {frozenset((v, w)) for v, around in rotation.items() for w in around}
+        )
+    }
     first = {edge: min(edge, key=repr) for edge in number}
-    return {v: tuple(2 * number[e] + (first[e] != v) for w in around for e in [frozenset((v, w))]) for v, around in rotation.items()}
+    return {
+        v: tuple(2 * number[e] + (first[e] != v) for w in around for e in [frozenset((v, w))])
+        for v, around in rotation.items()
+    }
 
 
 def networkx_says(rotation: dict[object, list[object]]) -> bool:
@@ -81,7 +89,11 @@ def test_rotation_systems_of_random_graphs() -> None:
     answers = []
     for _ in range(600):
         size = rng.randint(2, 7)
-        graph = nx.gnm_random_graph(size, rng.randint(size - 1, min(size * (size - 1) // 2, 2 * size)), seed=rng.randrange(10**6))
+        graph = nx.gnm_random_graph(
+            size,
+            rng.randint(size - 1, min(size * (size - 1) // 2, 2 * size)),
+            seed=rng.randrange(10**6),
+        )
         rotation = scrambled(graph, rng)
         answers.append(is_planar(ends_of(rotation)))
         assert answers[-1] == networkx_says(rotation)
@@ -90,7 +102,10 @@ def test_rotation_systems_of_random_graphs() -> None:
 
 def test_drawings_with_free_orders_are_those_of_planar_graphs() -> None:
     rng = random.Random(1)
-    graphs = [NAMED[name] for name in ("K4", "K5", "K5 without an edge", "K3,3", "grid", "wheel", "two parts")]
+    graphs = [
+        NAMED[name]
+        for name in ("K4", "K5", "K5 without an edge", "K3,3", "grid", "wheel", "two parts")
+    ]
     graphs += [nx.gnm_random_graph(6, rng.randint(6, 12), seed=seed) for seed in range(60)]
     answers = [can_be_drawn(list(graph.edges), lambda place, ends: True) for graph in graphs]
     assert answers == [nx.is_planar(graph) for graph in graphs]
@@ -104,9 +119,15 @@ def test_drawings_with_given_orders_are_those_of_rotation_systems() -> None:
         graph = nx.gnm_random_graph(5, rng.randint(4, 8), seed=rng.randrange(10**6))
         edges = list(graph.edges)
         ends = [(v, 2 * i + side) for i, edge in enumerate(edges) for side, v in enumerate(edge)]
-        around = {v: rng.sample(there, len(there)) for v in graph if (there := [end for w, end in ends if w == v])}
+        around = {
+            v: rng.sample(there, len(there))
+            for v in graph
+            if (there := [end for w, end in ends if w == v])
+        }
 
-        def allows(place: object, some: tuple[int, ...], around: dict[object, list[int]] = around) -> bool:
+        def allows(
+            place: object, some: tuple[int, ...], around: dict[object, list[int]] = around
+        ) -> bool:
             positions = [around[place].index(end) for end in some]
             return sum(positions[i - 1] > positions[i] for i in range(len(positions))) <= 1
 
@@ -149,7 +170,9 @@ TREES: list[tuple[str, Cells | None, tuple[int, int, int, int]]] = [
 
 
 @pytest.mark.parametrize(("route", "walls", "counts"), TREES)
-def test_the_table_of_numbers_of_maps(route: str, walls: Cells | None, counts: tuple[int, ...]) -> None:
+def test_the_table_of_numbers_of_maps(
+    route: str, walls: Cells | None, counts: tuple[int, ...]
+) -> None:
     choices = ([], [passes_no_place_twice], [drawn], [passes_no_place_twice, drawn])
     assert tuple(len(list(levels(route, walls, allows))[-1]) for allows in choices) == counts
 
@@ -178,7 +201,9 @@ def equalities(joined: Joined, route: str) -> tuple[tuple[int, ...], tuple[int, 
         steps.append(faced)
     dstates: dict[object, int] = {}
     places: dict[int, int] = {}
-    return tuple(dstates.setdefault(s, len(dstates)) for s in steps), tuple(places.setdefault(s[0], len(places)) for s in steps)
+    return tuple(dstates.setdefault(s, len(dstates)) for s in steps), tuple(
+        places.setdefault(s[0], len(places)) for s in steps
+    )
 
 
 @pytest.mark.parametrize("planar", [False, True])
@@ -189,7 +214,9 @@ def test_the_maps_of_the_solver_are_those_of_the_tree(route: str, planar: bool) 
     expected = {equalities(joined, route) for joined in list(levels(route, None, allows))[-1]}
     theory = Theory(star="frame", boundary="none", next_place=True, planar=planar, prefer=())
     found = solve(route_trace(route), theory, max_maps=None).maps
-    assert {(m.labels, tuple(m.dstates[label].place for label in m.labels)) for m in found} == expected
+    assert {
+        (m.labels, tuple(m.dstates[label].place for label in m.labels)) for m in found
+    } == expected
 
 
 # Minimal maps, against the brute force
@@ -212,7 +239,10 @@ def loose(data: st.DataObject, trace: Trace) -> Theory:
         boundary=data.draw(st.sampled_from(["none", "strict"]), label="boundary"),
         path_order=data.draw(st.sampled_from(["partial", "total"]), label="order"),
         symmetric_sides=data.draw(st.booleans(), label="symmetric"),
-        prefer=data.draw(st.sampled_from([("dstates", "paths", "places"), ("places", "dstates"), ()]), label="prefer"),
+        prefer=data.draw(
+            st.sampled_from([("dstates", "paths", "places"), ("places", "dstates"), ()]),
+            label="prefer",
+        ),
     )
 
 
@@ -223,7 +253,10 @@ def test_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
     theory = loose(data, trace)
     counts, expected = minimal_maps(trace, theory)
     first_prefix = data.draw(st.sampled_from([1, 8]), label="first prefix")
-    with patch.object(prefixes, "FIRST_PREFIX", first_prefix), patch.object(search, "FEW_STEPS", data.draw(st.sampled_from([0, 24]))):
+    with (
+        patch.object(prefixes, "FIRST_PREFIX", first_prefix),
+        patch.object(search, "FEW_STEPS", data.draw(st.sampled_from([0, 24]))),
+    ):
         solution = solve(trace, theory, max_maps=None)
     assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
     assert {key(ssh_map) for ssh_map in solution.maps} == expected
@@ -233,7 +266,9 @@ def test_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
 
 def holds(equality: Equality, ssh_map: SSHMap) -> bool:
     """Whether a map says what an equality says."""
-    here, there = (ssh_map.dstates[ssh_map.labels[step]] for step in (equality.first, equality.second))
+    here, there = (
+        ssh_map.dstates[ssh_map.labels[step]] for step in (equality.first, equality.second)
+    )
     same = here.id == there.id if equality.of == "dstate" else here.place == there.place
     return same == equality.holds
 
@@ -244,7 +279,11 @@ def test_what_is_refused_holds_in_no_planar_map_and_the_checker_refuses_the_same
     refused = accepted = 0
     for _ in range(20):
         letters = [rng.choice("TTTTRLA") for _ in range(6)]
-        trace = Trace.from_steps("a" * 7, [ACTIONS[letter] for letter in letters], stars=[(1, 1, 1, 1)] * 7 if rng.random() < 0.5 else None)
+        trace = Trace.from_steps(
+            "a" * 7,
+            [ACTIONS[letter] for letter in letters],
+            stars=[(1, 1, 1, 1)] * 7 if rng.random() < 0.5 else None,
+        )
         theory = Theory(boundary="none", path_order="partial", prefer=()).resolve(trace)
         planar = theory.replace(planar=True)
         drawable = {found for found, _ in consistent_maps(trace, planar)}
@@ -253,10 +292,16 @@ def test_what_is_refused_holds_in_no_planar_map_and_the_checker_refuses_the_same
         assert {key(ssh_map) for ssh_map, reason in reasons.items() if not reason} == drawable
         for ssh_map, reason in reasons.items():
             refused, accepted = refused + bool(reason), accepted + (not reason)
-            assert [v.axiom for v in check(trace, ssh_map, planar)] == (["planar"] if reason else [])
+            assert [v.axiom for v in check(trace, ssh_map, planar)] == (
+                ["planar"] if reason else []
+            )
             if reason:
                 assert all(holds(equality, ssh_map) for equality in reason)
-                assert not any(all(holds(equality, other) for equality in reason) for other in maps if not reasons[other])
+                assert not any(
+                    all(holds(equality, other) for equality in reason)
+                    for other in maps
+                    if not reasons[other]
+                )
     assert min(refused, accepted) > 20
 
 
@@ -285,7 +330,9 @@ def test_while_a_robot_drives_maps_are_those_of_solve(data: st.DataObject) -> No
         assert before.action is not None
         assert step.view is not None
         online = mapper.observe(before.action, step.view, star=step.star)
-    assert {key(m) for m in online.maps} == {key(m) for m in solve(trace, theory, max_maps=None).maps}
+    assert {key(m) for m in online.maps} == {
+        key(m) for m in solve(trace, theory, max_maps=None).maps
+    }
 
 
 # Worlds
@@ -311,7 +358,10 @@ def tour() -> Trace:
         else:
             facing = (facing + QUARTERS[action]) % 4
         states.append((place, facing))
-    steps = tuple(replace(step, view="a", truth=f"{p}{f}") for step, (p, f) in zip(seen.steps, states, strict=True))
+    steps = tuple(
+        replace(step, view="a", truth=f"{p}{f}")
+        for step, (p, f) in zip(seen.steps, states, strict=True)
+    )
     return replace(seen, steps=steps)
 
 
@@ -326,13 +376,17 @@ def true_labels(trace: Trace) -> tuple[int, ...]:
     return tuple(number.setdefault(step.truth, len(number)) for step in trace.steps)
 
 
-def test_planarity_excludes_the_minimal_maps_and_finds_the_true_one(tour: Trace, smaller: Solution) -> None:
+def test_planarity_excludes_the_minimal_maps_and_finds_the_true_one(
+    tour: Trace, smaller: Solution
+) -> None:
     """Four smaller maps explain the tour; their streets cross."""
     assert smaller.cost
     assert (smaller.cost.dstates, smaller.count) == (14, 4)
     assert true_labels(tour) not in {ssh_map.labels for ssh_map in smaller.maps}
     for ssh_map in smaller.maps:
-        assert "planar" in {violation.axiom for violation in check(tour, ssh_map, Theory(planar=True))}
+        assert "planar" in {
+            violation.axiom for violation in check(tour, ssh_map, Theory(planar=True))
+        }
     solution = solve(tour, Theory(planar=True), max_maps=None)
     assert solution.status is Status.OPTIMAL
     assert [ssh_map.labels for ssh_map in solution.maps] == [true_labels(tour)]
@@ -343,32 +397,52 @@ def test_the_checker_names_streets_that_cross(tour: Trace, smaller: Solution) ->
     (violation,) = (v for v in check(tour, ssh_map, Theory(planar=True)) if v.axiom == "planar")
     assert "paths cross" in violation.message
     moved = {t for t, action in enumerate(tour.actions) if action.kind == "travel"}
-    assert set(violation.steps) == {step for t in moved & set(violation.steps) if t + 1 in violation.steps for step in (t, t + 1)}
+    assert set(violation.steps) == {
+        step
+        for t in moved & set(violation.steps)
+        if t + 1 in violation.steps
+        for step in (t, t + 1)
+    }
 
 
-def test_what_is_refused_speaks_of_few_steps_and_tells_their_places_apart(tour: Trace, smaller: Solution) -> None:
+def test_what_is_refused_speaks_of_few_steps_and_tells_their_places_apart(
+    tour: Trace, smaller: Solution
+) -> None:
     """A place that the map keeps apart from another one may be where streets meet: without that a set would forbid planar maps."""
     ssh_map = smaller.maps[0]
     reason = Planar.of(Theory(planar=True).resolve(tour)).refuse(tour, ssh_map)
     assert reason
-    place = {step: ssh_map.dstates[ssh_map.labels[step]].place for e in reason for step in (e.first, e.second)}
+    place = {
+        step: ssh_map.dstates[ssh_map.labels[step]].place
+        for e in reason
+        for step in (e.first, e.second)
+    }
     assert len(place) < len(tour)
     apart = {frozenset((place[e.first], place[e.second])) for e in reason if not e.holds}
-    assert apart == {frozenset(pair) for pair in combinations(sorted(set(place.values()), key=str), 2)}
+    assert apart == {
+        frozenset(pair) for pair in combinations(sorted(set(place.values()), key=str), 2)
+    }
 
 
 @pytest.mark.parametrize("star", ["frame", "none"])
 @pytest.mark.parametrize("follow", [True, False])
 @pytest.mark.parametrize(("cells", "steps"), [(4, 60), (8, 300)])
-def test_the_true_map_of_a_maze_is_not_refused(cells: int, steps: int, follow: bool, star: Literal["frame", "none"]) -> None:
+def test_the_true_map_of_a_maze_is_not_refused(
+    cells: int, steps: int, follow: bool, star: Literal["frame", "none"]
+) -> None:
     """However much is open of the order of gateways where places have no frames."""
     walk = maze(cells, cells, steps=steps, seed=101, stars=True, follow=follow)
     number: dict[tuple[int, ...], int] = {}
     places: dict[tuple[int, ...], int] = {}
     labels = tuple(number.setdefault(state, len(number)) for state in walk.truth)
-    dstates = tuple(DState(i, "", places.setdefault(state[:2], len(places))) for state, i in number.items())
+    dstates = tuple(
+        DState(i, "", places.setdefault(state[:2], len(places))) for state, i in number.items()
+    )
     assert len(places) > cells
-    assert Planar.of(Theory(planar=True, star=star)).refuse(walk.trace, SSHMap(labels, dstates, ())) is None
+    assert (
+        Planar.of(Theory(planar=True, star=star)).refuse(walk.trace, SSHMap(labels, dstates, ()))
+        is None
+    )
 
 
 @pytest.mark.parametrize(("planar", "expected"), [(False, {0, 1}), (True, {1})])
@@ -389,7 +463,13 @@ def test_headings_decide_whether_three_streets_cross(slot: int, expected: bool) 
 
 def test_streets_without_an_order_are_free() -> None:
     """Without frames, sides tell less than slots: three streets between two places can be drawn, and a turn right and back right cannot."""
-    free = Edges([(0, 1), (2, 3), (4, 5)], [(1, "right", 2), (3, "right", 4)], {0: 0, 1: 1, 2: 1, 3: 0, 4: 0, 5: 1})
+    free = Edges(
+        [(0, 1), (2, 3), (4, 5)],
+        [(1, "right", 2), (3, "right", 4)],
+        {0: 0, 1: 1, 2: 1, 3: 0, 4: 0, 5: 1},
+    )
     assert free.can_be_drawn(crossing=True)
-    both_right = Edges([(0, 1), (2, 3)], [(1, "right", 2), (2, "right", 1)], {0: 0, 1: 1, 2: 1, 3: 2})
+    both_right = Edges(
+        [(0, 1), (2, 3)], [(1, "right", 2), (2, "right", 1)], {0: 0, 1: 1, 2: 1, 3: 2}
+    )
     assert not both_right.can_be_drawn(crossing=True)

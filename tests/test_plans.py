@@ -24,7 +24,11 @@ NOISE = Odometry(along=0.05, across=0.02, heading=0.002)
 
 # Four rooms in a ring, 10 m apart, and a closet beside the second; y grows downwards. A pixel is a tenth of a metre, and each door is drawn at both sides of a wall of 0.2 m.
 MIDDLES = {"a": (50, 50), "b": (150, 50), "c": (150, 150), "d": (50, 150), "closet": (230, 50)}
-DOORS = [("a", "b", (99, 50), (101, 50)), ("b", "c", (150, 99), (150, 101)), ("c", "d", (101, 150), (99, 150))]
+DOORS = [
+    ("a", "b", (99, 50), (101, 50)),
+    ("b", "c", (150, 99), (150, 101)),
+    ("c", "d", (101, 150), (99, 150)),
+]
 DOORS += [("d", "a", (50, 101), (50, 99)), ("b", "closet", (199, 50), (201, 50))]
 
 
@@ -34,7 +38,9 @@ def line(name: str, point: tuple[int, int]) -> str:
 
 
 def xml(
-    doors: list[tuple[str, str, tuple[int, int], tuple[int, int]]] = DOORS, unit: str = "cm", middles: dict[str, tuple[int, int]] = MIDDLES
+    doors: list[tuple[str, str, tuple[int, int], tuple[int, int]]] = DOORS,
+    unit: str = "cm",
+    middles: dict[str, tuple[int, int]] = MIDDLES,
 ) -> str:
     """A plan in the form of the school plans."""
     spaces = []
@@ -45,7 +51,10 @@ def xml(
             f"<portal><linesegment>{i}{room}</linesegment><target><id>{door[0]}</id><id>{door[1]}</id></target></portal>"
             for i, door in here
         )
-        corners = "".join(f'<point x="{x + dx}" y="{y + dy}"/>' for dx, dy in ((-49, -49), (49, -49), (49, 49), (-49, 49)))
+        corners = "".join(
+            f'<point x="{x + dx}" y="{y + dy}"/>'
+            for dx, dy in ((-49, -49), (49, -49), (49, 49), (-49, 49))
+        )
         spaces.append(
             f'<space id="{room}"><labels><label>CLASSROOM</label></labels><centroid><point x="{x}" y="{y}"/></centroid>'
             f"<bounding_polygon>{corners}</bounding_polygon><space_representation>{walls}</space_representation><portals>{portals}</portals></space>"
@@ -71,35 +80,59 @@ def true_map(plan: Plan, trace: Trace) -> SSHMap:
     numbers: dict[str, dict[str, int]] = {"dstate": {}, "place": {}, "path": {}}
     dstates = []
     for step in trace.steps:
-        name, place, path = (numbers[kind].setdefault(step.truth[kind], len(numbers[kind])) for kind in numbers)
+        name, place, path = (
+            numbers[kind].setdefault(step.truth[kind], len(numbers[kind])) for kind in numbers
+        )
         if name == len(dstates):
             assert step.view is not None
             dstates.append(DState(name, step.view, place, path, step.truth["direction"]))
     labels = tuple(numbers["dstate"][step.truth["dstate"]] for step in trace.steps)
-    links = {(here, action.name, there) for here, action, there in zip(labels, trace.actions, labels[1:], strict=False)}
+    links = {
+        (here, action.name, there)
+        for here, action, there in zip(labels, trace.actions, labels[1:], strict=False)
+    }
     courses = []
     for text, number in numbers["path"].items():
         legs = plan.paths[int(text.removeprefix("path "))]
         last = set(plan.doors[legs[-1][1]].rooms) - {legs[-1][0]}
-        rooms = [numbers["place"].get(f"room {room}") for room in (*(room for room, _ in legs), *last)]
+        rooms = [
+            numbers["place"].get(f"room {room}") for room in (*(room for room, _ in legs), *last)
+        ]
         seen = {dstate.place for dstate in dstates if dstate.path == number}
-        courses.append(MapPath(number, tuple(place for place in rooms if place is not None and place in seen)))
-    return SSHMap(labels, tuple(dstates), tuple(links), tuple(numbers["place"].values()), tuple(courses)).renumbered()
+        courses.append(
+            MapPath(number, tuple(place for place in rooms if place is not None and place in seen))
+        )
+    return SSHMap(
+        labels, tuple(dstates), tuple(links), tuple(numbers["place"].values()), tuple(courses)
+    ).renumbered()
 
 
 def test_a_plan_is_read_in_metres_with_north_up(ring: Plan) -> None:
     assert ring.name == "school"
-    assert [room.centre for room in ring.rooms] == [(5, -5), (15, -5), (15, -15), (5, -15), (23, -5)]
+    assert [room.centre for room in ring.rooms] == [
+        (5, -5),
+        (15, -5),
+        (15, -15),
+        (5, -15),
+        (23, -5),
+    ]
     assert ring.rooms[0].polygon[0] == pytest.approx((0.1, -0.1))
     assert sorted(door.rooms for door in ring.doors) == [(0, 1), (0, 3), (1, 2), (1, 4), (2, 3)]
-    assert next(door.position for door in ring.doors if door.rooms == (0, 1)) == pytest.approx((10, -5))
+    assert next(door.position for door in ring.doors if door.rooms == (0, 1)) == pytest.approx(
+        (10, -5)
+    )
     assert [[(g.to, round(g.bearing)) for g in found] for found in ring.gateways[:2]] == [
         [(1, 90), (3, 180)],
         [(4, 90), (2, 180), (0, 270)],
     ]
     assert [g.opposite for g in ring.gateways[1]] == [2, None, 0]
     assert ring.connected == (0, 1, 2, 3, 4)
-    assert sorted(map(len, ring.paths)) == [1, 1, 1, 2]  # from a through b into the closet is one path
+    assert sorted(map(len, ring.paths)) == [
+        1,
+        1,
+        1,
+        2,
+    ]  # from a through b into the closet is one path
 
 
 def test_two_doors_between_two_rooms_are_two(tmp_path: Path) -> None:
@@ -126,7 +159,9 @@ def test_each_step_is_at_a_room_and_a_door(ring: Plan) -> None:
         else:
             assert sees(after, 0)
             assert before.truth["place"] == after.truth["place"]
-    closet = next(step for step in trace.steps[1:] if step.truth["dstate"].startswith("room 4, from"))
+    closet = next(
+        step for step in trace.steps[1:] if step.truth["dstate"].startswith("room 4, from")
+    )
     assert sees(closet, 180)
     assert (closet.view, closet.action and closet.action.name) == ("1 door: 180", "around")
 
@@ -136,21 +171,40 @@ def sees(step: Step, bearing: float) -> bool:
     seen = step.gateways.gateways if step.gateways else ()
     for gateway in seen:
         if gateway.opposite is not None:
-            assert abs((gateway.bearing - seen[gateway.opposite].bearing) % 360 - 180) <= STRAIGHT + APART / 2
-    return any(abs((gateway.bearing - bearing + 180) % 360 - 180) <= gateway.spread == APART / 4 for gateway in seen)
+            assert (
+                abs((gateway.bearing - seen[gateway.opposite].bearing) % 360 - 180)
+                <= STRAIGHT + APART / 2
+            )
+    return any(
+        abs((gateway.bearing - bearing + 180) % 360 - 180) <= gateway.spread == APART / 4
+        for gateway in seen
+    )
 
 
 def test_turns_are_counted_to_their_side(tmp_path: Path) -> None:
     """A hub with doors at 0, 60, 120, 195 and 300 degrees: what a turn is called is where it ends, relative to where it began."""
     bearings = (0, 60, 120, 195, 300)
-    out = {f"r{b}": (round(1000 + 400 * math.sin(math.radians(b))), round(1000 - 400 * math.cos(math.radians(b)))) for b in bearings}
+    out = {
+        f"r{b}": (
+            round(1000 + 400 * math.sin(math.radians(b))),
+            round(1000 - 400 * math.cos(math.radians(b))),
+        )
+        for b in bearings
+    }
     half = {name: ((1000 + x) // 2, (1000 + y) // 2) for name, (x, y) in out.items()}
-    plan = plan_of(tmp_path, xml([("hub", name, p, p) for name, p in half.items()], middles={"hub": (1000, 1000), **out}))
+    plan = plan_of(
+        tmp_path,
+        xml(
+            [("hub", name, p, p) for name, p in half.items()], middles={"hub": (1000, 1000), **out}
+        ),
+    )
     turns: dict[str, set[tuple[int, int]]] = {}
     trace = tour(plan, 400, seed=0)
     for before, after, action in zip(trace.steps, trace.steps[1:], trace.actions, strict=False):
         if action.kind == "turn" and before.truth["place"] == "room 0":
-            degrees = [round(90 - math.degrees(step.truth["pose"][2])) % 360 for step in (before, after)]
+            degrees = [
+                round(90 - math.degrees(step.truth["pose"][2])) % 360 for step in (before, after)
+            ]
             turns.setdefault(action.name, set()).add((degrees[0], (degrees[1] - degrees[0]) % 360))
     # Who comes through the door at 120 faces the one at 300, and who comes through that at 195 faces the one at 0, which is nearly opposite.
     for name, found in turns.items():
@@ -163,7 +217,13 @@ def test_turns_are_counted_to_their_side(tmp_path: Path) -> None:
             assert (by < 180) == (side == "right")
     assert {name.split()[0] for name in turns} == {"right", "left"}
     headings = {here for found in turns.values() for here, _ in found}
-    assert headings == {0, 120, 195, 240, 300}  # at 240 it faces no door, as it comes through the one at 60
+    assert headings == {
+        0,
+        120,
+        195,
+        240,
+        300,
+    }  # at 240 it faces no door, as it comes through the one at 60
 
 
 def test_without_noise_displacements_lead_from_true_pose_to_true_pose(ring: Plan) -> None:
@@ -173,20 +233,32 @@ def test_without_noise_displacements_lead_from_true_pose_to_true_pose(ring: Plan
         assert step.displacement is not None
         pose = moved(pose, step.displacement)
         assert pose[:2] == pytest.approx(step.truth["pose"][:2], abs=1e-3)
-        assert math.remainder(pose[2] - step.truth["pose"][2], math.tau) == pytest.approx(0, abs=1e-3)
+        assert math.remainder(pose[2] - step.truth["pose"][2], math.tau) == pytest.approx(
+            0, abs=1e-3
+        )
 
 
 def test_noise_does_not_change_the_way(ring: Plan) -> None:
     exact, noisy = tour(ring, 40, seed=1), tour(ring, 40, seed=1, odometry=NOISE, scale=0.1)
     assert noisy.odometry == NOISE
     assert noisy.without_displacements().steps == exact.without_displacements().steps
-    ways = [[math.hypot(*step.displacement[:2]) for step in trace.steps if step.displacement] for trace in (exact, noisy)]
+    ways = [
+        [math.hypot(*step.displacement[:2]) for step in trace.steps if step.displacement]
+        for trace in (exact, noisy)
+    ]
     assert sum(ways[1]) / sum(ways[0]) == pytest.approx(1.1, abs=0.03)
 
 
 def test_the_truth_of_a_tour_is_a_map(ring: Plan, tmp_path: Path) -> None:
     trace = tour(ring, 60, seed=3)
-    assert check(trace, true_map(ring, trace), Theory.topological().replace(star="none", displacement="none")) == ()
+    assert (
+        check(
+            trace,
+            true_map(ring, trace),
+            Theory.topological().replace(star="none", displacement="none"),
+        )
+        == ()
+    )
     trace.save(tmp_path / "tour.jsonl")
     again = Trace.load(tmp_path / "tour.jsonl")
     assert [step.truth for step in again.steps] == [step.truth for step in trace.steps]
@@ -196,9 +268,20 @@ def test_the_truth_of_a_tour_is_a_map(ring: Plan, tmp_path: Path) -> None:
 def test_directions_of_doors_tell_dstates_apart(tmp_path: Path) -> None:
     """A hub with four doors, two of them nearly in one direction: the odometer takes one for the other, and the star does not."""
     bearings = (0, 7, 120, 240)
-    out = {f"r{b}": (round(1000 + 400 * math.sin(math.radians(b))), round(1000 - 400 * math.cos(math.radians(b)))) for b in bearings}
+    out = {
+        f"r{b}": (
+            round(1000 + 400 * math.sin(math.radians(b))),
+            round(1000 - 400 * math.cos(math.radians(b))),
+        )
+        for b in bearings
+    }
     half = {name: ((1000 + x) // 2, (1000 + y) // 2) for name, (x, y) in out.items()}
-    plan = plan_of(tmp_path, xml([("hub", name, p, p) for name, p in half.items()], middles={"hub": (1000, 1000), **out}))
+    plan = plan_of(
+        tmp_path,
+        xml(
+            [("hub", name, p, p) for name, p in half.items()], middles={"hub": (1000, 1000), **out}
+        ),
+    )
     trace = tour(plan, 60, seed=0, odometry=Odometry(along=0.1, heading=0.05))
     for theory, right in ((Theory.causal(), False), (Theory.causal().replace(star="alike"), True)):
         maps = solve(trace, theory, max_maps=None).maps
@@ -213,12 +296,18 @@ def test_directions_of_doors_tell_dstates_apart(tmp_path: Path) -> None:
         ("", "expected a plan in XML, got something else"),
         ("<building/>", "scale/represented_distance: expected a number, got none; mend it"),
         (xml(unit="ell"), "scale/real_distance/um: expected m or cm or mm, got 'ell'; mend it"),
-        (xml().replace('x="50" y="50"', 'x="left" y="50"'), r"space\[0\]\.centroid\.x: expected a number, got 'left'; mend it"),
+        (
+            xml().replace('x="50" y="50"', 'x="left" y="50"'),
+            r"space\[0\]\.centroid\.x: expected a number, got 'left'; mend it",
+        ),
         (
             xml().replace("<id>a</id>", "<id>z</id>", 1),
             r"space\[0\]\.portal\[0\]\.target: expected the ids of this space and of another one",
         ),
-        (xml().replace('<space id="b">', '<space id="a">'), "space: expected an id for each space that no other has"),
+        (
+            xml().replace('<space id="b">', '<space id="a">'),
+            "space: expected an id for each space that no other has",
+        ),
         ('<!DOCTYPE b [<!ENTITY e "e">]>' + xml(), "expected a plan without entities of its own"),
     ],
 )
@@ -230,7 +319,9 @@ def test_what_is_wrong_with_a_plan_is_said(tmp_path: Path, text: str, message: s
 def test_tours_that_cannot_be(tmp_path: Path, ring: Plan) -> None:
     with pytest.raises(SimulatorError, match="expected a readable plan: No such file"):
         Plan.load(tmp_path / "none.xml")
-    with pytest.raises(SimulatorError, match="steps: expected a number of actions from 0 to 10,000,000, got -1"):
+    with pytest.raises(
+        SimulatorError, match="steps: expected a number of actions from 0 to 10,000,000, got -1"
+    ):
         tour(ring, -1)
     with pytest.raises(SimulatorError, match="school: expected rooms with doors between them"):
         tour(plan_of(tmp_path, xml([])), 5)
@@ -243,12 +334,24 @@ def test_all_school_plans_can_be_driven() -> None:
     for path in SCHOOLS:
         plan = Plan.load(path)
         assert len(plan.connected) >= len(plan.rooms) - 1, plan.name
-        assert nx.is_connected(plan.told_apart(APART).graph.subgraph(plan.told_apart(APART).connected))
+        assert nx.is_connected(
+            plan.told_apart(APART).graph.subgraph(plan.told_apart(APART).connected)
+        )
         trace = tour(plan, 120, seed=0, odometry=NOISE)
         if trace.actions[-1].kind == "turn":
-            trace = trace.prefix(len(trace) - 1)  # nothing travels from where the last turn ends, so that is along no path of a map
+            trace = trace.prefix(
+                len(trace) - 1
+            )  # nothing travels from where the last turn ends, so that is along no path of a map
         theory = Theory.topological().replace(star="none", displacement="none", boundary="none")
-        assert (check(trace, true_map(plan.told_apart(), trace), theory) == ()) == (plan.name != "westasheville")
+        assert (check(trace, true_map(plan.told_apart(), trace), theory) == ()) == (
+            plan.name != "westasheville"
+        )
         found[plan.name] = (len(plan.rooms), len(plan.doors))
-        assert len({step.view for step in trace.steps}) < len({step.truth["dstate"] for step in trace.steps}), plan.name
-    assert (found["Borchen4"], found["hendersonhighschool"], found["southmountainschool_2"]) == ((10, 9), (62, 73), (25, 32))
+        assert len({step.view for step in trace.steps}) < len(
+            {step.truth["dstate"] for step in trace.steps}
+        ), plan.name
+    assert (found["Borchen4"], found["hendersonhighschool"], found["southmountainschool_2"]) == (
+        (10, 9),
+        (62, 73),
+        (25, 32),
+    )

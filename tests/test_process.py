@@ -64,7 +64,9 @@ def test_the_result_comes_from_another_process() -> None:
     assert process != os.getpid()
 
 
-def test_what_else_is_written_is_not_part_of_the_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_else_is_written_is_not_part_of_the_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "sitecustomize.py").write_text("print('good morning' * 1000)")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     doubled, process = in_process(double_and_tell_where, [1, 2], watch=Watch())
@@ -109,7 +111,9 @@ from ssh_abduction.solver.asp.process import in_process
 from test_process import write_again_and_again
 in_process(write_again_and_again, Path({str(path)!r}), watch=Watch())
 """
-    with subprocess.Popen([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}) as waiting:
+    with subprocess.Popen(
+        [sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    ) as waiting:
         while not path.exists():
             assert waiting.poll() is None
             time.sleep(0.01)

@@ -38,7 +38,9 @@ MODULES = """
 def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder has a file named after each of these modules, which leaves a mark where it is run."""
     for name in MODULES:
-        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'mark')!r}, 'a').write({name!r})")
+        (tmp_path / f"{name}.py").write_text(
+            f"open({str(tmp_path / 'mark')!r}, 'a').write({name!r})"
+        )
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -46,7 +48,9 @@ def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def modules_from(folder: str) -> list[str]:
     """The modules that this process loaded from a folder."""
     return sorted(
-        name for name, module in list(sys.modules.items()) if (getattr(module, "__file__", None) or "").startswith(f"{folder}{os.sep}")
+        name
+        for name, module in list(sys.modules.items())
+        if (getattr(module, "__file__", None) or "").startswith(f"{folder}{os.sep}")
     )
 
 
@@ -68,10 +72,14 @@ def test_a_file_of_the_current_folder_is_run_if_nothing_is_done_about_it(hostile
     assert "csv" in (hostile / "mark").read_text()
 
 
-def test_no_process_that_is_begun_runs_a_file_of_the_current_folder(hostile: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_process_that_is_begun_runs_a_file_of_the_current_folder(
+    hostile: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sys, "path", ["", str(hostile), *sys.path])
     assert process.in_process(from_here, str(hostile), watch=Watch()) == []
-    assert list(workers.answers(from_there, [(0, str(hostile))], 1, lambda: False, None, 1.0)) == [[]]
+    assert list(workers.answers(from_there, [(0, str(hostile))], 1, lambda: False, None, 1.0)) == [
+        []
+    ]
     assert not (hostile / "mark").exists()
 
 
@@ -84,7 +92,12 @@ def test_no_process_that_is_begun_runs_a_file_of_the_current_folder(hostile: Pat
     ids=" ".join,
 )
 def test_the_program_runs_no_file_of_the_current_folder(hostile: Path, words: list[str]) -> None:
-    done = subprocess.run([sys.executable, "-P", "-m", "ssh_abduction", *words], check=False, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "ssh_abduction", *words],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
     assert (done.returncode, (hostile / "mark").exists()) == (0, False), done.stderr
 
 
@@ -92,7 +105,13 @@ def test_without_p_the_program_puts_the_current_folder_behind_all_others(tmp_pat
     """Python itself has loaded some modules by then, which are left out here; runpy does not load these ones."""
     for name in ("csv", "signal", "json", "argparse", "numpy", "clingo"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit(99)")
-    done = subprocess.run([sys.executable, "-m", "ssh_abduction", "solve", ACES], cwd=tmp_path, check=False, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "ssh_abduction", "solve", ACES],
+        cwd=tmp_path,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -122,8 +141,12 @@ __main__.run()
 
 @POSIX
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_verb_that_hears_nothing_is_ended_with_the_code_of_the_signal(number: int, code: int) -> None:
-    with subprocess.Popen([sys.executable, "-c", DEAF, "facts", ACES], stdout=subprocess.PIPE, text=True) as process:
+def test_a_verb_that_hears_nothing_is_ended_with_the_code_of_the_signal(
+    number: int, code: int
+) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", DEAF, "facts", ACES], stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout
         assert process.stdout.readline() == "ready\n"
         process.send_signal(number)
@@ -140,11 +163,17 @@ def signals(monkeypatch: pytest.MonkeyPatch) -> None:
 @POSIX
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_ladder_prints_the_rungs_so_far(
-    number: int, code: int, signals: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    number: int,
+    code: int,
+    signals: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     solve, asked = UnderWay.solve, []
 
-    def solve_until_the_second(under_way: UnderWay, trace: Trace, theory: Theory, **limits: Any) -> Solution:
+    def solve_until_the_second(
+        under_way: UnderWay, trace: Trace, theory: Theory, **limits: Any
+    ) -> Solution:
         asked.append(theory)
         if len(asked) == 2:
             os.kill(os.getpid(), number)
@@ -159,10 +188,28 @@ def test_ladder_prints_the_rungs_so_far(
 
 @POSIX
 def test_map_that_is_interrupted_says_so_and_is_done_again(
-    tmp_path: Path, signals: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    signals: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     log, runs = tmp_path / "drive.log", tmp_path / "runs"
-    assert main(["simulate", "notched-rectangle", "--as", "carmen", "--every", "0.5", "-q", "-o", str(log)]) == 0
+    assert (
+        main(
+            [
+                "simulate",
+                "notched-rectangle",
+                "--as",
+                "carmen",
+                "--every",
+                "0.5",
+                "-q",
+                "-o",
+                str(log),
+            ]
+        )
+        == 0
+    )
     solve = LogMapping.solve
 
     def solve_until_a_signal(mapping: LogMapping, *trace: Any, **limits: Any) -> Solution:

@@ -29,13 +29,21 @@ from ssh_abduction.solver.steps.log import Log
 @settings(max_examples=20)
 @given(machines(most_steps=30))
 def test_what_the_solver_writes_holds(trace: Trace) -> None:
-    for theory in (Theory.causal(), Theory.topological().replace(star="none")) if len(trace) < 12 else (Theory.causal(),):
+    for theory in (
+        (Theory.causal(), Theory.topological().replace(star="none"))
+        if len(trace) < 12
+        else (Theory.causal(),)
+    ):
         solution = solve(trace, theory, max_maps=1)
         assert solution.certificate is not None
         bound = check_bound(trace, solution.certificate.to_dict(trace))
         assert bound.faults == ()
         if solution.cost is not None:  # boundary axioms leave some random traces without any map
-            assert bound.dstates + len(bound.refuted) == solution.certificate.bound == solution.cost.dstates
+            assert (
+                bound.dstates + len(bound.refuted)
+                == solution.certificate.bound
+                == solution.cost.dstates
+            )
 
 
 @pytest.mark.parametrize("length", [12, 120])
@@ -49,7 +57,9 @@ def test_a_certificate_is_worked_out_when_asked_for(length: int) -> None:
     log = Log(trace, search.theory)
     certificate = solution.certificate
     assert certificate is not None
-    assert certificate.clique == tuple(Continuations(log.seen[: solution.prefix], log.actions[: solution.prefix - 1]).clique())
+    assert certificate.clique == tuple(
+        Continuations(log.seen[: solution.prefix], log.actions[: solution.prefix - 1]).clique()
+    )
     assert solution.cost is not None
     assert certificate.bound == solution.cost.dstates
     assert solution.certificate is certificate
@@ -93,7 +103,9 @@ def test_a_short_trace_is_solved_without_numpy() -> None:
         print("numpy" in sys.modules)
         print(solution.certificate.clique, "numpy" in sys.modules)
     """)
-    shown = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, check=True).stdout
+    shown = subprocess.run(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, check=True
+    ).stdout
     assert shown.splitlines() == ["False", "(0, 1) True"]
 
 
@@ -150,7 +162,9 @@ def test_a_certificate_says_its_clique() -> None:
         check_bound(certified()[0], {})
 
 
-def test_check_bound_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_bound_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trace, maps = tmp_path / "trace.jsonl", tmp_path / "maps.json"
     wandering(1, rooms=12, length=300, views=3).save(trace)
     assert main(["solve", str(trace), "--theory", "causal", "--json"]) == 0
@@ -160,12 +174,16 @@ def test_check_bound_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
     data = json.loads(maps.read_text())
     assert f"at least {len(data['certificate']['clique'])} dstates: as many steps" in shown
     assert f"the maps have {data['cost']['dstates']}: no map has fewer" in shown
-    data["certificate"]["refuted"] = list(range(len(data["certificate"]["clique"]), data["cost"]["dstates"] + 1))
+    data["certificate"]["refuted"] = list(
+        range(len(data["certificate"]["clique"]), data["cost"]["dstates"] + 1)
+    )
     maps.write_text(json.dumps(data))
     assert main(["check", "--bound", str(trace), str(maps)]) == 20
     assert "fewer than that, so this bound or a map is wrong" in capsys.readouterr().out
     clique = data["certificate"]["clique"]
-    clique.append(next(step for step in range(301) if step not in clique))  # as it is a largest one, this step is not apart from all of it
+    clique.append(
+        next(step for step in range(301) if step not in clique)
+    )  # as it is a largest one, this step is not apart from all of it
     data["certificate"]["refuted"] = list(range(len(clique), data["cost"]["dstates"]))
     maps.write_text(json.dumps(data))
     assert main(["check", "--bound", str(trace), str(maps)]) == 20
@@ -178,7 +196,9 @@ def test_check_bound_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
     assert "which the proof rests on" in capsys.readouterr().err
 
 
-def test_a_verdict_on_another_theory_or_trace_is_not_believed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_verdict_on_another_theory_or_trace_is_not_believed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Without sides the rectangle has four dstates; what clingo said of a theory with sides does not count there."""
     trace, maps = tmp_path / "trace.jsonl", tmp_path / "maps.json"
     rectangle(400).save(trace)
@@ -188,7 +208,9 @@ def test_a_verdict_on_another_theory_or_trace_is_not_believed(tmp_path: Path, ca
     assert "the maps have 8: no map has fewer" in capsys.readouterr().out
     assert main(["check", "--bound", "--boundary", "none", str(trace), str(maps)]) == 0
     shown = capsys.readouterr().out
-    assert "clingo's verdict on 4 dstates and more is left out: the file is of another theory" in shown
+    assert (
+        "clingo's verdict on 4 dstates and more is left out: the file is of another theory" in shown
+    )
     assert "the maps have 8, 4 more than proven" in shown
     data = json.loads(maps.read_text())
     del data["theory"]

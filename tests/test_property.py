@@ -50,19 +50,28 @@ def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
     first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
     first_paths = data.draw(st.sampled_from([1, 2, prefixes.FIRST_PATHS]), label="first paths")
     few_steps = data.draw(st.sampled_from([0, solver.FEW_STEPS]), label="few steps")
-    with patch.multiple(prefixes, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths), patch.object(solver, "FEW_STEPS", few_steps):
+    with (
+        patch.multiple(prefixes, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths),
+        patch.object(solver, "FEW_STEPS", few_steps),
+    ):
         agree(trace, theory)
 
 
-@pytest.mark.parametrize("prefer", [("places",), ("paths", "places"), ("excuses", "places"), ("places", "excuses")])
-def test_excuses_are_counted_where_no_pair_of_paths_can_be_excused(prefer: tuple[Count, ...]) -> None:
+@pytest.mark.parametrize(
+    "prefer", [("places",), ("paths", "places"), ("excuses", "places"), ("places", "excuses")]
+)
+def test_excuses_are_counted_where_no_pair_of_paths_can_be_excused(
+    prefer: tuple[Count, ...],
+) -> None:
     """The maps 0, 0 and 0, 1 are both minimal where dstates are not counted."""
     trace = Trace.from_steps("aa", ["around"])
     agree(trace, Theory(boundary="defeasible", star="none", prefer=prefer))
 
 
 @pytest.mark.parametrize("prefer", [(), ("excuses",)])
-def test_excuses_alone_are_minimised_where_no_pair_of_paths_can_be_excused(prefer: tuple[Count, ...]) -> None:
+def test_excuses_alone_are_minimised_where_no_pair_of_paths_can_be_excused(
+    prefer: tuple[Count, ...],
+) -> None:
     trace = Trace.from_steps("aaaaaaa", ["travel"] * 6)
     agree(trace, Theory(boundary="defeasible", next_place=True, star="none", prefer=prefer))
 

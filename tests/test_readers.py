@@ -62,7 +62,9 @@ def agree(read: Scan, written: Scan) -> bool:
         and is_near(read.odometry, written.odometry)
         and is_near(read.corrected, written.corrected)
         and np.allclose(
-            [*laser.mount, laser.first, laser.step, laser.reach], [*other.mount, other.first, other.step, other.reach], atol=1e-4
+            [*laser.mount, laser.first, laser.step, laser.reach],
+            [*other.mount, other.first, other.step, other.reach],
+            atol=1e-4,
         )
         and read.time == pytest.approx(written.time)
     )
@@ -82,9 +84,7 @@ def flaser(first: Pose, second: Pose, time: str = "1.5", ranges: str = "1 2 8 8 
 
 
 def robotlaser(first: Pose, second: Pose, time: float = 1.5) -> str:
-    return (
-        f"ROBOTLASER1 0 -1.5707963 3.1415927 0.7853982 8.0 0.1 0 5 1 2 7.99 8 9 0 {pose(first)} {pose(second)} 0 0 0 0 0 {time} host {time}"
-    )
+    return f"ROBOTLASER1 0 -1.5707963 3.1415927 0.7853982 8.0 0.1 0 5 1 2 7.99 8 9 0 {pose(first)} {pose(second)} 0 0 0 0 0 {time} host {time}"
 
 
 def odom(value: Pose, time: str = "1.5") -> str:
@@ -96,9 +96,13 @@ def by_gmapping(scans: int = 8, with_neff: bool = True) -> tuple[list[str], list
     rng = np.random.default_rng(3)
     lines, odometry, truth, at = [], [START], [], START
     for i in range(scans):
-        corrected: Pose = moved(at, (0.2, -0.15, 0.1)) if i else at  # the correction jumps as far as the robot drives
+        corrected: Pose = (
+            moved(at, (0.2, -0.15, 0.1)) if i else at
+        )  # the correction jumps as far as the robot drives
         truth.append(corrected)
-        lines += [flaser(corrected, corrected, f"{i}.5"), odom(corrected, "0")] + ["NEFF 30"] * with_neff
+        lines += [flaser(corrected, corrected, f"{i}.5"), odom(corrected, "0")] + [
+            "NEFF 30"
+        ] * with_neff
         at = corrected
         for part in range(3):
             step = (0.15, float(rng.normal(0, 0.01)), float(rng.normal(0, 0.1)))
@@ -158,7 +162,9 @@ def test_writers_refuse_what_they_cannot_write(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("with_neff", [True, False])
-def test_odometry_of_gmappings_logs_is_without_the_corrections(tmp_path: Path, with_neff: bool) -> None:
+def test_odometry_of_gmappings_logs_is_without_the_corrections(
+    tmp_path: Path, with_neff: bool
+) -> None:
     lines, odometry, truth = by_gmapping(with_neff=with_neff)
     log = read_text(tmp_path / "a.log", *lines)
     assert all(is_near(scan.odometry, at) for scan, at in zip(log.scans, odometry, strict=True))
@@ -167,8 +173,19 @@ def test_odometry_of_gmappings_logs_is_without_the_corrections(tmp_path: Path, w
 
 
 @pytest.mark.parametrize("with_neff", [True, False])
-@pytest.mark.parametrize("damage", ["FLASER 5 1 2 3", "FLASER 5 1 2 8 8 8 nan 0 0 nan 0 0 1 h 1", "\x01\x07\ufffd", "FLXSER 5 1 2", None])
-def test_a_scan_that_is_lost_leaves_no_correction_in_odometry(tmp_path: Path, damage: str | None, with_neff: bool) -> None:
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "FLASER 5 1 2 3",
+        "FLASER 5 1 2 8 8 8 nan 0 0 nan 0 0 1 h 1",
+        "\x01\x07\ufffd",
+        "FLXSER 5 1 2",
+        None,
+    ],
+)
+def test_a_scan_that_is_lost_leaves_no_correction_in_odometry(
+    tmp_path: Path, damage: str | None, with_neff: bool
+) -> None:
     lines, odometry, _ = by_gmapping(with_neff=with_neff)
     at = next(i for i, line in enumerate(lines) if line.startswith("FLASER 5") and i > 15)
     lines[at : at + 1] = [damage] * (damage is not None)
@@ -180,13 +197,28 @@ def test_a_scan_that_is_lost_leaves_no_correction_in_odometry(tmp_path: Path, da
     assert all(is_near(scan.odometry, at) for scan, at in zip(log.scans, kept, strict=True))
 
 
-def test_a_lost_odometer_line_of_gmappings_logs_costs_no_more_than_its_motion(tmp_path: Path) -> None:
+def test_a_lost_odometer_line_of_gmappings_logs_costs_no_more_than_its_motion(
+    tmp_path: Path,
+) -> None:
     lines, odometry, _ = by_gmapping()
-    restarts = [i for i, line in enumerate(lines) if line.startswith("ODOM") and lines[i - 1].startswith("FLASER")]
-    log = read_text(tmp_path / "a.log", *("ODOM 1 2 x" if i == restarts[3] else line for i, line in enumerate(lines)))
+    restarts = [
+        i
+        for i, line in enumerate(lines)
+        if line.startswith("ODOM") and lines[i - 1].startswith("FLASER")
+    ]
+    log = read_text(
+        tmp_path / "a.log",
+        *("ODOM 1 2 x" if i == restarts[3] else line for i, line in enumerate(lines)),
+    )
     off = [
         between(moved(a, between(b, c)), d)
-        for a, b, c, d in zip(odometry, [s.odometry for s in log.scans], [s.odometry for s in log.scans[1:]], odometry[1:], strict=False)
+        for a, b, c, d in zip(
+            odometry,
+            [s.odometry for s in log.scans],
+            [s.odometry for s in log.scans[1:]],
+            odometry[1:],
+            strict=False,
+        )
     ]
     assert max(max(map(abs, v)) for v in off) < 0.3
     assert sum(max(map(abs, v)) > 1e-4 for v in off) == 1
@@ -195,9 +227,15 @@ def test_a_lost_odometer_line_of_gmappings_logs_costs_no_more_than_its_motion(tm
 def test_poses_of_a_raw_log_are_odometry(tmp_path: Path) -> None:
     """Though each scan was logged before the ODOM line of its time, which then repeats its pose."""
     poses: list[Pose] = [(0.1 * i, 0.0, 0.02 * i) for i in range(6)]
-    lines = [line for i, at in enumerate(poses) for line in (flaser(moved(at, (0.15, 0, 0)), at, f"{i}.0"), odom(at, f"{i}.0"))]
+    lines = [
+        line
+        for i, at in enumerate(poses)
+        for line in (flaser(moved(at, (0.15, 0, 0)), at, f"{i}.0"), odom(at, f"{i}.0"))
+    ]
     log = read_text(tmp_path / "a.log", "PARAM robot_frontlaser_offset 0.3 host 1", *lines)
-    assert [is_near(scan.odometry, at) for scan, at in zip(log.scans, poses, strict=True)] == [True] * 6
+    assert [is_near(scan.odometry, at) for scan, at in zip(log.scans, poses, strict=True)] == [
+        True
+    ] * 6
     assert {scan.corrected for scan in log.scans} == {None}
     assert is_near(log.scans[0].laser.mount, (0.15, 0, 0))
 
@@ -221,11 +259,19 @@ def test_a_first_pose_that_wanders_is_a_corrected_one(tmp_path: Path) -> None:
         (361, ["PARAM laser_front_laser_fov 90 host 1"], 90 / 360, 9.0),
     ],
 )
-def test_where_beams_go_and_how_far(tmp_path: Path, beams: int, lines: list[str], step: float, reach: float) -> None:
-    log = read_text(tmp_path / "a.log", *lines, flaser(START, START, ranges=" ".join(["0 6 9 9 9 -1 nan", *["1.5"] * (beams - 7)])))
+def test_where_beams_go_and_how_far(
+    tmp_path: Path, beams: int, lines: list[str], step: float, reach: float
+) -> None:
+    log = read_text(
+        tmp_path / "a.log",
+        *lines,
+        flaser(START, START, ranges=" ".join(["0 6 9 9 9 -1 nan", *["1.5"] * (beams - 7)])),
+    )
     scan = log.scans[0]
     assert math.degrees(scan.laser.step) == pytest.approx(step, abs=1e-5)
-    assert math.degrees(scan.laser.first) == pytest.approx(-step * (beams // 2), abs=1e-4)  # at the right
+    assert math.degrees(scan.laser.first) == pytest.approx(
+        -step * (beams // 2), abs=1e-4
+    )  # at the right
     assert scan.laser.reach == reach
     assert np.isnan(scan.ranges[[0, 5, 6]]).all()
     assert np.isinf(scan.ranges[2:5]).all()
@@ -234,7 +280,9 @@ def test_where_beams_go_and_how_far(tmp_path: Path, beams: int, lines: list[str]
 
 @pytest.mark.parametrize("lines", [[], ["PARAM robot_front_laser_max 81.92 host 1"]])
 def test_the_codes_of_a_sick_are_no_ranges(tmp_path: Path, lines: list[str]) -> None:
-    scan = read_text(tmp_path / "a.log", *lines, flaser(START, START, ranges="81.91 81.87 40 2 1")).scans[0]
+    scan = read_text(
+        tmp_path / "a.log", *lines, flaser(START, START, ranges="81.91 81.87 40 2 1")
+    ).scans[0]
     assert scan.ranges.tolist() == [math.inf, math.inf, 40, 2, 1]
 
 
@@ -254,7 +302,9 @@ def test_scans_without_poses_are_placed_between_odometer_lines(tmp_path: Path) -
 
 
 def test_of_scans_that_are_logged_twice_the_better_ones_are_read(tmp_path: Path) -> None:
-    log = read_text(tmp_path / "a.log", *[flaser(START, START), robotlaser(START, START)] * 4, "RLASER 1 2")
+    log = read_text(
+        tmp_path / "a.log", *[flaser(START, START), robotlaser(START, START)] * 4, "RLASER 1 2"
+    )
     assert len(log) == 4
     assert log.scans[0].ranges.tolist() == [1, 2, 7.99, math.inf, math.inf]
     assert "FLASER, RLASER are not read" in log.notes[0]
@@ -271,7 +321,10 @@ def test_true_poses_of_carmens_simulator_are_kept(tmp_path: Path) -> None:
 
 
 def graph(
-    vertices: list[Pose], motions: list[Pose], names: tuple[str, str] = ("VERTEX2", "EDGE2"), scans: list[Pose] | None = None
+    vertices: list[Pose],
+    motions: list[Pose],
+    names: tuple[str, str] = ("VERTEX2", "EDGE2"),
+    scans: list[Pose] | None = None,
 ) -> list[str]:
     lines = []
     for i, (vertex, scan) in enumerate(zip(vertices, scans or vertices, strict=True)):
@@ -292,7 +345,9 @@ def chained(motions: Iterable[Pose]) -> list[Pose]:
 
 @pytest.mark.parametrize("names", [("VERTEX2", "EDGE2"), ("VERTEX_SE2", "EDGE_SE2")])
 @pytest.mark.parametrize("order", ["as they are", "edges first", "vertices first"])
-def test_odometry_of_a_graph_is_the_chain_of_its_edges(tmp_path: Path, names: tuple[str, str], order: str) -> None:
+def test_odometry_of_a_graph_is_the_chain_of_its_edges(
+    tmp_path: Path, names: tuple[str, str], order: str
+) -> None:
     lines = graph(VERTICES, MOTIONS, names)
     if order != "as they are":
         first = "EDGE" if order == "edges first" else "VERTEX"
@@ -300,8 +355,16 @@ def test_odometry_of_a_graph_is_the_chain_of_its_edges(tmp_path: Path, names: tu
     log = read_text(tmp_path / "a.graph", *lines)
     assert log.format == "g2o"
     assert not log.damaged
-    assert [scan.time for scan in log.scans] == [0, 1, 2, 3, 4]  # as relations name scans by their times
-    assert all(is_near(scan.odometry, at) for scan, at in zip(log.scans, chained(MOTIONS), strict=True))
+    assert [scan.time for scan in log.scans] == [
+        0,
+        1,
+        2,
+        3,
+        4,
+    ]  # as relations name scans by their times
+    assert all(
+        is_near(scan.odometry, at) for scan, at in zip(log.scans, chained(MOTIONS), strict=True)
+    )
     assert all(is_near(scan.corrected, at) for scan, at in zip(log.scans, VERTICES, strict=True))
     assert is_near(log.scans[0].laser.mount, (-0.04, 0, 0))
 
@@ -330,7 +393,9 @@ def test_a_damaged_vertex_costs_its_scan_alone(tmp_path: Path) -> None:
 
 def test_a_missing_edge_is_told(tmp_path: Path) -> None:
     lines = graph(VERTICES, MOTIONS)
-    lines[-2] = f"EDGE2 3 2 {pose(between(MOTIONS[2], START))} 1 0 1 1 0 0"  # as good as the one from 2 to 3
+    lines[-2] = (
+        f"EDGE2 3 2 {pose(between(MOTIONS[2], START))} 1 0 1 1 0 0"  # as good as the one from 2 to 3
+    )
     assert is_near(read_text(tmp_path / "a.graph", *lines).scans[-1].odometry, chained(MOTIONS)[-1])
     log = read_text(tmp_path / "a.graph", *lines[:-1])
     assert "before these vertices, so that it seems to have stood still: 4" in " ".join(log.notes)
@@ -383,9 +448,13 @@ class Messages:
         )  # fmt: skip
 
     def odometry(self, time: float, at: Pose, base: str = "base_link") -> Any:
-        geometry, zero = "geometry_msgs/msg/", self.types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+        geometry, zero = (
+            "geometry_msgs/msg/",
+            self.types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0),
+        )
         where = self.types[geometry + "Pose"](
-            position=self.types[geometry + "Point"](x=at[0], y=at[1], z=0.0), orientation=self.quaternion(at[2])
+            position=self.types[geometry + "Point"](x=at[0], y=at[1], z=0.0),
+            orientation=self.quaternion(at[2]),
         )
         return self.types["nav_msgs/msg/Odometry"](
             header=self.header("odom", time),
@@ -394,11 +463,17 @@ class Messages:
             twist=self.types[geometry + "TwistWithCovariance"](twist=self.types[geometry + "Twist"](linear=zero, angular=zero), covariance=np.zeros(36)),
         )  # fmt: skip
 
-    def transform(self, parent: str, child: str, at: Pose, time: float = 0.0, upside_down: bool = False) -> Any:
+    def transform(
+        self, parent: str, child: str, at: Pose, time: float = 0.0, upside_down: bool = False
+    ) -> Any:
         geometry = "geometry_msgs/msg/"
         move = self.types[geometry + "Vector3"](x=at[0], y=at[1], z=0.3)
-        transform = self.types[geometry + "Transform"](translation=move, rotation=self.quaternion(at[2], upside_down))
-        stamped = self.types[geometry + "TransformStamped"](header=self.header(parent, time), child_frame_id=child, transform=transform)
+        transform = self.types[geometry + "Transform"](
+            translation=move, rotation=self.quaternion(at[2], upside_down)
+        )
+        stamped = self.types[geometry + "TransformStamped"](
+            header=self.header(parent, time), child_frame_id=child, transform=transform
+        )
         return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
 
 
@@ -407,7 +482,10 @@ def test_odometry_of_a_bag_is_that_at_the_times_of_the_scans(tmp_path: Path) -> 
     path = bag(
         tmp_path / "bag",
         lambda m: (
-            [("/odom", t, m.odometry(t, (0.5 * t, 1.0, math.remainder(2.9 + 0.2 * t, math.tau)))) for t in range(1, 5)]
+            [
+                ("/odom", t, m.odometry(t, (0.5 * t, 1.0, math.remainder(2.9 + 0.2 * t, math.tau))))
+                for t in range(1, 5)
+            ]
             + [("/front", t + 0.1, m.scan(t)) for t in (1.0, 1.5, 2.25, 9.0)]
         ),
     )
@@ -431,8 +509,14 @@ def test_odometry_of_transforms_and_a_laser_upside_down(tmp_path: Path) -> None:
             ("/tf_static", 0.5, m.transform("/base_link", "mast", (0.1, 0.2, math.pi / 2))),
             ("/tf_static", 0.5, m.transform("mast", "laser", (0.3, 0.0, 0.0), upside_down=True)),
             ("/tf", 0.6, m.transform("wheel_link", "wheel", (0.0, 0.0, 1.0), 0.6)),
-            *[("/tf", t, m.transform("odom", "base_footprint", (t, 0.0, 0.0), t)) for t in (1.0, 2.0, 3.0)],
-            *[("/tf", t, m.transform("base_footprint", "/base_link", (0.0, 0.0, 0.0), t)) for t in (1.0, 2.0, 3.0)],
+            *[
+                ("/tf", t, m.transform("odom", "base_footprint", (t, 0.0, 0.0), t))
+                for t in (1.0, 2.0, 3.0)
+            ],
+            *[
+                ("/tf", t, m.transform("base_footprint", "/base_link", (0.0, 0.0, 0.0), t))
+                for t in (1.0, 2.0, 3.0)
+            ],
             *[("/tf", t, m.transform("map", "odom", (5.0, t, math.pi / 2), t)) for t in (1.0, 3.0)],
             *[("/scan", t, m.scan(t)) for t in (1.5, 2.0)],
         ],
@@ -446,10 +530,15 @@ def test_odometry_of_transforms_and_a_laser_upside_down(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stamp", [0.0, 500.0])
-def test_times_of_recording_are_used_where_headers_have_none_or_those_of_another_clock(tmp_path: Path, stamp: float) -> None:
+def test_times_of_recording_are_used_where_headers_have_none_or_those_of_another_clock(
+    tmp_path: Path, stamp: float
+) -> None:
     path = bag(
         tmp_path / "bag",
-        lambda m: [("/odom", t, m.odometry(t, (t, 0.0, 0.0))) for t in (1.0, 2.0, 3.0)] + [("/scan", t, m.scan(stamp)) for t in (1.5, 2.5)],
+        lambda m: (
+            [("/odom", t, m.odometry(t, (t, 0.0, 0.0))) for t in (1.0, 2.0, 3.0)]
+            + [("/scan", t, m.scan(stamp)) for t in (1.5, 2.5)]
+        ),
     )
     log = read_log(path)
     assert [scan.odometry[0] for scan in log.scans] == [1.5, 2.5]
@@ -458,11 +547,20 @@ def test_times_of_recording_are_used_where_headers_have_none_or_those_of_another
 
 def test_a_damaged_message_is_skipped_and_told(tmp_path: Path) -> None:
     def messages(m: Messages) -> list[tuple[str, float, Any]]:
-        no_step, no_ranges, nowhere = m.scan(1.0), m.scan(1.0), m.odometry(1.5, (math.nan, 0.0, 0.0))
+        no_step, no_ranges, nowhere = (
+            m.scan(1.0),
+            m.scan(1.0),
+            m.odometry(1.5, (math.nan, 0.0, 0.0)),
+        )
         no_step.angle_increment = math.nan
         no_ranges.ranges = np.zeros(0, dtype=np.float32)
         cut = b"\0\1\0\0" + bytes(9)
-        odometry = [m.odometry(1.0, (1.0, 0.0, 0.0)), cut, nowhere, m.odometry(2.0, (2.0, 0.0, 0.0))]
+        odometry = [
+            m.odometry(1.0, (1.0, 0.0, 0.0)),
+            cut,
+            nowhere,
+            m.odometry(2.0, (2.0, 0.0, 0.0)),
+        ]
         scans = [m.scan(1.0), cut, no_step, no_ranges, m.scan(2.0)]
         return [("/odom", 1.0 + i / 3, message) for i, message in enumerate(odometry)] + [
             ("/scan", 1.0 + i / 4, s) for i, s in enumerate(scans)
@@ -485,10 +583,16 @@ def test_several_topics_are_listed_and_can_be_named(tmp_path: Path) -> None:
         tmp_path / "bag",
         lambda m: (
             [(f"/{side}", 1.0, m.scan(1.0)) for side in ("front", "rear", "rear")]
-            + [(topic, 1.0, m.odometry(1.0, (x, 0.0, 0.0))) for topic, x in (("/odom", 1.0), ("/truth", 2.0))]
+            + [
+                (topic, 1.0, m.odometry(1.0, (x, 0.0, 0.0)))
+                for topic, x in (("/odom", 1.0), ("/truth", 2.0))
+            ]
         ),
     )
-    with pytest.raises(LogError, match=r"got 2: /front \(1 messages\), /rear \(2 messages\); name one with --scan-topic"):
+    with pytest.raises(
+        LogError,
+        match=r"got 2: /front \(1 messages\), /rear \(2 messages\); name one with --scan-topic",
+    ):
         read_log(path)
     with pytest.raises(LogError, match=r"/odom .*/truth .*--odom-topic"):
         read_log(path, scan_topic="rear")
@@ -516,10 +620,15 @@ def test_a_bag_is_known_by_its_content(tmp_path: Path) -> None:
         assert read_log(tmp_path / "log.data").format == format
 
 
-def test_without_rosbags_the_error_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rosbags_the_error_says_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_bag(tmp_path / "a.bag", drive(2))
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    for act in (lambda: read_log(tmp_path / "a.bag"), lambda: write_bag(tmp_path / "b.bag", drive(2))):
+    for act in (
+        lambda: read_log(tmp_path / "a.bag"),
+        lambda: write_bag(tmp_path / "b.bag", drive(2)),
+    ):
         with pytest.raises(LogError, match=r"pip install 'ssh-abduction\[ros\]'"):
             act()
 
@@ -569,7 +678,15 @@ def test_a_mark_of_the_encoding_costs_no_scan(tmp_path: Path) -> None:
 
 
 def test_what_no_reader_knows_is_no_damage(tmp_path: Path) -> None:
-    log = read_text(tmp_path / "a.log", "# a comment", "", "SYNC 1", "MARKER here", flaser(START, START).replace(" ", "\t"), "WIFI -70\r")
+    log = read_text(
+        tmp_path / "a.log",
+        "# a comment",
+        "",
+        "SYNC 1",
+        "MARKER here",
+        flaser(START, START).replace(" ", "\t"),
+        "WIFI -70\r",
+    )
     assert len(log) == 1
     assert not log.damaged
 
@@ -619,7 +736,10 @@ def test_paths_and_formats_that_cannot_be(tmp_path: Path) -> None:
     ):
         with pytest.raises(LogError, match=text):
             read_log(path, **options)
-    assert read_text(tmp_path / "g", *graph(VERTICES, MOTIONS), format="carmen").scans[1].odometry == VERTICES[1]
+    assert (
+        read_text(tmp_path / "g", *graph(VERTICES, MOTIONS), format="carmen").scans[1].odometry
+        == VERTICES[1]
+    )
 
 
 @pytest.mark.parametrize("name", ["drive.log", "drive.log.gz", "gmapping.log", "graph.log", *BAGS])
@@ -631,7 +751,9 @@ def test_nothing_that_bytes_can_hold_is_a_crash(tmp_path: Path, name: str) -> No
     elif name.startswith("drive"):
         write_carmen(file, drive(6, SMALL))
     else:
-        file.write_text("\n".join(by_gmapping(5)[0] if name == "gmapping.log" else graph(VERTICES, MOTIONS)))
+        file.write_text(
+            "\n".join(by_gmapping(5)[0] if name == "gmapping.log" else graph(VERTICES, MOTIONS))
+        )
     if file.is_dir():
         file = next(file.glob("*.db3"))
     whole = file.read_bytes()
@@ -651,7 +773,9 @@ def test_nothing_that_bytes_can_hold_is_a_crash(tmp_path: Path, name: str) -> No
         for scan in log.scans:
             assert len(scan.ranges) == scan.laser.beams
             assert np.isfinite([*scan.odometry, *(scan.corrected or START)]).all()
-    assert read > 5 or name in BAGS or name.endswith(".gz")  # of gzipped data the check sum is wrong
+    assert (
+        read > 5 or name in BAGS or name.endswith(".gz")
+    )  # of gzipped data the check sum is wrong
 
 
 def test_memory_does_not_grow_with_what_is_skipped(tmp_path: Path) -> None:
@@ -687,7 +811,10 @@ def test_a_log_that_is_given_as_a_trace_is_named(tmp_path: Path) -> None:
     write_bag(tmp_path / "a.bag", drive(2))
     (tmp_path / "b.log").write_text("\n".join(graph(VERTICES, MOTIONS)))
     for name in ("a.log", "a.log.gz", "a.bag", "b.log"):
-        with pytest.raises(TraceError, match=r"as robots' logs are; make a trace of it with ssh-abduction import LOG -o trace\.jsonl"):
+        with pytest.raises(
+            TraceError,
+            match=r"as robots' logs are; make a trace of it with ssh-abduction import LOG -o trace\.jsonl",
+        ):
             Trace.load(tmp_path / name)
 
 
@@ -715,15 +842,22 @@ def test_logs_of_real_robots(name: str) -> None:
     assert 0.001 < np.mean([np.isinf(scan.ranges).mean() for scan in log.scans]) < 0.03
     steps = list(zip(log.scans, log.scans[1:], strict=False))
     by_odometry = [between(a.odometry, b.odometry) for a, b in steps]
-    by_truth = [between(a.corrected, b.corrected) for a, b in steps if a.corrected is not None and b.corrected is not None]
-    assert [sum(math.hypot(*step[:2]) for step in way) for way in (by_odometry, by_truth)] == pytest.approx([driven, truly], abs=1)
+    by_truth = [
+        between(a.corrected, b.corrected)
+        for a, b in steps
+        if a.corrected is not None and b.corrected is not None
+    ]
+    assert [
+        sum(math.hypot(*step[:2]) for step in way) for way in (by_odometry, by_truth)
+    ] == pytest.approx([driven, truly], abs=1)
     off = np.abs([between(a, b) for a, b in zip(by_odometry, by_truth, strict=True)])
     off = np.column_stack([np.hypot(off[:, 0], off[:, 1]), np.degrees(off[:, 2])])
     assert (np.median(off, axis=0) < median).all()
     assert (np.quantile(off, 0.95, axis=0) < most).all()
     assert (off.max(axis=0) > 0).all()  # odometry is no copy of the corrected poses
     end = between(
-        between(log.scans[0].odometry, log.scans[-1].odometry), between(log.scans[0].corrected or START, log.scans[-1].corrected or START)
+        between(log.scans[0].odometry, log.scans[-1].odometry),
+        between(log.scans[0].corrected or START, log.scans[-1].corrected or START),
     )
     assert math.hypot(*end[:2]) > 0.5  # and drifts
 

@@ -30,17 +30,26 @@ from ssh_abduction.theory.theory import Theory
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
-TUTORIALS = sorted({*(ROOT / "docs" / "tutorials").glob("*.md")} - {ROOT / "docs" / "tutorials" / "index.md"})
+TUTORIALS = sorted(
+    {*(ROOT / "docs" / "tutorials").glob("*.md")} - {ROOT / "docs" / "tutorials" / "index.md"}
+)
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCKS = {page: re.findall(r"```(\w*)\n(.*?)```", page.read_text(), re.DOTALL) for page in PAGES}
 # How links of the README begin, which PyPI shows, too: what follows is the path of a file in this checkout.
-ABSOLUTE = (
-    r"https://(?:github\.com/ssh-abduction/ssh-abduction/(?:blob|tree)|raw\.githubusercontent\.com/ssh-abduction/ssh-abduction)/main/"
-)
+ABSOLUTE = r"https://(?:github\.com/ssh-abduction/ssh-abduction/(?:blob|tree)|raw\.githubusercontent\.com/ssh-abduction/ssh-abduction)/main/"
 
 FILES = [
     path
-    for folder in ("benchmarks", "encodings", "examples", "perception", "simulator", "ssh_abduction", "tests", "website")
+    for folder in (
+        "benchmarks",
+        "encodings",
+        "examples",
+        "perception",
+        "simulator",
+        "ssh_abduction",
+        "tests",
+        "website",
+    )
     for path in (ROOT / folder).rglob("*.*")
 ]
 EXAMPLES = {
@@ -73,7 +82,9 @@ class Block:
 
 def blocks(page: Path) -> list[Block]:
     """The blocks of a page in Python and for the shell. The output is a block without a language behind them."""
-    found = re.findall(r"(?:<!-- not run: (.+?) -->\n)?```(\w*)\n(.*?)```", page.read_text(), re.DOTALL)
+    found = re.findall(
+        r"(?:<!-- not run: (.+?) -->\n)?```(\w*)\n(.*?)```", page.read_text(), re.DOTALL
+    )
     return [
         Block(language, lines, output if not following else None, why)
         for (why, language, lines), (_, following, output) in pairwise([*found, ("", "end", "")])
@@ -90,7 +101,9 @@ RUN = [
 ]
 
 
-LINE = re.compile(r".*<<'(\w+)'\n(?:.*\n)*?\1\n|(?:.*\\\n)*.+\n")  # with the text that it is given, or with the lines in which it goes on
+LINE = re.compile(
+    r".*<<'(\w+)'\n(?:.*\n)*?\1\n|(?:.*\\\n)*.+\n"
+)  # with the text that it is given, or with the lines in which it goes on
 
 
 def run(block: Block) -> tuple[str, int]:
@@ -139,26 +152,39 @@ printed_often = cache(printed)
 
 def shell(lines: str, given: str = "") -> int:
     """Run lines in a process of their own, in which python is this one, and print what they print; returns the exit code."""
-    lines = re.sub(r"(?<![\w/-])ssh-abduction(?= )", f"{shlex.quote(sys.executable)} -m ssh_abduction", lines)
-    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-    done = subprocess.run(lines, shell=True, input=given, capture_output=True, text=True, check=False, env=environment)
+    lines = re.sub(
+        r"(?<![\w/-])ssh-abduction(?= )", f"{shlex.quote(sys.executable)} -m ssh_abduction", lines
+    )
+    environment = {
+        **os.environ,
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+    }
+    done = subprocess.run(
+        lines, shell=True, input=given, capture_output=True, text=True, check=False, env=environment
+    )
     print(done.stdout, end="")
     return done.returncode
 
 
 def without_seconds(text: str) -> str:
     """Without what depends on how fast the machine is: how long it took, and of how many steps clingo was told, as other engines take over after some time."""
-    return re.sub(r"\d+\.\d+ s\b", "_ s", re.sub(r"\d+ of (\d+ steps given to clingo)", r"_ of \1", text))
+    return re.sub(
+        r"\d+\.\d+ s\b", "_ s", re.sub(r"\d+ of (\d+ steps given to clingo)", r"_ of \1", text)
+    )
 
 
 def compare(block: Block) -> None:
     output, code = run(block)
-    assert code == next((code for code, said in CODES.items() if said in (block.output or "")), 0), block.lines
+    assert code == next(
+        (code for code, said in CODES.items() if said in (block.output or "")), 0
+    ), block.lines
     assert block.output is None or without_seconds(output) == without_seconds(block.output)
 
 
 @pytest.mark.parametrize("block", RUN)
-def test_the_shell_lines_and_python_lines_print_what_is_shown(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_shell_lines_and_python_lines_print_what_is_shown(
+    block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     compare(block)
@@ -181,7 +207,13 @@ def test_what_is_shown_is_run() -> None:
 
 
 def test_the_command_line_knows_all_that_is_shown() -> None:
-    lines = [line for blocks in BLOCKS.values() for _, text in blocks for line in text.splitlines() if line.startswith("ssh-abduction ")]
+    lines = [
+        line
+        for blocks in BLOCKS.values()
+        for _, text in blocks
+        for line in text.splitlines()
+        if line.startswith("ssh-abduction ")
+    ]
     assert len(lines) > 10
     for line in lines:
         words = shlex.split(re.split(r" > | \| ", line)[0], comments=True)
@@ -228,30 +260,50 @@ def test_every_file_it_names_exists(page: Path) -> None:
     said = [ROOT / name for name in re.findall(folders, text)]
     for path in (*linked, *whole, *said):
         assert path.exists(), path
-    for name in re.findall(r"`([\w./-]+\.(?:py|lp|jsonl?))`", text):  # pages name modules from the folder that they are in on
+    for name in re.findall(
+        r"`([\w./-]+\.(?:py|lp|jsonl?))`", text
+    ):  # pages name modules from the folder that they are in on
         assert any(path.match(name) for path in FILES) or Path(name).name in EXAMPLES, name
     assert page != README or len(whole) > 5
 
 
 def test_the_design_has_a_sentence_for_each_module() -> None:
-    sections = dict(re.findall(r"\n### (\w+):.*?\n(.*?)(?=\n##)", (ROOT / "docs" / "design.md").read_text(), re.DOTALL))
+    sections = dict(
+        re.findall(
+            r"\n### (\w+):.*?\n(.*?)(?=\n##)", (ROOT / "docs" / "design.md").read_text(), re.DOTALL
+        )
+    )
     for path in sorted((ROOT / "ssh_abduction").rglob("[a-z]*.py")):
-        folder = path.relative_to(ROOT / "ssh_abduction").parts[0] if path.parent.name != "ssh_abduction" else "ssh_abduction"
-        rows = [line for line in sections[folder].splitlines() if f"`{path.stem}`" in line.split(" | ")[0]]
+        folder = (
+            path.relative_to(ROOT / "ssh_abduction").parts[0]
+            if path.parent.name != "ssh_abduction"
+            else "ssh_abduction"
+        )
+        rows = [
+            line
+            for line in sections[folder].splitlines()
+            if f"`{path.stem}`" in line.split(" | ")[0]
+        ]
         assert rows, path
 
 
 def test_the_design_tells_the_floors_as_they_are_checked() -> None:
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"][
+        "contracts"
+    ]
     layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
-    (told,) = re.findall(r"From the top: (.*?)\. ", (ROOT / "docs" / "design.md").read_text(), re.DOTALL)
+    (told,) = re.findall(
+        r"From the top: (.*?)\. ", (ROOT / "docs" / "design.md").read_text(), re.DOTALL
+    )
     assert [set(re.findall(r"`(\w+)`", floor)) for floor in told.split(";")] == [
         set(re.findall(r"(\w+)(?= \||$)", layer)) for layer in layers
     ]
 
 
 def test_the_rule_of_the_theory_page_is_obeyed() -> None:
-    (rule,) = [text for language, text in BLOCKS[ROOT / "docs" / "theory.md"] if language == "prolog"]
+    (rule,) = [
+        text for language, text in BLOCKS[ROOT / "docs" / "theory.md"] if language == "prolog"
+    ]
     trace = Trace.load(ROOT / "examples" / "notched-rectangle.jsonl").prefix(24)
     assert fewest(trace, Theory.causal()) == 4
     assert fewest(trace, Theory.causal().replace(rules=[Rules("own.lp", rule)])) == 16

@@ -29,7 +29,11 @@ BOTH = Theory.causal().replace(misread=1.5, slipped=3)
 
 
 def followed(
-    trace: Trace, theory: Theory, limit: float | None = None, maps: int = 0, speedups: Speedups | None = None
+    trace: Trace,
+    theory: Theory,
+    limit: float | None = None,
+    maps: int = 0,
+    speedups: Speedups | None = None,
 ) -> Iterator[tuple[OnlineMapper, Solution]]:
     """The mapper after each step of a trace, and its answer."""
     first, *rest = trace.steps
@@ -45,23 +49,41 @@ def followed(
     )
     yield mapper, mapper.solution
     for action, step in zip(trace.actions, rest, strict=True):
-        yield mapper, mapper.observe(action, step.view or "", star=step.star, displacement=step.displacement, confidence=step.confidence)
+        yield (
+            mapper,
+            mapper.observe(
+                action,
+                step.view or "",
+                star=step.star,
+                displacement=step.displacement,
+                confidence=step.confidence,
+            ),
+        )
 
 
 def circuit(steps: int, wrong: int | None = None, seen: str = "v3") -> Trace:
     """Round a rectangle of four views, one of which is perhaps wrong."""
     return Trace.from_steps(
-        [seen if t == wrong else f"v{t % 4}" for t in range(steps + 1)], [("right", "travel")[t % 2] for t in range(steps)]
+        [seen if t == wrong else f"v{t % 4}" for t in range(steps + 1)],
+        [("right", "travel")[t % 2] for t in range(steps)],
     )
 
 
 @settings(max_examples=6)
-@given(small_traces(max_steps=7), st.sampled_from([0.0, 0.4, 1.0]), st.sampled_from([0.0, 0.3, 1.0]))
-def test_after_every_step_the_maps_are_those_of_brute_force(trace: Trace, misread: float, slipped: float) -> None:
+@given(
+    small_traces(max_steps=7), st.sampled_from([0.0, 0.4, 1.0]), st.sampled_from([0.0, 0.3, 1.0])
+)
+def test_after_every_step_the_maps_are_those_of_brute_force(
+    trace: Trace, misread: float, slipped: float
+) -> None:
     if not misread and not slipped:
         return
-    for mapper, solution in followed(trace, Theory.causal().replace(misread=misread, slipped=slipped)):
-        cost, expected = cheapest(trace.prefix(solution.steps), round(10 * misread), round(10 * slipped))
+    for mapper, solution in followed(
+        trace, Theory.causal().replace(misread=misread, slipped=slipped)
+    ):
+        cost, expected = cheapest(
+            trace.prefix(solution.steps), round(10 * misread), round(10 * slipped)
+        )
         assert solution.status is Status.OPTIMAL
         assert solution.complete
         assert solution.cost is not None
@@ -69,7 +91,9 @@ def test_after_every_step_the_maps_are_those_of_brute_force(trace: Trace, misrea
         assert {told(ssh_map) for ssh_map in solution.maps} == expected
         assert len(solution.maps) == len(expected)
         if mapper.standing.certain:
-            futures = {Rival.of(ssh_map, mapper.trace, mapper.theory).future() for ssh_map in solution.maps}
+            futures = {
+                Rival.of(ssh_map, mapper.trace, mapper.theory).future() for ssh_map in solution.maps
+            }
             assert len(futures) == 1
 
 
@@ -78,16 +102,31 @@ def test_after_every_step_the_maps_are_those_of_brute_force(trace: Trace, misrea
 def test_what_is_known_of_steps_and_places_is_obeyed(data: st.DataObject) -> None:
     """Pairs of steps that somebody asserts, and places with stars, are more than the two causal axioms: the maps are those of solving anew, too."""
     trace = data.draw(small_traces(max_steps=5))
-    prices = {"misread": data.draw(st.sampled_from([0.0, 0.4, 1.0])), "slipped": data.draw(st.sampled_from([0.3, 1.0]))}
+    prices = {
+        "misread": data.draw(st.sampled_from([0.0, 0.4, 1.0])),
+        "slipped": data.draw(st.sampled_from([0.3, 1.0])),
+    }
     if data.draw(st.booleans(), label="places"):
-        stars = data.draw(st.lists(st.sampled_from([(1, 0, 0, 0), (1, 1, 0, 0)]), min_size=len(trace), max_size=len(trace)))
-        trace = Trace.from_steps(trace.views, [action.name for action in trace.actions], stars=stars)
+        stars = data.draw(
+            st.lists(
+                st.sampled_from([(1, 0, 0, 0), (1, 1, 0, 0)]),
+                min_size=len(trace),
+                max_size=len(trace),
+            )
+        )
+        trace = Trace.from_steps(
+            trace.views, [action.name for action in trace.actions], stars=stars
+        )
         theory = Theory(**prices, star="frame")
     else:
         pairs = [pair for pair in [(0, 2), (1, 3)] if max(pair) < len(trace)]
-        theory = Theory.causal().replace(**prices, **{data.draw(st.sampled_from(["same", "different"])): pairs})
+        theory = Theory.causal().replace(
+            **prices, **{data.draw(st.sampled_from(["same", "different"])): pairs}
+        )
     for _, solution in followed(trace, theory):
-        anew = solve(trace.prefix(solution.steps), theory.of_steps(0, solution.steps), max_maps=None)
+        anew = solve(
+            trace.prefix(solution.steps), theory.of_steps(0, solution.steps), max_maps=None
+        )
         assert (solution.status, solution.complete) == (anew.status, True)
         assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
         assert len(solution.maps) == len(anew.maps)
@@ -96,7 +135,9 @@ def test_what_is_known_of_steps_and_places_is_obeyed(data: st.DataObject) -> Non
 def test_a_theory_without_an_axiom_is_solved_anew() -> None:
     theory = Theory.causal().replace(misread=0.4, without=("deterministic",))
     for _, solution in followed(Trace.from_steps("abaabb", ["travel"] * 5), theory):
-        anew = solve(Trace.from_steps("abaabb", ["travel"] * 5).prefix(solution.steps), theory, max_maps=None)
+        anew = solve(
+            Trace.from_steps("abaabb", ["travel"] * 5).prefix(solution.steps), theory, max_maps=None
+        )
         assert (solution.status, solution.complete) == (anew.status, True)
         assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in anew.maps}
 
@@ -107,23 +148,34 @@ def test_a_wrong_view_is_told_and_excused() -> None:
         assert sum(hypothesis.weight for hypothesis in standing.hypotheses) == pytest.approx(1)
         assert standing.certain == (t != 17)
         if t == 17:
-            assert standing.broke == ("step 17: seen v3, expected v1 at dstate 1: misread, slipped, or the map is wrong",)
+            assert standing.broke == (
+                "step 17: seen v3, expected v1 at dstate 1: misread, slipped, or the map is wrong",
+            )
             assert [h.said for h in standing.hypotheses] == [
                 "the view at step 17 is misread: v3, expected v1; the robot is at dstate 1 of 4",
                 "the action at step 16 slipped: right; the robot is at dstate 3 of 4",
             ]
             assert isinstance(standing.where, Belief)
-            assert str(standing).startswith("uncertain, most likely: the view at step 17 is misread")
+            assert str(standing).startswith(
+                "uncertain, most likely: the view at step 17 is misread"
+            )
         else:
             assert standing.broke == (() if t != 18 else standing.broke[:1])
-    assert [str(fault) for fault in solution.maps[0].faults] == ["the view at step 17 is misread: v3, expected v1"]
+    assert [str(fault) for fault in solution.maps[0].faults] == [
+        "the view at step 17 is misread: v3, expected v1"
+    ]
     assert mapper.searches < 6  # what is predicted is replayed
 
 
 @pytest.mark.parametrize("fault", ["wrong", "jumps"])
 def test_a_robot_is_certain_again_and_right(fault: str) -> None:
     record = bench.run(rectangle_of_five(0, steps=60, **{fault: 1}), BOTH, limit=5)
-    assert (record["noticed"], record["right_again"], record["right"], record["found"]) == (0, True, True, [True])
+    assert (record["noticed"], record["right_again"], record["right"], record["found"]) == (
+        0,
+        True,
+        True,
+        [True],
+    )
 
 
 def test_a_star_that_is_misread_is_told() -> None:
@@ -134,7 +186,9 @@ def test_a_star_that_is_misread_is_told() -> None:
     for mapper, solution in followed(trace, Theory(misread=1.5, star="frame")):
         certain.append(mapper.standing.certain)
         if solution.steps == 7:
-            assert mapper.standing.broke == ("step 6: seen another star than expected at dstate 2: misread, or the map is wrong",)
+            assert mapper.standing.broke == (
+                "step 6: seen another star than expected at dstate 2: misread, or the map is wrong",
+            )
     assert certain.index(False) == 6
     assert certain[-1]
     assert [str(fault) for fault in solution.maps[0].faults] == ["the star at step 6 is misread"]
@@ -149,19 +203,27 @@ def test_without_time_there_is_a_map_and_a_belief() -> None:
         assert (solution.bound.tenths or 0) <= solution.cost.tenths
         assert check(mapper.trace, solution.maps[0], BOTH) == ()
         assert not mapper.standing.certain
-        assert sum(hypothesis.weight for hypothesis in mapper.standing.hypotheses) == pytest.approx(1)
+        assert sum(hypothesis.weight for hypothesis in mapper.standing.hypotheses) == pytest.approx(
+            1
+        )
     assert mapper._recovery is not None
     assert mapper._recovery._meanwhile is None
 
 
-def one_of_the_maps(trace: Trace, theory: Theory, limit: float | None, maps: int, speedups: Speedups) -> recovery.Solved:
+def one_of_the_maps(
+    trace: Trace, theory: Theory, limit: float | None, maps: int, speedups: Speedups
+) -> recovery.Solved:
     """As if there were time to prove one map minimal, but not to list all."""
     found = solve(trace, theory, max_maps=None)
-    return recovery.Solved(len(trace), found.status, found.maps[-1:], found.bound, complete=False, stopped="time limit")
+    return recovery.Solved(
+        len(trace), found.status, found.maps[-1:], found.bound, complete=False, stopped="time limit"
+    )
 
 
 @pytest.mark.parametrize("in_a_step", [recovery.solved, one_of_the_maps])
-def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(in_a_step: Callable[..., recovery.Solved]) -> None:
+def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(
+    in_a_step: Callable[..., recovery.Solved],
+) -> None:
     """A second process is stood in for by what it would find, of steps that have been outgrown by then."""
     trace, solved = circuit(30, wrong=17), recovery.solved
     begun = []
@@ -189,7 +251,9 @@ def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(in_a_st
     assert solution.complete
     assert mapper is not None
     assert mapper.standing.certain
-    assert {(m, m.faults) for m in solution.maps} == {(m, m.faults) for m in solve(trace, BOTH, max_maps=None).maps}
+    assert {(m, m.faults) for m in solution.maps} == {
+        (m, m.faults) for m in solve(trace, BOTH, max_maps=None).maps
+    }
 
 
 class Busy:
@@ -200,7 +264,10 @@ class Busy:
 
 
 def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again() -> None:
-    with patch.object(Meanwhile, "begun", lambda *told: Busy()), patch.object(recovery, "OVERRUN", 0):
+    with (
+        patch.object(Meanwhile, "begun", lambda *told: Busy()),
+        patch.object(recovery, "OVERRUN", 0),
+    ):
         answers = list(followed(circuit(30, wrong=17), BOTH, NO_TIME))
     assert {solution.status for _, solution in answers} == {Status.FEASIBLE}
     assert answers[-1][0].searches == 1
@@ -221,7 +288,9 @@ def test_a_process_of_its_own_solves_the_trace() -> None:
 
 def test_displacements_that_come_later_are_used() -> None:
     """Maps are sought anew where the trace settles the theory anew."""
-    mapper = OnlineMapper("corner", Theory.causal().replace(misread=1.5), odometry={"along": 0.02}, time_limit=None)
+    mapper = OnlineMapper(
+        "corner", Theory.causal().replace(misread=1.5), odometry={"along": 0.02}, time_limit=None
+    )
     mapper.observe("travel", "wall")
     for _ in range(4):
         mapper.observe("left", "corner", displacement=(0.0, 0.0, 1.5708))
@@ -235,7 +304,12 @@ def test_displacements_that_come_later_are_used() -> None:
 def test_what_is_decided_is_what_will_be() -> None:
     """Two actions in a row, one of which slipped: which one it was nothing tells, and the map is certain."""
     for seed in range(40):
-        for mapper, solution in followed(bench.machine(seed, jumps=1).walk.trace.prefix(60), Theory.causal().replace(slipped=1.5), 1, 100):
+        for mapper, solution in followed(
+            bench.machine(seed, jumps=1).walk.trace.prefix(60),
+            Theory.causal().replace(slipped=1.5),
+            1,
+            100,
+        ):
             if mapper.standing.certain and len({m.faults for m in solution.maps}) > 1:
                 rivals = [Rival.of(m, mapper.trace, mapper.theory) for m in solution.maps]
                 assert len({rival.future() for rival in rivals}) == 1
@@ -252,7 +326,9 @@ def test_rivals_are_weighed_by_faults_and_by_what_they_assume() -> None:
     wrong, slipped, new = lead.ways_on("right", replace(step, view="v2"), ("v2", None), theory)
     assert [rival.cost[0] for rival in (lead, wrong, slipped, new)] == [40, 55, 70, 80]
     shares = Scale.of(theory, 0.01, dstates=4, views=4).shares([wrong, slipped, new])
-    assert shares[1] == pytest.approx(0.01 * shares[0])  # twice the price, and as many dstates as views
+    assert shares[1] == pytest.approx(
+        0.01 * shares[0]
+    )  # twice the price, and as many dstates as views
     assert sum(shares) == pytest.approx(1)
     again = next(new.ways_on("travel", step, ("v3", None), theory))
     shares = Scale.of(theory, 0.01, dstates=4, views=4).shares([new, again])
@@ -272,7 +348,19 @@ def test_what_does_not_fit_is_refused_and_changes_nothing() -> None:
 
 def test_weights_sum_to_one_and_ties_are_told() -> None:
     """Both kinds at one price: which it was is not known at first, nor said."""
-    walk = [mapper.standing for mapper, _ in followed(circuit(18, wrong=17), Theory.causal().replace(misread=1.5, slipped=1.5))]
-    assert all(first.weight >= second.weight for standing in walk for first, second in pairwise(standing.hypotheses[:-1]))
-    assert {h.said.partition(":")[0] for h in walk[17].hypotheses} >= {"the view at step 17 is misread", "the action at step 16 slipped"}
+    walk = [
+        mapper.standing
+        for mapper, _ in followed(
+            circuit(18, wrong=17), Theory.causal().replace(misread=1.5, slipped=1.5)
+        )
+    ]
+    assert all(
+        first.weight >= second.weight
+        for standing in walk
+        for first, second in pairwise(standing.hypotheses[:-1])
+    )
+    assert {h.said.partition(":")[0] for h in walk[17].hypotheses} >= {
+        "the view at step 17 is misread",
+        "the action at step 16 slipped",
+    }
     assert not walk[17].certain

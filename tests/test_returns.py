@@ -28,7 +28,9 @@ def seen(trace: Trace, truth: tuple[object, ...], dstates: int = 1000) -> SSHMap
     labels = tuple(number.setdefault(state, len(number)) % dstates for state in truth[: len(trace)])
     places: dict[object, int] = {}
     of_dstate = [places.setdefault(state[:2], len(places)) for state in number]  # type: ignore[index]
-    return SSHMap(labels, tuple(DState(i, "", place) for i, place in enumerate(of_dstate[:dstates])), ())
+    return SSHMap(
+        labels, tuple(DState(i, "", place) for i, place in enumerate(of_dstate[:dstates])), ()
+    )
 
 
 def evidence_of(trace: Trace, **choices: object) -> Displacement:
@@ -53,12 +55,22 @@ def test_what_is_known_of_a_trace_grows_with_it(data: st.DataObject) -> None:
 
 def test_the_reckoning_of_a_maze_grows_with_it() -> None:
     trace = maze(4, 4, steps=60, seed=2, odometry=Odometry()).trace
-    trace = replace(trace, steps=tuple(replace(step, displacement=None) if t in (20, 21) else step for t, step in enumerate(trace)))
+    trace = replace(
+        trace,
+        steps=tuple(
+            replace(step, displacement=None) if t in (20, 21) else step
+            for t, step in enumerate(trace)
+        ),
+    )
     reckoning = Reckoning(trace.prefix(1))
     for size in range(2, len(trace) + 1):
         before, reckoning = reckoning, Reckoning(trace.prefix(size), reckoning)
-    other = replace(trace, steps=(*trace.steps[:-1], replace(trace.steps[-1], displacement=(3.0, 2.0, 1.0))))
-    assert not np.array_equal(Reckoning(other, before).loops(0).poses, reckoning.loops(0).poses)  # and what the first one has stays
+    other = replace(
+        trace, steps=(*trace.steps[:-1], replace(trace.steps[-1], displacement=(3.0, 2.0, 1.0)))
+    )
+    assert not np.array_equal(
+        Reckoning(other, before).loops(0).poses, reckoning.loops(0).poses
+    )  # and what the first one has stays
     whole = Reckoning(trace)
     assert whole.begins[-1] > 20
     assert np.array_equal(reckoning.begins, whole.begins)
@@ -75,7 +87,9 @@ def joint_excess(returns: Returns, rows: np.ndarray, thresholds: dict[int, float
     i, j = np.triu_indices(len(rows), 1)
     shared = np.maximum(rows[i, 0], rows[j, 0]) < np.minimum(rows[i, 1], rows[j, 1])
     i, j = i[shared], j[shared]
-    most = np.array([thresholds.get(freedom, 0.0) for freedom in range(7)])[4 + rows[i, 2] + rows[j, 2]]
+    most = np.array([thresholds.get(freedom, 0.0) for freedom in range(7)])[
+        4 + rows[i, 2] + rows[j, 2]
+    ]
     least = np.full(len(i), np.inf)
     for number, unlikely in enumerate(reckoning.unlikely):
         left = np.flatnonzero(least > 0)  # what one drift explains is not refused
@@ -85,19 +99,28 @@ def joint_excess(returns: Returns, rows: np.ndarray, thresholds: dict[int, float
     return excess
 
 
-@pytest.mark.parametrize(("noise", "bend"), [("usual", 0.0), ("steady drift", 0.006), ("white", 0.0)])
+@pytest.mark.parametrize(
+    ("noise", "bend"), [("usual", 0.0), ("steady drift", 0.006), ("white", 0.0)]
+)
 def test_bounds_change_no_answer(noise: str, bend: float) -> None:
     """With each return in turn as the only new one, and thresholds so low that many sets are refused of which no return is, though the map is true."""
     refused = only_together = 0
     for seed in (1, 2) if noise == "white" else (1,):
-        model = Odometry(along=0.04, across=0.005, heading=0.003, position=0.02, angle=0.003, turning=0.0)
+        model = Odometry(
+            along=0.04, across=0.005, heading=0.003, position=0.02, angle=0.003, turning=0.0
+        )
         model = replace(model, bend=0.0, scale=0.0) if noise == "white" else model
-        walk = maze(3, 3, steps=20 if noise == "steady drift" else 26, seed=seed, odometry=model, bend=bend)
+        walk = maze(
+            3, 3, steps=20 if noise == "steady drift" else 26, seed=seed, odometry=model, bend=bend
+        )
         trace = walk.trace
         returns, ssh_map = Returns(evidence_of(trace), trace), seen(trace, walk.truth)
         rows = returns._returns_of(ssh_map.labels, tuple(s.place for s in ssh_map.dstates))
         thresholds = {4: 3.0, 5: 4.0, 6: 5.0}
-        expected, together = joint_excess(returns, rows, thresholds), Together(returns.reckoning, thresholds, rows)
+        expected, together = (
+            joint_excess(returns, rows, thresholds),
+            Together(returns.reckoning, thresholds, rows),
+        )
         for new in np.eye(len(rows), dtype=bool):
             worst, excess = together.worst(new), expected[new][0]
             assert (worst is None) == (excess.max() <= 0)
@@ -112,9 +135,17 @@ def test_bounds_change_no_answer(noise: str, bend: float) -> None:
 
 def square_alone(returns: Returns, row: np.ndarray) -> float:
     """The chi-square of a return alone, for the drift for which that is least."""
-    closings = (returns.reckoning.loops(number).closings(row[:1], row[1:2]) for number in range(len(returns.reckoning.bends)))
+    closings = (
+        returns.reckoning.loops(number).closings(row[:1], row[1:2])
+        for number in range(len(returns.reckoning.bends))
+    )
     squares = [chi_squares(*found)[int(row[2])][0] for found in closings]
-    return float(min(square + unlikely for square, unlikely in zip(squares, returns.reckoning.unlikely, strict=True)))
+    return float(
+        min(
+            square + unlikely
+            for square, unlikely in zip(squares, returns.reckoning.unlikely, strict=True)
+        )
+    )
 
 
 def test_only_returns_that_end_later_are_asked_about_once_a_map_was_accepted() -> None:
@@ -123,7 +154,11 @@ def test_only_returns_that_end_later_are_asked_about_once_a_map_was_accepted() -
     evidence = evidence_of(trace, reject=0.3)
     wrong = seen(trace, walk.truth, 14)
     module._KEPT.clear()
-    size = next(n for n in range(2, len(trace)) if evidence.refuse(trace.prefix(n + 1), replace(wrong, labels=wrong.labels[: n + 1])))
+    size = next(
+        n
+        for n in range(2, len(trace))
+        if evidence.refuse(trace.prefix(n + 1), replace(wrong, labels=wrong.labels[: n + 1]))
+    )
     for n in range(2, size + 2):
         prefix, ssh_map = trace.prefix(n), replace(wrong, labels=wrong.labels[:n])
         grown = evidence.refuse(prefix, ssh_map, since=n - 1)
@@ -137,13 +172,19 @@ def test_bounds_change_nothing_that_the_judge_says(noise: str) -> None:
     """With shares so large that true maps are refused, too: the judge says the same of all sets as of those that its bound does not pass."""
     said = []
     for seed in range(4):
-        model = replace(Odometry(along=0.02), **({"bend": 0.0, "scale": 0.0} if noise == "white" else {}))
+        model = replace(
+            Odometry(along=0.02), **({"bend": 0.0, "scale": 0.0} if noise == "white" else {})
+        )
         walk = maze(3, 3, steps=30, seed=seed, odometry=model)
         theory = Theory(displacement="use", returns=3, reject=0.97, star="none")
         for dstates in (1000, 9):
             ssh_map = seen(walk.trace, walk.truth, dstates)
             bounded = list(refused_returns(walk.trace, ssh_map, theory))
-            with patch.object(geometry, "_is_safe", lambda share, squares, most: np.zeros_like(squares, dtype=bool)):
+            with patch.object(
+                geometry,
+                "_is_safe",
+                lambda share, squares, most: np.zeros_like(squares, dtype=bool),
+            ):
                 assert list(refused_returns(walk.trace, ssh_map, theory)) == bounded
             said += [len(refused.returns) for refused in bounded]
     assert said.count(2) > 4

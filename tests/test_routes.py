@@ -26,10 +26,19 @@ def square() -> SSHMap:
 def random_map(seed: int) -> SSHMap:
     """Links between six dstates by chance, with poses."""
     chance = random.Random(seed)
-    links = {(s, action, chance.randrange(6)) for s in range(6) for action in "xy" if chance.random() < 0.6}
-    poses = tuple(Pose(chance.uniform(1, 9), chance.uniform(1, 9), 0.0, (0.1, 0.0, 0.1)) for _ in range(6))
+    links = {
+        (s, action, chance.randrange(6))
+        for s in range(6)
+        for action in "xy"
+        if chance.random() < 0.6
+    }
+    poses = tuple(
+        Pose(chance.uniform(1, 9), chance.uniform(1, 9), 0.0, (0.1, 0.0, 0.1)) for _ in range(6)
+    )
     dstates = tuple(DState(i, f"v{i}") for i in range(6))
-    return SSHMap(tuple(range(6)), dstates, tuple(sorted(links)), fit=Fit(0.0, 1, 1.0, poses=poses)).renumbered()
+    return SSHMap(
+        tuple(range(6)), dstates, tuple(sorted(links)), fit=Fit(0.0, 1, 1.0, poses=poses)
+    ).renumbered()
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -45,7 +54,11 @@ def test_no_sequence_of_actions_is_shorter(seed: int, by: str) -> None:
             there = leads.get((here, action))
             if there is None:
                 break
-            cost += 1 if by == "actions" else abs(complex(poses[here].x - poses[there].x, poses[here].y - poses[there].y))
+            cost += (
+                1
+                if by == "actions"
+                else abs(complex(poses[here].x - poses[there].x, poses[here].y - poses[there].y))
+            )
             here = there
         else:
             shortest[here] = min(cost, shortest.get(here, cost))
@@ -59,10 +72,14 @@ def test_no_sequence_of_actions_is_shorter(seed: int, by: str) -> None:
         assert found.views == tuple(ssh_map.dstates[s or 0].view for s in found.dstates)
         assert found.is_known
         assert found.metres is not None
-        assert (len(found.moves) if by == "actions" else found.metres) == pytest.approx(shortest[goal])
+        assert (len(found.moves) if by == "actions" else found.metres) == pytest.approx(
+            shortest[goal]
+        )
 
 
-def test_a_route_by_places_leads_back_along_a_street_that_was_driven_one_way(square: SSHMap) -> None:
+def test_a_route_by_places_leads_back_along_a_street_that_was_driven_one_way(
+    square: SSHMap,
+) -> None:
     by_links = route(square, 0, "p3")
     by_places = route(square, 0, "p3", by="places")
     assert (len(by_links.moves), by_links.is_known) == (5, True)
@@ -80,17 +97,23 @@ def test_what_is_avoided_is_gone_round() -> None:
     assert route(ssh_map, 0, 1).dstates == (0, 1)
     assert route(ssh_map, 0, 1).goal == "dstate 1"
     assert route(ssh_map, 0, 3).dstates == (0, 1, 3)
-    with pytest.raises(MapError, match="avoid: expected a way round what is avoided, got none to dstate 3; avoid less"):
+    with pytest.raises(
+        MapError,
+        match="avoid: expected a way round what is avoided, got none to dstate 3; avoid less",
+    ):
         route(ssh_map, 0, 3, avoid=[1])
     with pytest.raises(MapError, match="those of to"):
         route(ssh_map, 0, 3, avoid=["p3"])
-    detour = SSHMap(ssh_map.labels, dstates, (*links, (2, "d", 3)), (0, 1, 2, 3), (MapPath(0, (0, 1)),))
+    detour = SSHMap(
+        ssh_map.labels, dstates, (*links, (2, "d", 3)), (0, 1, 2, 3), (MapPath(0, (0, 1)),)
+    )
     assert route(detour, 0, 3, avoid=["p1"]).actions == ("b", "d")
 
 
 def test_rivals_agree_where_their_links_lead_to_the_same_views() -> None:
     corridor = Trace.from_steps(
-        ["end", "hall", "hall", "end", "end", "hall", "hall"], ["travel", "travel", "travel", "around", "travel", "around"]
+        ["end", "hall", "hall", "end", "end", "hall", "hall"],
+        ["travel", "travel", "travel", "around", "travel", "around"],
     )
     solution = solve(corridor)
     assert solution.count > 1
@@ -115,7 +138,10 @@ def test_rivals_agree_where_their_links_lead_to_the_same_views() -> None:
         ({"start": 0, "goal": 1, "avoid": ["x"]}, r"avoid\[0\]: expected a dstate"),
         ({"start": 0, "goal": 1, "by": "hours"}, "by: expected actions, places or metres"),
         ({"start": 0, "goal": 1, "map": 7}, "expected the number of a map, 1 to 1"),
-        ({"start": 0, "goal": 1, "by": "metres"}, "by: expected actions or places, got metres: the map has no poses"),
+        (
+            {"start": 0, "goal": 1, "by": "metres"},
+            "by: expected actions or places, got metres: the map has no poses",
+        ),
     ],
 )
 def test_errors_name_the_range(arguments: dict[str, object], message: str) -> None:
@@ -130,18 +156,27 @@ def test_maps_without_paths_have_no_routes_by_places() -> None:
 
 def test_a_map_numbered_anew_keeps_its_poses(square: SSHMap) -> None:
     assert square.renumbered().fit == square.fit
-    turned = SSHMap((1, 0), (DState(0, "a"), DState(1, "b")), (), fit=Fit(0.0, 1, 1.0, poses=(Pose(1.0, 2.0, 3.0), Pose(0.0, 0.0, 0.0))))
+    turned = SSHMap(
+        (1, 0),
+        (DState(0, "a"), DState(1, "b")),
+        (),
+        fit=Fit(0.0, 1, 1.0, poses=(Pose(1.0, 2.0, 3.0), Pose(0.0, 0.0, 0.0))),
+    )
     found = turned.renumbered().fit
     assert found is not None
     assert found.poses == (Pose(0.0, 0.0, 0.0), Pose(1.0, 2.0, 3.0))
 
 
-def test_the_command_prints_what_python_finds(square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_what_python_finds(
+    square: SSHMap, tmp_path: object, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = f"{tmp_path}/map.json"
     square.save(file)
     assert main(["route", file, "--from", "0", "--to", "p2", "--by", "metres", "--json"]) == 0
     printed = capsys.readouterr().out
-    assert json.loads(printed) == json.loads(json.dumps(route(square, 0, "p2", by="metres").to_dict()))
+    assert json.loads(printed) == json.loads(
+        json.dumps(route(square, 0, "p2", by="metres").to_dict())
+    )
     assert main(["route", file, "--to", "p1", "--by", "places", "--avoid", "p2,p3"]) == 0
     told = capsys.readouterr().out
     assert "never tried" not in told or "implied" in told

@@ -92,7 +92,9 @@ def test_many_poses_at_once_are_the_same_as_one_by_one(monkeypatch: pytest.Monke
     together = Laser().exact(RECTANGLE, poses)
     monkeypatch.setattr("simulator.laser._BLOCK", 180 * 8 * 7)
     np.testing.assert_array_equal(Laser().exact(RECTANGLE, poses), together)
-    np.testing.assert_array_equal(np.vstack([Laser().exact(RECTANGLE, pose) for pose in poses]), together)
+    np.testing.assert_array_equal(
+        np.vstack([Laser().exact(RECTANGLE, pose) for pose in poses]), together
+    )
 
 
 def test_the_first_beam_is_at_the_right_and_the_last_at_the_left() -> None:
@@ -120,7 +122,9 @@ def test_noise_dropouts_and_reach() -> None:
 
 def test_shipped_worlds_are_what_they_say() -> None:
     assert len(RECTANGLE.dstates) == 8
-    assert len({s.place for s in RECTANGLE.dstates}) == len({s.path for s in RECTANGLE.dstates}) == 4
+    assert (
+        len({s.place for s in RECTANGLE.dstates}) == len({s.path for s in RECTANGLE.dstates}) == 4
+    )
     assert len(HALL.dstates) == 20
     assert len({s.place for s in HALL.dstates}) == 7
     assert len({s.path for s in HALL.dstates}) == 4
@@ -135,13 +139,20 @@ def test_a_world_from_an_occupancy_map(tmp_path: Path) -> None:
         (b"P2\n# drawn by hand\n44 24\n255\n", " ".join(map(str, cells.ravel())).encode()),
     ):
         (tmp_path / "map.pgm").write_bytes(head + body)
-        (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.1\norigin: [-0.2, -0.2, 0.0]\nnegate: 0\noccupied_thresh: 0.65\n")
+        (tmp_path / "map.yaml").write_text(
+            "image: map.pgm\nresolution: 0.1\norigin: [-0.2, -0.2, 0.0]\nnegate: 0\noccupied_thresh: 0.65\n"
+        )
         world = World.named(str(tmp_path / "map.yaml"))
         assert world.bounds == pytest.approx((-0.2, -0.2, 4.2, 2.2))
         ranges = Laser().exact(world, np.array([[1.0, 0.5, 0.0]]))[0]
         assert ranges[0] == pytest.approx(0.5, abs=0.01)
         assert ranges[-1] == pytest.approx(1.5, abs=0.01)
-        driven = simulate(world.with_choices("3.4,1.4,0", "right,travel,right,travel,right,travel,right,travel", 0.6), tours=2)
+        driven = simulate(
+            world.with_choices(
+                "3.4,1.4,0", "right,travel,right,travel,right,travel,right,travel", 0.6
+            ),
+            tours=2,
+        )
         assert len(driven) == 16
 
 
@@ -152,14 +163,20 @@ def test_a_world_from_an_occupancy_map(tmp_path: Path) -> None:
         ({"version": 2}, "format: expected"),
         ({"polygons": []}, "polygons: expected at least one wall"),
         ({"polygons": [[[0, 0], [1, 1]]]}, r"polygons\[0\]: expected at least three points"),
-        ({"polygons": [[[0, 0], [1, 1], [0, "a"]]]}, r"polygons\[0\]\[2\]: expected 2 finite numbers"),
+        (
+            {"polygons": [[[0, 0], [1, 1], [0, "a"]]]},
+            r"polygons\[0\]\[2\]: expected 2 finite numbers",
+        ),
         ({"segments": [[1, 2, 3]]}, r"segments\[0\]: expected 4 finite numbers"),
         ({"route": ["fly"]}, r"route\[0\]: expected travel, right, left or around"),
         ({"reach": 0}, "reach: expected metres above 0"),
         ({"angles": 60}, 'angles: expected "right" or "any"'),
         ({"start": [1]}, "start: expected 3 finite numbers"),
         ({"clutter": [3]}, r"clutter\[0\]: expected an object"),
-        ({"clutter": [{"polygon": [[0, 0], [1, 0], [1, 1]], "present": 2}]}, r"clutter\[0\].present: expected a probability"),
+        (
+            {"clutter": [{"polygon": [[0, 0], [1, 0], [1, 1]], "present": 2}]},
+            r"clutter\[0\].present: expected a probability",
+        ),
         ({"dstates": [{"name": "a"}]}, r"dstates\[0\]: expected an object"),
     ],
 )
@@ -189,7 +206,9 @@ def test_worlds_that_are_not_there(tmp_path: Path) -> None:
 
 @settings(max_examples=30)
 @given(st.floats(0.45, 0.75), st.floats(0.45, 0.75), st.floats(-12, 12), st.sampled_from(range(4)))
-def test_sight_measures_the_corner_that_it_sees(ahead: float, left: float, degrees: float, corner: int) -> None:
+def test_sight_measures_the_corner_that_it_sees(
+    ahead: float, left: float, degrees: float, corner: int
+) -> None:
     """In a room without a notch, facing into each corner: distances to both walls, and the tilt, to a few millimetres and tenths of a degree.
 
     Of the wall on the left a robot turned to the right sees less than what is ahead of it; where that is less than 0.4 m, it may count as no wall.
@@ -198,7 +217,9 @@ def test_sight_measures_the_corner_that_it_sees(ahead: float, left: float, degre
     room = np.array([[0, 0, 4, 0], [4, 0, 4, 2], [4, 2, 0, 2], [0, 2, 0, 0]], float)
     sizes = [(4 - ahead, 2 - left), (4 - left, ahead), (ahead, left), (left, 2 - ahead)]
     pose = (*sizes[corner], quarter + math.radians(degrees))
-    image = Laser().scan(replace(RECTANGLE, segments=room), np.repeat([pose], 9, axis=0), np.random.default_rng(0))
+    image = Laser().scan(
+        replace(RECTANGLE, segments=room), np.repeat([pose], 9, axis=0), np.random.default_rng(0)
+    )
     seen = sight(np.median(image, axis=0), 0.6, 8.0)
     assert seen.front == pytest.approx(ahead, abs=0.01)
     if seen.left is not None or ahead + left * math.tan(math.radians(degrees)) > LONG + 0.05:
@@ -210,12 +231,20 @@ def test_sight_measures_the_corner_that_it_sees(ahead: float, left: float, degre
 
 def test_an_image_of_nothing_shows_nothing() -> None:
     seen = sight(np.full(180, 8.0), 1.0, 8.0)
-    assert (seen.front, seen.left, seen.right, seen.to_go(1.0), seen.offset(1.0)) == (None, None, None, None, None)
+    assert (seen.front, seen.left, seen.right, seen.to_go(1.0), seen.offset(1.0)) == (
+        None,
+        None,
+        None,
+        None,
+        None,
+    )
 
 
 @settings(max_examples=13)
 @given(st.floats(-0.05, 0.05), st.floats(-0.012, 0.012), st.floats(-10, 10), st.integers(0, 10**6))
-def test_hill_climbing_ends_at_the_fixed_point(dx: float, dy: float, degrees: float, seed: int) -> None:
+def test_hill_climbing_ends_at_the_fixed_point(
+    dx: float, dy: float, degrees: float, seed: int
+) -> None:
     """From anywhere near x0, along the way and in heading, the robot comes to within the tolerance of the law."""
     rng = np.random.default_rng(seed)
     robot = Robot(Body(), (3.4 + dx, 1.4 + dy, math.radians(degrees)), rng)
@@ -267,9 +296,15 @@ def test_errors_do_not_add_up(circuits: Trace) -> None:
     for poses in poses_by_dstate(circuits).values():
         off = np.abs(poses[:, :2] - poses[:, :2].mean(0)).max(1)
         assert off.max() < 0.025
-        assert np.abs(np.unwrap(poses[:, 2]) - np.unwrap(poses[:, 2]).mean()).max() < math.radians(2)
-    first = np.array([np.abs(p[:10, :2] - p[:, :2].mean(0)).mean() for p in poses_by_dstate(circuits).values()])
-    last = np.array([np.abs(p[-10:, :2] - p[:, :2].mean(0)).mean() for p in poses_by_dstate(circuits).values()])
+        assert np.abs(np.unwrap(poses[:, 2]) - np.unwrap(poses[:, 2]).mean()).max() < math.radians(
+            2
+        )
+    first = np.array(
+        [np.abs(p[:10, :2] - p[:, :2].mean(0)).mean() for p in poses_by_dstate(circuits).values()]
+    )
+    last = np.array(
+        [np.abs(p[-10:, :2] - p[:, :2].mean(0)).mean() for p in poses_by_dstate(circuits).values()]
+    )
     assert last.mean() < 1.5 * first.mean()
 
 
@@ -296,7 +331,9 @@ def test_odometry_drifts_and_is_not_the_truth(circuits: Trace) -> None:
 # Odometry
 
 POSES = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3, 3))
-SQUARE = 2 * ([(0.15, 0.01)] * 20 + [(0.0, -math.pi / 2)])  # two sides of a square, in strides and turns
+SQUARE = 2 * (
+    [(0.15, 0.01)] * 20 + [(0.0, -math.pi / 2)]
+)  # two sides of a square, in strides and turns
 
 
 def whitened(error: Any, covariance: Any) -> np.ndarray:
@@ -305,13 +342,22 @@ def whitened(error: Any, covariance: Any) -> np.ndarray:
     return np.asarray(np.linalg.solve(np.linalg.cholesky(np.array(covariance)), error))
 
 
-def errors_of(trace: Trace, poses: list[tuple[float, float, float]], odometry: Odometry, kind: str) -> np.ndarray:
+def errors_of(
+    trace: Trace, poses: list[tuple[float, float, float]], odometry: Odometry, kind: str
+) -> np.ndarray:
     """The errors of the displacements of the actions of a kind, against those between poses, in standard deviations: (n, 3)."""
     found = []
-    for before, after, step, action in zip(poses, poses[1:], trace.steps[1:], trace.actions, strict=False):
+    for before, after, step, action in zip(
+        poses, poses[1:], trace.steps[1:], trace.actions, strict=False
+    ):
         assert step.displacement is not None
         if action.kind == kind:
-            found.append(whitened(np.subtract(step.displacement, between(before, after)), odometry.covariance(step.displacement)))
+            found.append(
+                whitened(
+                    np.subtract(step.displacement, between(before, after)),
+                    odometry.covariance(step.displacement),
+                )
+            )
     return np.array(found)
 
 
@@ -321,20 +367,32 @@ def fixed_points(trace: Trace) -> list[tuple[float, float, float]]:
     for step in trace.steps:
         places.setdefault(step.truth["place"], []).append(step.truth["pose"][:2])
     middle = {place: np.mean(found, 0) for place, found in places.items()}
-    heading = {name: math.atan2(np.sin(p[:, 2]).mean(), np.cos(p[:, 2]).mean()) for name, p in poses_by_dstate(trace).items()}
-    return [(*map(float, middle[step.truth["place"]]), heading[step.truth["dstate"]]) for step in trace.steps]
+    heading = {
+        name: math.atan2(np.sin(p[:, 2]).mean(), np.cos(p[:, 2]).mean())
+        for name, p in poses_by_dstate(trace).items()
+    }
+    return [
+        (*map(float, middle[step.truth["place"]]), heading[step.truth["dstate"]])
+        for step in trace.steps
+    ]
 
 
 @settings(max_examples=25)
 @given(POSES, POSES)
-def test_a_displacement_leads_from_one_pose_to_the_other(start: tuple[float, float, float], end: tuple[float, float, float]) -> None:
+def test_a_displacement_leads_from_one_pose_to_the_other(
+    start: tuple[float, float, float], end: tuple[float, float, float]
+) -> None:
     x, y, heading = moved(start, between(start, end))
     assert (x, y) == pytest.approx(end[:2], abs=1e-9)
     assert math.remainder(heading - end[2], math.tau) == pytest.approx(0, abs=1e-9)
 
 
 def test_noise_has_the_covariance_that_the_odometry_says() -> None:
-    rng, displacement, odometry = np.random.default_rng(0), (6.0, -8.0, 0.5), Odometry(along=0.05, across=0.01, heading=0.01)
+    rng, displacement, odometry = (
+        np.random.default_rng(0),
+        (6.0, -8.0, 0.5),
+        Odometry(along=0.05, across=0.01, heading=0.01),
+    )
     told = np.array([reported(displacement, odometry, rng) for _ in range(4000)])
     np.testing.assert_allclose(told.mean(0), displacement, atol=0.03)
     np.testing.assert_allclose(np.cov(told.T), odometry.covariance(displacement), atol=0.015)
@@ -363,19 +421,27 @@ def test_the_covariance_of_a_report_is_that_of_its_errors() -> None:
         for motion in SQUARE:
             robot.move(*motion)
         said = robot.report()
-        errors.append(whitened(np.subtract(said.displacement, between(start, robot.pose)), said.covariance))
+        errors.append(
+            whitened(np.subtract(said.displacement, between(start, robot.pose)), said.covariance)
+        )
     found = np.array(errors)
     np.testing.assert_allclose(found.mean(0), 0, atol=0.15)
     np.testing.assert_allclose(np.cov(found.T), np.eye(3), atol=0.2)
 
 
 def test_worn_wheels_report_too_long_ways_and_unequal_ones_a_drift() -> None:
-    robot = Robot(Body(slip=0, wander=0, odometry=0, scale=0.1, bend=0.02), (0.0, 0.0, 0.0), np.random.default_rng(0))
+    robot = Robot(
+        Body(slip=0, wander=0, odometry=0, scale=0.1, bend=0.02),
+        (0.0, 0.0, 0.0),
+        np.random.default_rng(0),
+    )
     for _ in range(50):
         robot.move(0.2, 0.0)
     assert robot.pose == pytest.approx((10.0, 0.0, 0.0))
     assert robot.driven == pytest.approx(11.0)
-    assert robot.report().displacement == pytest.approx((11.0 * math.sin(0.2) / 0.2, 11.0 * (1 - math.cos(0.2)) / 0.2, 0.2), abs=0.01)
+    assert robot.report().displacement == pytest.approx(
+        (11.0 * math.sin(0.2) / 0.2, 11.0 * (1 - math.cos(0.2)) / 0.2, 0.2), abs=0.01
+    )
     for _ in range(50):
         robot.move(-0.2, 0.0)
     assert robot.odometry == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
@@ -386,7 +452,9 @@ def test_displacements_are_the_motions_between_the_dstates(circuits: Trace, tour
     for trace in (circuits, tours):
         assert trace.steps[0].displacement is None
         assert trace.odometry is not None
-        turns = errors_of(trace, [tuple(step.truth["pose"]) for step in trace.steps], trace.odometry, "turn")[:, 2]
+        turns = errors_of(
+            trace, [tuple(step.truth["pose"]) for step in trace.steps], trace.odometry, "turn"
+        )[:, 2]
         assert abs(turns.mean()) < 0.5
         assert 0.5 < (turns**2).mean() < 1.5
         travels = errors_of(trace, fixed_points(trace), trace.odometry, "travel")
@@ -408,7 +476,12 @@ def test_the_shares_of_a_step_are_those_of_its_motions() -> None:
     odometry = noise_model(reports, body)
     assert odometry.along == pytest.approx(0.05 / math.sqrt(60), rel=0.05)
     assert (odometry.position, odometry.angle, odometry.scale) == (0, 0, 0)
-    along = np.array([whitened(e, odometry.covariance(r.displacement))[0] for e, r in zip(errors, reports, strict=True)])
+    along = np.array(
+        [
+            whitened(e, odometry.covariance(r.displacement))[0]
+            for e, r in zip(errors, reports, strict=True)
+        ]
+    )
     assert 0.8 < (along**2).mean() < 1.2
 
 
@@ -417,16 +490,27 @@ def test_wrong_scale_and_steady_drift_are_in_the_trace_and_in_its_odometry() -> 
     trace = simulate(RECTANGLE, 5, seed=7, body=Body(scale=0.1, bend=0.0035))
     assert trace.odometry is not None
     assert (trace.odometry.scale, trace.odometry.bend) == (0.1, 0.0035)
-    assert [step.truth["dstate"] for step in trace.steps] == [step.truth["dstate"] for step in plain.steps]
-    pairs = [(a, b) for a, b, action in zip(trace.steps, trace.steps[1:], trace.actions, strict=False) if action.kind == "travel"]
+    assert [step.truth["dstate"] for step in trace.steps] == [
+        step.truth["dstate"] for step in plain.steps
+    ]
+    pairs = [
+        (a, b)
+        for a, b, action in zip(trace.steps, trace.steps[1:], trace.actions, strict=False)
+        if action.kind == "travel"
+    ]
     told = sum(math.hypot(*b.displacement[:2]) for _, b in pairs if b.displacement)
     true = sum(math.dist(a.truth["pose"][:2], b.truth["pose"][:2]) for a, b in pairs)
     assert told / true == pytest.approx(1.1, abs=0.01)
 
 
-@pytest.mark.parametrize(("name", "value"), [("scale", 0.6), ("bend", -0.7), ("odometry", -0.1), ("scale", math.nan)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("scale", 0.6), ("bend", -0.7), ("odometry", -0.1), ("scale", math.nan)]
+)
 def test_an_odometry_that_nobody_can_drive_with(name: str, value: float) -> None:
-    with pytest.raises(SimulatorError, match=rf"body\.{name}: expected a number from .* to 0\.5.*, got .*; choose a smaller error"):
+    with pytest.raises(
+        SimulatorError,
+        match=rf"body\.{name}: expected a number from .* to 0\.5.*, got .*; choose a smaller error",
+    ):
         Body(**{name: value})
 
 
@@ -461,7 +545,9 @@ def test_images_at_even_distances() -> None:
 def test_clutter_moves_between_tours_only() -> None:
     rng = np.random.default_rng(0)
     one, other = HALL.arranged(rng), HALL.arranged(rng)
-    assert one.segments.shape[0] - len(HALL.segments) in range(4 * (len(HALL.clutter) - 1), 4 * len(HALL.clutter) + 1)
+    assert one.segments.shape[0] - len(HALL.segments) in range(
+        4 * (len(HALL.clutter) - 1), 4 * len(HALL.clutter) + 1
+    )
     assert not np.array_equal(one.segments[-40:], other.segments[-40:])
     np.testing.assert_array_equal(one.segments[: len(HALL.segments)], HALL.segments)
 
@@ -476,7 +562,10 @@ def test_a_start_inside_a_wall(tmp_path: Path) -> None:
 
 
 def test_a_route_into_a_wall(tmp_path: Path) -> None:
-    with pytest.raises(SimulatorError, match=r"travel at \(3\.\d\d, 1\.\d\d\): expected a free way ahead, got a wall"):
+    with pytest.raises(
+        SimulatorError,
+        match=r"travel at \(3\.\d\d, 1\.\d\d\): expected a free way ahead, got a wall",
+    ):
         simulate(world_of(tmp_path, route=["travel"]), tours=2)
 
 
@@ -488,7 +577,9 @@ def test_a_gap_through_which_the_robot_escapes(tmp_path: Path) -> None:
         "reach": 1.0,
         "route": ["travel"],
     }
-    with pytest.raises(SimulatorError, match=r"the robot left the world at \(9\.\d+, 1\.\d+\); close the gap"):
+    with pytest.raises(
+        SimulatorError, match=r"the robot left the world at \(9\.\d+, 1\.\d+\); close the gap"
+    ):
         simulate(world_of(tmp_path, **corridor), tours=2)
 
 

@@ -46,7 +46,10 @@ def test_lists_of_fields_and_examples_keep_their_lines() -> None:
     ("link", "shown"),
     [
         ("../encodings", "https://github.com/ssh-abduction/ssh-abduction/tree/main/encodings"),
-        ("../README.md#try-it", "https://github.com/ssh-abduction/ssh-abduction/blob/main/README.md#try-it"),
+        (
+            "../README.md#try-it",
+            "https://github.com/ssh-abduction/ssh-abduction/blob/main/README.md#try-it",
+        ),
         ("formats.md#maps", "formats.md#maps"),
     ],
 )
@@ -56,17 +59,30 @@ def test_links_out_of_the_pages_lead_to_github(link: str, shown: str) -> None:
 
 
 def test_links_that_are_called_as_a_file_have_its_title() -> None:
-    assert hooks.with_titles("as [theory.md](theory.md#faults) says") == "as [The theory](theory.md#faults) says"
+    assert (
+        hooks.with_titles("as [theory.md](theory.md#faults) says")
+        == "as [The theory](theory.md#faults) says"
+    )
 
 
 def test_all_names_that_pages_import_have_a_page() -> None:
     imported = set()
     for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
         for text in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
-            found = re.findall(r"^from ((?:ssh_abduction|perception|simulator)\S*) import (.*)$", text, re.MULTILINE)
-            imported |= {f"{module}.{name.strip()}" for module, names in found for name in names.split(",")}
+            found = re.findall(
+                r"^from ((?:ssh_abduction|perception|simulator)\S*) import (.*)$",
+                text,
+                re.MULTILINE,
+            )
+            imported |= {
+                f"{module}.{name.strip()}" for module, names in found for name in names.split(",")
+            }
     themed = {path for paths in hooks.themes().values() for path in paths}
-    ours = {path for path in imported if not any(hooks.named(path) is hooks.named(other) for other in themed)}
+    ours = {
+        path
+        for path in imported
+        if not any(hooks.named(path) is hooks.named(other) for other in themed)
+    }
     assert len(imported) > 10
     assert ours == set()
 
@@ -93,7 +109,9 @@ def test_what_leads_nowhere_or_is_loaded_from_elsewhere_is_found(tag: str, tmp_p
 
 
 def test_style_sheets_that_load_from_elsewhere_are_found(tmp_path: Path) -> None:
-    (tmp_path / "s.css").write_text("@import 'https://x.example/a.css'; p { background: url(\"no.png\") }")
+    (tmp_path / "s.css").write_text(
+        "@import 'https://x.example/a.css'; p { background: url(\"no.png\") }"
+    )
     assert list(check.problems(tmp_path)) == [
         "s.css: loads https://x.example/a.css from elsewhere",
         "s.css: loads no.png, which is no file of the site",
@@ -101,7 +119,9 @@ def test_style_sheets_that_load_from_elsewhere_are_found(tmp_path: Path) -> None
 
 
 def test_each_page_is_once_in_the_navigation() -> None:
-    listed = re.findall(r"^ +- (?:.*: )?([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    listed = re.findall(
+        r"^ +- (?:.*: )?([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE
+    )
     made = {"index.md", "reference/index.md"}
     pages = {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
     assert sorted(listed) == sorted(pages | made)

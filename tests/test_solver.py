@@ -44,7 +44,11 @@ from ssh_abduction.theory import Speedups
 
 TRACE = rectangle(8)
 MAP = solve(TRACE).maps[0]
-THEORIES = {"causal": Theory.causal(), "topological": Theory.topological(), "circumscriptive": Theory.circumscriptive()}
+THEORIES = {
+    "causal": Theory.causal(),
+    "topological": Theory.topological(),
+    "circumscriptive": Theory.circumscriptive(),
+}
 
 
 def wandering(seed: int, rooms: int, length: int, views: int) -> Trace:
@@ -77,22 +81,34 @@ def clock() -> Iterator[Callable[[float], None]]:
 def test_prefixes_give_what_solving_at_once_gives(tour: str, theory: Theory) -> None:
     world, place, heading, actions = TOURS[tour]
     trace = drive(world, place, heading, actions, stars=theory.level == "topological")
-    by_prefix, at_once = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=None, speedups=Speedups(prefixes=False))
+    by_prefix, at_once = (
+        solve(trace, theory, max_maps=None),
+        solve(trace, theory, max_maps=None, speedups=Speedups(prefixes=False)),
+    )
     assert set(by_prefix.maps) == set(at_once.maps)
-    assert (by_prefix.cost, by_prefix.bound, by_prefix.complete) == (at_once.cost, at_once.bound, True)
+    assert (by_prefix.cost, by_prefix.bound, by_prefix.complete) == (
+        at_once.cost,
+        at_once.bound,
+        True,
+    )
     assert at_once.prefix == len(trace)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_prefixes_of_random_machines(seed: int) -> None:
     trace = wandering(seed, rooms=4, length=40, views=3)
-    by_prefix, at_once = (solve(trace, Theory.causal(), max_maps=None, speedups=Speedups(prefixes=p)) for p in (True, False))
+    by_prefix, at_once = (
+        solve(trace, Theory.causal(), max_maps=None, speedups=Speedups(prefixes=p))
+        for p in (True, False)
+    )
     assert set(by_prefix.maps) == set(at_once.maps)
     assert len(set(by_prefix.maps)) == by_prefix.count
 
 
 @settings(max_examples=8)
-@given(traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
+@given(
+    traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory)))
+)
 def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
     """Every prefix is tried, from the shortest, so that replay has all chances to go wrong."""
     trace, theory = case
@@ -108,7 +124,9 @@ def test_prefixes_from_one_step_on(case: tuple[Trace, Theory]) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_streaming_lists_no_map_twice_and_misses_none(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streaming_lists_no_map_twice_and_misses_none(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With nothing held back, maps stream from a prefix that is too short for others."""
     trace = wandering(seed, rooms=5, length=30, views=3)
     at_once = solve(trace, Theory.causal(), max_maps=None, speedups=Speedups(prefixes=False))
@@ -142,20 +160,37 @@ def test_arguments_of_another_kind(arguments: tuple[Any, ...], message: str) -> 
     ("call", "message"),
     [
         (lambda: OnlineMapper("a", "causal"), "theory: expected a Theory, got 'causal'"),
-        (lambda: OnlineMapper("a", time_limit="5"), "limit: expected a number of seconds above 0, got '5'"),
+        (
+            lambda: OnlineMapper("a", time_limit="5"),
+            "limit: expected a number of seconds above 0, got '5'",
+        ),
         (lambda: OnlineMapper("a", speedups=None), "speedups: expected Speedups, got None"),
-        (lambda: BootstrapLearner().fit(None), "traces: expected a Trace, or a list of them, got None"),
+        (
+            lambda: BootstrapLearner().fit(None),
+            "traces: expected a Trace, or a list of them, got None",
+        ),
         (lambda: check(TRACE, None), "map: expected an SSHMap, got None"),
-        (lambda: solve(TRACE, memory_limit=float("nan")), "memory (--memory-limit): expected a number of MiB above 0, got nan"),
-        (lambda: solve(TRACE, time_limit=10**400), "limit (--time-limit): expected a number of seconds above 0, got 1000"),
+        (
+            lambda: solve(TRACE, memory_limit=float("nan")),
+            "memory (--memory-limit): expected a number of MiB above 0, got nan",
+        ),
+        (
+            lambda: solve(TRACE, time_limit=10**400),
+            "limit (--time-limit): expected a number of seconds above 0, got 1000",
+        ),
         (lambda: solve(TRACE, speedups="none"), "speedups: expected Speedups, got 'none'"),
-        (lambda: solve(TRACE, on_progress=3), "on_progress: expected a function of one Progress, got 3"),
+        (
+            lambda: solve(TRACE, on_progress=3),
+            "on_progress: expected a function of one Progress, got 3",
+        ),
         (lambda: Speedups.without(3), "speedups: expected names out of "),
         (lambda: Speedups(prefixes="no"), "speedups: prefixes: expected true or false, got 'no'"),
         (lambda: Trace.from_steps(["a"], [], stars=[{}]), "star"),
     ],
 )
-def test_arguments_of_another_kind_are_errors_of_the_package(call: Callable[[], Any], message: str) -> None:
+def test_arguments_of_another_kind_are_errors_of_the_package(
+    call: Callable[[], Any], message: str
+) -> None:
     with pytest.raises(AbductionError, match=re.escape(message)):
         call()
 
@@ -195,14 +230,21 @@ def test_a_surprise_after_many_circuits_is_not_missed() -> None:
     for ssh_map in solution.maps:
         assert check(surprised, ssh_map, Theory.causal()) == ()
     assert solution.cost is not None
-    assert solution.cost.dstates == 49  # a loop of four can end in nothing but v0, so nothing may be closed: 48 + the surprise
+    assert (
+        solution.cost.dstates == 49
+    )  # a loop of four can end in nothing but v0, so nothing may be closed: 48 + the surprise
 
 
 def test_at_most_so_many_maps() -> None:
     trace = drive(*TOURS["comb"])
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
     some, everything = solve(trace, theory, max_maps=5), solve(trace, theory, max_maps=None)
-    assert (some.count, some.complete, some.stopped, some.status) == (5, False, "maps limit", Status.OPTIMAL)
+    assert (some.count, some.complete, some.stopped, some.status) == (
+        5,
+        False,
+        "maps limit",
+        Status.OPTIMAL,
+    )
     assert (everything.count, everything.complete, everything.stopped) == (308, True, None)
     assert set(some.maps) <= set(everything.maps)
     exactly = solve(trace, theory, max_maps=308)
@@ -221,7 +263,9 @@ def test_a_stream_of_millions_starts_at_once() -> None:
 def test_nothing_preferred_means_all_consistent_maps() -> None:
     trace = written("a T a T a")
     theory = Theory.causal().replace(prefer=())
-    assert solve(trace, theory).count == 4  # of the partitions of three steps, {0,1}{2} alone breaks determinism
+    assert (
+        solve(trace, theory).count == 4
+    )  # of the partitions of three steps, {0,1}{2} alone breaks determinism
 
 
 def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
@@ -239,7 +283,12 @@ def test_time_limit_leaves_the_best_map_and_its_bound() -> None:
 
 def test_no_time_at_all_is_unknown_not_unsatisfiable() -> None:
     solution = solve(drive(*TOURS["comb"]), time_limit=1e-9, speedups=Speedups.without("greedy"))
-    assert (solution.status, solution.stopped, solution.maps, solution.cost) == (Status.UNKNOWN, "time limit", (), None)
+    assert (solution.status, solution.stopped, solution.maps, solution.cost) == (
+        Status.UNKNOWN,
+        "time limit",
+        (),
+        None,
+    )
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
@@ -250,7 +299,9 @@ def test_no_time_at_all_still_leaves_a_map_and_a_bound(theory: Theory) -> None:
     assert check(trace, solution.maps[0], theory) == ()
     assert solution.certificate is not None
     assert best.cost is not None
-    assert 1 < len(solution.certificate.clique) <= (solution.bound.dstates or 0) <= best.cost.dstates
+    assert (
+        1 < len(solution.certificate.clique) <= (solution.bound.dstates or 0) <= best.cost.dstates
+    )
 
 
 def test_time_limit_while_listing_keeps_the_proof() -> None:
@@ -261,7 +312,11 @@ def test_time_limit_while_listing_keeps_the_proof() -> None:
         maps.append(ssh_map)
         search._watch._spent += 500  # so that the time is over after two maps
     solution = search.solution(tuple(maps))
-    assert (solution.status, solution.complete, solution.stopped) == (Status.OPTIMAL, False, "time limit")
+    assert (solution.status, solution.complete, solution.stopped) == (
+        Status.OPTIMAL,
+        False,
+        "time limit",
+    )
     assert solution.count == 2
 
 
@@ -281,7 +336,11 @@ def test_ctrl_c_leaves_the_best_map() -> None:
         solution = solve(too_hard(), Theory.causal(), on_progress=lambda _: print("searching", flush=True))
         print(solution.stopped, solution.status.value, solution.bound.dstates is not None)
     """)
-    with subprocess.Popen([sys.executable, "-c", program, os.path.dirname(__file__)], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", program, os.path.dirname(__file__)],
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "searching\n"
         process.send_signal(signal.SIGINT)
@@ -299,7 +358,9 @@ def test_a_stream_that_is_left_does_not_abort_python() -> None:
         print(len(next(maps).labels))
     """)
     trace = os.path.join(os.path.dirname(__file__), "..", "examples", "aces3-route.jsonl")
-    done = subprocess.run([sys.executable, "-c", program, trace], check=False, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program, trace], check=False, capture_output=True, text=True
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "23\n", "")
 
 
@@ -331,7 +392,10 @@ def test_limits_that_make_no_sense(choices: dict[str, int], name: str) -> None:
     ("choices", "message"),
     [
         ({"boundary": "soft"}, "boundary: expected one of none, strict, defeasible, got 'soft'"),
-        ({"prefer": ("dstates", "streets")}, "prefer: expected names out of dstates, paths, places, excuses, auto, got 'streets'"),
+        (
+            {"prefer": ("dstates", "streets")},
+            "prefer: expected names out of dstates, paths, places, excuses, auto, got 'streets'",
+        ),
         ({"prefer": ("dstates", "dstates")}, "prefer: expected each name once"),
         ({"prefer": ("excuses",)}, "prefer: expected no excuses with boundary=strict"),
         ({"without": ("gravity",)}, "without: expected names out of"),
@@ -351,7 +415,10 @@ def test_theories_survive_a_round_trip() -> None:
     assert Theory.from_dict({"level": "causal"}) == Theory.causal()
     with pytest.raises(TheoryError, match="theory: expected an object, got 5"):
         Theory.from_dict(5)  # type: ignore[arg-type]
-    for theory in (*THEORIES.values(), Theory(boundary="defeasible", prefer=("paths", "excuses"), without=("on_path",))):
+    for theory in (
+        *THEORIES.values(),
+        Theory(boundary="defeasible", prefer=("paths", "excuses"), without=("on_path",)),
+    ):
         assert Theory.from_dict(theory.to_dict()) == theory
 
 
@@ -388,7 +455,9 @@ def test_replay_stops_where_the_map_knows_nothing_or_is_wrong() -> None:
     log = Log(trace, Theory.causal())
     assert log.replay((0, 1, 2)) == log.replay((0, 1, 2), known=3)
     assert log.replay((0, 1, 2)).outcome is Outcome.UNKNOWN
-    assert log.replay((0, 1, 2, 0)).outcome is Outcome.CONTRADICTED  # a T leads to b, but c was seen
+    assert (
+        log.replay((0, 1, 2, 0)).outcome is Outcome.CONTRADICTED
+    )  # a T leads to b, but c was seen
 
 
 def test_mutated_maps_fail_the_check() -> None:
@@ -403,7 +472,9 @@ def test_mutated_maps_fail_the_check() -> None:
         for k, path in enumerate(ssh_map.paths):
             if len(path.order) > 1:
                 turned = replace(path, order=path.order[::-1])
-                wrong.append(replace(ssh_map, paths=(*ssh_map.paths[:k], turned, *ssh_map.paths[k + 1 :])))
+                wrong.append(
+                    replace(ssh_map, paths=(*ssh_map.paths[:k], turned, *ssh_map.paths[k + 1 :]))
+                )
         for mutant in wrong:
             assert check(trace, mutant, theory)
             mutants += 1
@@ -415,7 +486,12 @@ def test_nothing_that_infers_reads_the_truth() -> None:
     truths = [step.truth for step in route.steps]
     assert any(truths)
     random.Random(0).shuffle(truths)
-    shuffled = replace(route, steps=tuple(replace(step, truth=truth) for step, truth in zip(route.steps, truths, strict=True)))
+    shuffled = replace(
+        route,
+        steps=tuple(
+            replace(step, truth=truth) for step, truth in zip(route.steps, truths, strict=True)
+        ),
+    )
     bare = replace(route, steps=tuple(replace(step, truth=None) for step in route.steps))
     answers = [[m.to_dict() for m in solve(trace).maps] for trace in (route, shuffled, bare)]
     assert answers[0] == answers[1] == answers[2]
@@ -462,11 +538,18 @@ def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(search._prefixes.engine, "maps_of_cost", interrupted)
     maps = tuple(search)
     solution = search.solution(maps)
-    assert (solution.count, len(set(maps)), solution.complete, solution.stopped) == (200, 200, False, "interrupted")
+    assert (solution.count, len(set(maps)), solution.complete, solution.stopped) == (
+        200,
+        200,
+        False,
+        "interrupted",
+    )
     assert solution.status is Status.OPTIMAL
 
 
-def test_a_stop_while_the_prefix_grows_gives_the_maps_that_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_while_the_prefix_grows_gives_the_maps_that_replayed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(prefixes, "FIRST_PREFIX", 2)
     given = []
     for seed in (1, 4, 6):
@@ -497,7 +580,11 @@ def test_a_search_runs_once() -> None:
 
 def test_costs_are_right_where_a_map_cannot_show_them() -> None:
     """Without one_place a dstate may be at many places; the map shows the first, the cost counts all."""
-    solution = solve(Trace.from_steps("aaaaa", ["travel"] * 4), Theory(prefer=("places",), without=("one_place",)), max_maps=None)
+    solution = solve(
+        Trace.from_steps("aaaaa", ["travel"] * 4),
+        Theory(prefer=("places",), without=("one_place",)),
+        max_maps=None,
+    )
     assert solution.cost is not None
     assert (solution.cost.places, solution.bound.places, solution.count) == (5, 5, 11)
 
@@ -546,7 +633,9 @@ def shape(ssh_map: SSHMap) -> tuple[object, ...]:
 
 
 @settings(max_examples=8)
-@given(traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory))))
+@given(
+    traces(max_steps=8).flatmap(lambda trace: theories(trace).map(lambda theory: (trace, theory)))
+)
 def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory]) -> None:
     trace, theory = case
     shapes = {shape(m) for m in solve(trace, theory, max_maps=None).maps}
@@ -554,13 +643,17 @@ def test_renaming_and_mirroring_leave_the_maps_alone(case: tuple[Trace, Theory])
     views = [f"seen {v}" for v in trace.views]
     moved = [step.displacement for step in trace.steps[1:]] if trace.has_displacements else None
     renamed = [{"name": f"do {a.name}", "kind": a.kind, "turn": a.turn} for a in trace.actions]
-    again = Trace.from_steps(views, renamed, stars=stars, displacements=moved, odometry=trace.odometry)
+    again = Trace.from_steps(
+        views, renamed, stars=stars, displacements=moved, odometry=trace.odometry
+    )
     assert {shape(m) for m in solve(again, theory, max_maps=None).maps} == shapes
     flip = {"right": "left", "left": "right", "around": "around", None: None}
     mirrored = [{"name": a.name, "kind": a.kind, "turn": flip[a.turn]} for a in trace.actions]
     turned = [None if s is None else (s[0], s[3], s[2], s[1]) for s in stars] if stars else None
     mirrored_moves = [None if d is None else (d[0], -d[1], -d[2]) for d in moved] if moved else None
-    mirror = Trace.from_steps(views, mirrored, stars=turned, displacements=mirrored_moves, odometry=trace.odometry)
+    mirror = Trace.from_steps(
+        views, mirrored, stars=turned, displacements=mirrored_moves, odometry=trace.odometry
+    )
     assert {shape(m) for m in solve(mirror, theory, max_maps=None).maps} == shapes
 
 
@@ -599,9 +692,16 @@ def test_whether_there_is_one_more_map_is_not_sought_for_long() -> None:
         while True:
             self.asker.watch.check()
 
-    with patch.object(CausalEngine, "maps_of_cost", slow), patch.object(solver_module, "ONE_MORE", 0.01):
+    with (
+        patch.object(CausalEngine, "maps_of_cost", slow),
+        patch.object(solver_module, "ONE_MORE", 0.01),
+    ):
         search = Search(trace, Theory.causal(), max_maps=every.count, time_limit=100.0)
         asked_for = search.solution(tuple(search))
     assert set(asked_for.maps) == set(every.maps)
-    assert (asked_for.status, asked_for.complete, asked_for.stopped) == (Status.OPTIMAL, False, "maps limit")
+    assert (asked_for.status, asked_for.complete, asked_for.stopped) == (
+        Status.OPTIMAL,
+        False,
+        "maps limit",
+    )
     assert not search.over()

@@ -49,7 +49,13 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
         return draw(traces(max_steps=8))
     states = draw(st.integers(1, 6))
     views = draw(st.lists(st.sampled_from("ab"), min_size=states, max_size=states))
-    follow = draw(st.lists(st.lists(st.integers(0, states - 1), min_size=2, max_size=2), min_size=states, max_size=states))
+    follow = draw(
+        st.lists(
+            st.lists(st.integers(0, states - 1), min_size=2, max_size=2),
+            min_size=states,
+            max_size=states,
+        )
+    )
     done = draw(st.lists(st.integers(0, 1), min_size=1, max_size=most_steps))
     state, seen = 0, [views[0]]
     for action in done:
@@ -60,7 +66,9 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
 
 @settings(max_examples=12)
 @given(machines(), st.sets(st.sampled_from(NAMES)), st.data())
-def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trace, off: set[str], data: st.DataObject) -> None:
+def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(
+    trace: Trace, off: set[str], data: st.DataObject
+) -> None:
     """With prefixes, patience and what is held back so small that all of it happens on short traces."""
     expected = solve(trace, Theory.causal(), max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, 5, 32]), label="first prefixes")
@@ -71,7 +79,16 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(trace: Trac
     cores = data.draw(st.sampled_from([0, 1, 10_000]), label="cores")
     spares = data.draw(st.sampled_from([0, 1, 2]), label="spare names")
     settings = patch.multiple(engine, FIRST_PREFIXES=first, AT_ONCE=at_once)
-    fewer = patch.multiple(named, AT_ONCE=at_once, WHOLE=whole, PATIENCE=patience, HELD_BACK=held, CORES=cores, SPARES=spares, MORE_LINKS=2)
+    fewer = patch.multiple(
+        named,
+        AT_ONCE=at_once,
+        WHOLE=whole,
+        PATIENCE=patience,
+        HELD_BACK=held,
+        CORES=cores,
+        SPARES=spares,
+        MORE_LINKS=2,
+    )
     with settings, fewer, patch.object(solver, "FEW_STEPS", 0):
         found = solve(trace, Theory.causal(), max_maps=None, speedups=Speedups.without(off))
     assert found.status is expected.status is Status.OPTIMAL
@@ -95,7 +112,9 @@ def test_names_read_from_where_actions_lead_are_those_read_whole(seed: int) -> N
     few = patch.multiple(named, PATIENCE=0, CORES=0, SPARES=0)
     with few, patch.object(facts.NameReader, "read", compared):
         speedups = Speedups.without(("annealed", "threads"))
-        assert solve(moore(8, 2, steps=60, seed=seed).trace, Theory.causal(), max_maps=20, speedups=speedups).complete
+        assert solve(
+            moore(8, 2, steps=60, seed=seed).trace, Theory.causal(), max_maps=20, speedups=speedups
+        ).complete
     assert answers
 
 
@@ -106,7 +125,10 @@ def noted_reads() -> Iterator[set[str]]:
     get = Speedups.__getattribute__
 
     def noted(self: Speedups, name: str) -> object:
-        if name in NAMES and Path(sys._getframe(1).f_code.co_filename).name not in ("speedups.py", "dataclasses.py"):
+        if name in NAMES and Path(sys._getframe(1).f_code.co_filename).name not in (
+            "speedups.py",
+            "dataclasses.py",
+        ):
             read.add(name)
         return get(self, name)
 
@@ -114,7 +136,9 @@ def noted_reads() -> Iterator[set[str]]:
         yield read
 
 
-CIRCUITS = Trace.from_steps([f"v{i % 4}" for i in range(24)], [("right", "travel")[i % 2] for i in range(23)])
+CIRCUITS = Trace.from_steps(
+    [f"v{i % 4}" for i in range(24)], [("right", "travel")[i % 2] for i in range(23)]
+)
 CASES = {
     "causal": (moore(6, 2, steps=60, seed=1).trace, Theory.causal()),
     "topological": (CIRCUITS, Theory.topological()),
@@ -163,7 +187,10 @@ def test_each_speedup_that_is_read_off_alone(case: str) -> None:
 @pytest.mark.parametrize("most", [1, 2, 5])
 def test_as_many_maps_as_asked_for(most: int) -> None:
     """Spurs off a ring that look alike: with what is lazy, and what is held back, the number asked for comes, and no map twice."""
-    trace = Trace.from_steps("abacabadabacab", ["travel", "right", "travel", "left", "right", "right", "travel"] + ["travel", "left"] * 3)
+    trace = Trace.from_steps(
+        "abacabadabacab",
+        ["travel", "right", "travel", "left", "right", "right", "travel"] + ["travel", "left"] * 3,
+    )
     every = solve(trace, Theory.causal(), max_maps=None, speedups=PLAIN)
     with patch.object(solver, "FEW_STEPS", 0):
         found = solve(trace, Theory.causal(), max_maps=most)
@@ -176,7 +203,10 @@ def test_as_many_maps_as_asked_for(most: int) -> None:
 @given(machines(most_steps=40))
 def test_merging_greedily_gives_a_map(trace: Trace) -> None:
     theory = Theory.causal()
-    with patch.object(named.NamedLabels, "grow", side_effect=KeyboardInterrupt), patch.object(solver, "FEW_STEPS", 0):
+    with (
+        patch.object(named.NamedLabels, "grow", side_effect=KeyboardInterrupt),
+        patch.object(solver, "FEW_STEPS", 0),
+    ):
         found = solve(trace, theory)
     assert found.status is Status.FEASIBLE
     assert check(trace, found.maps[0], theory) == ()
@@ -191,11 +221,16 @@ def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
     apart, graph = continuations.apart(), nx.empty_graph(len(trace))
     for i, j in product(range(len(trace)), repeat=2):
         k = 0
-        while log.seen[i + k] == log.seen[j + k] and log.actions[i + k : i + k + 1] == log.actions[j + k : j + k + 1] != []:
+        while (
+            log.seen[i + k] == log.seen[j + k]
+            and log.actions[i + k : i + k + 1] == log.actions[j + k : j + k + 1] != []
+        ):
             k += 1
         differ = log.seen[i + k] != log.seen[j + k]
         assert apart[i, j] == differ
-        assert [continuations.apart_from(i, actions)[j] for actions in range(4)] == [differ and k >= actions for actions in range(4)]
+        assert [continuations.apart_from(i, actions)[j] for actions in range(4)] == [
+            differ and k >= actions for actions in range(4)
+        ]
         graph.add_edges_from([(i, j)] if differ else [])
     cliques = list(nx.find_cliques(graph))
     most = max((len(steps), sum(int(apart[i].sum()) for i in steps)) for steps in cliques)
@@ -221,11 +256,15 @@ def test_a_search_without_greedy_merging_has_a_bound_when_time_is_over() -> None
         search = Search(trace, Theory.causal(), speedups=Speedups.without("greedy"))
     with patch.object(named.NamedLabels, "improving", side_effect=KeyboardInterrupt):
         assert list(search) == []
-    assert search.bound.dstates == 4 + 2  # a, b, c, d, and the first a and b, which lead to another c and d
+    assert (
+        search.bound.dstates == 4 + 2
+    )  # a, b, c, d, and the first a and b, which lead to another c and d
 
 
 def test_unknown_speedups_are_an_error() -> None:
-    with pytest.raises(SolverError, match=r"speedups: expected names out of prefixes, .*, got 'magic'"):
+    with pytest.raises(
+        SolverError, match=r"speedups: expected names out of prefixes, .*, got 'magic'"
+    ):
         Speedups.without("magic")
 
 
@@ -258,11 +297,20 @@ def test_dstates_that_are_one_are_merged() -> None:
 def test_a_limit_leaves_a_map_of_merged_steps() -> None:
     """Twice as good as one that is made at once, where clingo takes its time and no guess is annealed."""
     walk = maze(5, 5, steps=1600, seed=0)
-    with patch.multiple(named, PATIENCE=1, CORES=1), patch.object(named.NamedLabels, "_more_links", side_effect=[[], KeyboardInterrupt]):
-        solution = solve(walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,annealed,threads"))
+    with (
+        patch.multiple(named, PATIENCE=1, CORES=1),
+        patch.object(named.NamedLabels, "_more_links", side_effect=[[], KeyboardInterrupt]),
+    ):
+        solution = solve(
+            walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,annealed,threads")
+        )
     assert solution.status is Status.FEASIBLE
     assert solution.cost
-    assert solution.cost.dstates < 2 * len(set(walk.truth)) < len(set(Log(walk.trace, Theory.causal()).merged()))
+    assert (
+        solution.cost.dstates
+        < 2 * len(set(walk.truth))
+        < len(set(Log(walk.trace, Theory.causal()).merged()))
+    )
     assert check(walk.trace, solution.maps[0], Theory.causal()) == ()
 
 
@@ -313,8 +361,13 @@ def test_a_guess_that_takes_too_much_memory_is_not_begun() -> None:
 def test_what_cannot_be_stopped_is_not_begun_where_time_is_short() -> None:
     """clingo is not told where names lead, if the limit would be over before it can be stopped. The clique is a bound by then."""
     walk = moore(8, 2, steps=100, seed=0)
-    with patch.object(named, "SECONDS_A_CHARACTER", 1.0), patch.object(named, "new_control", side_effect=AssertionError):
-        solution = solve(walk.trace, Theory.causal(), time_limit=30, speedups=Speedups.without("prefixes"))
+    with (
+        patch.object(named, "SECONDS_A_CHARACTER", 1.0),
+        patch.object(named, "new_control", side_effect=AssertionError),
+    ):
+        solution = solve(
+            walk.trace, Theory.causal(), time_limit=30, speedups=Speedups.without("prefixes")
+        )
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
     assert solution.certificate
     assert solution.bound.dstates == len(solution.certificate.clique) > 2

@@ -12,7 +12,9 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.solver import Status
 
 P0 = Theory.causal()
-P1 = Theory(boundary="none", path_order="partial", star="none", prefer=("paths", "places", "dstates"))
+P1 = Theory(
+    boundary="none", path_order="partial", star="none", prefer=("paths", "places", "dstates")
+)
 P2 = Theory.circumscriptive().replace(star="none")
 P3 = Theory.topological().replace(star="none")
 PLACES_FIRST = P2.replace(prefer=("places", "paths", "dstates"))
@@ -47,8 +49,16 @@ def answer(trace: Trace, theory: Theory, expected: Expected) -> tuple[Expected, 
     [
         pytest.param(written(text), theory, row[0], row[1], id=f"{name}-{policy}")
         for name, text, rows in [
-            ("A corridor, one view", "a T a T a", [(1, 1), ((3, 3, 1), 1), ((3, 3, 1), 1), ((3, 3, 1), 1)]),
-            ("B out and back", "a T b A c T d A a", [(4, 1), ((4, 2, 1), 1), ((4, 2, 1), 1), ((4, 2, 1), 1)]),
+            (
+                "A corridor, one view",
+                "a T a T a",
+                [(1, 1), ((3, 3, 1), 1), ((3, 3, 1), 1), ((3, 3, 1), 1)],
+            ),
+            (
+                "B out and back",
+                "a T b A c T d A a",
+                [(4, 1), ((4, 2, 1), 1), ((4, 2, 1), 1), ((4, 2, 1), 1)],
+            ),
             ("C aliased ends", C, [(2, 1), ((4, 2, 1), 1), ((4, 2, 1), 1), ((4, 2, 1), 1)]),
             ("C2 twice round", C + C[1:], [(2, 1), ((4, 2, 1), 1), ((4, 2, 1), 1), ((4, 2, 1), 1)]),
             (
@@ -56,19 +66,53 @@ def answer(trace: Trace, theory: Theory, expected: Expected) -> tuple[Expected, 
                 "o T jr R jo T e A o T jw R jr T e A o T jl T e A o",
                 [(9, 2), ((10, 3, 2), 2), ((10, 4, 2), 1), ((10, 4, 2), 1)],
             ),
-            ("E square, 4 actions", "a R b T a R b T a", [(2, 1), ((4, 2, 2), 1), ((5, 3, 2), 1), ((5, 3, 2), 1)]),
+            (
+                "E square, 4 actions",
+                "a R b T a R b T a",
+                [(2, 1), ((4, 2, 2), 1), ((5, 3, 2), 1), ((5, 3, 2), 1)],
+            ),
             *[
-                (f"E square, {2 * k} actions", "a" + " R b T a" * k, [(2, 1), ((4, 2, 2), 1), ((6, 3, 3), 1), ((6, 3, 3), 1)])
+                (
+                    f"E square, {2 * k} actions",
+                    "a" + " R b T a" * k,
+                    [(2, 1), ((4, 2, 2), 1), ((6, 3, 3), 1), ((6, 3, 3), 1)],
+                )
                 for k in (3, 4, 5, 6)
             ],
-            ("I ring corridor", "v0 T v1 T v2 T v0 T v1", [(3, 1), ((5, 5, 1), 1), ((5, 5, 1), 1), ((5, 5, 1), 1)]),
-            ("J spin, 4 views", "a R b R c R d R a", [(4, 1), ((4, 1, 0), 1), ((4, 1, 0), 1), ((4, 1, 0), 1)]),
-            ("J2 spin, 1 view", "a R a R a R a R a", [(1, 1), ((1, 1, 0), 1), ((1, 1, 0), 1), ((1, 1, 0), 1)]),
-            ("K two causal maps", "a Tm b Tk a Tk a Tm c", [(4, 2), ((5, 5, 1), 1), ((5, 5, 1), 1), ((5, 5, 1), 1)]),
-            ("G1 two minimal maps", "b T a T b A b T b", [None, None, ((5, 3, 1), 2), ((5, 3, 1), 2)]),
-            ("G2 two minimal maps", "b T a A a T b T a", [None, None, ((5, 3, 1), 2), ((5, 3, 1), 2)]),
+            (
+                "I ring corridor",
+                "v0 T v1 T v2 T v0 T v1",
+                [(3, 1), ((5, 5, 1), 1), ((5, 5, 1), 1), ((5, 5, 1), 1)],
+            ),
+            (
+                "J spin, 4 views",
+                "a R b R c R d R a",
+                [(4, 1), ((4, 1, 0), 1), ((4, 1, 0), 1), ((4, 1, 0), 1)],
+            ),
+            (
+                "J2 spin, 1 view",
+                "a R a R a R a R a",
+                [(1, 1), ((1, 1, 0), 1), ((1, 1, 0), 1), ((1, 1, 0), 1)],
+            ),
+            (
+                "K two causal maps",
+                "a Tm b Tk a Tk a Tm c",
+                [(4, 2), ((5, 5, 1), 1), ((5, 5, 1), 1), ((5, 5, 1), 1)],
+            ),
+            (
+                "G1 two minimal maps",
+                "b T a T b A b T b",
+                [None, None, ((5, 3, 1), 2), ((5, 3, 1), 2)],
+            ),
+            (
+                "G2 two minimal maps",
+                "b T a A a T b T a",
+                [None, None, ((5, 3, 1), 2), ((5, 3, 1), 2)],
+            ),
         ]
-        for policy, theory, row in zip(("P0", "P1", "P2", "P3"), (P0, P1, P2, P3), rows, strict=True)
+        for policy, theory, row in zip(
+            ("P0", "P1", "P2", "P3"), (P0, P1, P2, P3), rows, strict=True
+        )
         if row is not None
     ],
 )
@@ -92,11 +136,18 @@ def test_next_place_leaves_one_map(text: str, theory: Theory) -> None:
         *[
             (n, theory, expected, count)
             for n in (10, 12, 14, 16)
-            for theory, expected, count in [(P0, 8, 1), (P1, (8, 3, 2), 2), (P2, (8, 4, 4), 1), (P3, (8, 4, 4), 1)]
+            for theory, expected, count in [
+                (P0, 8, 1),
+                (P1, (8, 3, 2), 2),
+                (P2, (8, 4, 4), 1),
+                (P3, (8, 4, 4), 1),
+            ]
         ],
     ],
 )
-def test_rectangle_with_eight_views(actions: int, theory: Theory, expected: Expected, count: int) -> None:
+def test_rectangle_with_eight_views(
+    actions: int, theory: Theory, expected: Expected, count: int
+) -> None:
     assert answer(rectangle(actions, views=8), theory, expected) == (expected, count)
 
 
@@ -104,30 +155,119 @@ LENGTHS = (4, 6, 7, 8, 9, 10, 12, 16)
 NOTCHED: list[tuple[Theory, list[Expected | None], list[int]]] = [
     (P0, [4] * 8, [1] * 8),
     (P1, [(4, 2, 2)] * 8, [1] * 8),
-    (P3, [(5, 3, 2), (7, 3, 3), (8, 3, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4)], [1] * 8),
-    (P2, [(5, 3, 2), (7, 3, 3), (8, 3, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4)], [1] * 8),
-    (ALL_ON_PATHS, [(5, 3, 3), (7, 4, 3), (8, 3, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4)], [1] * 8),
-    (PARTIAL, [(5, 3, 2), (7, 3, 3), (8, 3, 3), (9, 5, 3), (10, 5, 3), (11, 6, 3), (12, 6, 3), (12, 6, 3)], [1] * 8),
-    (ONE_SIDE, [(5, 3, 2), (7, 3, 3), (8, 3, 3), (9, 4, 3), (10, 4, 3), (11, 5, 3), (12, 6, 3), (12, 6, 3)], [1, 1, 1, 3, 3, 3, 1, 1]),
-    (PARTIAL_ONE_SIDE, [None, None, None, (9, 4, 3), None, (11, 5, 3), (12, 6, 3), (12, 6, 3)], [0, 0, 0, 3, 0, 5, 8, 8]),
-    (PLACES_FIRST, [(5, 3, 2), (7, 3, 3), (8, 3, 3), (9, 3, 4), (10, 3, 4), (11, 3, 5), (12, 3, 6), (12, 3, 6)], [1] * 8),
-    (SOFT, [(5, 3, 2), (7, 3, 3), (8, 3, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4)], [1] * 8),
-    (SOFT_LAST, [(4, 2, 2), (4, 2, 2), None, (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2)], [1] * 8),
-    (SOFT_DSTATES, [(4, 2, 2), (4, 2, 2), None, (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2)], [1] * 8),
-    (FRAME, [(5, 3, 2), (7, 4, 3), (8, 4, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4), None], [1] * 8),
-    (P3.replace(star="frame"), [(5, 3, 2), (7, 4, 3), (8, 4, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), None], [1] * 8),
-    (PLACES_FIRST.replace(star="frame"), [(5, 3, 2), (7, 4, 3), (8, 4, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), None], [1] * 8),
+    (
+        P3,
+        [(5, 3, 2), (7, 3, 3), (8, 3, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4)],
+        [1] * 8,
+    ),
+    (
+        P2,
+        [(5, 3, 2), (7, 3, 3), (8, 3, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4)],
+        [1] * 8,
+    ),
+    (
+        ALL_ON_PATHS,
+        [(5, 3, 3), (7, 4, 3), (8, 3, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4)],
+        [1] * 8,
+    ),
+    (
+        PARTIAL,
+        [
+            (5, 3, 2),
+            (7, 3, 3),
+            (8, 3, 3),
+            (9, 5, 3),
+            (10, 5, 3),
+            (11, 6, 3),
+            (12, 6, 3),
+            (12, 6, 3),
+        ],
+        [1] * 8,
+    ),
+    (
+        ONE_SIDE,
+        [
+            (5, 3, 2),
+            (7, 3, 3),
+            (8, 3, 3),
+            (9, 4, 3),
+            (10, 4, 3),
+            (11, 5, 3),
+            (12, 6, 3),
+            (12, 6, 3),
+        ],
+        [1, 1, 1, 3, 3, 3, 1, 1],
+    ),
+    (
+        PARTIAL_ONE_SIDE,
+        [None, None, None, (9, 4, 3), None, (11, 5, 3), (12, 6, 3), (12, 6, 3)],
+        [0, 0, 0, 3, 0, 5, 8, 8],
+    ),
+    (
+        PLACES_FIRST,
+        [
+            (5, 3, 2),
+            (7, 3, 3),
+            (8, 3, 3),
+            (9, 3, 4),
+            (10, 3, 4),
+            (11, 3, 5),
+            (12, 3, 6),
+            (12, 3, 6),
+        ],
+        [1] * 8,
+    ),
+    (
+        SOFT,
+        [(5, 3, 2), (7, 3, 3), (8, 3, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4)],
+        [1] * 8,
+    ),
+    (
+        SOFT_LAST,
+        [(4, 2, 2), (4, 2, 2), None, (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2)],
+        [1] * 8,
+    ),
+    (
+        SOFT_DSTATES,
+        [(4, 2, 2), (4, 2, 2), None, (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2), (4, 2, 2)],
+        [1] * 8,
+    ),
+    (
+        FRAME,
+        [(5, 3, 2), (7, 4, 3), (8, 4, 3), (9, 5, 3), (10, 5, 3), (8, 4, 4), (8, 4, 4), None],
+        [1] * 8,
+    ),
+    (
+        P3.replace(star="frame"),
+        [(5, 3, 2), (7, 4, 3), (8, 4, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), None],
+        [1] * 8,
+    ),
+    (
+        PLACES_FIRST.replace(star="frame"),
+        [(5, 3, 2), (7, 4, 3), (8, 4, 3), (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), None],
+        [1] * 8,
+    ),
 ]
 NOTCHED += [
-    (P3.replace(**choices), [(5, 3, 2), (7, 3, 3), None, (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), None], [1] * 8)
-    for choices in ({"path_order": "partial"}, {"symmetric_sides": False}, {"path_order": "partial", "symmetric_sides": False})
+    (
+        P3.replace(**choices),
+        [(5, 3, 2), (7, 3, 3), None, (8, 4, 4), (8, 4, 4), (8, 4, 4), (8, 4, 4), None],
+        [1] * 8,
+    )
+    for choices in (
+        {"path_order": "partial"},
+        {"symmetric_sides": False},
+        {"path_order": "partial", "symmetric_sides": False},
+    )
 ]
 
 
 def cornered(trace: Trace) -> Trace:
     """The notched rectangle with the stars of its corners: open ahead after the turn, and to the right before it."""
     stars = [(0, 1, 1, 0), (1, 1, 0, 0)]
-    return Trace.from_steps(trace.views, trace.actions, stars=[stars[i % 2] for i in range(len(trace))])  # type: ignore[arg-type]
+    return Trace.from_steps(
+        trace.views, trace.actions, stars=[stars[i % 2] for i in range(len(trace))]
+    )  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -139,7 +279,9 @@ def cornered(trace: Trace) -> Trace:
         if expected is not None
     ],
 )
-def test_notched_rectangle_by_number_of_actions(theory: Theory, actions: int, expected: Expected, count: int) -> None:
+def test_notched_rectangle_by_number_of_actions(
+    theory: Theory, actions: int, expected: Expected, count: int
+) -> None:
     trace = rectangle(actions)
     if theory.star == "frame":
         trace = cornered(trace)
@@ -149,7 +291,9 @@ def test_notched_rectangle_by_number_of_actions(theory: Theory, actions: int, ex
 @pytest.mark.parametrize("theory", [P0, P1, P2, P3])
 @pytest.mark.parametrize("actions", LENGTHS)
 def test_the_mirror_image_has_mirrored_maps(theory: Theory, actions: int) -> None:
-    clockwise, anticlockwise = (solve(rectangle(actions, turn=turn), theory, max_maps=None) for turn in "RL")
+    clockwise, anticlockwise = (
+        solve(rectangle(actions, turn=turn), theory, max_maps=None) for turn in "RL"
+    )
     assert {m.labels for m in clockwise.maps} == {m.labels for m in anticlockwise.maps}
     assert {m.dstates for m in clockwise.maps} == {m.dstates for m in anticlockwise.maps}
 
@@ -158,7 +302,10 @@ def test_the_mirror_image_has_mirrored_maps(theory: Theory, actions: int) -> Non
     ("theory", "counts"),
     [
         (P2.replace(prefer=()), [1, 1, 1, 1, 1, 1, 2, 2, 7, 8, 29, 32, 160]),
-        (PARTIAL.replace(boundary="none", prefer=()), [1, 1, 1, 1, 3, 4, 13, 16, 119, 160, 1191, 1589]),
+        (
+            PARTIAL.replace(boundary="none", prefer=()),
+            [1, 1, 1, 1, 3, 4, 13, 16, 119, 160, 1191, 1589],
+        ),
     ],
 )
 def test_numbers_of_all_consistent_maps(theory: Theory, counts: list[int]) -> None:
@@ -209,7 +356,10 @@ ENVIRONMENTS: list[tuple[str, Theory, Expected, int]] = [
 
 @pytest.mark.parametrize(("tour", "theory", "expected", "count"), ENVIRONMENTS)
 def test_simulated_environments(tour: str, theory: Theory, expected: Expected, count: int) -> None:
-    assert answer(drive(*TOURS[tour], stars=theory.star != "none"), theory, expected) == (expected, count)
+    assert answer(drive(*TOURS[tour], stars=theory.star != "none"), theory, expected) == (
+        expected,
+        count,
+    )
 
 
 @pytest.mark.parametrize(
@@ -228,15 +378,25 @@ def test_aces3_route(theory: Theory, expected: Expected, count: int) -> None:
     assert answer(route, theory, expected) == (expected, count)
 
 
-@pytest.mark.parametrize(("first", "second", "actions"), [(0, 4, 4), (1, 5, 5), (2, 6, 6), (3, 7, 7)])
+@pytest.mark.parametrize(
+    ("first", "second", "actions"), [(0, 4, 4), (1, 5, 5), (2, 6, 6), (3, 7, 7)]
+)
 def test_half_a_circuit_tells_aliased_dstates_apart(first: int, second: int, actions: int) -> None:
     """Section 6.2: with 4 to 7 actions no two steps of one view are equal in any consistent map."""
     for ssh_map in solve(rectangle(actions), P2.replace(prefer=()), max_maps=None).maps:
         assert ssh_map.labels[first] != ssh_map.labels[second]
 
 
-@pytest.mark.parametrize(("actions", "equal"), [(8, {(0, 8)}), (9, {(0, 8), (1, 9)}), (10, {(0, 8), (1, 9), (2, 10)})])
+@pytest.mark.parametrize(
+    ("actions", "equal"), [(8, {(0, 8)}), (9, {(0, 8), (1, 9)}), (10, {(0, 8), (1, 9), (2, 10)})]
+)
 def test_which_equalities_are_possible(actions: int, equal: set[tuple[int, int]]) -> None:
     """Section 6.2: what holds in at least one consistent map."""
     maps = solve(rectangle(actions), P2.replace(prefer=()), max_maps=None).maps
-    assert {(i, j) for m in maps for j in range(actions + 1) for i in range(j) if m.labels[i] == m.labels[j]} == equal
+    assert {
+        (i, j)
+        for m in maps
+        for j in range(actions + 1)
+        for i in range(j)
+        if m.labels[i] == m.labels[j]
+    } == equal

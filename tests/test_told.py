@@ -37,13 +37,18 @@ def lines(capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> tup
 @pytest.fixture
 def noisy(tmp_path: Path) -> str:
     circuits = rectangle(40)
-    trace = circuits.with_views([view if t != 33 else "v0" for t, view in enumerate(map(str, circuits.views))])
+    trace = circuits.with_views(
+        [view if t != 33 else "v0" for t, view in enumerate(map(str, circuits.views))]
+    )
     trace.save(tmp_path / "noisy.jsonl")
     return str(tmp_path / "noisy.jsonl")
 
 
 def test_the_library_is_silent(capfd: pytest.CaptureFixture[str]) -> None:
-    assert any(isinstance(handler, logging.NullHandler) for handler in logging.getLogger("ssh_abduction").handlers)
+    assert any(
+        isinstance(handler, logging.NullHandler)
+        for handler in logging.getLogger("ssh_abduction").handlers
+    )
     solve(drive(*TOURS["comb"]))
     assert capfd.readouterr() == ("", "")
 
@@ -53,7 +58,9 @@ def test_the_log_says_what_is_found_and_proven(caplog: pytest.LogCaptureFixture)
         solution = solve(Trace.load(ACES))
     told = [record.getMessage() for record in caplog.records]
     assert {record.name.partition(".")[0] for record in caplog.records} == {"ssh_abduction"}
-    assert told[0].startswith("search of <Trace 'ACES3 route': 23 steps, 6 views, 4 actions; stars> under Theory(")
+    assert told[0].startswith(
+        "search of <Trace 'ACES3 route': 23 steps, 6 views, 4 actions; stars> under Theory("
+    )
     assert told[0].endswith(", with StepEngine")
     assert "minimal maps cost 19 dstates, 10 places, 4 paths; they are listed" in told
     assert "StepEngine is given 23 of 23 steps" in told
@@ -87,7 +94,11 @@ def test_verbose_tells_and_twice_tells_more(capsys: pytest.CaptureFixture[str]) 
     assert sum("prefixes: " in line for line in more) > 3
     assert all(MESSAGE.fullmatch(line) for line in [*some, *before, *more])
     assert logging.getLogger("ssh_abduction").level == logging.NOTSET
-    assert not [h for h in logging.getLogger("ssh_abduction").handlers if not isinstance(h, logging.NullHandler)]
+    assert not [
+        h
+        for h in logging.getLogger("ssh_abduction").handlers
+        if not isinstance(h, logging.NullHandler)
+    ]
 
 
 def test_quiet_leaves_errors_alone(noisy: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,7 +110,9 @@ def test_quiet_leaves_errors_alone(noisy: str, capsys: pytest.CaptureFixture[str
     assert json.loads(quiet)["warnings"] == json.loads(out)["warnings"]
     assert lines(capsys, "-q", "solve", noisy, "--theory", "causal")[1] == []
     _, wrong = lines(capsys, "-q", "solve", "no such file", code=1)
-    assert wrong == ["ssh-abduction: no such file: expected a readable trace file: No such file or directory; check the path"]
+    assert wrong == [
+        "ssh-abduction: no such file: expected a readable trace file: No such file or directory; check the path"
+    ]
 
 
 def test_quiet_and_verbose_contradict_each_other(capsys: pytest.CaptureFixture[str]) -> None:
@@ -117,10 +130,14 @@ def test_every_verb_takes_them(verb: str, capsys: pytest.CaptureFixture[str]) ->
     assert "-v, --verbose" in out
 
 
-def test_lines_of_progress_come_now_and_then(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_of_progress_come_now_and_then(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert lines(capsys, "solve", ACES)[1] == []
     seconds = itertools.count()
-    monkeypatch.setattr(verbosity, "time", Mock(monotonic=lambda: next(seconds)))  # a second passes whenever somebody looks
+    monkeypatch.setattr(
+        verbosity, "time", Mock(monotonic=lambda: next(seconds))
+    )  # a second passes whenever somebody looks
     monkeypatch.setattr(verbosity, "EVERY", 4.0)
     some = lines(capsys, "solve", ACES)[1]
     assert some
@@ -128,7 +145,10 @@ def test_lines_of_progress_come_now_and_then(capsys: pytest.CaptureFixture[str],
     for verb in ("solve", "ladder"):
         _, told = lines(capsys, verb, ACES)
         assert len(told) > len(some)
-        assert all(re.fullmatch(r"ssh-abduction: prefix \d+ of 23 steps; .*; \d+ maps; \d+\.\d s", line) for line in told)
+        assert all(
+            re.fullmatch(r"ssh-abduction: prefix \d+ of 23 steps; .*; \d+ maps; \d+\.\d s", line)
+            for line in told
+        )
     assert lines(capsys, "solve", ACES, "-q")[1] == []
     assert all(MESSAGE.fullmatch(line) for line in lines(capsys, "solve", ACES, "-v")[1])
 
@@ -137,15 +157,21 @@ EAGER = "import sys; from ssh_abduction.cli import main, verbosity; verbosity.EV
 
 
 @pytest.mark.parametrize(("words", "mixed"), [((), True), (("--json",), False)])
-def test_progress_never_comes_between_the_lines_of_an_answer_for_programs(words: tuple[str, ...], mixed: bool) -> None:
+def test_progress_never_comes_between_the_lines_of_an_answer_for_programs(
+    words: tuple[str, ...], mixed: bool
+) -> None:
     command = [sys.executable, "-c", EAGER, "solve", ACES, *words]
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True)
+    done = subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True
+    )
     assert ("ssh-abduction: prefix" in done.stdout) == mixed
     if not mixed:
         assert json.loads(done.stdout)["count"] == 4
 
 
-def test_a_view_cannot_steer_the_terminal_by_the_log(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_view_cannot_steer_the_terminal_by_the_log(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     trace = Trace.from_steps(["\x1b[2J", "b"], ["travel"], name="\x1b[31m\nname")
     trace.save(tmp_path / "trace.jsonl")
     _, told = lines(capsys, "solve", str(tmp_path / "trace.jsonl"), "-vv")
@@ -167,14 +193,20 @@ def test_a_view_cannot_steer_the_terminal_by_the_log(capsys: pytest.CaptureFixtu
         ("completion bsh", "bash"),
     ],
 )
-def test_what_was_perhaps_meant_is_named(words: str, meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_was_perhaps_meant_is_named(
+    words: str, meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(words.split())
     assert capsys.readouterr().err.endswith(f"; did you mean {meant}?\n")
 
 
-@pytest.mark.parametrize("words", ["frobnicate", "solve trace.jsonl --xyzzy", "solve a b --star \x1b[2J", "check a b c"])
-def test_what_is_near_nothing_is_no_question(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "words", ["frobnicate", "solve trace.jsonl --xyzzy", "solve a b --star \x1b[2J", "check a b c"]
+)
+def test_what_is_near_nothing_is_no_question(
+    words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(words.split(" "))
     err = capsys.readouterr().err
@@ -183,7 +215,9 @@ def test_what_is_near_nothing_is_no_question(words: str, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize("shell", SHELLS)
-def test_completions_know_every_verb_and_its_options(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_completions_know_every_verb_and_its_options(
+    shell: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, _ = lines(capsys, "completion", shell)
     for verb in VERBS:
         assert verb in out
@@ -193,9 +227,16 @@ def test_completions_know_every_verb_and_its_options(shell: str, capsys: pytest.
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash")
 @pytest.mark.parametrize(
     ("typed", "completed"),
-    [("sol", ["solve"]), ("solve --time", ["--time-limit"]), ("solve --star f", ["frame"]), ("solve exa", ["example.jsonl"])],
+    [
+        ("sol", ["solve"]),
+        ("solve --time", ["--time-limit"]),
+        ("solve --star f", ["frame"]),
+        ("solve exa", ["example.jsonl"]),
+    ],
 )
-def test_bash_completes(typed: str, completed: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bash_completes(
+    typed: str, completed: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, _ = lines(capsys, "completion", "bash")
     (tmp_path / "complete.bash").write_text(out)
     (tmp_path / "example.jsonl").write_text("")
@@ -205,11 +246,15 @@ def test_bash_completes(typed: str, completed: list[str], tmp_path: Path, capsys
         f"COMP_WORDS=(ssh-abduction {' '.join(words)}); COMP_CWORD={len(words)}; "
         "$(complete -p ssh-abduction | sed 's/.*-F \\([^ ]*\\).*/\\1/'); printf '%s\\n' \"${COMPREPLY[@]}\""
     )
-    done = subprocess.run(["bash", "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["bash", "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.stdout.split() == completed
 
 
-def test_without_shtab_it_is_named(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_shtab_it_is_named(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     imported = builtins.__import__
 
     def without(name: str, *rest: Any, **more: Any) -> Any:
@@ -219,7 +264,9 @@ def test_without_shtab_it_is_named(capsys: pytest.CaptureFixture[str], monkeypat
 
     monkeypatch.setattr(builtins, "__import__", without)
     _, told = lines(capsys, "completion", "bash", code=1)
-    assert told == ["ssh-abduction: completion: expected the package shtab, got none; pip install 'ssh-abduction[completion]'"]
+    assert told == [
+        "ssh-abduction: completion: expected the package shtab, got none; pip install 'ssh-abduction[completion]'"
+    ]
 
 
 def test_the_bootstrap_loop_tells_its_stages(caplog: pytest.LogCaptureFixture) -> None:
@@ -230,6 +277,14 @@ def test_the_bootstrap_loop_tells_its_stages(caplog: pytest.LogCaptureFixture) -
     run = simulate(World.named("notched-rectangle"), tours=4, seed=1)
     with caplog.at_level(logging.INFO, "ssh_abduction"):
         learner = BootstrapLearner().fit(run)
-    told = [record.getMessage() for record in caplog.records if record.name == "ssh_abduction.learning.learner"]
-    assert told == [f"{len(run)} images, 4 views", "a map of 8 dstates", f"a recogniser of {len(run)} images"]
+    told = [
+        record.getMessage()
+        for record in caplog.records
+        if record.name == "ssh_abduction.learning.learner"
+    ]
+    assert told == [
+        f"{len(run)} images, 4 views",
+        "a map of 8 dstates",
+        f"a recogniser of {len(run)} images",
+    ]
     assert np.all(learner.labels_ >= 0)

@@ -17,9 +17,13 @@ TWO = streets(("a", "E", "b"))
 THREE = (0, 120, 240)
 
 
-def shortest(world: Streets, at: tuple[str, int], seen: set[object], actions: tuple[str, ...]) -> int:
+def shortest(
+    world: Streets, at: tuple[str, int], seen: set[object], actions: tuple[str, ...]
+) -> int:
     """How many actions it takes at least to see all dstates and do all travels that are not seen, by breadth first search."""
-    everything = {(place, k) for place in world for k in range(4)} | {(place, heading) for place, ways in world.items() for heading in ways}
+    everything = {(place, k) for place in world for k in range(4)} | {
+        (place, heading) for place, ways in world.items() for heading in ways
+    }
     queue = deque([(at, frozenset(everything - seen), 0)])
     known = set()
     while True:
@@ -40,7 +44,9 @@ def shortest(world: Streets, at: tuple[str, int], seen: set[object], actions: tu
                 queue.append((*after, steps + 1))
 
 
-@pytest.mark.parametrize("actions", [("right", "travel"), ("right", "left", "travel"), (*TURNS, "travel")])
+@pytest.mark.parametrize(
+    "actions", [("right", "travel"), ("right", "left", "travel"), (*TURNS, "travel")]
+)
 def test_a_tour_is_as_short_as_can_be_where_every_end_is_expected(actions: tuple[str, ...]) -> None:
     trace = Trace.from_steps(["end", "wall"], ["travel"], stars=ENDS)
     tour = next_tour(solve(trace).maps[0], trace, actions=actions)
@@ -54,7 +60,9 @@ def test_a_robot_drives_on_before_it_looks_around_where_it_will_come_back() -> N
 
 def test_nothing_is_left_where_all_was_tried() -> None:
     driven = Trace.from_steps(
-        ["end", "wall", "back", "wall back", "end"], ["travel", "around", "travel", "around"], stars=[*ENDS, *ENDS, ENDS[0]]
+        ["end", "wall", "back", "wall back", "end"],
+        ["travel", "around", "travel", "around"],
+        stars=[*ENDS, *ENDS, ENDS[0]],
     )
     ssh_map = solve(driven).maps[0]
     assert next_tour(ssh_map, driven) == ()
@@ -63,18 +71,34 @@ def test_nothing_is_left_where_all_was_tried() -> None:
 
 def test_what_cannot_be_done_there_is_not_planned() -> None:
     alone = Trace.from_steps(["end"], [], stars=ENDS[:1])
-    assert next_tour(solve(alone).maps[0], alone, actions=("right", "travel"), can=lambda seen: ["right"])[0] == "right"
+    assert (
+        next_tour(
+            solve(alone).maps[0], alone, actions=("right", "travel"), can=lambda seen: ["right"]
+        )[0]
+        == "right"
+    )
 
 
 def test_gateways_tell_where_turns_lead() -> None:
-    turns = [Action("right 1", "turn", "right", gateway=1), Action("left 1", "turn", "left", gateway=1)]
+    turns = [
+        Action("right 1", "turn", "right", gateway=1),
+        Action("left 1", "turn", "left", gateway=1),
+    ]
     theory = Theory.causal().replace(star="alike")
-    trace = Trace.from_steps(["tri", "wall", "end", "back"], ["travel", "around", "travel"], stars=[THREE, (180,), (0,), (60, 180, 300)])
+    trace = Trace.from_steps(
+        ["tri", "wall", "end", "back"],
+        ["travel", "around", "travel"],
+        stars=[THREE, (180,), (0,), (60, 180, 300)],
+    )
     tour = next_tour(solve(trace, theory).maps[0], trace, theory=theory, actions=turns)
-    assert tour in (("left 1", "travel"), ("right 1", "travel"))  # to a gateway that it never went through
+    assert tour in (
+        ("left 1", "travel"),
+        ("right 1", "travel"),
+    )  # to a gateway that it never went through
     looked = Trace.from_steps(["tri", "one", "two", "tri"], [turns[0]] * 3, stars=[THREE] * 4)
     assert (
-        next_tour(solve(looked, theory).maps[0], looked, theory=theory, actions=[turns[1]]) == ("left 1",) * 3
+        next_tour(solve(looked, theory).maps[0], looked, theory=theory, actions=[turns[1]])
+        == ("left 1",) * 3
     )  # the ends are expected, and still to be tried
 
 

@@ -47,14 +47,32 @@ def test_a_trace_survives_a_round_trip(tmp_path: Path) -> None:
 
 def test_standard_actions_need_no_object() -> None:
     trace = Trace.from_steps("abcde", ["travel", "right", "left", "around"])
-    assert [(a.kind, a.turn) for a in trace.actions] == [("travel", None), ("turn", "right"), ("turn", "left"), ("turn", "around")]
-    assert [step.to_json().get("action") for step in trace.steps] == ["travel", "right", "left", "around", None]
+    assert [(a.kind, a.turn) for a in trace.actions] == [
+        ("travel", None),
+        ("turn", "right"),
+        ("turn", "left"),
+        ("turn", "around"),
+    ]
+    assert [step.to_json().get("action") for step in trace.steps] == [
+        "travel",
+        "right",
+        "left",
+        "around",
+        None,
+    ]
 
 
 def test_fields_may_come_in_any_order(tmp_path: Path) -> None:
-    there = Trace.load(written(tmp_path, HEADER, '{"view": "a", "star": [1, 0, 0, 0], "action": "travel"}', LAST))
+    there = Trace.load(
+        written(tmp_path, HEADER, '{"view": "a", "star": [1, 0, 0, 0], "action": "travel"}', LAST)
+    )
     back = Trace.load(
-        written(tmp_path, '{"version": 1, "format": "ssh-trace"}', '{"action": "travel", "star": [1, 0, 0, 0], "view": "a"}', LAST)
+        written(
+            tmp_path,
+            '{"version": 1, "format": "ssh-trace"}',
+            '{"action": "travel", "star": [1, 0, 0, 0], "view": "a"}',
+            LAST,
+        )
     )
     assert there == back
 
@@ -81,52 +99,117 @@ def test_bearings_that_share_a_quarter() -> None:
 BAD: dict[str, tuple[list[str], str]] = {
     "no header": ([STEP, LAST], "1: format: expected"),
     "wrong format": (['{"format": "csv", "version": 1}', LAST], "1: format: expected"),
-    "wrong version": (['{"format": "ssh-trace", "version": 2}', LAST], "1: version: expected 1, got 2"),
+    "wrong version": (
+        ['{"format": "ssh-trace", "version": 2}', LAST],
+        "1: version: expected 1, got 2",
+    ),
     "no version": (['{"format": "ssh-trace"}', LAST], "1: version: expected 1, got None"),
     "header of another type": (["[1, 2]", LAST], "1: line: expected a JSON object"),
     "header alone": ([HEADER], "2: step: expected at least one"),
-    "name that is no text": (['{"format": "ssh-trace", "version": 1, "name": 3}', LAST], "1: name: expected a text"),
-    "NaN": ([HEADER, '{"view": "a", "displacement": [NaN, 0, 0]}'], "2: displacement[0]: expected a finite number, got NaN"),
-    "infinite range": ([HEADER, '{"image": [1, Infinity]}'], "2: image[1]: expected a finite number, got Infinity"),
-    "number that overflows": ([HEADER, '{"image": [1, 1e999]}'], "2: image[1]: expected a finite number"),
-    "number of a million digits": ([HEADER, '{"view": ' + "1" * 10**6 + "}"], "2: line: expected one JSON object, got a number"),
+    "name that is no text": (
+        ['{"format": "ssh-trace", "version": 1, "name": 3}', LAST],
+        "1: name: expected a text",
+    ),
+    "NaN": (
+        [HEADER, '{"view": "a", "displacement": [NaN, 0, 0]}'],
+        "2: displacement[0]: expected a finite number, got NaN",
+    ),
+    "infinite range": (
+        [HEADER, '{"image": [1, Infinity]}'],
+        "2: image[1]: expected a finite number, got Infinity",
+    ),
+    "number that overflows": (
+        [HEADER, '{"image": [1, 1e999]}'],
+        "2: image[1]: expected a finite number",
+    ),
+    "number of a million digits": (
+        [HEADER, '{"view": ' + "1" * 10**6 + "}"],
+        "2: line: expected one JSON object, got a number",
+    ),
     "no view": ([HEADER, '{"action": "travel"}', LAST], "2: view: expected"),
-    "view of another type": ([HEADER, '{"view": 1.5}'], "2: view: expected a text or an integer, got 1.5"),
-    "true as a view": ([HEADER, '{"view": true}'], "2: view: expected a text or an integer, got True"),
-    "view of 40 bits": ([HEADER, '{"view": 1000000000000}'], "2: view: expected an integer of 32 bits"),
-    "view with a null character": ([HEADER, '{"view": "a\\u0000"}'], "2: view: expected a text without null"),
+    "view of another type": (
+        [HEADER, '{"view": 1.5}'],
+        "2: view: expected a text or an integer, got 1.5",
+    ),
+    "true as a view": (
+        [HEADER, '{"view": true}'],
+        "2: view: expected a text or an integer, got True",
+    ),
+    "view of 40 bits": (
+        [HEADER, '{"view": 1000000000000}'],
+        "2: view: expected an integer of 32 bits",
+    ),
+    "view with a null character": (
+        [HEADER, '{"view": "a\\u0000"}'],
+        "2: view: expected a text without null",
+    ),
     "last step with an action": ([HEADER, STEP], "2: action: expected none on the last step"),
     "missing action": ([HEADER, LAST, LAST], "2: action: expected one"),
-    "action of another type": ([HEADER, '{"view": "a", "action": 3}', LAST], "2: action: expected a name"),
-    "action without a name": ([HEADER, '{"view": "a", "action": {"kind": "travel"}}', LAST], "2: action.name: expected a text"),
-    "unknown kind": ([HEADER, '{"view": "a", "action": {"name": "j", "kind": "jump"}}', LAST], "2: action.kind: expected"),
-    "unknown turn": ([HEADER, '{"view": "a", "action": {"name": "u", "kind": "turn", "turn": "up"}}', LAST], "2: action.turn: expected"),
-    "turn without a side": ([HEADER, '{"view": "a", "action": {"name": "u", "kind": "turn"}}', LAST], "2: action.turn: expected"),
+    "action of another type": (
+        [HEADER, '{"view": "a", "action": 3}', LAST],
+        "2: action: expected a name",
+    ),
+    "action without a name": (
+        [HEADER, '{"view": "a", "action": {"kind": "travel"}}', LAST],
+        "2: action.name: expected a text",
+    ),
+    "unknown kind": (
+        [HEADER, '{"view": "a", "action": {"name": "j", "kind": "jump"}}', LAST],
+        "2: action.kind: expected",
+    ),
+    "unknown turn": (
+        [HEADER, '{"view": "a", "action": {"name": "u", "kind": "turn", "turn": "up"}}', LAST],
+        "2: action.turn: expected",
+    ),
+    "turn without a side": (
+        [HEADER, '{"view": "a", "action": {"name": "u", "kind": "turn"}}', LAST],
+        "2: action.turn: expected",
+    ),
     "travel with a turn": (
         [HEADER, '{"view": "a", "action": {"name": "u", "kind": "travel", "turn": "left"}}', LAST],
         "2: action.kind: expected",
     ),
     "one name, two kinds": (
-        [HEADER, '{"view": "a", "action": {"name": "go", "kind": "travel"}}', '{"view": "a", "action": "go"}', LAST],
+        [
+            HEADER,
+            '{"view": "a", "action": {"name": "go", "kind": "travel"}}',
+            '{"view": "a", "action": "go"}',
+            LAST,
+        ],
         "3: action: 'go' has kind None",
     ),
-    "star of texts": ([HEADER, '{"view": "a", "star": ["n"]}'], "2: star[0]: expected a finite number"),
-    "star with equal bearings": ([HEADER, '{"view": "a", "star": [10, 370]}'], "2: star: expected four 0/1"),
+    "star of texts": (
+        [HEADER, '{"view": "a", "star": ["n"]}'],
+        "2: star[0]: expected a finite number",
+    ),
+    "star with equal bearings": (
+        [HEADER, '{"view": "a", "star": [10, 370]}'],
+        "2: star: expected four 0/1",
+    ),
     "displacement in millimetres": (
         [HEADER, '{"view": "a", "displacement": [5000, 0, 0]}'],
         "2: displacement: expected metres, at most 1,000",
     ),
-    "displacement in degrees": ([HEADER, '{"view": "a", "displacement": [5, 0, 90]}'], "2: displacement[2]: expected radians"),
+    "displacement in degrees": (
+        [HEADER, '{"view": "a", "displacement": [5, 0, 90]}'],
+        "2: displacement[2]: expected radians",
+    ),
     "covariance without displacement": (
         [HEADER, '{"view": "a", "covariance": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}'],
         "2: covariance: expected a displacement",
     ),
     "covariance not positive": (
-        [HEADER, '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 2, 0], [2, 1, 0], [0, 0, 1]]}'],
+        [
+            HEADER,
+            '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 2, 0], [2, 1, 0], [0, 0, 1]]}',
+        ],
         "2: covariance: expected a positive definite matrix",
     ),
     "covariance not symmetric": (
-        [HEADER, '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}'],
+        [
+            HEADER,
+            '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}',
+        ],
         "2: covariance: expected a symmetric matrix",
     ),
     "covariance of two rows": (
@@ -134,26 +217,47 @@ BAD: dict[str, tuple[list[str], str]] = {
         "2: covariance: expected three rows",
     ),
     "covariance with a text": (
-        [HEADER, '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 0, 0], [0, "x", 0], [0, 0, 1]]}'],
+        [
+            HEADER,
+            '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 0, 0], [0, "x", 0], [0, 0, 1]]}',
+        ],
         "2: covariance[1][1]: expected a finite number",
     ),
-    "odometry no object": (['{"format": "ssh-trace", "version": 1, "odometry": 3}'], "1: odometry: expected an object"),
+    "odometry no object": (
+        ['{"format": "ssh-trace", "version": 1, "odometry": 3}'],
+        "1: odometry: expected an object",
+    ),
     "odometry negative": (
         ['{"format": "ssh-trace", "version": 1, "odometry": {"along": -1}}'],
         "1: odometry.along: expected a number from 0",
     ),
-    "displacement of two": ([HEADER, '{"view": "a", "displacement": [1, 2]}'], "2: displacement: expected [dx, dy, dtheta]"),
+    "displacement of two": (
+        [HEADER, '{"view": "a", "displacement": [1, 2]}'],
+        "2: displacement: expected [dx, dy, dtheta]",
+    ),
     "negative index": ([HEADER, '{"image": -1}'], "2: image: expected an index"),
-    "broken JSON": ([HEADER, STEP, '{"view": "b"'], "3: line: expected one JSON object, got broken JSON at column 13"),
-    "two objects on a line": ([HEADER, LAST + LAST], "2: line: expected one JSON object, got broken JSON"),
-    "a field twice": ([HEADER, '{"view": "a", "view": "b"}'], "2: line: expected one JSON object, got the field 'view' twice"),
+    "broken JSON": (
+        [HEADER, STEP, '{"view": "b"'],
+        "3: line: expected one JSON object, got broken JSON at column 13",
+    ),
+    "two objects on a line": (
+        [HEADER, LAST + LAST],
+        "2: line: expected one JSON object, got broken JSON",
+    ),
+    "a field twice": (
+        [HEADER, '{"view": "a", "view": "b"}'],
+        "2: line: expected one JSON object, got the field 'view' twice",
+    ),
     "empty line inside": ([HEADER, STEP, "", LAST], "3: line: expected a step, got an empty line"),
     "a number on a line": ([HEADER, "5"], "2: line: expected a JSON object in braces, got 5"),
     "NaN in the truth": (
         [HEADER, '{"view": "a", "truth": {"pose": [1, [2, -Infinity]]}}'],
         "2: truth.pose[1][1]: expected a finite number, got -Inf",
     ),
-    "half a character": ([HEADER, '{"view": "a\\ud800"}'], "2: line: expected text, got half a character, \\ud800"),
+    "half a character": (
+        [HEADER, '{"view": "a\\ud800"}'],
+        "2: line: expected text, got half a character, \\ud800",
+    ),
     "nested too deeply": (
         [HEADER, '{"view": "a", "x": ' + "[" * 10**5 + "]" * 10**5 + "}"],
         "2: line: expected one JSON object, got one nested",
@@ -176,7 +280,10 @@ def test_bad_files_say_file_line_field_and_how_to_mend_it(case: str, tmp_path: P
 
 def test_broken_json_in_line_4711(tmp_path: Path) -> None:
     path = written(tmp_path, HEADER, *[STEP] * 4709, '{"view": "a", "action": travel}', LAST)
-    with pytest.raises(TraceError, match=r"trace\.jsonl:4711: line: expected one JSON object, got broken JSON at column 25"):
+    with pytest.raises(
+        TraceError,
+        match=r"trace\.jsonl:4711: line: expected one JSON object, got broken JSON at column 25",
+    ):
         Trace.load(path)
 
 
@@ -199,7 +306,9 @@ def test_a_folder_and_a_missing_file(tmp_path: Path) -> None:
         Trace.load(tmp_path / "nothing")
 
 
-def test_a_line_without_end_is_not_read_into_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_without_end_is_not_read_into_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A sparse file of 1 GB stands for a line of that length."""
     path = tmp_path / "t"
     with path.open("wb") as file:
@@ -251,7 +360,9 @@ def test_a_prefix_ends_without_an_action() -> None:
 
 
 @settings(max_examples=150)
-@given(st.binary(max_size=200) | st.text(max_size=200).map(lambda text: f"{HEADER}\n{text}".encode()))
+@given(
+    st.binary(max_size=200) | st.text(max_size=200).map(lambda text: f"{HEADER}\n{text}".encode())
+)
 def test_any_file_is_a_trace_or_a_clear_error(data: bytes) -> None:
     import tempfile
 
@@ -276,7 +387,14 @@ def test_traces_can_be_keys() -> None:
 
 @pytest.mark.parametrize(
     ("name", "kind", "turn"),
-    [("spin", "turn", None), ("x", "hop", None), ("x", "travel", "right"), (5, "travel", None), ("", None, None), ("x", None, "left")],
+    [
+        ("spin", "turn", None),
+        ("x", "hop", None),
+        ("x", "travel", "right"),
+        (5, "travel", None),
+        ("", None, None),
+        ("x", None, "left"),
+    ],
 )
 def test_actions_that_make_no_sense(name: str, kind: str, turn: str) -> None:
     with pytest.raises(TraceError, match=r"^action\.(name|kind|turn): expected"):
@@ -326,9 +444,13 @@ def test_displacements_and_odometry_survive_a_round_trip(tmp_path: Path) -> None
 
 def test_covariance_follows_the_way_of_a_step() -> None:
     odometry = Odometry(along=0.1, across=0.01, heading=0.01, turning=0.1, position=0.0, angle=0.0)
-    (xx, xy, _), (_, yy, _), (_, _, heading) = odometry.covariance((0.0, 10.0, math.pi / 2))  # to the left
+    (xx, xy, _), (_, yy, _), (_, _, heading) = odometry.covariance(
+        (0.0, 10.0, math.pi / 2)
+    )  # to the left
     assert (xx, xy, yy) == pytest.approx((0.01, 0.0, 1.0), abs=1e-5)
     assert heading == pytest.approx(0.01 + (0.1 * math.pi / 2) ** 2, abs=1e-5)
-    (xx, xy, _), _, _ = odometry.covariance((6.0, 8.0, 0.0))  # along and across are turned to the way
+    (xx, xy, _), _, _ = odometry.covariance(
+        (6.0, 8.0, 0.0)
+    )  # along and across are turned to the way
     assert xx == pytest.approx(0.6**2 * 1.0 + 0.8**2 * 0.01, abs=1e-5)
     assert xy == pytest.approx((1.0 - 0.01) * 0.6 * 0.8, abs=1e-5)

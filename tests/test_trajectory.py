@@ -31,14 +31,29 @@ def tum(shift: float = 0.0) -> str:
     for i in range(2 * 20 * 4 + 1):
         leg, share = divmod(i / 40, 1)
         ends = STOPS[int(leg)], STOPS[min(int(leg) + 1, 4)]
-        text += line(TIMES[0] + i / 2 + shift, ends[0] + share * (ends[1] - ends[0]), 0, 0.0 if leg < 2 else math.pi)
+        text += line(
+            TIMES[0] + i / 2 + shift,
+            ends[0] + share * (ends[1] - ends[0]),
+            0,
+            0.0 if leg < 2 else math.pi,
+        )
     return text
 
 
-def trace_at(times: tuple[float | None, ...] = TIMES, seen: tuple[float, float, float] | None = None) -> Trace:
-    extra = [({} if time is None else {"time": time}) | ({} if seen is None else {"seen": list(seen)}) for time in times]
+def trace_at(
+    times: tuple[float | None, ...] = TIMES, seen: tuple[float, float, float] | None = None
+) -> Trace:
+    extra = [
+        ({} if time is None else {"time": time}) | ({} if seen is None else {"seen": list(seen)})
+        for time in times
+    ]
     go = Action("go", "travel")
-    return Trace(tuple(Step(view="v", action=go if t < len(times) - 1 else None, extra=e) for t, e in enumerate(extra)))
+    return Trace(
+        tuple(
+            Step(view="v", action=go if t < len(times) - 1 else None, extra=e)
+            for t, e in enumerate(extra)
+        )
+    )
 
 
 def there_and_back() -> SSHMap:
@@ -54,7 +69,16 @@ def evaluated(folder: Path, text: str, trace: Trace, *options: str) -> int:
     (folder / "true.tum").write_text(text)
     trace.save(folder / "trace.jsonl")
     there_and_back().save(folder / "map.json")
-    return main(["evaluate", str(folder / "map.json"), str(folder / "trace.jsonl"), "--truth", str(folder / "true.tum"), *options])
+    return main(
+        [
+            "evaluate",
+            str(folder / "map.json"),
+            str(folder / "trace.jsonl"),
+            "--truth",
+            str(folder / "true.tum"),
+            *options,
+        ]
+    )
 
 
 @pytest.mark.parametrize(
@@ -77,27 +101,44 @@ def evaluated(folder: Path, text: str, trace: Trace, *options: str) -> int:
 def test_each_form_of_the_format_is_read(form: Callable[[str], str], tmp_path: Path) -> None:
     poses = told_poses(read(tmp_path, form(tum())).told_to(trace_at()))
     assert [pose and pose[:2] for pose in poses] == [pytest.approx((x, 0), abs=1e-9) for x in STOPS]
-    assert [pose and abs(pose[2]) for pose in poses] == pytest.approx([0, 0, math.pi, math.pi, math.pi])
+    assert [pose and abs(pose[2]) for pose in poses] == pytest.approx(
+        [0, 0, math.pi, math.pi, math.pi]
+    )
 
 
-def test_the_command_judges_by_the_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_judges_by_the_trajectory(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert evaluated(tmp_path, tum(), trace_at(), "--json") == 0
     printed = capsys.readouterr()
     found = json.loads(printed.out)["poses"]
     assert printed.err == ""
     assert (found["places"]["judged"], found["places"]["returns"]) == (10, 2)
     assert (found["maps"][0]["places"]["precision"], found["maps"][0]["places"]["recall"]) == (1, 1)
-    by_python = evaluate_visits([there_and_back()], Trajectory.load(tmp_path / "true.tum").told_to(trace_at()))
+    by_python = evaluate_visits(
+        [there_and_back()], Trajectory.load(tmp_path / "true.tum").told_to(trace_at())
+    )
     assert json.loads(json.dumps(by_python.to_dict())) == found
 
 
 def test_a_pose_is_where_the_dstate_is_and_other_truth_stays(tmp_path: Path) -> None:
     trajectory = read(tmp_path, line(0, 1, 2, math.pi / 2) + line(1, 1, 4, math.pi / 2))
     told = trajectory.told_to(trace_at((0.5, 0.0), (2.0, 0.5, 0.25)))
-    assert told_poses(told) == [pytest.approx((0.5, 5.0, math.pi / 2 + 0.25)), pytest.approx((0.5, 4.0, math.pi / 2 + 0.25))]
+    assert told_poses(told) == [
+        pytest.approx((0.5, 5.0, math.pi / 2 + 0.25)),
+        pytest.approx((0.5, 4.0, math.pi / 2 + 0.25)),
+    ]
     named = Trace((Step(view="v", truth={"place": "A", "pose": [9, 9, 9]}, extra={"time": 0.0}),))
-    assert trajectory.told_to(named).steps[0].truth == {"place": "A", "pose": [1.0, 2.0, pytest.approx(math.pi / 2)]}
-    assert trajectory.told_to(Trace((Step(view="v", truth="x0", extra={"time": 0.0}),))).steps[0].truth["dstate"] == "x0"
+    assert trajectory.told_to(named).steps[0].truth == {
+        "place": "A",
+        "pose": [1.0, 2.0, pytest.approx(math.pi / 2)],
+    }
+    assert (
+        trajectory.told_to(Trace((Step(view="v", truth="x0", extra={"time": 0.0}),)))
+        .steps[0]
+        .truth["dstate"]
+        == "x0"
+    )
 
 
 @pytest.mark.parametrize(
@@ -113,8 +154,12 @@ def test_a_pose_is_where_the_dstate_is_and_other_truth_stays(tmp_path: Path) -> 
         (9.6, None),
     ],
 )
-def test_between_two_poses_the_robot_is_on_the_way(time: float, pose: tuple[float, float, float] | None) -> None:
-    at = Trajectory([(0.0, (0.0, 0.0, 3.0)), (0.5, (1.0, 0.0, -3.0)), (9.0, (7.0, 0.0, 0.0))]).at(time)
+def test_between_two_poses_the_robot_is_on_the_way(
+    time: float, pose: tuple[float, float, float] | None
+) -> None:
+    at = Trajectory([(0.0, (0.0, 0.0, 3.0)), (0.5, (1.0, 0.0, -3.0)), (9.0, (7.0, 0.0, 0.0))]).at(
+        time
+    )
     assert at == pose if pose is None else at is not None and at[:2] == pytest.approx(pose[:2])
     assert pose is None or at is None or math.cos(at[2] - pose[2]) == pytest.approx(1)
 
@@ -140,7 +185,11 @@ def test_between_two_poses_the_robot_is_on_the_way(time: float, pose: tuple[floa
     ],
 )  # fmt: skip
 def test_a_trajectory_that_does_not_fit_is_no_silent_nothing(
-    text: str, times: tuple[float | None, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    text: str,
+    times: tuple[float | None, ...],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     with pytest.raises(TraceError, match=message):
         read(tmp_path, text).told_to(trace_at(times))
@@ -156,7 +205,9 @@ def test_no_text_is_no_trajectory(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("default")
-def test_steps_without_truth_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_steps_without_truth_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert evaluated(tmp_path, tum(), trace_at((*TIMES[:3], 5.0, None))) == 0
     printed = capsys.readouterr()
     assert "2 of 5 steps have no pose within 0.5 s of their time, and no truth" in printed.err
@@ -164,20 +215,27 @@ def test_steps_without_truth_are_counted(tmp_path: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.filterwarnings("default")
-def test_where_nothing_is_judged_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_where_nothing_is_judged_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert evaluated(tmp_path, tum(), trace_at((TIMES[0], None, None, None, None))) == 0
     assert (
         "judged by poses: expected pairs of visits to judge, got none: the trace has 5 visits; of 10 pairs poses do not tell"
         in capsys.readouterr().err
     )
     assert evaluated(tmp_path, tum(), trace_at((1000.0, 1000.5, 1001.0, 1001.5, 1002.0))) == 0
-    assert "of 10 pairs within 2 m the robot was at no visit farther away in between" in capsys.readouterr().err
+    assert (
+        "of 10 pairs within 2 m the robot was at no visit farther away in between"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "".join(f"{t} {t} 0 0 -0.5 0.5 -0.5 0.5\n" for t in range(9)),  # of a camera: its z axis looks ahead
+        "".join(
+            f"{t} {t} 0 0 -0.5 0.5 -0.5 0.5\n" for t in range(9)
+        ),  # of a camera: its z axis looks ahead
         "".join(f"{t} 0 0 {t} 0 0 0 1\n" for t in range(9)),
     ],
 )
@@ -186,14 +244,26 @@ def test_a_way_that_is_on_no_floor_is_noticed(text: str, tmp_path: Path) -> None
         read(tmp_path, text)
 
 
-def test_a_trajectory_is_no_file_of_relations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_trajectory_is_no_file_of_relations(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Both have eight numbers a line. Read as relations, a trajectory judged no pair and said nothing."""
     for text in (tum(), line(1000, 0), HEAD + "5 2 3 4 0 0 0 1\n"):
         (tmp_path / "relations").write_text(text)
         trace_at().save(tmp_path / "trace.jsonl")
         there_and_back().save(tmp_path / "map.json")
         assert (
-            main(["evaluate", *(str(tmp_path / name) for name in ("map.json", "trace.jsonl")), "--relations", str(tmp_path / "relations")])
+            main(
+                [
+                    "evaluate",
+                    *(str(tmp_path / name) for name in ("map.json", "trace.jsonl")),
+                    "--relations",
+                    str(tmp_path / "relations"),
+                ]
+            )
             == 1
         )
-        assert "got a trajectory: each line ends in a quaternion; give it as the truth of the steps (--truth)" in capsys.readouterr().err
+        assert (
+            "got a trajectory: each line ends in a quaternion; give it as the truth of the steps (--truth)"
+            in capsys.readouterr().err
+        )

@@ -35,12 +35,18 @@ def test_a_maze_has_the_displacements_of_its_cells() -> None:
     start = (CELL * cells[0][0], CELL * cells[0][1], math.pi / 2 * (1 - cells[0][2]))
     for (x, y, heading), pose in zip(cells, reckoned(walk.trace, start), strict=True):
         assert pose[:2] == pytest.approx((CELL * x, CELL * y), abs=0.2)
-        assert math.remainder(pose[2] - math.pi / 2 * (1 - heading), math.tau) == pytest.approx(0, abs=0.02)
+        assert math.remainder(pose[2] - math.pi / 2 * (1 - heading), math.tau) == pytest.approx(
+            0, abs=0.02
+        )
     assert walk.trace.without_displacements() == maze(4, 4, steps=40, seed=3).trace
 
 
 def test_the_noise_of_a_maze_is_along_the_way() -> None:
-    ways = [step.displacement for seed in range(20) for step in maze(4, 4, steps=60, seed=seed, odometry=NOISE, scale=0.1).trace.steps[1:]]
+    ways = [
+        step.displacement
+        for seed in range(20)
+        for step in maze(4, 4, steps=60, seed=seed, odometry=NOISE, scale=0.1).trace.steps[1:]
+    ]
     travels = np.array([way for way in ways if way and abs(way[0]) > 1])
     assert travels[:, 0].mean() == pytest.approx(11.0, abs=0.1)
     assert travels[:, 0].std() == pytest.approx(0.05 * 11, rel=0.15)
@@ -53,15 +59,25 @@ def test_the_route_of_aces3_has_the_displacements_of_its_layout() -> None:
     poses = reckoned(known.trace, (*truth.ACES3["N"], 0.0))
     for place, pose in zip(known.places, poses, strict=True):
         assert pose[:2] == pytest.approx(truth.ACES3[str(place)], abs=0.2)
-    assert [round(math.hypot(*step.displacement[:2]), 1) for step in known.trace.steps[1:3] if step.displacement] == [23.5, 0.0]
+    assert [
+        round(math.hypot(*step.displacement[:2]), 1)
+        for step in known.trace.steps[1:3]
+        if step.displacement
+    ] == [23.5, 0.0]
 
 
 def test_a_map_is_true_if_its_dstates_and_its_places_are() -> None:
     (known,) = truth.mazes(2, 20, [1], truth.Noise(NOISE))
-    ssh_map = next(ssh_map for ssh_map in solve(known.trace, Theory.topological()).maps if truth.is_true(ssh_map, known))
+    ssh_map = next(
+        ssh_map
+        for ssh_map in solve(known.trace, Theory.topological()).maps
+        if truth.is_true(ssh_map, known)
+    )
     for (i, a), (j, b) in combinations(enumerate(ssh_map.labels), 2):
         assert (a == b) == (known.dstates[i] == known.dstates[j])
-        assert (ssh_map.dstates[a].place == ssh_map.dstates[b].place) == (known.places[i] == known.places[j])
+        assert (ssh_map.dstates[a].place == ssh_map.dstates[b].place) == (
+            known.places[i] == known.places[j]
+        )
     renamed = replace(known, dstates=tuple(f"here {name}" for name in known.dstates))
     assert truth.is_true(ssh_map, renamed)
     assert not truth.is_true(ssh_map, replace(known, dstates=("elsewhere", *known.dstates[1:])))
@@ -71,7 +87,9 @@ def test_a_map_is_true_if_its_dstates_and_its_places_are() -> None:
 def test_the_table_says_which_maps_are_true(capsys: pytest.CaptureFixture[str]) -> None:
     """On the route of ACES3 views and openings alone are explained by 19 dstates, of which no map is true."""
     options = truth.arguments().parse_args(["--family", "aces3", "--seeds", "1", "--stars"])
-    said = truth.report(truth.chosen(options), Theory.topological().replace(displacement="none"), 30)
+    said = truth.report(
+        truth.chosen(options), Theory.topological().replace(displacement="none"), 30
+    )
     assert said.startswith("all minimal maps are true: 0 of 1; median ")
     assert "| ACES3, 0 | 23 | 22, 9 | optimal | 19, 10, 4 | 0 of 4 |" in capsys.readouterr().out
     said = truth.report(truth.chosen(options), Theory.topological(), 30)
@@ -86,5 +104,11 @@ def test_what_is_refused_of_true_maps_is_counted() -> None:
     assert reject.true_map(white).labels == reject.true_map(repeating).labels
     assert not reject.is_refused(white, 0.001)
     assert not reject.is_refused(repeating, 0.001)
-    wrong = replace(white.trace, steps=tuple(replace(step, displacement=step.displacement and (9.0, 0.0, 0.1)) for step in white.trace))
+    wrong = replace(
+        white.trace,
+        steps=tuple(
+            replace(step, displacement=step.displacement and (9.0, 0.0, 0.1))
+            for step in white.trace
+        ),
+    )
     assert reject.is_refused(replace(white, trace=wrong), 0.001)

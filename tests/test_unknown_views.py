@@ -36,7 +36,9 @@ def hidden(trace: Trace, steps: set[int]) -> Trace:
 @given(st.data())
 def test_solver_and_checker_agree_with_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=6), label="trace")
-    steps = data.draw(st.sets(st.integers(0, len(trace) - 1), min_size=1, max_size=3), label="hidden")
+    steps = data.draw(
+        st.sets(st.integers(0, len(trace) - 1), min_size=1, max_size=3), label="hidden"
+    )
     agree(hidden(trace, steps), data.draw(theories(trace), label="theory"))
 
 
@@ -44,17 +46,29 @@ def test_solver_and_checker_agree_with_the_brute_force(data: st.DataObject) -> N
 @given(st.data())
 def test_to_hide_a_view_never_costs_anything(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
-    choices = data.draw(st.sampled_from([{}, {"misread": 1.5}, {"slipped": 1.0}, {"misread": 0.5, "slipped": 2.0}]), label="faults")
-    theory = data.draw(st.sampled_from([Theory.causal(), Theory.topological()]), label="theory").replace(**choices)
+    choices = data.draw(
+        st.sampled_from([{}, {"misread": 1.5}, {"slipped": 1.0}, {"misread": 0.5, "slipped": 2.0}]),
+        label="faults",
+    )
+    theory = data.draw(
+        st.sampled_from([Theory.causal(), Theory.topological()]), label="theory"
+    ).replace(**choices)
     steps = data.draw(st.sets(st.integers(0, len(trace) - 1), min_size=1), label="hidden")
     before, unknown = solve(trace, theory, time_limit=LIMIT), hidden(trace, steps)
     after = solve(unknown, theory, time_limit=LIMIT)
     for ssh_map in after.maps:
         assert check(unknown, ssh_map, theory) == ()
-        assert not any(fault.kind == "misread" and unknown.views[fault.step] is None for fault in ssh_map.faults)
+        assert not any(
+            fault.kind == "misread" and unknown.views[fault.step] is None
+            for fault in ssh_map.faults
+        )
     if before.cost:
         assert after.cost
-        costs = [solution.cost.faults + solution.cost.dstates for solution in (before, after) if solution.cost]
+        costs = [
+            solution.cost.faults + solution.cost.dstates
+            for solution in (before, after)
+            if solution.cost
+        ]
         assert costs[1] <= costs[0]
 
 
@@ -62,11 +76,15 @@ def test_an_unknown_step_does_not_make_two_views_one() -> None:
     """The step between could be at either dstate, but not at both."""
     trace = Trace.from_steps(["a", None, "b"], ["stay", "stay"])
     found = solve(trace, Theory.causal(), max_maps=None)
-    assert {m.labels for m in found.maps} == {(0, 0, 1), (0, 1, 1)} - {(0, 0, 1)}  # after the first, the same action would lead to b
+    assert {m.labels for m in found.maps} == {(0, 0, 1), (0, 1, 1)} - {
+        (0, 0, 1)
+    }  # after the first, the same action would lead to b
     assert [s.view for s in found.maps[0].dstates] == ["a", "b"]
 
 
-def test_a_dstate_that_was_never_seen_has_no_view(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dstate_that_was_never_seen_has_no_view(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trace = Trace.from_steps([None if t == 2 else view for t, view in enumerate(CORRIDOR)], DRIVEN)
     (ssh_map,) = solve(trace, Theory.topological(), max_maps=None).maps
     assert [s.view for s in ssh_map.dstates] == ["end", "hall", None, "end", "hall", "end"]
@@ -86,25 +104,33 @@ def test_a_dstate_that_was_never_seen_has_no_view(tmp_path: Path, capsys: pytest
         assert main([words[0], str(tmp_path / "maps.json"), *words[1:]]) == 0
         assert "None" not in capsys.readouterr().out
     assert main(["check", str(tmp_path / "trace.jsonl"), str(tmp_path / "maps.json")]) == 0
-    assert main(["check", "--bound", str(tmp_path / "trace.jsonl"), str(tmp_path / "maps.json")]) == 1
+    assert (
+        main(["check", "--bound", str(tmp_path / "trace.jsonl"), str(tmp_path / "maps.json")]) == 1
+    )
     assert "expected a trace whose views are all known" in capsys.readouterr().err
 
 
 def test_a_null_is_unknown_and_a_missing_field_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "trace.jsonl"
-    path.write_text(HEAD + '{"view": "a", "action": "go"}\n{"view": null, "action": "go"}\n{"view": "null"}\n')
+    path.write_text(
+        HEAD + '{"view": "a", "action": "go"}\n{"view": null, "action": "go"}\n{"view": "null"}\n'
+    )
     trace = Trace.load(path)
     assert trace.views == ("a", None, "null")
     trace.save(path)
     assert Trace.load(path).steps == trace.steps
     path.write_text(HEAD + '{"view": "a", "action": "go"}\n{"vew": "b"}\n')
-    with pytest.raises(TraceError, match=r"3: view: expected a text .* or null where that was not logged"):
+    with pytest.raises(
+        TraceError, match=r"3: view: expected a text .* or null where that was not logged"
+    ):
         Trace.load(path)
     with pytest.raises(TraceError, match="view: expected one, got only an image; cluster"):
         solve(Trace.from_steps([None, None], ["go"]))
 
 
-@pytest.mark.parametrize("theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()])
+@pytest.mark.parametrize(
+    "theory", [Theory.causal(), Theory.topological(), Theory.circumscriptive()]
+)
 def test_there_is_a_map_when_the_time_is_over(theory: Theory) -> None:
     trace = drive(*TOURS["comb"])
     trace = hidden(trace, set(range(1, len(trace), 3)))
@@ -115,7 +141,16 @@ def test_there_is_a_map_when_the_time_is_over(theory: Theory) -> None:
 
 def test_no_speedup_that_reads_views_is_on() -> None:
     theory = Theory.topological().resolve(Trace.from_steps(["a", None], ["travel"]))
-    kept = {"path_names", "sides", "lazy", "core_guided", "threads", "processes", "annealed", "greedy"}
+    kept = {
+        "path_names",
+        "sides",
+        "lazy",
+        "core_guided",
+        "threads",
+        "processes",
+        "annealed",
+        "greedy",
+    }
     assert {row.name for row in TABLE if row.holds_for(theory)} <= kept
 
 
@@ -133,7 +168,10 @@ def test_rivals_are_not_told_apart_by_what_was_never_seen() -> None:
     assert json.loads(json.dumps(compare(solution).to_dict()))
     plan = next_experiment(solution, trace).to_dict()["plan"]
     assert {expected["how"] for expected in plan["untried"]["expects"]} == {"link", "open"}
-    assert all((expected["view"] is None) == (expected["how"] == "open") for expected in plan["untried"]["expects"])
+    assert all(
+        (expected["view"] is None) == (expected["how"] == "open")
+        for expected in plan["untried"]["expects"]
+    )
 
 
 def test_no_proof_rests_on_what_was_never_seen() -> None:

@@ -15,7 +15,17 @@ from worlds import TOURS, drive, rectangle
 import ssh_abduction
 from simulator.errors import SimulatorError
 from simulator.world import World
-from ssh_abduction import AbductionError, Localiser, OnlineMapper, Solution, SSHMap, Theory, Trace, evaluate, solve
+from ssh_abduction import (
+    AbductionError,
+    Localiser,
+    OnlineMapper,
+    Solution,
+    SSHMap,
+    Theory,
+    Trace,
+    evaluate,
+    solve,
+)
 from ssh_abduction.data import MapError, RangeError, TraceError, maps
 from ssh_abduction.learning.labels import LearnerError
 from ssh_abduction.solver import Certificate, Search, Status
@@ -31,7 +41,9 @@ LONG = 120  # characters of a repr, at most
 
 
 def misread() -> tuple[Trace, Solution]:
-    trace = Trace.from_steps([f"v{t % 4}" if t != 9 else "v0" for t in range(25)], ["right", "travel"] * 12)
+    trace = Trace.from_steps(
+        [f"v{t % 4}" if t != 9 else "v0" for t in range(25)], ["right", "travel"] * 12
+    )
     return trace, solve(trace, Theory.causal().replace(misread=1.5))
 
 
@@ -44,22 +56,35 @@ def online() -> tuple[Trace, Solution]:
 
 
 def in_metres() -> tuple[Trace, Solution]:
-    trace = Trace.from_steps("cwcwcwcwc", ["travel", "left"] * 4, displacements=[(10, 0, 0), (0, 0, 1.5708)] * 4)
+    trace = Trace.from_steps(
+        "cwcwcwcwc", ["travel", "left"] * 4, displacements=[(10, 0, 0), (0, 0, 1.5708)] * 4
+    )
     return trace, solve(trace, Theory.causal())
 
 
 def noisy() -> Trace:
     circuits = rectangle(40)
-    return circuits.with_views([view if t != 33 else "v0" for t, view in enumerate(map(str, circuits.views))])
+    return circuits.with_views(
+        [view if t != 33 else "v0" for t, view in enumerate(map(str, circuits.views))]
+    )
 
 
 SOLVED: dict[str, Callable[[], tuple[Trace, Solution]]] = {
     "several maps": lambda: (ACES, SOLUTION),
     "one map": lambda: (RECTANGLE, solve(RECTANGLE)),
     "cut off": lambda: (ACES, solve(ACES, max_maps=2)),
-    "levels": lambda: (ACES, solve(ACES, within=3, max_maps=None, prefer=("dstates", "places", "paths"))),
-    "levels cut off": lambda: (ACES, solve(ACES, within=3, max_maps=9, prefer=("dstates", "places", "paths"))),
-    "stars": lambda: ((trace := drive(*TOURS["comb"], stars=True)), solve(trace, Theory.circumscriptive())),
+    "levels": lambda: (
+        ACES,
+        solve(ACES, within=3, max_maps=None, prefer=("dstates", "places", "paths")),
+    ),
+    "levels cut off": lambda: (
+        ACES,
+        solve(ACES, within=3, max_maps=9, prefer=("dstates", "places", "paths")),
+    ),
+    "stars": lambda: (
+        (trace := drive(*TOURS["comb"], stars=True)),
+        solve(trace, Theory.circumscriptive()),
+    ),
     "poses": in_metres,
     "faults": misread,
     "online": online,
@@ -83,14 +108,29 @@ def test_reprs_are_short() -> None:
     assert repr(Theory.topological()) == "Theory()"
     assert repr(Speedups.without("threads")) == "Speedups(threads=False)"
     assert repr(RECTANGLE[0]) == "Step(view='v0', action='right')"
-    assert repr(solve(misread()[0], Theory.causal(), time_limit=1e-9)) == "<Solution feasible (time limit): 13 dstates; dstates ≥ 13>"
+    assert (
+        repr(solve(misread()[0], Theory.causal(), time_limit=1e-9))
+        == "<Solution feasible (time limit): 13 dstates; dstates ≥ 13>"
+    )
 
 
 @pytest.mark.parametrize("kind", SOLVED)
 def test_no_repr_is_long(kind: str) -> None:
     trace, solution = SOLVED[kind]()
-    values = [trace, trace[0], solution, *solution, solution.backbone, solution.bound, solution.cost, solution.certificate]
-    values += [Search(trace, solution.theory), evaluate(solution.maps, ACES) if trace is ACES and len(solution) else None]
+    values = [
+        trace,
+        trace[0],
+        solution,
+        *solution,
+        solution.backbone,
+        solution.bound,
+        solution.cost,
+        solution.certificate,
+    ]
+    values += [
+        Search(trace, solution.theory),
+        evaluate(solution.maps, ACES) if trace is ACES and len(solution) else None,
+    ]
     values += [solution.backbone.dstates] if solution.backbone else []
     for value in values:
         assert len(repr(value)) <= LONG, value
@@ -111,7 +151,9 @@ def test_a_solution_is_a_sequence_of_its_maps() -> None:
     assert SOLUTION[1:3] == SOLUTION.maps[1:3]
     assert list(reversed(SOLUTION)) == list(SOLUTION.maps[::-1])  # type: ignore[call-overload]
     assert SOLUTION[2] in SOLUTION
-    with pytest.raises(RangeError, match=r"^maps: expected 0 to 3, or -4 to -1 from the end, got 4$"):
+    with pytest.raises(
+        RangeError, match=r"^maps: expected 0 to 3, or -4 to -1 from the end, got 4$"
+    ):
         SOLUTION[4]
     none = solve(IMPOSSIBLE)
     assert (len(none), list(none), bool(none)) == (0, [], True)
@@ -127,7 +169,12 @@ def test_traces_are_sliced() -> None:
     for start, stop in ((0, 5), (4, 9), (22, 23), (-5, None), (3, -2)):
         part = ACES[start:stop]
         assert part.views == ACES.views[start:stop]
-        assert part.actions == ACES.actions[slice(start, stop).indices(23)[0] : slice(start, stop).indices(23)[1] - 1]
+        assert (
+            part.actions
+            == ACES.actions[
+                slice(start, stop).indices(23)[0] : slice(start, stop).indices(23)[1] - 1
+            ]
+        )
         assert part.name == ACES.name
     assert solve(RECTANGLE[8:200]).cost == solve(RECTANGLE).cost
 
@@ -135,13 +182,21 @@ def test_traces_are_sliced() -> None:
 def test_a_slice_of_a_trace_has_no_displacement_that_led_to_it() -> None:
     trace = in_metres()[0]
     part = trace[3:6]
-    assert [step.displacement for step in part] == [None, trace[4].displacement, trace[5].displacement]
-    assert [step.displacement for step in trace[:3]] == [step.displacement for step in trace.steps[:3]]
+    assert [step.displacement for step in part] == [
+        None,
+        trace[4].displacement,
+        trace[5].displacement,
+    ]
+    assert [step.displacement for step in trace[:3]] == [
+        step.displacement for step in trace.steps[:3]
+    ]
 
 
 @pytest.mark.parametrize("index", [23, -24, 10**30])
 def test_a_step_that_there_is_not_names_the_range(index: int) -> None:
-    with pytest.raises(RangeError, match=r"^steps: expected 0 to 22, or -23 to -1 from the end, got "):
+    with pytest.raises(
+        RangeError, match=r"^steps: expected 0 to 22, or -23 to -1 from the end, got "
+    ):
         ACES[index]
 
 
@@ -157,13 +212,18 @@ def test_a_step_that_there_is_not_names_the_range(index: int) -> None:
         (True, TypeError, "whole number"),
     ],
 )
-def test_a_slice_that_is_no_trace_is_an_error(wrong: Any, error: type[Exception], said: str) -> None:
+def test_a_slice_that_is_no_trace_is_an_error(
+    wrong: Any, error: type[Exception], said: str
+) -> None:
     with pytest.raises(error, match=said):
         ACES[wrong]
 
 
 def test_the_version_is_that_of_the_package() -> None:
-    assert ssh_abduction.__version__ == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert (
+        ssh_abduction.__version__
+        == tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    )
     assert "__version__" in dir(ssh_abduction)
 
 
@@ -213,7 +273,9 @@ def test_a_solution_survives_files(kind: str, tmp_path: Path) -> None:
     assert pickle.loads(pickle.dumps(loaded)) == solution
 
 
-def test_what_the_shell_prints_is_what_is_saved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_the_shell_prints_is_what_is_saved(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from ssh_abduction.cli import main
 
     assert main(["solve", str(ROOT / "examples" / "aces3-route.jsonl"), "--json"]) == 0
@@ -227,7 +289,17 @@ def test_what_the_shell_prints_is_what_is_saved(tmp_path: Path, capsys: pytest.C
     assert data[0] == data[1]
     (tmp_path / "printed.json").write_text(printed)
     assert Solution.load(tmp_path / "printed.json", ACES) == SOLUTION
-    assert main(["check", str(ROOT / "examples" / "aces3-route.jsonl"), str(tmp_path / "saved.json"), "--bound"]) == 0
+    assert (
+        main(
+            [
+                "check",
+                str(ROOT / "examples" / "aces3-route.jsonl"),
+                str(tmp_path / "saved.json"),
+                "--bound",
+            ]
+        )
+        == 0
+    )
     assert capsys.readouterr().out.startswith("4 of 4 maps satisfy")
 
 
@@ -252,13 +324,22 @@ def changed(**fields: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (changed(version=2), r"version: expected 1, got 2; read it with the ssh-abduction that wrote it"),
+        (
+            changed(version=2),
+            r"version: expected 1, got 2; read it with the ssh-abduction that wrote it",
+        ),
         (changed(version=True), "version: expected 1"),
         (changed(format="ssh-trace"), "format: expected \"ssh-solution\", got 'ssh-trace'"),
-        (changed(theory=...), "theory: expected what solve --json or Solution.save writes, got none"),
+        (
+            changed(theory=...),
+            "theory: expected what solve --json or Solution.save writes, got none",
+        ),
         (changed(theory={"level": "astral"}), "theory: level: expected"),
         (changed(status="great"), "status: expected one of optimal"),
-        (changed(status="unsatisfiable"), "status: expected optimal or feasible, as there is a map"),
+        (
+            changed(status="unsatisfiable"),
+            "status: expected optimal or feasible, as there is a map",
+        ),
         (changed(complete="yes"), "complete: expected true or false"),
         (changed(count=5), "count: expected 4, as so many maps are listed, got 5"),
         (changed(steps=24), r"maps\[0\].labels: expected 24, one a step, got 23"),
@@ -275,14 +356,29 @@ def changed(**fields: Any) -> dict[str, Any]:
         (changed(stopped="boredom"), "stopped: expected one of"),
         (changed(evidence={"stars": 7}), "evidence.stars: expected an object"),
         (changed(partial={}), "partial: dstates: expected"),
-        (changed(certificate={"clique": [0, 0], "refuted": []}), "certificate.clique: expected different steps from 0 to 22"),
-        (changed(certificate={"clique": [0, 23], "refuted": []}), "certificate.clique: expected different steps from 0 to 22"),
-        (changed(certificate={"clique": [0, 1], "refuted": [7]}), "certificate.refuted: expected the numbers of dstates from 2 on"),
+        (
+            changed(certificate={"clique": [0, 0], "refuted": []}),
+            "certificate.clique: expected different steps from 0 to 22",
+        ),
+        (
+            changed(certificate={"clique": [0, 23], "refuted": []}),
+            "certificate.clique: expected different steps from 0 to 22",
+        ),
+        (
+            changed(certificate={"clique": [0, 1], "refuted": [7]}),
+            "certificate.refuted: expected the numbers of dstates from 2 on",
+        ),
         (changed(backbone={"proven": 1}), "backbone: expected an object with proven and dstates"),
-        (changed(backbone={"proven": True, "dstates": {"always": [0], "sometimes": []}}), "backbone: dstates.always: expected 23 numbers"),
+        (
+            changed(backbone={"proven": True, "dstates": {"always": [0], "sometimes": []}}),
+            "backbone: dstates.always: expected 23 numbers",
+        ),
         (changed(warnings=[3]), r"warnings\[0\]: expected a sentence"),
         (SAVED["maps"][0], "maps: expected a solution, got one map; take SSHMap.load"),
-        ({"trace": "x", "status": "error", "error": "x: no trace"}, "got the error that solve ended with: 'x: no trace'"),
+        (
+            {"trace": "x", "status": "error", "error": "x: no trace"},
+            "got the error that solve ended with: 'x: no trace'",
+        ),
         ([], "expected an object"),
         (None, "expected an object"),
         ({}, "maps: expected what solve --json"),
@@ -297,7 +393,15 @@ def test_nonsense_is_named(data: Any, said: str, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("text", "said"), [("", "got an empty file"), ("  \n", "empty file"), ("{", "broken JSON"), ("\0", "broken JSON")])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "got an empty file"),
+        ("  \n", "empty file"),
+        ("{", "broken JSON"),
+        ("\0", "broken JSON"),
+    ],
+)
 def test_what_is_no_json_is_named(text: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "maps.json").write_text(text)
     with pytest.raises(MapError, match=said):
@@ -314,10 +418,16 @@ def test_a_huge_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_maps_of_another_trace_are_named(tmp_path: Path) -> None:
     SOLUTION.save(tmp_path / "maps.json")
-    with pytest.raises(MapError, match=r"expected 400, one for each step of the trace, got 23; the maps are of another trace"):
+    with pytest.raises(
+        MapError,
+        match=r"expected 400, one for each step of the trace, got 23; the maps are of another trace",
+    ):
         Solution.load(tmp_path / "maps.json", RECTANGLE)
     other = ACES.with_views(["hall", *ACES.views[1:]])  # type: ignore[list-item]
-    with pytest.raises(MapError, match=r"maps\[0\]: expected view 'hall' at step 0, as the trace has it, got 'open-ahead"):
+    with pytest.raises(
+        MapError,
+        match=r"maps\[0\]: expected view 'hall' at step 0, as the trace has it, got 'open-ahead",
+    ):
         Solution.load(tmp_path / "maps.json", other)
     solve(IMPOSSIBLE).save(tmp_path / "none.json")
     with pytest.raises(MapError, match="steps: expected those of a trace of 23 steps, got 4"):
@@ -334,7 +444,9 @@ def test_single_maps_say_what_they_are(tmp_path: Path) -> None:
     (tmp_path / "map.json").write_text(json.dumps(data | {"version": 7}))
     with pytest.raises(MapError, match="version: expected 1, got 7"):
         SSHMap.load(tmp_path / "map.json")
-    assert maps.maps_of({k: v for k, v in data.items() if k not in ("format", "version")}, "old") == [SOLUTION[0]]
+    assert maps.maps_of(
+        {k: v for k, v in data.items() if k not in ("format", "version")}, "old"
+    ) == [SOLUTION[0]]
 
 
 def test_a_solution_without_the_maps_that_were_found_is_not_written(tmp_path: Path) -> None:

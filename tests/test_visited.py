@@ -12,7 +12,20 @@ import networkx as nx
 import numpy as np
 import pytest
 from skeleton import CELL, _chains, _pixels, _prune, _with_doors, poses_of, skeleton_of
-from visited import ACES_COLUMNS, ACES_NAMES, ACES_ROUTE, ACES_ROWS, Events, Truth, Visit, judged, passes, truth_of, visits_of, with_names
+from visited import (
+    ACES_COLUMNS,
+    ACES_NAMES,
+    ACES_ROUTE,
+    ACES_ROWS,
+    Events,
+    Truth,
+    Visit,
+    judged,
+    passes,
+    truth_of,
+    visits_of,
+    with_names,
+)
 
 from perception.readers.scans import Laser, RobotLog, Scan
 from simulator.laser import BEAMS, BEARINGS, meetings
@@ -24,12 +37,18 @@ LOGS = ROOT.parent / "shared" / "data" / "logs"
 
 def aces_poses(spacing: float = 1.0) -> np.ndarray:
     """A drive through the crossings of ACES3 in the true order, in straight lines."""
-    at = {name: (x, y) for y, names in zip(ACES_ROWS, ACES_NAMES, strict=True) for x, name in zip(ACES_COLUMNS, names, strict=True)}
+    at = {
+        name: (x, y)
+        for y, names in zip(ACES_ROWS, ACES_NAMES, strict=True)
+        for x, name in zip(ACES_COLUMNS, names, strict=True)
+    }
     poses = []
     for here, there in pairwise(ACES_ROUTE):
         (x, y), (dx, dy) = at[here], np.subtract(at[there], at[here])
         parts = round(math.hypot(dx, dy) / spacing)
-        poses += [(x + dx * k / parts, y + dy * k / parts, math.atan2(dy, dx)) for k in range(parts)]
+        poses += [
+            (x + dx * k / parts, y + dy * k / parts, math.atan2(dy, dx)) for k in range(parts)
+        ]
     return np.array([*poses, (*at[ACES_ROUTE[-1]], 0.0)])
 
 
@@ -51,19 +70,31 @@ def test_a_trace_with_the_names_of_true_places_has_the_true_map() -> None:
         visit += t == 0 or shipped.actions[t - 1].kind != "turn"
         there = truth.visits[visit]
         scan = (there.first + there.last) // 2
-        pose = [*poses[scan][:2], {"E": 0, "N": math.pi / 2, "W": math.pi, "S": -math.pi / 2}[step.truth["heading"]]]
+        pose = [
+            *poses[scan][:2],
+            {"E": 0, "N": math.pi / 2, "W": math.pi, "S": -math.pi / 2}[step.truth["heading"]],
+        ]
         steps.append(replace(step, truth={"pose": pose}, extra={"scan": scan}))
     named = with_names(replace(shipped, steps=tuple(steps)), truth)
     for step, told in zip(shipped.steps, named.steps, strict=True):
-        assert (told.truth["place"], told.truth["heading"]) == (step.truth["place"], step.truth["heading"])
+        assert (told.truth["place"], told.truth["heading"]) == (
+            step.truth["place"],
+            step.truth["heading"],
+        )
     found = evaluate([], named)
     assert (found.true_dstates, found.true_places, found.true_paths) == (22, 9, 6)
     maps = solve(shipped, max_maps=None).maps
-    assert [one.accuracy for one in evaluate(maps, named).maps] == [one.accuracy for one in evaluate(maps, shipped).maps]
+    assert [one.accuracy for one in evaluate(maps, named).maps] == [
+        one.accuracy for one in evaluate(maps, shipped).maps
+    ]
 
     figures = judged(Events.of(named, maps[0]), truth)
     assert (figures.precision, figures.recall, figures.isomorphic) == (1, 1, False)
-    assert figures.named.maps[0].place_precision == evaluate([maps[0]], shipped).maps[0].place_precision or figures.nodes == 10
+    assert (
+        figures.named.maps[0].place_precision
+        == evaluate([maps[0]], shipped).maps[0].place_precision
+        or figures.nodes == 10
+    )
 
 
 def test_events_are_matched_to_visits_one_by_one() -> None:
@@ -73,7 +104,12 @@ def test_events_are_matched_to_visits_one_by_one() -> None:
     assert truth.matched([1, 3, 5, 30]) == [None, None, 0, None]
     assert truth.names([1, 3, 5, 30, 31]) == ["elsewhere 1", "A", "A", "elsewhere 2", "elsewhere 2"]
     figures = judged(Events((3, 5, 18, 30), ("a", "a", "b", "c")), truth)
-    assert (figures.nodes, figures.precision, figures.recall, figures.isomorphic) == (3, 1 / 2, 1, False)
+    assert (figures.nodes, figures.precision, figures.recall, figures.isomorphic) == (
+        3,
+        1 / 2,
+        1,
+        False,
+    )
     assert judged(Events((5, 18), ("a", "b")), truth).isomorphic
     assert not judged(Events((5, 18), ("a", "a")), truth).isomorphic
 
@@ -94,10 +130,20 @@ def test_events_in_buildings_are_at_doors_or_in_rooms(tmp_path: Path) -> None:
     }
     (tmp_path / "truth.json").write_text(json.dumps(told))
     truth = Truth.load(tmp_path / "truth.json")
-    assert truth.names(range(7)) == ["room 0 1", "door 0", "door 0", "door 0", "room 1 1", "room 1 1", "room 1 2"]
+    assert truth.names(range(7)) == [
+        "room 0 1",
+        "door 0",
+        "door 0",
+        "door 0",
+        "room 1 1",
+        "room 1 1",
+        "room 1 2",
+    ]
     told_apart = judged(Events((1, 2, 4, 5, 6), ("a", "a", "b", "b", "c")), truth)
     assert (told_apart.precision, told_apart.recall, told_apart.isomorphic) == (None, 1, True)
-    assert not judged(Events((1, 2, 4, 5, 6), ("a", "b", "c", "c", "d")), truth).isomorphic  # one door, both ways
+    assert not judged(
+        Events((1, 2, 4, 5, 6), ("a", "b", "c", "c", "d")), truth
+    ).isomorphic  # one door, both ways
     late = judged(Events((4, 6), ("b", "c")), truth)
     assert (late.recall, late.named.maps[0].places_right, late.isomorphic) == (0, True, False)
     assert truth.doorways == (Visit("door 0", 1, 3),)  # in and out by one door is one
@@ -119,7 +165,10 @@ def test_branches_that_hardly_leave_their_junction_are_cut_off() -> None:
     for _, data in graph.nodes(data=True):
         data["clear"] = 0.1
     _prune(graph)
-    assert sorted(graph) == [(2, 0), (5, 9)]  # no branch is a metre longer than its junction is from a wall
+    assert sorted(graph) == [
+        (2, 0),
+        (5, 9),
+    ]  # no branch is a metre longer than its junction is from a wall
 
 
 def test_a_ring_has_one_node() -> None:
@@ -127,12 +176,18 @@ def test_a_ring_has_one_node() -> None:
     thin[1:5, 1:7] = True
     thin[2:4, 2:6] = False
     graph = _chains(_pixels(thin))
-    assert (len(graph), [round(data["metres"], 6) for *_, data in graph.edges(data=True)]) == (1, [1.6])
+    assert (len(graph), [round(data["metres"], 6) for *_, data in graph.edges(data=True)]) == (
+        1,
+        [1.6],
+    )
 
 
 def test_a_narrow_part_of_an_edge_is_a_door() -> None:
     width = np.full(100, 1.0)
-    width[40:43], width[60:100] = (0.6, 0.5, 0.6), 0.7  # a door, and from there on a corridor that is narrow and stays so
+    width[40:43], width[60:100] = (
+        (0.6, 0.5, 0.6),
+        0.7,
+    )  # a door, and from there on a corridor that is narrow and stays so
     graph = nx.MultiGraph()
     graph.add_nodes_from([(0, 0), (0, 99)])
     graph.add_edge((0, 0), (0, 99), cells=[(0, k) for k in range(100)], metres=9.9)
@@ -149,9 +204,13 @@ def crossing() -> RobotLog:
     ways += [(0.0, float(y), -math.pi / 2) for y in np.arange(8, -8.5, -0.5)]
     corners = [(-10, -1.5), (-1.5, -1.5), (-1.5, -10), (1.5, -10), (1.5, -1.5), (10, -1.5)]
     outline = np.array([*corners, *((-x, -y) for x, y in corners)], dtype=float)
-    ranges = meetings(np.hstack([outline, np.roll(outline, -1, axis=0)]), np.array(ways), BEARINGS).min(axis=2)
+    ranges = meetings(
+        np.hstack([outline, np.roll(outline, -1, axis=0)]), np.array(ways), BEARINGS
+    ).min(axis=2)
     laser = Laser(float(BEARINGS[0]), math.radians(1), BEAMS, 30.0)
-    return RobotLog(tuple(Scan(scan, laser, pose, pose) for scan, pose in zip(ranges, ways, strict=True)))
+    return RobotLog(
+        tuple(Scan(scan, laser, pose, pose) for scan, pose in zip(ranges, ways, strict=True))
+    )
 
 
 def test_the_skeleton_of_a_crossing_has_five_nodes() -> None:
@@ -164,7 +223,14 @@ def test_the_skeleton_of_a_crossing_has_five_nodes() -> None:
     (middle,) = [node for node, degree in skeleton.graph.degree if degree == 4]
     assert math.hypot(*skeleton.graph.nodes[middle]["at"]) < 0.5
     passed = [node for _, node in skeleton.events(poses)]
-    assert [node == middle for node in passed] == [True, False, True, False, True, False]  # the end behind the start is farther away
+    assert [node == middle for node in passed] == [
+        True,
+        False,
+        True,
+        False,
+        True,
+        False,
+    ]  # the end behind the start is farther away
     assert len(set(passed)) == 4
 
 

@@ -30,7 +30,10 @@ def posed(poses: Sequence[object], kinds: Sequence[str], times: Sequence[float] 
     extras = [{"time": time} for time in times] or [{}] * len(poses)
     return replace(
         seen,
-        steps=tuple(replace(step, truth={"pose": pose}, extra=extra) for step, pose, extra in zip(seen.steps, poses, extras, strict=True)),
+        steps=tuple(
+            replace(step, truth={"pose": pose}, extra=extra)
+            for step, pose, extra in zip(seen.steps, poses, extras, strict=True)
+        ),
     )
 
 
@@ -83,21 +86,39 @@ def test_pairs_are_those_that_are_counted_naively(seed: int) -> None:
         add(counts, is_near(at[v], at[w]), left, True, bool(own - {None}))
         for i in visits[v]:
             for j in visits[w]:
-                facing = poses[i] is not None and poses[j] is not None and poses[i][2] == poses[j][2]  # type: ignore[index]
+                facing = (
+                    poses[i] is not None and poses[j] is not None and poses[i][2] == poses[j][2]
+                )  # type: ignore[index]
                 add(steps, is_near(poses[i], poses[j]), left, facing, labels[i] == labels[j])
-    for pairs, map_pairs, naive in ((found.places, found.maps[0].places, counts), (found.dstates, found.maps[0].dstates, steps)):
-        assert [pairs.judged, pairs.returns, pairs.stayed, pairs.unknown] == [naive[k] for k in ("judged", "returns", "stayed", "unknown")]
+    for pairs, map_pairs, naive in (
+        (found.places, found.maps[0].places, counts),
+        (found.dstates, found.maps[0].dstates, steps),
+    ):
+        assert [pairs.judged, pairs.returns, pairs.stayed, pairs.unknown] == [
+            naive[k] for k in ("judged", "returns", "stayed", "unknown")
+        ]
         assert map_pairs is not None
         assert (map_pairs.joined, map_pairs.right) == (naive["joined"], naive["right"])
 
 
 def test_a_turn_is_no_return_and_neither_is_the_next_door() -> None:
-    trace = posed([[0, 0, 0], [0, 0, 1.6], [1.5, 0, 0], [9, 0, 0], [1, 0, 3.1]], ["turn", "travel", "travel", "travel"])
+    trace = posed(
+        [[0, 0, 0], [0, 0, 1.6], [1.5, 0, 0], [9, 0, 0], [1, 0, 3.1]],
+        ["turn", "travel", "travel", "travel"],
+    )
     found = evaluate_visits([labelled([0, 1, 2, 3, 4], [0, 0, 0, 1, 0])], trace)
-    assert (found.visits, found.places.judged, found.places.returns, found.places.stayed) == (4, 5, 2, 1)
+    assert (found.visits, found.places.judged, found.places.returns, found.places.stayed) == (
+        4,
+        5,
+        2,
+        1,
+    )
     assert found.maps[0].places is not None
     assert (found.maps[0].places.precision, found.maps[0].places.recall) == (1, 1)
-    assert (found.dstates.returns, found.maps[0].dstates.recall) == (0, None)  # the last step faces back
+    assert (found.dstates.returns, found.maps[0].dstates.recall) == (
+        0,
+        None,
+    )  # the last step faces back
     causal = evaluate_visits([labelled([0] * 5, [None])], trace).maps[0]
     assert causal.places is None
     assert (causal.dstates.joined, causal.dstates.right) == (7, 0)
@@ -105,7 +126,10 @@ def test_a_turn_is_no_return_and_neither_is_the_next_door() -> None:
 
 def circle(turns: int) -> tuple[list[Pose], list[Relation]]:
     """Poses once a second on a circle of 20 m, the relations from each to the next, and one that closes it after each turn."""
-    poses = [(20 * math.sin(a), 20 * (1 - math.cos(a)), a) for a in (math.radians(3 * t) for t in range(120 * turns + 1))]
+    poses = [
+        (20 * math.sin(a), 20 * (1 - math.cos(a)), a)
+        for a in (math.radians(3 * t) for t in range(120 * turns + 1))
+    ]
     pairs = [*pairwise(range(len(poses))), *((t, t + 120) for t in range(0, len(poses) - 120, 120))]
     return poses, [Relation(float(i), float(j), between(poses[i], poses[j])) for i, j in pairs]
 
@@ -118,41 +142,76 @@ def test_relations_are_composed_along_the_shortest_way() -> None:
     for time, told in zip(times[2:4], seen[2:4], strict=True):
         assert told is not None
         pose, way = told
-        start = (20 * math.sin(math.radians(90.75)), 20 * (1 - math.cos(math.radians(90.75))), math.radians(90.75))
+        start = (
+            20 * math.sin(math.radians(90.75)),
+            20 * (1 - math.cos(math.radians(90.75))),
+            math.radians(90.75),
+        )
         assert pose == pytest.approx(between(start, poses[int(time)]), abs=0.01)
-        assert way < 60  # not the way that was driven, of up to 215 m, but over the relation that closes the circle
+        assert (
+            way < 60
+        )  # not the way that was driven, of up to 215 m, but over the relation that closes the circle
     assert seen[4] is None  # long after the last time
 
 
-def test_relations_judge_where_poses_are_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_relations_judge_where_poses_are_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _, related = circle(2)
     (tmp_path / "relations").write_text(
         "# seconds, metres, radians\n"
-        + "".join(f"{r.first} {r.second} {r.displacement[0]} {r.displacement[1]} 0 0 0 {r.displacement[2]}\n" for r in related)
+        + "".join(
+            f"{r.first} {r.second} {r.displacement[0]} {r.displacement[1]} 0 0 0 {r.displacement[2]}\n"
+            for r in related
+        )
     )
     trace = posed([None] * 5, ["travel"] * 4, [0, 60, 120, 182, 240])
-    found = evaluate_visits([labelled([0, 1, 0, 0, 1], [0, 1])], trace, relations=Relations.load(tmp_path / "relations"))
-    assert (found.judge, found.places.judged, found.places.returns, found.places.unknown) == ("relations", 9, 3, 1)  # 2.1 m are in doubt
+    found = evaluate_visits(
+        [labelled([0, 1, 0, 0, 1], [0, 1])], trace, relations=Relations.load(tmp_path / "relations")
+    )
+    assert (found.judge, found.places.judged, found.places.returns, found.places.unknown) == (
+        "relations",
+        9,
+        3,
+        1,
+    )  # 2.1 m are in doubt
     assert found.maps[0].places is not None
     assert (found.maps[0].places.joined, found.maps[0].places.right) == (4, 1)
     # The robot saw the third place 30 m to its left: that is far from the first one.
     aside = replace(
-        trace, steps=tuple(replace(step, extra={**step.extra, "seen": [0, 30 * (t == 2), 0]}) for t, step in enumerate(trace.steps))
+        trace,
+        steps=tuple(
+            replace(step, extra={**step.extra, "seen": [0, 30 * (t == 2), 0]})
+            for t, step in enumerate(trace.steps)
+        ),
     )
-    assert evaluate_visits([], aside, relations=Relations.load(tmp_path / "relations")).places.returns == 1
+    assert (
+        evaluate_visits([], aside, relations=Relations.load(tmp_path / "relations")).places.returns
+        == 1
+    )
     trace.save(tmp_path / "trace.jsonl")
     labelled([0, 1, 0, 0, 1], [0, 1]).save(tmp_path / "map.json")
-    arguments = ["evaluate", str(tmp_path / "map.json"), str(tmp_path / "trace.jsonl"), "--relations", str(tmp_path / "relations")]
+    arguments = [
+        "evaluate",
+        str(tmp_path / "map.json"),
+        str(tmp_path / "trace.jsonl"),
+        "--relations",
+        str(tmp_path / "relations"),
+    ]
     assert main([*arguments, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"count": 1, "relations": found.to_dict()}
     assert main(arguments) == 0
     first, left_out, _, row = capsys.readouterr().out.splitlines()
-    assert first.startswith("judged by relations: of 9 pairs of different visits 3 are returns to one place: within 2 m, and")
+    assert first.startswith(
+        "judged by relations: of 9 pairs of different visits 3 are returns to one place: within 2 m, and"
+    )
     assert left_out == "left out: 1 pair, as relations do not tell how far apart they are"
     assert row.split()[:6] == ["1", "2", "4", "1", "0.250", "0.333"]
 
 
-def test_relations_of_another_log_are_noticed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_relations_of_another_log_are_noticed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     poses, related = circle(2)
     times = [0, 60, 120, 180, 240]
     relations = Relations(related)
@@ -163,19 +222,40 @@ def test_relations_of_another_log_are_noticed(tmp_path: Path, capsys: pytest.Cap
     other.save(tmp_path / "trace.jsonl")
     labelled(range(5), range(5)).save(tmp_path / "map.json")
     (tmp_path / "relations").write_text(
-        "".join(f"{r.first} {r.second} {' '.join(map(str, r.displacement[:2]))} 0 0 0 {r.displacement[2]}\n" for r in related)
+        "".join(
+            f"{r.first} {r.second} {' '.join(map(str, r.displacement[:2]))} 0 0 0 {r.displacement[2]}\n"
+            for r in related
+        )
     )
     assert (
-        main(["evaluate", *(str(tmp_path / name) for name in ("map.json", "trace.jsonl")), "--relations", str(tmp_path / "relations")]) == 0
+        main(
+            [
+                "evaluate",
+                *(str(tmp_path / name) for name in ("map.json", "trace.jsonl")),
+                "--relations",
+                str(tmp_path / "relations"),
+            ]
+        )
+        == 0
     )
     said = capsys.readouterr()
-    assert "relations and the poses of the trace judge 6 of 10 pairs of visits alike: are " in said.err
+    assert (
+        "relations and the poses of the trace judge 6 of 10 pairs of visits alike: are " in said.err
+    )
     assert "poses judge 6 of 10 pairs of visits alike" in said.out
 
 
-def test_names_and_poses_are_judged_where_both_are_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_and_poses_are_judged_where_both_are_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trace = posed([[0, 0, 0], [9, 0, 0], [1, 0, 0]], ["travel", "travel"])
-    trace = replace(trace, steps=tuple(replace(step, truth={**step.truth, "place": "ABA"[t]}) for t, step in enumerate(trace.steps)))
+    trace = replace(
+        trace,
+        steps=tuple(
+            replace(step, truth={**step.truth, "place": "ABA"[t]})
+            for t, step in enumerate(trace.steps)
+        ),
+    )
     trace.save(tmp_path / "trace.jsonl")
     labelled([0, 1, 0], [0, 1]).save(tmp_path / "map.json")
     arguments = ["evaluate", str(tmp_path / "map.json"), str(tmp_path / "trace.jsonl"), "--json"]
@@ -195,7 +275,10 @@ def test_names_and_poses_are_judged_where_both_are_asked_for(tmp_path: Path, cap
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        ("1 2 0.5 0 0 0 0", "relations:1: expected the numbers time1 time2 x y z roll pitch yaw, got '1 2 0.5 0 0 0 0'"),
+        (
+            "1 2 0.5 0 0 0 0",
+            "relations:1: expected the numbers time1 time2 x y z roll pitch yaw, got '1 2 0.5 0 0 0 0'",
+        ),
         ("# none\n\n1 2 x 0 0 0 0 0", "relations:3: expected the numbers"),
         ("1 2 nan 0 0 0 0 0", "relations:1: expected finite numbers"),
         ("1 1 0.5 0 0 0 0 0", "relations:1: time2: expected another time than time1, got 1 twice"),
@@ -211,9 +294,14 @@ def test_relations_that_cannot_be_used(lines: str, message: str, tmp_path: Path)
 
 def test_poses_and_times_that_cannot_be_used() -> None:
     ssh_map = labelled([0, 1], [0, 1])
-    with pytest.raises(TraceError, match=r"^step 1: truth.pose: expected \[x, y, heading\] in metres and radians, got \[1, 2\]"):
+    with pytest.raises(
+        TraceError,
+        match=r"^step 1: truth.pose: expected \[x, y, heading\] in metres and radians, got \[1, 2\]",
+    ):
         evaluate_visits([ssh_map], posed([[0, 0, 0], [1, 2]], ["travel"]))
-    with pytest.raises(TraceError, match=r"^trace: truth.pose: expected the true pose of some step, got none"):
+    with pytest.raises(
+        TraceError, match=r"^trace: truth.pose: expected the true pose of some step, got none"
+    ):
         evaluate_visits([ssh_map], posed([None, None], ["travel"]))
     with pytest.raises(TraceError, match=r"^near: expected a number above 0, got 0"):
         evaluate_visits([ssh_map], posed([[0, 0, 0]] * 2, ["travel"]), near=0)
@@ -221,10 +309,19 @@ def test_poses_and_times_that_cannot_be_used() -> None:
     with pytest.raises(TraceError, match=r"^step 0: time: expected seconds, got 'noon'"):
         evaluate_visits([ssh_map], posed([None] * 2, ["travel"], ["noon", 1]), relations=relations)  # type: ignore[list-item]
     seen = posed([None] * 2, ["travel"], [1, 2])
-    seen = replace(seen, steps=tuple(replace(step, extra={**step.extra, "seen": "there"}) for step in seen.steps))
-    with pytest.raises(TraceError, match=r"^step 0: seen: expected \[x, y, heading\] in metres and radians, got 'there'"):
+    seen = replace(
+        seen,
+        steps=tuple(replace(step, extra={**step.extra, "seen": "there"}) for step in seen.steps),
+    )
+    with pytest.raises(
+        TraceError,
+        match=r"^step 0: seen: expected \[x, y, heading\] in metres and radians, got 'there'",
+    ):
         evaluate_visits([ssh_map], seen, relations=relations)
-    with pytest.raises(TraceError, match=r"^trace: time: expected steps at times that are related, from 1 to 2 s, got none"):
+    with pytest.raises(
+        TraceError,
+        match=r"^trace: time: expected steps at times that are related, from 1 to 2 s, got none",
+    ):
         evaluate_visits([ssh_map], posed([None] * 2, ["travel"], [7, 8]), relations=relations)
 
 
@@ -235,7 +332,11 @@ def test_the_relations_of_freiburg_agree_with_the_corrected_poses() -> None:
     times = [float(line[-3]) for line in lines if line[0] == "ROBOTLASER1"][::12]
     ssh_map = labelled(range(len(poses)), range(len(poses)))
     trace = posed([list(pose) for pose in poses], ["travel"] * (len(poses) - 1), times)
-    nearer, near = (evaluate_visits([ssh_map], trace, near=metres).places.returns for metres in (1.5, 2))
-    by_relations = evaluate_visits([ssh_map], trace, relations=Relations.load(FREIBURG / "fr079.relations")).places
+    nearer, near = (
+        evaluate_visits([ssh_map], trace, near=metres).places.returns for metres in (1.5, 2)
+    )
+    by_relations = evaluate_visits(
+        [ssh_map], trace, relations=Relations.load(FREIBURG / "fr079.relations")
+    ).places
     assert by_relations.judged > 0.95 * len(poses) * (len(poses) - 1) / 2
     assert nearer < by_relations.returns < near  # pairs about 2 m apart are in doubt

@@ -41,7 +41,16 @@ def bare_theories(draw: st.DrawFn) -> Theory:
         symmetric_sides=draw(st.booleans()),
         path_order=draw(st.sampled_from(["partial", "total"])),
         star="none",
-        prefer=draw(st.sampled_from([("dstates",), ("dstates", "paths"), ("dstates", "places", "paths"), ("dstates", "paths", "places")])),
+        prefer=draw(
+            st.sampled_from(
+                [
+                    ("dstates",),
+                    ("dstates", "paths"),
+                    ("dstates", "places", "paths"),
+                    ("dstates", "paths", "places"),
+                ]
+            )
+        ),
     )
 
 
@@ -58,7 +67,10 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     if not expected.cost:
         return  # the engine is asked only where some map is known
-    with patch.multiple(named, SPARES=spares, PATIENCE=patience, CORES=cores), patch.object(ways, "CONTRARY", contrary):
+    with (
+        patch.multiple(named, SPARES=spares, PATIENCE=patience, CORES=cores),
+        patch.object(ways, "CONTRARY", contrary),
+    ):
         known = data.draw(st.sampled_from([None, expected.maps[0].labels]), label="known")
         engine = FramelessEngine(Task.of(trace, theory), known or ())
         engine.grow(len(trace))
@@ -76,7 +88,10 @@ def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.Da
     """Two returns of a minimal map, to dstates or to places, are forbidden: the maps that are left are those of the readable encodings, which are told the same."""
     trace = data.draw(traces(max_steps=9), label="trace").without_stars()
     task = Task.of(trace, data.draw(bare_theories(), label="theory").resolve(trace))
-    plain, engine = StepEngine(task, most_paths(trace, task.theory, len(trace))), FramelessEngine(task)
+    plain, engine = (
+        StepEngine(task, most_paths(trace, task.theory, len(trace))),
+        FramelessEngine(task),
+    )
     plain.grow(len(trace))
     engine.grow(len(trace))
     for _ in range(2):
@@ -89,11 +104,21 @@ def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.Da
         assert (set(found), len(found)) == (expected, len(expected))
         minimal = min(expected, key=repr)
         label = minimal.labels
-        one_dstate = [Equality(i, j) for j in range(len(trace)) for i in range(j) if label[i] == label[j]]
-        one_place = [Equality(i, j, "place") for j in range(len(trace)) for i in range(j) if minimal.place_of(i) == minimal.place_of(j)]
+        one_dstate = [
+            Equality(i, j) for j in range(len(trace)) for i in range(j) if label[i] == label[j]
+        ]
+        one_place = [
+            Equality(i, j, "place")
+            for j in range(len(trace))
+            for i in range(j)
+            if minimal.place_of(i) == minimal.place_of(j)
+        ]
         if not one_place:
             return
-        refused = data.draw(st.sets(st.sampled_from(one_dstate + one_place), min_size=1, max_size=2), label="refused")
+        refused = data.draw(
+            st.sets(st.sampled_from(one_dstate + one_place), min_size=1, max_size=2),
+            label="refused",
+        )
         assert plain.forbid(refused)
         assert engine.forbid(refused)
 
@@ -108,7 +133,10 @@ def test_a_limit_while_labels_are_listed_is_a_limit() -> None:
         engine.grow(len(trace))
         maps = engine.improving_maps()
         next(maps)
-        with patch.object(Watch, "allows", lambda _, seconds: not seconds), pytest.raises(LimitError, match="time limit"):
+        with (
+            patch.object(Watch, "allows", lambda _, seconds: not seconds),
+            pytest.raises(LimitError, match="time limit"),
+        ):
             list(maps)
 
 
@@ -145,19 +173,28 @@ def test_the_route_of_a_robot() -> None:
 @pytest.mark.parametrize("settled", [False, True], ids=["step by step", "dstates first"])
 def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled: bool) -> None:
     """Two steps may not be at one place, which they are in most of the minimal maps: few maps are no complete list, and all that are left are found."""
-    trace, theory = Trace.load(EXAMPLES / "aces3-route.jsonl"), Theory(star="none", prefer=("dstates", "places", "paths"))
+    trace, theory = (
+        Trace.load(EXAMPLES / "aces3-route.jsonl"),
+        Theory(star="none", prefer=("dstates", "places", "paths")),
+    )
     every = solve(trace, theory, max_maps=None).maps
     pairs = [(i, j) for j in range(len(trace)) for i in range(j)]
     held = {(i, j): sum(m.place_of(i) == m.place_of(j) for m in every) for i, j in pairs}
-    first, second = max((pair for pair in pairs if held[pair] < len(every)), key=lambda pair: held[pair])
+    first, second = max(
+        (pair for pair in pairs if held[pair] < len(every)), key=lambda pair: held[pair]
+    )
 
     def refusal(_: Judging, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
-        refused = len(ssh_map.labels) > second and ssh_map.place_of(first) == ssh_map.place_of(second)
+        refused = len(ssh_map.labels) > second and ssh_map.place_of(first) == ssh_map.place_of(
+            second
+        )
         return ("test", frozenset({Equality(first, second, "place")})) if refused else None
 
     with (
         patch.multiple(Judging, refusal=refusal, may_refuse=True),
-        patch.multiple(solver, FRAME_AFTER=-1.0 if settled else 60.0, FEW_STEPS=0 if settled else 24),
+        patch.multiple(
+            solver, FRAME_AFTER=-1.0 if settled else 60.0, FEW_STEPS=0 if settled else 24
+        ),
     ):
         few, left = solve(trace, theory, max_maps=1), solve(trace, theory, max_maps=None)
     assert set(left.maps) == {m for m in every if m.place_of(first) != m.place_of(second)}
@@ -169,7 +206,12 @@ def test_few_of_many_maps() -> None:
     trace = maze(2, 2, steps=120, seed=2).trace
     with patch.object(solver, "FRAME_AFTER", -1.0):
         few, every = solve(trace, max_maps=3), solve(trace, max_maps=None)
-    assert (few.status, few.count, few.complete, few.stopped) == (Status.OPTIMAL, 3, False, "maps limit")
+    assert (few.status, few.count, few.complete, few.stopped) == (
+        Status.OPTIMAL,
+        3,
+        False,
+        "maps limit",
+    )
     assert every.complete
     assert set(few.maps) < set(every.maps)
     assert all(check(trace, ssh_map, every.theory) == () for ssh_map in every.maps)
@@ -179,7 +221,10 @@ def test_few_of_many_maps() -> None:
 def test_what_ends_it_leaves_the_map_with_frames(name: str) -> None:
     """Whatever it is at: the map that was known before is the answer."""
     trace = maze(2, 2, steps=120, seed=1).trace
-    with patch.object(solver, "FRAME_AFTER", -1.0), patch.object(ways.PlacesAndPaths, name, side_effect=KeyboardInterrupt):
+    with (
+        patch.object(solver, "FRAME_AFTER", -1.0),
+        patch.object(ways.PlacesAndPaths, name, side_effect=KeyboardInterrupt),
+    ):
         found = solve(trace)
     assert (found.status, found.stopped, found.count) == (Status.FEASIBLE, "interrupted", 1)
     assert check(trace, found.maps[0], found.theory) == ()
@@ -196,4 +241,6 @@ def test_a_robot_that_goes_on_where_that_ended() -> None:
         after = Search(trace, max_maps=None, after=search)
         found = after.solution(tuple(after))
     assert before.complete
-    assert set(found.maps) == set(solve(trace, max_maps=None, speedups=Speedups.without("ways")).maps)
+    assert set(found.maps) == set(
+        solve(trace, max_maps=None, speedups=Speedups.without("ways")).maps
+    )

@@ -40,7 +40,9 @@ def test_near_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> 
     theory = data.draw(theories(trace), label="theory")
     within = data.draw(st.integers(0, 3), label="within")
     toys = [toy for toy in TOYS if toy.rules in theory.rules]
-    expected = near_minimal_maps(trace, theory, within, lambda found: all(toy.allows(found) for toy in toys))
+    expected = near_minimal_maps(
+        trace, theory, within, lambda found: all(toy.allows(found) for toy in toys)
+    )
     first_paths = data.draw(st.sampled_from([1, prefixes.FIRST_PATHS]), label="first paths")
     with patch.object(prefixes, "FIRST_PATHS", first_paths):
         solution = solve(trace, theory, max_maps=None, within=within, time_limit=LIMIT)
@@ -70,10 +72,18 @@ def test_the_brute_force_for_near_minimal_maps_begins_with_the_minimal_ones() ->
 def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
     """With stars, and places before paths, it is one of the best twelve that have 22 dstates."""
     trace = Trace.load(ACES3)
-    true = [(step.truth["place"], step.truth["heading"]) for step in trace.steps if isinstance(step.truth, dict)]
+    true = [
+        (step.truth["place"], step.truth["heading"])
+        for step in trace.steps
+        if isinstance(step.truth, dict)
+    ]
     solution = solve(trace, prefer=("dstates", "places", "paths"), max_maps=None, within=3)
     assert solution.complete
-    assert [(level.cost.dstates, level.count) for level in solution.levels] == [(19, 6), (20, 6), (22, 12)]
+    assert [(level.cost.dstates, level.count) for level in solution.levels] == [
+        (19, 6),
+        (20, 6),
+        (22, 12),
+    ]
     assert solution.cost == solution.levels[0].cost == Cost(19, 8, 5)
     places = [place for place, _ in true]
     right = [
@@ -93,8 +103,12 @@ def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed()
     assert [(level.cost.dstates, level.count) for level in solution.levels] == [(19, 68), (20, 158)]
 
 
-@pytest.mark.parametrize(("maps", "levels"), [(3, [3]), (4, [4]), (5, [4, 1]), (7, [4, 1, 2]), (11, [4, 1, 6])])
-def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(maps: int, levels: list[int]) -> None:
+@pytest.mark.parametrize(
+    ("maps", "levels"), [(3, [3]), (4, [4]), (5, [4, 1]), (7, [4, 1, 2]), (11, [4, 1, 6])]
+)
+def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(
+    maps: int, levels: list[int]
+) -> None:
     solution = solve(Trace.load(ACES3), max_maps=maps, within=3)
     assert [level.count for level in solution.levels] == levels
     assert solution.complete == (maps == 11)
@@ -102,8 +116,12 @@ def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(map
     assert solution.status is Status.OPTIMAL
 
 
-@pytest.mark.parametrize("theory", [Theory.causal(), Theory.topological(), Theory.topological().replace(star="frame")])
-def test_near_minimal_maps_of_a_longer_trace_are_those_that_a_rule_for_their_number_lets_pass(theory: Theory) -> None:
+@pytest.mark.parametrize(
+    "theory", [Theory.causal(), Theory.topological(), Theory.topological().replace(star="frame")]
+)
+def test_near_minimal_maps_of_a_longer_trace_are_those_that_a_rule_for_their_number_lets_pass(
+    theory: Theory,
+) -> None:
     """The minimal maps are replayed from a prefix; for the others the whole trace is asked. The rule is one of a user's own, which no speed-up knows."""
     trace = Trace.load(EXAMPLE).prefix(30)
     if theory.star == "frame":
@@ -141,7 +159,9 @@ def test_more_dstates_than_steps_are_not_asked_for() -> None:
 
 @pytest.mark.parametrize("within", [-1, 1.5, True, "2", None])
 def test_a_wrong_within_is_an_error(within: object) -> None:
-    with pytest.raises(SolverError, match=r"within \(--within\): expected a whole number, 0 or more, got"):
+    with pytest.raises(
+        SolverError, match=r"within \(--within\): expected a whole number, 0 or more, got"
+    ):
         solve(Trace.from_steps("a", []), within=within)  # type: ignore[arg-type]
 
 
@@ -149,15 +169,25 @@ def test_a_wrong_within_is_an_error(within: object) -> None:
 def near() -> dict[str, Any]:
     """What `solve --within 3 --json` prints of the real route."""
     shell = [sys.executable, "-m", "ssh_abduction", "solve", ACES3, "--within", "3", "--json"]
-    return dict(json.loads(subprocess.run(shell, check=True, capture_output=True, text=True).stdout))
+    return dict(
+        json.loads(subprocess.run(shell, check=True, capture_output=True, text=True).stdout)
+    )
 
 
 def test_the_json_says_what_each_map_costs(near: dict[str, Any]) -> None:
     assert near["within"] == 3
     assert near["cost"] == {"dstates": 19, "places": 10, "paths": 4}
-    assert [(level["cost"]["dstates"], level["count"]) for level in near["levels"]] == [(19, 4), (20, 1), (22, 6)]
-    assert [ssh_map["cost"] for ssh_map in near["maps"]] == [level["cost"] for level in near["levels"] for _ in range(level["count"])]
-    assert [len(ssh_map["dstates"]) for ssh_map in near["maps"]] == [ssh_map["cost"]["dstates"] for ssh_map in near["maps"]]
+    assert [(level["cost"]["dstates"], level["count"]) for level in near["levels"]] == [
+        (19, 4),
+        (20, 1),
+        (22, 6),
+    ]
+    assert [ssh_map["cost"] for ssh_map in near["maps"]] == [
+        level["cost"] for level in near["levels"] for _ in range(level["count"])
+    ]
+    assert [len(ssh_map["dstates"]) for ssh_map in near["maps"]] == [
+        ssh_map["cost"]["dstates"] for ssh_map in near["maps"]
+    ]
 
 
 @pytest.mark.parametrize(
@@ -170,7 +200,9 @@ def test_the_json_says_what_each_map_costs(near: dict[str, Any]) -> None:
         ({"maps": [4, 0]}, "expected 20 to 23 dstates in map 2, as within is 3, got 19"),
     ],
 )
-def test_a_file_of_near_minimal_maps_is_not_taken_at_its_word(near: dict[str, Any], change: dict[str, Any], fault: str | None) -> None:
+def test_a_file_of_near_minimal_maps_is_not_taken_at_its_word(
+    near: dict[str, Any], change: dict[str, Any], fault: str | None
+) -> None:
     """A change to maps names those that are listed, by their numbers."""
     chosen = change.get("maps", range(near["count"]))
     answer = near | change | {"maps": [near["maps"][i] for i in chosen], "count": len(chosen)}
@@ -184,6 +216,11 @@ def test_a_map_that_does_not_cost_what_it_is_said_to_cost_is_found(near: dict[st
     maps = [SSHMap.from_dict(ssh_map) for ssh_map in near["maps"]]
     wrong = [ssh_map | {"cost": near["cost"]} for ssh_map in near["maps"]]
     trace = Trace.load(ACES3)
-    false = false_claims(near | {"maps": wrong}, maps, len(trace), Theory.topological().resolve(trace), 19)
+    false = false_claims(
+        near | {"maps": wrong}, maps, len(trace), Theory.topological().resolve(trace), 19
+    )
     assert len(false) == 7
-    assert false[0] == "maps[4].cost: expected 20 dstates, 10 places, 4 paths, as the map has these, got 19 dstates, 10 places, 4 paths"
+    assert (
+        false[0]
+        == "maps[4].cost: expected 20 dstates, 10 places, 4 paths, as the map has these, got 19 dstates, 10 places, 4 paths"
+    )

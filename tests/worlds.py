@@ -22,7 +22,9 @@ def written(text: str) -> Trace:
 def rectangle(actions: int, views: int = 4, turn: str = "R") -> Trace:
     """The notched rectangle after so many actions: a turn and a travel in turn, the views repeating after `views`."""
     kinds = [ACTIONS[turn], "travel"]
-    return Trace.from_steps([f"v{i % views}" for i in range(actions + 1)], [kinds[i % 2] for i in range(actions)])
+    return Trace.from_steps(
+        [f"v{i % views}" for i in range(actions + 1)], [kinds[i % 2] for i in range(actions)]
+    )
 
 
 def streets(*edges: tuple[str, str, str]) -> Streets:
@@ -34,7 +36,9 @@ def streets(*edges: tuple[str, str, str]) -> Streets:
     return found
 
 
-def drive(world: Streets, place: str, heading: str, actions: Iterable[str], stars: bool = False) -> Trace:
+def drive(
+    world: Streets, place: str, heading: str, actions: Iterable[str], stars: bool = False
+) -> Trace:
     """The trace of a robot that drives through a world; its views name the openings ahead, right, back and left."""
     facing = HEADINGS.index(heading)
     seen: list[list[int]] = []
@@ -55,12 +59,25 @@ def drive(world: Streets, place: str, heading: str, actions: Iterable[str], star
 
 
 TWO_BLOCKS = streets(
-    ("a1", "E", "a2"), ("a2", "E", "a3"), ("b1", "E", "b2"), ("b2", "E", "b3"), ("a1", "S", "b1"), ("a2", "S", "b2"), ("a3", "S", "b3")
+    ("a1", "E", "a2"),
+    ("a2", "E", "a3"),
+    ("b1", "E", "b2"),
+    ("b2", "E", "b3"),
+    ("a1", "S", "b1"),
+    ("a2", "S", "b2"),
+    ("a3", "S", "b3"),
 )
 SQUARE = streets(("a", "E", "b"), ("b", "S", "c"), ("d", "E", "c"), ("a", "S", "d"))
 TEE = streets(("W", "E", "J"), ("J", "E", "E"), ("J", "S", "S"))
 PLUS = streets(("W", "E", "J"), ("J", "E", "E"), ("J", "S", "S"), ("N", "S", "J"))
-COMB = streets(("P1", "E", "P2"), ("P2", "E", "P3"), ("P3", "E", "P4"), ("P1", "S", "D1"), ("P2", "S", "D2"), ("P4", "S", "D3"))
+COMB = streets(
+    ("P1", "E", "P2"),
+    ("P2", "E", "P3"),
+    ("P3", "E", "P4"),
+    ("P1", "S", "D1"),
+    ("P2", "S", "D2"),
+    ("P4", "S", "D3"),
+)
 
 TOURS: dict[str, tuple[Streets, str, str, str]] = {
     "two blocks": (TWO_BLOCKS, "a1", "E", "TTRTRTTRTR"),

@@ -17,7 +17,9 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 ROOT = Path(__file__).parent.parent
-ON_GITHUB = re.compile(r"https://github\.com/ssh-abduction/ssh-abduction/(?:blob|tree|raw)/main/([^#?]*)")
+ON_GITHUB = re.compile(
+    r"https://github\.com/ssh-abduction/ssh-abduction/(?:blob|tree|raw)/main/([^#?]*)"
+)
 # Attributes whose address a browser fetches when it shows a page. Of `link` it fetches all but what only names another page.
 FETCHED = {
     "script": ("src",),
@@ -75,12 +77,18 @@ def problems(site: Path) -> Iterator[str]:
             if found := ON_GITHUB.match(link):
                 if not (ROOT / unquote(found[1])).exists():
                     yield f"{name}: links {link}, which is not in the repository"
-            elif not parts.scheme and not parts.netloc and name != Path("404.html"):  # links of 404.html begin at the root of a server
+            elif (
+                not parts.scheme and not parts.netloc and name != Path("404.html")
+            ):  # links of 404.html begin at the root of a server
                 target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
                 target = target / "index.html" if target.is_dir() else target
                 if not target.is_file():
                     yield f"{name}: links {link}, which is no file of the site"
-                elif parts.fragment and target.suffix == ".html" and unquote(parts.fragment) not in page(target).anchors:
+                elif (
+                    parts.fragment
+                    and target.suffix == ".html"
+                    and unquote(parts.fragment) not in page(target).anchors
+                ):
                     yield f"{name}: links {link}, but that page has no such anchor"
     for path in sorted(site.rglob("*.css")):
         for address in addresses(path.read_text(encoding="utf-8")):

@@ -22,7 +22,9 @@ NAME = re.compile(r"[A-Za-z_]\w*")
 
 
 def as_markdown(docstring: str) -> str:
-    return "\n\n".join(_paragraph(paragraph) for paragraph in re.split(r"\n\s*\n", docstring.strip("\n")))
+    return "\n\n".join(
+        _paragraph(paragraph) for paragraph in re.split(r"\n\s*\n", docstring.strip("\n"))
+    )
 
 
 def _paragraph(paragraph: str) -> str:

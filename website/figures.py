@@ -11,7 +11,9 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-os.environ["SOURCE_DATE_EPOCH"] = "0"  # matplotlib writes a date into its files, which would differ from run to run
+os.environ["SOURCE_DATE_EPOCH"] = (
+    "0"  # matplotlib writes a date into its files, which would differ from run to run
+)
 
 import matplotlib
 import numpy as np
@@ -22,7 +24,12 @@ from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Trace, solve
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.evaluation.paper.figures import draw_quality, draw_telling, draw_views, draw_world
+from ssh_abduction.evaluation.paper.figures import (
+    draw_quality,
+    draw_telling,
+    draw_views,
+    draw_world,
+)
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output.picture import svg
 
@@ -45,7 +52,9 @@ def loop() -> str:
             f'<path d="M{x + 90},60 {onward}" class="flow"/>',
             f'<text x="{x + 127}" y="52" class="made">{made}</text>',
         ]
-    parts.append('<text x="360" y="112" class="made">the robot knows its places, and drives on</text>')
+    parts.append(
+        '<text x="360" y="112" class="made">the robot knows its places, and drives on</text>'
+    )
     style = "text{font:13px sans-serif;text-anchor:middle}.made{font-style:italic;fill:#555}.flow{fill:none;stroke:#555;stroke-width:1.5;marker-end:url(#end)}"
     head = '<marker id="end" markerWidth="8" markerHeight="8" refX="6" refY="4" orient="auto"><path d="M0,0 L7,4 L0,8 z" fill="#555"/></marker>'
     return f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 720 140" width="720"><style>{style}</style><defs>{head}</defs>{"".join(parts)}</svg>'
@@ -53,7 +62,9 @@ def loop() -> str:
 
 def folded() -> SSHMap:
     """The map of the rectangle where no axiom tells its opposite corners apart."""
-    return solve(Trace.load(EXAMPLES / "notched-rectangle.jsonl"), without=("side_of_branch",)).maps[0]
+    return solve(
+        Trace.load(EXAMPLES / "notched-rectangle.jsonl"), without=("side_of_branch",)
+    ).maps[0]
 
 
 @cache
@@ -81,7 +92,12 @@ def draw_learning() -> None:
     draw_world(FIGURES / "world.svg", world, [step.truth["pose"] for step in trace.steps])
     draw_views(FIGURES / "views.svg", images, learner.views_, truth)
     draw_quality(FIGURES / "quality.svg", learner.clusterer_.quality_, {}, learner.clusterer_.k_)
-    draw_telling(FIGURES / "telling.png", images, learner.labels_, {(0, 4): telling_features(images, learner.labels_, 0, 4)})
+    draw_telling(
+        FIGURES / "telling.png",
+        images,
+        learner.labels_,
+        {(0, 4): telling_features(images, learner.labels_, 0, 4)},
+    )
 
 
 def main() -> int:

@@ -24,14 +24,59 @@ RAW = "https://raw.githubusercontent.com/ssh-abduction/ssh-abduction"
 
 # The public names by theme: all that `ssh_abduction` exports, and what else the pages import, with the module that has it.
 THEMES: dict[str, tuple[str, ...]] = {
-    "From a trace to its maps": ("solve", "Search", "Trace", "Step", "Action", "Odometry", "Theory", "Speedups"),
-    "What an answer says": ("Solution", "Status", "Cost", "Bound", "Certificate", "Level", "Progress", "Backbone"),
+    "From a trace to its maps": (
+        "solve",
+        "Search",
+        "Trace",
+        "Step",
+        "Action",
+        "Odometry",
+        "Theory",
+        "Speedups",
+    ),
+    "What an answer says": (
+        "Solution",
+        "Status",
+        "Cost",
+        "Bound",
+        "Certificate",
+        "Level",
+        "Progress",
+        "Backbone",
+    ),
     "Maps": ("SSHMap", "DState", "Path", "Pose", "Fit"),
-    "Rival maps": ("compare", "Comparison", "difference", "Difference", "Listing", "view_page", "Page"),
-    "Why": ("explain.pairs.explain_pair", "explain.pairs.explain_trace", "explain.no_map.why_apart", "solver.front.fault_front"),
-    "Is a map right?": ("evaluate", "Evaluation", "MapEvaluation", "evaluate_visits", "VisitsEvaluation", "ladder", "Rung"),
+    "Rival maps": (
+        "compare",
+        "Comparison",
+        "difference",
+        "Difference",
+        "Listing",
+        "view_page",
+        "Page",
+    ),
+    "Why": (
+        "explain.pairs.explain_pair",
+        "explain.pairs.explain_trace",
+        "explain.no_map.why_apart",
+        "solver.front.fault_front",
+    ),
+    "Is a map right?": (
+        "evaluate",
+        "Evaluation",
+        "MapEvaluation",
+        "evaluate_visits",
+        "VisitsEvaluation",
+        "ladder",
+        "Rung",
+    ),
     "Using a map": ("route", "Route", "Move", "export_map", "Localiser", "Belief", "Chances"),
-    "While the robot drives": ("OnlineMapper", "next_experiment", "Experiment", "Explorer", "Exploration"),
+    "While the robot drives": (
+        "OnlineMapper",
+        "next_experiment",
+        "Experiment",
+        "Explorer",
+        "Exploration",
+    ),
     "From images to recognition": (
         "learning.learner.BootstrapLearner",
         "perception.views.ViewClusterer",
@@ -61,7 +106,11 @@ THEMES: dict[str, tuple[str, ...]] = {
 
 def full(name: str) -> str:
     """Where a name of THEMES is imported from, with it."""
-    return name if name.split(".", maxsplit=1)[0] in ("perception", "simulator") else f"ssh_abduction.{name}"
+    return (
+        name
+        if name.split(".", maxsplit=1)[0] in ("perception", "simulator")
+        else f"ssh_abduction.{name}"
+    )
 
 
 def named(path: str) -> Any:
@@ -77,13 +126,22 @@ def page_of(path: str) -> str:
 
 def themes() -> dict[str, tuple[str, ...]]:
     """Where the names of each theme are imported from, with them. What is exported and has no theme yet comes last."""
-    more = tuple(name for name in ssh_abduction.__all__ if not any(name in names for names in THEMES.values()))
-    return {theme: tuple(map(full, names)) for theme, names in {**THEMES, "More": more}.items() if names}
+    more = tuple(
+        name
+        for name in ssh_abduction.__all__
+        if not any(name in names for names in THEMES.values())
+    )
+    return {
+        theme: tuple(map(full, names)) for theme, names in {**THEMES, "More": more}.items() if names
+    }
 
 
 def on_config(config: MkDocsConfig) -> None:
     (section,) = [item["Reference"] for item in config.nav or [] if "Reference" in item]
-    section.extend({theme: [{path.rpartition(".")[2]: page_of(path)} for path in paths]} for theme, paths in themes().items())
+    section.extend(
+        {theme: [{path.rpartition(".")[2]: page_of(path)} for path in paths]}
+        for theme, paths in themes().items()
+    )
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
@@ -99,13 +157,24 @@ def home() -> str:
 
 
 def index() -> str:
-    lines = ["# Reference", "", "Each public name has a page. What has no module before it is imported from `ssh_abduction`.", ""]
+    lines = [
+        "# Reference",
+        "",
+        "Each public name has a page. What has no module before it is imported from `ssh_abduction`.",
+        "",
+    ]
     for theme, paths in themes().items():
         lines += [f"## {theme}", ""]
         for path in paths:
             shown = path.removeprefix("ssh_abduction.")
-            what = re.split(r"(?<=[.:])\s|\n\n", getdoc(named(path)) or "")[0].replace("\n", " ").rstrip(".:")
-            lines.append(f"[`{shown}`]({posixpath.relpath(page_of(path), 'reference')})\n:   {what}\n")
+            what = (
+                re.split(r"(?<=[.:])\s|\n\n", getdoc(named(path)) or "")[0]
+                .replace("\n", " ")
+                .rstrip(".:")
+            )
+            lines.append(
+                f"[`{shown}`]({posixpath.relpath(page_of(path), 'reference')})\n:   {what}\n"
+            )
     return "\n".join(lines)
 
 
@@ -139,6 +208,8 @@ def to_github(markdown: str, uri: str) -> str:
         target = posixpath.normpath(posixpath.join("docs", posixpath.dirname(uri), link[1]))
         if target == "docs" or target.startswith("docs/"):
             return link[0]
-        return f"]({GITHUB}/{'tree' if (ROOT / target).is_dir() else 'blob'}/main/{target}{link[2]})"
+        return (
+            f"]({GITHUB}/{'tree' if (ROOT / target).is_dir() else 'blob'}/main/{target}{link[2]})"
+        )
 
     return re.sub(r"\]\((\.\./[^)#\s]*)(#[^)\s]*|)\)", mended, markdown)

@@ -102,9 +102,13 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
         compared if the odometer hardly moved.
     """
     odometry = np.array([scan.odometry for scan in log.scans])
-    stretches = [(i, j) for i, j in _stretches(odometry) if not any(i < cut <= j for cut in track.cuts)]
+    stretches = [
+        (i, j) for i, j in _stretches(odometry) if not any(i < cut <= j for cut in track.cuts)
+    ]
     if not stretches:
-        return Agreement(float(np.hypot(*np.diff(odometry[:, :2], axis=0).T).sum()), float(track.way[-1]))
+        return Agreement(
+            float(np.hypot(*np.diff(odometry[:, :2], axis=0).T).sum()), float(track.way[-1])
+        )
     told = np.array([between(odometry[i], odometry[j]) for i, j in stretches])
     seen = np.array([between(track.poses[i], track.poses[j]) for i, j in stretches])
     motion_told, motion_seen = (way[:, 0] + 1j * way[:, 1] for way in (told, seen))
@@ -146,7 +150,9 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
     if found.turning is not None and found.has_other_turns:
         differences.append(f"turns by scans are {found.turning:.2f} times those by odometry")
         if found.turning < 0:
-            causes.append(f"the laser hangs upside down (--fov {-math.copysign(fov, laser.step):.0f})")
+            causes.append(
+                f"the laser hangs upside down (--fov {-math.copysign(fov, laser.step):.0f})"
+            )
             covers = None
         elif covers is None and fov / found.turning <= 360:
             covers = fov / found.turning
@@ -154,11 +160,15 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
         causes.append(f"its beams cover about {covers:.0f} degrees, not {fov:.0f} (--fov)")
     if found.is_askew:
         degrees, side = abs(math.degrees(found.angle)), "left" if found.angle > 0 else "right"
-        differences.append(f"the direction by scans is {degrees:.0f} degrees to the {side} of that by odometry")
+        differences.append(
+            f"the direction by scans is {degrees:.0f} degrees to the {side} of that by odometry"
+        )
     if looks is not None:
         x, y, _ = laser.mount
         side = "left" if looks >= 0 else "right"
-        causes.append(f"the laser looks {abs(looks):.0f} degrees to the {side} of straight ahead (--mount={x:g},{y:g},{looks:.0f})")
+        causes.append(
+            f"the laser looks {abs(looks):.0f} degrees to the {side} of straight ahead (--mount={x:g},{y:g},{looks:.0f})"
+        )
     if not causes:
         causes = [
             'a range that means "nothing came back" is read as a wall (--no-return, --zero-is)',
@@ -168,9 +178,7 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
     causes.append("the odometer jumps, slips or is out of scale")
     if found.parted:
         differences.append(f"they part in {found.parted} of {found.of} stretches of a metre")
-    return (
-        f"The way by scans is not the way by odometry: {'; '.join(differences)}. The map may be wrong. Likely causes: {'; '.join(causes)}."
-    )
+    return f"The way by scans is not the way by odometry: {'; '.join(differences)}. The map may be wrong. Likely causes: {'; '.join(causes)}."
 
 
 def direction(log: RobotLog) -> float | None:
@@ -197,7 +205,11 @@ def field_of_view(log: RobotLog) -> float | None:
         return None
     apart = np.array([one[0] for one in tried if one is not None])
     best = int(np.argmin(apart))
-    return float(FIELDS[best]) if abs(FIELDS[best] - fov) >= LEAST_CHANGE and apart[best] < CLOSER_WIDENED * now[0] else None
+    return (
+        float(FIELDS[best])
+        if abs(FIELDS[best] - fov) >= LEAST_CHANGE and apart[best] < CLOSER_WIDENED * now[0]
+        else None
+    )
 
 
 def _fov(scan: Scan) -> float:
@@ -228,7 +240,9 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
         moved = complex(dx, dy) + (at + there[:, None] * looks) * np.exp(1j * turn)
         seen = (moved - at) / looks
         tree = cKDTree(np.stack([here.real, here.imag], axis=-1))
-        nearest, _ = tree.query(np.stack([seen.real, seen.imag], axis=-1), distance_upper_bound=MEET)
+        nearest, _ = tree.query(
+            np.stack([seen.real, seen.imag], axis=-1), distance_upper_bound=MEET
+        )
         apart.append(np.minimum(nearest, MEET).mean(axis=0))
     return np.asarray(np.mean(apart, axis=0)) if len(apart) >= PAIRS / 4 else None
 
@@ -244,14 +258,19 @@ def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
                 if math.hypot(dx, dy) < GAP[1] and abs(turn) < TURN_OF_PAIR[1]:
                     pairs.append((scan, later))
                 break
-    return [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).astype(int))]
+    return [
+        pairs[i]
+        for i in np.unique(np.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).astype(int))
+    ]
 
 
 def _points(scan: Scan, stretch: float) -> NDArray[np.complex128]:
     """What the beams of a scan met, seen from the laser, as complex numbers."""
     met = (scan.ranges > 0) & (scan.ranges < min(scan.laser.reach, NEAR))
     middle = scan.laser.bearings.mean()
-    return np.asarray(scan.ranges[met] * np.exp(1j * (middle + stretch * (scan.laser.bearings[met] - middle))))
+    return np.asarray(
+        scan.ranges[met] * np.exp(1j * (middle + stretch * (scan.laser.bearings[met] - middle)))
+    )
 
 
 def _stretches(odometry: Array) -> list[tuple[int, int]]:

@@ -54,7 +54,11 @@ class Door:
 def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
     """The doors that the robot drove through, in order. One that it drove through twice is there twice. Where the track is broken, each part is a way of its own."""
     return tuple(
-        replace(door, scan=min(door.scan + begin, end - (end < len(log))), way=door.way + float(track.way[begin]))
+        replace(
+            door,
+            scan=min(door.scan + begin, end - (end < len(log))),
+            way=door.way + float(track.way[begin]),
+        )
         for begin, end in track.spans
         for door in _doors_of_span(replace(log, scans=log.scans[begin:end]), track.part(begin, end))
     )
@@ -65,28 +69,49 @@ def _doors_of_span(log: RobotLog, track: Track) -> tuple[Door, ...]:
     ways = np.arange(0.0, track.way[-1], STRIDE)
     # While the robot stands, its way does not grow: only the first of such scans is a point to interpolate between.
     moving = np.concatenate([[True], np.diff(track.way) > 0])
-    positions = np.stack([np.interp(ways, track.way[moving], track.poses[moving, k]) for k in (0, 1)], axis=1)
+    positions = np.stack(
+        [np.interp(ways, track.way[moving], track.poses[moving, k]) for k in (0, 1)], axis=1
+    )
     scans = np.searchsorted(track.way, ways, side="right") - 1
-    ahead = positions[np.minimum(np.arange(len(ways)) + 3, len(ways) - 1)] - positions[np.maximum(np.arange(len(ways)) - 3, 0)]
+    ahead = (
+        positions[np.minimum(np.arange(len(ways)) + 3, len(ways) - 1)]
+        - positions[np.maximum(np.arange(len(ways)) - 3, 0)]
+    )
     across = np.arctan2(ahead[:, 1], ahead[:, 0]) + math.pi / 2
     gaps: list[tuple[float, Array]] = []
     for begin in range(0, len(ways), LOOKS):
         some = slice(begin, begin + LOOKS)
         middle = begin + len(positions[some]) // 2
         patch = maps.around(int(scans[middle]), positions[middle], ASIDE + 1)
-        gaps += [_gap(patch, at, angle) for at, angle in zip(positions[some], across[some], strict=True)]
+        gaps += [
+            _gap(patch, at, angle) for at, angle in zip(positions[some], across[some], strict=True)
+        ]
     widths = np.array([width for width, _ in gaps])
     found: list[Door] = []
     # The narrowest look comes first, so that each door is taken where it is narrowest, and what is found beside it later is the same door.
     for k in np.argsort(widths, kind="stable"):
         if widths[k] > DOOR:
             break
-        before, after = widths[(ways < ways[k]) & (ways >= ways[k] - BESIDE)], widths[(ways > ways[k]) & (ways <= ways[k] + BESIDE)]
+        before, after = (
+            widths[(ways < ways[k]) & (ways >= ways[k] - BESIDE)],
+            widths[(ways > ways[k]) & (ways <= ways[k] + BESIDE)],
+        )
         if not len(before) or not len(after) or min(before.max(), after.max()) < WIDER * widths[k]:
             continue
-        apart = [widths[(ways >= min(door.way, ways[k])) & (ways <= max(door.way, ways[k]))].max() >= WIDER * widths[k] for door in found]
+        apart = [
+            widths[(ways >= min(door.way, ways[k])) & (ways <= max(door.way, ways[k]))].max()
+            >= WIDER * widths[k]
+            for door in found
+        ]
         if all(apart) and all(abs(door.way - ways[k]) > DEEP for door in found):
-            found.append(Door(int(np.searchsorted(track.way, ways[k], side="right")), gaps[k][1], float(widths[k]), float(ways[k])))
+            found.append(
+                Door(
+                    int(np.searchsorted(track.way, ways[k], side="right")),
+                    gaps[k][1],
+                    float(widths[k]),
+                    float(ways[k]),
+                )
+            )
     return tuple(sorted(found, key=lambda door: door.way))
 
 
@@ -110,7 +135,10 @@ def are_frequent(doors: Sequence[Door], track: Track) -> bool:
 
 def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
     """The visits to doors, in order: one where the robot went into a room and came back by the same door. Corrected poses are not read."""
-    spans = [[door for door in doors if begin <= min(door.scan, len(track.poses) - 1) < end] for begin, end in track.spans]
+    spans = [
+        [door for door in doors if begin <= min(door.scan, len(track.poses) - 1) < end]
+        for begin, end in track.spans
+    ]
     return tuple(visit for some in spans for visit in _visits_of_span(track, some))
 
 
@@ -128,21 +156,37 @@ def _visits_of_span(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
             passes[-1] += [*part, door]
         else:
             passes.append([door])
-    middles = [min(same, key=lambda door: door.width).middle for same in passes]  # where it is narrowest
+    middles = [
+        min(same, key=lambda door: door.width).middle for same in passes
+    ]  # where it is narrowest
     return tuple(_visit(track, passes, middles, number) for number in range(len(passes)))
 
 
-def _visit(track: Track, passes: Sequence[Sequence[Door]], middles: Sequence[Array], number: int) -> Visit:
+def _visit(
+    track: Track, passes: Sequence[Sequence[Door]], middles: Sequence[Array], number: int
+) -> Visit:
     """The visit to a door, whose ways out are the straight ways to the doors before and after it."""
     same, middle = passes[number], middles[number]
     came = _bearing(middle, middles[number - 1]) if number > 0 else None
     went = _bearing(middle, middles[number + 1]) if number < len(passes) - 1 else None
-    if came is not None and went is not None and math.dist(middles[number - 1], middles[number + 1]) < SAME:
+    if (
+        came is not None
+        and went is not None
+        and math.dist(middles[number - 1], middles[number + 1]) < SAME
+    ):
         went = came
     ways = sorted({bearing for bearing in (came, went) if bearing is not None})
     arrived, left = (None if bearing is None else ways.index(bearing) for bearing in (came, went))
     end = min(same[-1].scan, len(track.poses) - 1)
-    return Visit(min(same[0].scan, end), middle, max(same[0].scan - 1, 0), end, tuple(map(Way, ways)), arrived, left)
+    return Visit(
+        min(same[0].scan, end),
+        middle,
+        max(same[0].scan - 1, 0),
+        end,
+        tuple(map(Way, ways)),
+        arrived,
+        left,
+    )
 
 
 def _bearing(start: Array, end: Array) -> float:

@@ -78,7 +78,9 @@ def outlook(open_cells: Bools, middle: Cell, radius: float) -> Outlook:
         if cells.sum() >= LEAST:
             row, column = np.argwhere(cells).mean(axis=0) - middle
             found.append(Exit(math.atan2(column, row), cells))
-    return Outlook(middle, tuple(sorted(_merged(found, middle), key=lambda exit: exit.bearing)), reached)
+    return Outlook(
+        middle, tuple(sorted(_merged(found, middle), key=lambda exit: exit.bearing)), reached
+    )
 
 
 def _merged(exits: list[Exit], middle: Cell) -> list[Exit]:
@@ -105,7 +107,10 @@ def parting(patch: Patch, open_cells: Bools, seen: Outlook, radius: float) -> Ce
     Of two ways out it is where the way from one to the other bends most.
     """
     inside = open_cells & np.isfinite(seen.reached)
-    total = sum((distances(inside, exit.cells, 2 * radius + 2) for exit in seen.exits), np.zeros(inside.shape))
+    total = sum(
+        (distances(inside, exit.cells, 2 * radius + 2) for exit in seen.exits),
+        np.zeros(inside.shape),
+    )
     good = total <= total.min() + (AS_GOOD if len(seen.exits) > 2 else 2 * AS_GOOD)
     cells = np.argwhere(good)
     if len(seen.exits) == 2:

@@ -61,7 +61,11 @@ class Imported:
 
 
 def import_log(
-    log: RobotLog, gateway: float | None = None, radius: float | None = None, name: str | None = None, doors: bool | None = None
+    log: RobotLog,
+    gateway: float | None = None,
+    radius: float | None = None,
+    name: str | None = None,
+    doors: bool | None = None,
 ) -> Imported:
     """The trace of a log. Corrected poses are truth for evaluation, and nothing here reads them for anything else.
 
@@ -91,7 +95,11 @@ def import_log(
         )
     with _timed(seconds, "scale"):
         found = suggested(log.scans, track)
-        scale = replace(found, gateway=found.gateway if gateway is None else gateway, radius=found.radius if radius is None else radius)
+        scale = replace(
+            found,
+            gateway=found.gateway if gateway is None else gateway,
+            radius=found.radius if radius is None else radius,
+        )
     with _timed(seconds, "places"):
         passed = find_doors(log, track) if doors or (doors is None and is_wide(scale)) else ()
         scale = replace(scale, doors=are_frequent(passed, track) if doors is None else doors)
@@ -141,7 +149,11 @@ def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
         tried = jumps.in_unit(stretch, UNITS[unit])
         told, seen = np.array([scan.odometry[:2] for scan in tried.scans]), follow(tried)
         ways = [np.hypot(*np.diff(way, axis=0).T) for way in (told, seen.poses[:, :2])]
-        return float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9)) if not seen.breaks else math.inf
+        return (
+            float(np.abs(ways[0] - ways[1]).sum() / max(ways[1].sum(), 1e-9))
+            if not seen.breaks
+            else math.inf
+        )
 
     found = min(UNITS, key=off)
     if off(found) > UNLIKE:
@@ -159,7 +171,9 @@ def _besides(notes: Sequence[str]) -> str:
 
 def with_views(trace: Trace) -> Trace:
     """The trace with views of its images: few, so that one place has one view, whatever stood around (Kuipers & Beeson 2002, section 3)."""
-    images = ReciprocalTransformer(floor=0.3).fit_transform(np.array([step.image for step in trace.steps]))
+    images = ReciprocalTransformer(floor=0.3).fit_transform(
+        np.array([step.image for step in trace.steps])
+    )
     most = max(2, len(images) // SEEN)
     if len(images) <= most or (images == images[0]).all():
         views, sure = np.zeros(len(images), int), np.ones(len(images))
@@ -169,7 +183,12 @@ def with_views(trace: Trace) -> Trace:
             clusterer = ViewClusterer(k_max=most, by="trimmed", random_state=0).fit(images)
         views, sure = clusterer.labels_, clusterer.confidence_
     seen = zip(trace.steps, views, sure, strict=True)
-    return replace(trace, steps=tuple(replace(step, view=int(view), confidence=round(float(c), 4)) for step, view, c in seen))
+    return replace(
+        trace,
+        steps=tuple(
+            replace(step, view=int(view), confidence=round(float(c), 4)) for step, view, c in seen
+        ),
+    )
 
 
 @contextmanager

@@ -64,7 +64,13 @@ def in_unit(log: RobotLog, count: float) -> RobotLog:
     """The log in metres, where its odometry counts something of which there are so many in a metre."""
     return replace(
         log,
-        scans=tuple(replace(scan, odometry=(scan.odometry[0] / count, scan.odometry[1] / count, scan.odometry[2])) for scan in log.scans),
+        scans=tuple(
+            replace(
+                scan,
+                odometry=(scan.odometry[0] / count, scan.odometry[1] / count, scan.odometry[2]),
+            )
+            for scan in log.scans
+        ),
     )
 
 
@@ -75,7 +81,9 @@ def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan
     poses = np.array([scans[number].odometry for number in members])
     poses[:, 2] = np.unwrap(poses[:, 2])
     rows = interp1d(members, poses, axis=0, fill_value="extrapolate")(np.arange(len(scans)))
-    odometry: list[Pose] = [(x, y, math.remainder(heading, math.tau)) for x, y, heading in rows.tolist()]
+    odometry: list[Pose] = [
+        (x, y, math.remainder(heading, math.tau)) for x, y, heading in rows.tolist()
+    ]
     return tuple(replace(scan, odometry=pose) for scan, pose in zip(scans, odometry, strict=True))
 
 
@@ -87,14 +95,20 @@ def said_of(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> lis
         track: Its track.
         turned: The scans at which the robot turned otherwise than the odometer says, and by how many radians.
     """
-    steps = {cut: between(log.scans[cut - 1].odometry, log.scans[cut].odometry) for cut in track.cuts}
+    steps = {
+        cut: between(log.scans[cut - 1].odometry, log.scans[cut].odometry) for cut in track.cuts
+    }
     far = {cut: math.hypot(x, y) for cut, (x, y, _) in steps.items()}
     jumps = [cut for cut in track.cuts if far[cut] > STILL]
     still = [cut for cut in track.cuts if far[cut] <= STILL and cut not in track.breaks]
     notes = []
     if jumps:
         first, most = jumps[0], max(jumps, key=far.__getitem__)
-        anew = ", where it starts anew from 0" if math.hypot(*log.scans[first].odometry[:2]) < ANEW else ""
+        anew = (
+            ", where it starts anew from 0"
+            if math.hypot(*log.scans[first].odometry[:2]) < ANEW
+            else ""
+        )
         notes.append(
             f"The odometry jumps {_times(len(jumps))} in {len(log)} scans: by {far[first]:.1f} m before scan {first} ({_where(log, first)}){anew}"
             + (f", and by {far[most]:.1f} m at most" if len(jumps) > 1 else "")
@@ -122,7 +136,10 @@ def said_of(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> lis
 def said_of_whole(log: RobotLog) -> list[str]:
     """What is to be said of an odometry that is wrong throughout, or of a log that is not in order."""
     notes = []
-    far_apart, to_and_fro = usual_step(log), float(_far(log, 2).sum() / max(2 * _far(log, 1).sum(), 1e-9))
+    far_apart, to_and_fro = (
+        usual_step(log),
+        float(_far(log, 2).sum() / max(2 * _far(log, 1).sum(), 1e-9)),
+    )
     if far_apart > LONG:
         notes.append(
             f"The usual step between two scans is {far_apart:.0f} m by the odometry: it does not count metres, or the log is not in order."
@@ -139,7 +156,9 @@ def said_of_whole(log: RobotLog) -> list[str]:
     times = np.array([scan.time for scan in log.scans if scan.time is not None])
     back = int((np.diff(times) < 0).sum())
     if back > SHUFFLED * len(log):
-        notes.append(f"The times of the scans run back {back} times in {len(log)} scans. If the log is not in the order of time, sort it.")
+        notes.append(
+            f"The times of the scans run back {back} times in {len(log)} scans. If the log is not in the order of time, sort it."
+        )
     return notes
 
 
@@ -179,7 +198,9 @@ def unknown_steps(log: RobotLog) -> Unknown:
     if len(log) < 3:
         return Unknown()
     seconds = _seconds(log)
-    paused = np.zeros(len(log) - 1, bool) if seconds is None else seconds > PAUSE * np.median(seconds)
+    paused = (
+        np.zeros(len(log) - 1, bool) if seconds is None else seconds > PAUSE * np.median(seconds)
+    )
     jumped, doubtful = _impossible(log, seconds, paused)
     carried, still = _moved_while_still(log, paused)
     moved = frozenset(k for first, last in still for k in range(first, last + 1))
@@ -199,7 +220,9 @@ def _impossible(
     if not far.any():
         return np.zeros(len(far), bool), np.zeros(len(far), bool)
     # Where poses alternate, each step is a jump, but those over two steps are not.
-    usual = min(float(np.median(steps[steps > 0])) for steps in (far, over_two) if (steps > 0).any())
+    usual = min(
+        float(np.median(steps[steps > 0])) for steps in (far, over_two) if (steps > 0).any()
+    )
     least = max(FAR, UNUSUAL * usual)
     jumped, doubtful = far > least, far > least / 2
     if seconds is not None and paused.any():
@@ -210,7 +233,9 @@ def _impossible(
     return jumped, doubtful
 
 
-def _moved_while_still(log: RobotLog, paused: NDArray[np.bool_]) -> tuple[frozenset[int], tuple[tuple[int, int], ...]]:
+def _moved_while_still(
+    log: RobotLog, paused: NDArray[np.bool_]
+) -> tuple[frozenset[int], tuple[tuple[int, int], ...]]:
     """Where the odometer stood still while what the laser sees changed: the scans before which none was logged for long, and the first and the last scan of other stretches.
 
     None where it mostly stands still, as then there is no odometer.
@@ -223,7 +248,11 @@ def _moved_while_still(log: RobotLog, paused: NDArray[np.bool_]) -> tuple[frozen
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         if any(_change(log.scans[begin], log.scans[k]) > MOVED for k in range(begin + 1, end + 1)):
             found.append((begin + 1, end))
-        carried |= {k for k in range(begin + 1, end + 1) if paused[k - 1] and _change(log.scans[k - 1], log.scans[k]) > MOVED_UNSEEN}
+        carried |= {
+            k
+            for k in range(begin + 1, end + 1)
+            if paused[k - 1] and _change(log.scans[k - 1], log.scans[k]) > MOVED_UNSEEN
+        }
     return frozenset(carried), tuple(found)
 
 
@@ -237,7 +266,10 @@ def _change(first: Scan, last: Scan) -> float:
     """The share of the beams whose ranges changed from one scan to another, of those that met something in either; 0 for scans of two lasers."""
     if first.laser != last.laser:
         return 0.0
-    before, after = (np.minimum(np.nan_to_num(scan.ranges, nan=0.0, posinf=NO_RANGE), NO_RANGE) for scan in (first, last))
+    before, after = (
+        np.minimum(np.nan_to_num(scan.ranges, nan=0.0, posinf=NO_RANGE), NO_RANGE)
+        for scan in (first, last)
+    )
     told = ((before < NO_RANGE) | (after < NO_RANGE)) & (before > 0) & (after > 0)
     changed = np.abs(before - after) > CHANGED + CHANGED_SHARE * np.minimum(before, after)
     return float(changed[told].mean()) if told.any() else 0.0

@@ -68,13 +68,18 @@ class Patch:
     def free_along(self, begin: Array, directions: Array, most: float) -> Array:
         """Metres that one can look from a position before something is met, and no more than `most`: one number for each direction, of unit vectors (..., 2)."""
         far = np.arange(0.0, most, CELL / 2)
-        cells = np.rint((begin + far[:, None] * directions[..., None, :] - self.corner) / CELL).astype(int)
+        cells = np.rint(
+            (begin + far[:, None] * directions[..., None, :] - self.corner) / CELL
+        ).astype(int)
         met = self._met[cells[..., 0], cells[..., 1]]
         return np.where(met.any(axis=-1), far[met.argmax(axis=-1)], most)
 
     def drivable(self, width: float) -> Bools:
         """Where something of this width in metres can go. Where the robot went is always one of these cells."""
-        return np.asarray((self.clearance >= width / 2) | ndimage.binary_dilation(self.trail, _EIGHT, iterations=2))
+        return np.asarray(
+            (self.clearance >= width / 2)
+            | ndimage.binary_dilation(self.trail, _EIGHT, iterations=2)
+        )
 
     def cell(self, position: Array | Sequence[float]) -> Cell:
         """The cell of a position; it may be outside of the patch."""
@@ -102,7 +107,9 @@ class LocalMaps:
     def around(self, scan: int, middle: Array | Sequence[float], half: float) -> Patch:
         """The square patch of 2 x half metres around a position near a scan, as the scans of its window saw it."""
         way = self._track.way
-        first_scan, last_scan = self._track.span_of(scan)  # what was seen elsewhere says nothing here
+        first_scan, last_scan = self._track.span_of(
+            scan
+        )  # what was seen elsewhere says nothing here
         begin = max(int(np.searchsorted(way, way[scan] - self._reach)), first_scan)
         end = min(int(np.searchsorted(way, way[scan] + self._reach, side="right")), last_scan)
         self._move(begin, end)
@@ -117,9 +124,13 @@ class LocalMaps:
         closed = ndimage.binary_closing(np.pad(free, 3), _EIGHT)[3:-3, 3:-3]
         return Patch((free | closed) & ~(occupied & ~free), occupied & ~trail, trail, first * CELL)
 
-    def _trail(self, begin: int, end: int, first: NDArray[np.int64], shape: tuple[int, ...]) -> Bools:
+    def _trail(
+        self, begin: int, end: int, first: NDArray[np.int64], shape: tuple[int, ...]
+    ) -> Bools:
         path = self._track.poses[begin:end, :2]
-        legs = [np.linspace(a, b, 2 + int(math.dist(a, b) / CELL)) for a, b in itertools.pairwise(path)]
+        legs = [
+            np.linspace(a, b, 2 + int(math.dist(a, b) / CELL)) for a, b in itertools.pairwise(path)
+        ]
         cells = np.rint(np.concatenate([path, *legs]) / CELL).astype(int) - first
         cells = cells[((cells >= 0) & (cells < shape)).all(axis=1)]
         trail = np.zeros(shape, bool)
@@ -164,7 +175,9 @@ class LocalMaps:
         rays = np.broadcast_to(along, through.shape)[through]
         which = np.nonzero(through)[0]
         passed = self._numbers(x + np.cos(angles)[which] * rays, y + np.sin(angles)[which] * rays)
-        ends = self._numbers(x + ranges[met] * np.cos(angles[met]), y + ranges[met] * np.sin(angles[met]))
+        ends = self._numbers(
+            x + ranges[met] * np.cos(angles[met]), y + ranges[met] * np.sin(angles[met])
+        )
         return np.setdiff1d(passed, ends, assume_unique=True), ends
 
     def _numbers(self, x: Array, y: Array) -> NDArray[np.int64]:

@@ -68,9 +68,13 @@ def suggested(scans: Sequence[Scan], track: Track) -> Scale:
         if (length := math.hypot(*ahead)) > 0.2:
             patch = maps.around(i, track.poses[i, :2], ASIDE + 1)
             left = np.array([-ahead[1], ahead[0]]) / length
-            widths.append(float(patch.free_along(track.poses[i, :2], np.stack([left, -left]), ASIDE).sum()))
+            widths.append(
+                float(patch.free_along(track.poses[i, :2], np.stack([left, -left]), ASIDE).sum())
+            )
     reach = float(np.median([scan.laser.reach for scan in scans]))
-    narrow, corridor, most = np.percentile(widths, [NARROW, CORRIDOR, MOST]) if widths else (1.2, 1.7, 1.7)
+    narrow, corridor, most = (
+        np.percentile(widths, [NARROW, CORRIDOR, MOST]) if widths else (1.2, 1.7, 1.7)
+    )
     return Scale(
         gateway=round(float(np.clip(SHARE * narrow, 0.5, 2.0)), 2),
         radius=round(float(np.clip(RADII * corridor, RADIUS[0], np.clip(reach, *RADIUS))), 2),

@@ -52,7 +52,9 @@ def has_right_angles(visits: Sequence[Visit]) -> bool:
     return bool(taken) and sum(taken) / len(taken) >= RIGHT
 
 
-def to_trace(log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit], name: str | None = None) -> Trace:
+def to_trace(
+    log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit], name: str | None = None
+) -> Trace:
     """The trace of a log: steps with images, stars and displacements, and the actions between them. Views are left to cluster."""
     # Ways are turned by multiples of the stride, an angle in radians; from door to door they lead in any direction.
     stride = None if scale.doors else QUARTER if has_right_angles(visits) else QUARTER / 2
@@ -63,10 +65,14 @@ def to_trace(log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit],
     last: tuple[Visit, Pose] | None = None
     for number, visit in enumerate(visits):
         patch = maps.around(visit.scan, visit.middle, scale.half)
-        came = None if visit.arrived is None else wrapped(visit.ways[visit.arrived].bearing + math.pi)
+        came = (
+            None if visit.arrived is None else wrapped(visit.ways[visit.arrived].bearing + math.pi)
+        )
         went = None if visit.left is None else visit.ways[visit.left].bearing
         # The only visit of a log that neither came from anywhere nor went on faces as the robot did.
-        headings = [heading for heading in (came, went) if heading is not None] or [float(track.poses[visit.scan, 2])]
+        headings = [heading for heading in (came, went) if heading is not None] or [
+            float(track.poses[visit.scan, 2])
+        ]
         if len(headings) == 2 and apart(*headings) < AHEAD and stride is not None:
             headings = headings[:1]
         for heading in headings:
@@ -75,13 +81,19 @@ def to_trace(log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit],
             last = (visit, pose)
         if steps and number < len(visits) - 1:
             carried = track.span_of(visit.scan) != track.span_of(visits[number + 1].scan)
-            steps[-1] = replace(steps[-1], action=Action.that_slipped(len(steps) - 1) if carried else Action.of("travel"))
+            steps[-1] = replace(
+                steps[-1],
+                action=Action.that_slipped(len(steps) - 1) if carried else Action.of("travel"),
+            )
     steps = _with_turns(steps, stride, visits)
     return Trace(
         tuple(steps),
         name=name,
         odometry=Odometry(
-            scale=SCALE, bend=DRIFT, offset=THRESHOLD if scale.doors else MIDDLE, facing=ACROSS if scale.doors else DIRECTION
+            scale=SCALE,
+            bend=DRIFT,
+            offset=THRESHOLD if scale.doors else MIDDLE,
+            facing=ACROSS if scale.doors else DIRECTION,
         ),
         extra={"beams": {"first": -90, "step": 1}, "right_angles": stride == QUARTER},
     )
@@ -116,7 +128,9 @@ def _step(
     return Step(
         image=tuple(round(float(r), 3) for r in _image(patch, visit.middle, pose[2])),
         star=None if stride is None else _star(visit, pose[2], stride),
-        displacement=None if onward is None else (round(onward[0], 4), round(onward[1], 4), round(onward[2], 5)),
+        displacement=None
+        if onward is None
+        else (round(onward[0], 4), round(onward[1], 4), round(onward[2], 5)),
         covariance=covariance,
         truth=truth,
         extra=extra,
@@ -139,8 +153,12 @@ def _aligned(visits: Sequence[Visit], stride: float) -> list[Visit]:
         number: dict[int, int] = {}
         for k, way in enumerate(visit.ways):
             slot = round((way.bearing - axis) / stride) % count
-            sure = way.sure and (abs(_off(way.bearing - axis, stride)) < OFF or k in (visit.arrived, visit.left))
-            ways[slot] = Way(wrapped(axis + slot * stride), sure or (slot in ways and ways[slot].sure))
+            sure = way.sure and (
+                abs(_off(way.bearing - axis, stride)) < OFF or k in (visit.arrived, visit.left)
+            )
+            ways[slot] = Way(
+                wrapped(axis + slot * stride), sure or (slot in ways and ways[slot].sure)
+            )
             number[k] = slot
         order = sorted(ways)
         aligned.append(
@@ -171,7 +189,10 @@ def _star(visit: Visit, heading: float, stride: float) -> tuple[float | Gateway 
     if stride == QUARTER:
         quarters = {round(bearing / 90) % 4: sure for bearing, sure in seen}
         return tuple((1 if quarters[k] else None) if k in quarters else 0 for k in range(4))
-    return tuple(Gateway(round(bearing, 1), SPREAD, open=True if sure else None) for bearing, sure in sorted(seen))
+    return tuple(
+        Gateway(round(bearing, 1), SPREAD, open=True if sure else None)
+        for bearing, sure in sorted(seen)
+    )
 
 
 def _image(patch: Patch, middle: Array, heading: float) -> Array:
@@ -179,7 +200,12 @@ def _image(patch: Patch, middle: Array, heading: float) -> Array:
     far = np.arange(0.0, min(patch.free.shape) * CELL / 2, CELL / 2)
     angles = heading + BEAMS
     cells = np.rint(
-        (middle + far[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :] - patch.corner) / CELL
+        (
+            middle
+            + far[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
+            - patch.corner
+        )
+        / CELL
     ).astype(int)
     inside = ((cells >= 0) & (cells < patch.free.shape)).all(axis=2)
     cells = np.clip(cells, 0, np.array(patch.free.shape) - 1)
@@ -198,7 +224,13 @@ def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> 
         pose = track.poses[i - 1]
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         # An error of an increment turns and shifts all that comes after it: the end of the way moves with the arm from there.
-        arm = np.array([[cos, -sin, -(y - track.poses[i, 1])], [sin, cos, x - track.poses[i, 0]], [0.0, 0.0, 1.0]])
+        arm = np.array(
+            [
+                [cos, -sin, -(y - track.poses[i, 1])],
+                [sin, cos, x - track.poses[i, 0]],
+                [0.0, 0.0, 1.0],
+            ]
+        )
         total += arm @ track.covariances[i] @ arm.T
     turned = np.eye(3)
     cos, sin = math.cos(first[2]), math.sin(first[2])
@@ -219,7 +251,10 @@ def _with_turns(steps: list[Step], stride: float | None, visits: Sequence[Visit]
             visit = visits[int(step.extra["visit"])]
             clockwise = -math.degrees(turned[2])
             done[i] = replace(
-                step, action=_any_turn(clockwise, visit.arrived == visit.left) if stride is None else _turn(clockwise, stride)
+                step,
+                action=_any_turn(clockwise, visit.arrived == visit.left)
+                if stride is None
+                else _turn(clockwise, stride),
             )
     return done
 
@@ -230,7 +265,9 @@ def _turn(clockwise: float, stride: float) -> Action:
     names = {90: "right", 180: "around", 270: "left"}
     if rounded in names:
         return Action.of(names[rounded])
-    return Action(f"turn {rounded}", "turn", "right" if rounded < 180 else "left", bearing=float(rounded))
+    return Action(
+        f"turn {rounded}", "turn", "right" if rounded < 180 else "left", bearing=float(rounded)
+    )
 
 
 def _any_turn(clockwise: float, back: bool) -> Action:

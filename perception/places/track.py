@@ -139,7 +139,8 @@ def follow(log: RobotLog, trust: Trust | None = None) -> Track:
         k
         for first, last in steps.still
         for k in range(first, last + 1)
-        if np.hypot(*(track.poses[first : last + 1, :2] - track.poses[first - 1, :2]).T).max() <= CARRIED
+        if np.hypot(*(track.poses[first : last + 1, :2] - track.poses[first - 1, :2]).T).max()
+        <= CARRIED
     )
     if standing:
         follower = replace(follower, steps=steps.but_for(standing))
@@ -182,9 +183,15 @@ class _Follower:
                     if found is None:
                         breaks.append(i)
                 else:
-                    pose, covariance, share = _matched(points, normals, recent, poses[-1], onward, self.trust.covariance(onward))
+                    pose, covariance, share = _matched(
+                        points, normals, recent, poses[-1], onward, self.trust.covariance(onward)
+                    )
                     doubtful = share < POOR and i in self.steps.doubtful
-                    if doubtful and (found := _bridged(points, normals, recent, poses[-1], before)) is not None:
+                    if (
+                        doubtful
+                        and (found := _bridged(points, normals, recent, poses[-1], before))
+                        is not None
+                    ):
                         cuts.append(i)
                         pose, covariance, share = found
                 if breaks[-1:] == [i]:
@@ -194,7 +201,13 @@ class _Follower:
                 covariances.append(covariance)
                 shares.append(share)
             recent.append((_moved(poses[-1], points), points_turned(poses[-1][2], normals)))
-        return Track(np.array(poses), np.array(covariances), np.array(shares), tuple(sorted({*cuts, *breaks})), tuple(breaks))
+        return Track(
+            np.array(poses),
+            np.array(covariances),
+            np.array(shares),
+            tuple(sorted({*cuts, *breaks})),
+            tuple(breaks),
+        )
 
 
 def _bridged(
@@ -202,7 +215,9 @@ def _bridged(
 ) -> tuple[Pose, Array, float] | None:
     """The pose of a scan by walls alone, with the covariance of the increment and the share of points on walls: near where the robot was, or where it went on as before. None where it matches nowhere."""
     wide = np.diag(UNKNOWN) ** 2
-    onward, stayed = (_matched(points, normals, recent, last, guess, wide) for guess in (before, (0.0, 0.0, 0.0)))
+    onward, stayed = (
+        _matched(points, normals, recent, last, guess, wide) for guess in (before, (0.0, 0.0, 0.0))
+    )
     best = stayed if stayed[2] > onward[2] + ALIKE else onward
     return best if best[2] >= SURE else None
 
@@ -222,12 +237,17 @@ def _carried(log: RobotLog, track: Track) -> list[int]:
         known: deque[tuple[Array, Array]] = deque()
         for k in range(begin, i):
             points, normals = surfaces(log.scans[k])
-            known.append((_moved(track.poses[k], points), points_turned(track.poses[k, 2], normals)))
+            known.append(
+                (_moved(track.poses[k], points), points_turned(track.poses[k, 2], normals))
+            )
         wide = np.diag(UNKNOWN) ** 2
         if not sum(len(walls) for walls, _ in known):
             continue
         shares = [
-            _matched(*surfaces(log.scans[k]), known, _as_pose(track.poses[k]), (0.0, 0.0, 0.0), wide)[2] for k in range(i, i + IN_A_ROW)
+            _matched(
+                *surfaces(log.scans[k]), known, _as_pose(track.poses[k]), (0.0, 0.0, 0.0), wide
+            )[2]
+            for k in range(i, i + IN_A_ROW)
         ]
         # They have to see each other, or else it is the laser that sees nothing.
         if max(shares) < STRANGE and track.shares[i + 1 : i + IN_A_ROW].min() >= POOR:
@@ -257,7 +277,11 @@ def surfaces(scan: Scan) -> tuple[Array, Array]:
     r = np.where(good, ranges, 0.0)
     points = np.stack([r * np.cos(laser.bearings), r * np.sin(laser.bearings)], axis=1)
     normals = np.full(points.shape, np.nan)
-    for k in (1, 2, 3):  # The farthest neighbours that still lie on one line with the point tell the normal best.
+    for k in (
+        1,
+        2,
+        3,
+    ):  # The farthest neighbours that still lie on one line with the point tell the normal best.
         if len(points) <= 2 * k:
             break
         middle = slice(k, len(points) - k)
@@ -265,14 +289,28 @@ def surfaces(scan: Scan) -> tuple[Array, Array]:
         length = np.hypot(*line.T)
         normal = np.stack([-line[:, 1], line[:, 0]], axis=1) / np.maximum(length, 1e-9)[:, None]
         off = np.abs(((points[middle] - points[: -2 * k]) * normal).sum(axis=1))
-        smooth = good[2 * k :] & good[: -2 * k] & good[middle] & (length > 1e-6) & (length < 0.25 + 0.1 * r[middle]) & (off < ROUGHNESS)
+        smooth = (
+            good[2 * k :]
+            & good[: -2 * k]
+            & good[middle]
+            & (length > 1e-6)
+            & (length < 0.25 + 0.1 * r[middle])
+            & (off < ROUGHNESS)
+        )
         normals[middle][smooth] = normal[smooth]
     on_surface = good & np.isfinite(normals[:, 0])
-    return _moved(laser.mount, points[on_surface]), points_turned(laser.mount[2], normals[on_surface])
+    return _moved(laser.mount, points[on_surface]), points_turned(
+        laser.mount[2], normals[on_surface]
+    )
 
 
 def _matched(
-    points: Array, normals: Array, recent: deque[tuple[Array, Array]], last: Pose, onward: Pose, prior: Array
+    points: Array,
+    normals: Array,
+    recent: deque[tuple[Array, Array]],
+    last: Pose,
+    onward: Pose,
+    prior: Array,
 ) -> tuple[Pose, Array, float]:
     """The pose of a scan, the covariance of the increment, in the frame of the robot at the scan before, and the share of the points that lie on walls."""
     turn: Array = np.eye(3)
@@ -288,7 +326,9 @@ def _matched(
         share, pose, information = fit.improved(guess, weight)
         if share < POOR:
             turned = [guess + np.array([0, 0, 2 * math.pi * k / HEADINGS]) for k in range(HEADINGS)]
-            best = max((fit.improved(other, weight) for other in turned), key=lambda found: found[0])
+            best = max(
+                (fit.improved(other, weight) for other in turned), key=lambda found: found[0]
+            )
             if best[0] > 1.5 * share:
                 share, pose, information = best
     covariance = np.asarray(turn.T @ _accumulating(information, weight) @ turn)
@@ -307,7 +347,9 @@ def _accumulating(information: Array, prior: Array) -> Array:
     posterior = np.linalg.inv(information)
     by_odometer = posterior @ prior
     by_walls = posterior @ (information - prior) @ posterior
-    return np.asarray(by_odometer @ np.linalg.inv(prior) @ by_odometer.T + 2 / (RECENT + 1) * by_walls)
+    return np.asarray(
+        by_odometer @ np.linalg.inv(prior) @ by_odometer.T + 2 / (RECENT + 1) * by_walls
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,9 +367,13 @@ class _Fit:
         information, pose, share = weight, guess, 0.0
         for count in range(ROUNDS):
             placed = _moved(pose, self.points)
-            distance, nearest = self.tree.query(placed, distance_upper_bound=max(END, BEGIN * SHRINK**count))
+            distance, nearest = self.tree.query(
+                placed, distance_upper_bound=max(END, BEGIN * SHRINK**count)
+            )
             met = np.flatnonzero(np.isfinite(distance))
-            alike = (points_turned(pose[2], self.normals[met]) * self.wall_normals[nearest[met]]).sum(axis=1)
+            alike = (
+                points_turned(pose[2], self.normals[met]) * self.wall_normals[nearest[met]]
+            ).sum(axis=1)
             met = met[np.abs(alike) > 0.8]
             share = float((distance[met] < END).sum() / len(placed))
             if len(met) < 5:
@@ -335,8 +381,12 @@ class _Fit:
             normal = self.wall_normals[nearest[met]]
             off = ((placed[met] - self.walls[nearest[met]]) * normal).sum(axis=1)
             arm = placed[met] - pose[:2]
-            jacobian = np.column_stack([normal, arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]])
-            weights = 1 / (TOGETHER * ROUGHNESS**2 * (1 + (off / (2 * ROUGHNESS)) ** 2))  # Cauchy's: what is far off counts little.
+            jacobian = np.column_stack(
+                [normal, arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]]
+            )
+            weights = 1 / (
+                TOGETHER * ROUGHNESS**2 * (1 + (off / (2 * ROUGHNESS)) ** 2)
+            )  # Cauchy's: what is far off counts little.
             astray = pose - guess
             astray[2] = wrapped(astray[2])
             information = jacobian.T @ (jacobian * weights[:, None]) + weight

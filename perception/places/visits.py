@@ -87,7 +87,9 @@ def find_visits(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
     return tuple(
         visit.later(begin)
         for begin, end in track.spans
-        for visit in _visits_of_span(replace(log, scans=log.scans[begin:end]), track.part(begin, end), scale)
+        for visit in _visits_of_span(
+            replace(log, scans=log.scans[begin:end]), track.part(begin, end), scale
+        )
     )
 
 
@@ -137,10 +139,18 @@ def _supported(votes: list[_Vote], asked: list[int], track: Track, scale: Scale)
     for group in groups:
         middle = _middle(group)
         begin, end = _stay(track, middle, group[len(group) // 2].scan, scale.radius)
-        near = [i for i in asked if begin <= i <= end and math.dist(track.poses[i, :2], middle) < ASKED * scale.radius]
+        near = [
+            i
+            for i in asked
+            if begin <= i <= end and math.dist(track.poses[i, :2], middle) < ASKED * scale.radius
+        ]
         support = sum(vote.scan in near for vote in group) / max(len(near), 1)
         scan = begin + int(np.hypot(*(track.poses[begin : end + 1, :2] - middle).T).argmin())
-        if len(group) >= VOTES and support >= AGREED and math.dist(track.poses[scan, :2], middle) < PASSING * scale.radius:
+        if (
+            len(group) >= VOTES
+            and support >= AGREED
+            and math.dist(track.poses[scan, :2], middle) < PASSING * scale.radius
+        ):
             found.append(Visit(scan, middle, begin, end, support=support))
     return sorted(found, key=lambda visit: visit.scan)
 
@@ -167,7 +177,9 @@ def _one_for_each_pass(found: list[Visit], scale: Scale) -> list[Visit]:
         if kept and math.dist(kept[-1].middle, visit.middle) < PASSING * scale.radius:
             last = kept[-1]
             best = max((last, visit), key=lambda one: (one.end - one.begin) * one.support)
-            kept[-1] = replace(best, begin=min(last.begin, visit.begin), end=max(last.end, visit.end))
+            kept[-1] = replace(
+                best, begin=min(last.begin, visit.begin), end=max(last.end, visit.end)
+            )
         else:
             kept.append(visit)
     return kept
@@ -191,7 +203,9 @@ def _with_turnings(found: list[Visit], track: Track, scale: Scale) -> list[Visit
     visits = list(found)
     for _, i in sorted(turned, reverse=True):
         if all(
-            math.dist(visit.middle, positions[i]) > scale.radius for visit in visits if abs(way[visit.scan] - way[i]) < 3 * scale.radius
+            math.dist(visit.middle, positions[i]) > scale.radius
+            for visit in visits
+            if abs(way[visit.scan] - way[i]) < 3 * scale.radius
         ):
             begin, end = _stay(track, positions[i], i, scale.radius / 2)
             visits.append(Visit(i, positions[i], begin, end, support=0.0))
@@ -205,7 +219,10 @@ def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
     for visit in found:
         if visits:
             last = visits[-1]
-            went, came = _crossing(track, last, scale.radius, 1), _crossing(track, visit, scale.radius, -1)
+            went, came = (
+                _crossing(track, last, scale.radius, 1),
+                _crossing(track, visit, scale.radius, -1),
+            )
             if went is not None and came is not None and visit.begin > last.end:
                 directions = went - last.middle, visit.middle - came
                 turned = apart(*(math.atan2(y, x) for x, y in directions))
@@ -220,7 +237,15 @@ def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
                 far = min(math.dist(positions[i], one.middle) for one in (last, visit))
                 if turned > BENT and far > scale.radius:
                     begin, end = _stay(track, positions[i], i, scale.radius / 2)
-                    visits.append(Visit(i, positions[i], max(begin, last.end + 1), min(end, visit.begin - 1), support=0.0))
+                    visits.append(
+                        Visit(
+                            i,
+                            positions[i],
+                            max(begin, last.end + 1),
+                            min(end, visit.begin - 1),
+                            support=0.0,
+                        )
+                    )
         visits.append(visit)
     return visits
 
@@ -271,8 +296,14 @@ def _unseen(patch: Patch, seen: Outlook, scale: Scale) -> list[float]:
     """Bearings at which drivable space ends, within the radius, because nothing was observed beyond, over the width of a gateway or more."""
     unknown = ~patch.free & ~patch.occupied
     # Cells next to a wall also border on what is behind it: the border to the unknown counts only away from what was met.
-    border = ndimage.binary_dilation(unknown, iterations=2) & patch.free & (patch.room > scale.doubtful / 2)
-    border &= ndimage.binary_dilation(np.isfinite(seen.reached), iterations=round(scale.doubtful / CELL))
+    border = (
+        ndimage.binary_dilation(unknown, iterations=2)
+        & patch.free
+        & (patch.room > scale.doubtful / 2)
+    )
+    border &= ndimage.binary_dilation(
+        np.isfinite(seen.reached), iterations=round(scale.doubtful / CELL)
+    )
     parts, count = ndimage.label(border, np.ones((3, 3), bool))
     found = []
     for k in range(1, count + 1):

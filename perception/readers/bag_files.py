@@ -19,7 +19,11 @@ from perception.readers.salvage import Salvage
 from ssh_abduction.data.errors import named
 
 # How a file begins, and what its name has to end in for rosbags.
-MAGICS = {b"#ROSBAG V": ("ros1", ".bag"), b"\x89MCAP0\r\n": ("mcap", ".mcap"), b"SQLite format 3\0": ("ros2", ".db3")}
+MAGICS = {
+    b"#ROSBAG V": ("ros1", ".bag"),
+    b"\x89MCAP0\r\n": ("mcap", ".mcap"),
+    b"SQLite format 3\0": ("ros2", ".db3"),
+}
 HEAD = max(map(len, MAGICS))
 # How the names of the files of bags end, packed ones too.
 NAMES = re.compile(r"\.(bag|bag\.active|mcap|db3)(\.(gz|bz2|xz|zstd|zst))?$")
@@ -62,7 +66,9 @@ def opened(path: Path, format: str) -> Iterator[Files]:
     try:
         from rosbags import rosbag1, rosbag2  # noqa: F401 - only whether they are there
     except ImportError:
-        raise LogError(f"{named(path)}: expected the package rosbags to read it with, got none; pip install 'ssh-abduction[ros]'") from None
+        raise LogError(
+            f"{named(path)}: expected the package rosbags to read it with, got none; pip install 'ssh-abduction[ros]'"
+        ) from None
     with ExitStack() as stack:
         try:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -74,13 +80,17 @@ def opened(path: Path, format: str) -> Iterator[Files]:
                 files.notes += _beside(path)
         except OSError as error:
             check_room(error, named(path))
-            raise LogError(f"{named(path)}: expected a readable bag: {error.strerror or error}; check the path") from None
+            raise LogError(
+                f"{named(path)}: expected a readable bag: {error.strerror or error}; check the path"
+            ) from None
         yield files
 
 
 def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
     """The files of a folder: by its metadata.yaml, or else all of them in the order of their numbers."""
-    parts = sorted((part for part in path.iterdir() if NAMES.search(part.name) and part.is_file()), key=_number)
+    parts = sorted(
+        (part for part in path.iterdir() if NAMES.search(part.name) and part.is_file()), key=_number
+    )
     files = Files("ros2")
     if (path / "metadata.yaml").exists():
         try:
@@ -97,14 +107,18 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
                 raise LogError(
                     f"{named(path)}: expected a bag of ROS 2, got one that cannot be opened ({cause(error)}); {REINDEX}"
                 ) from None
-            files.notes.append(f"{named(path / 'metadata.yaml')} cannot be used ({cause(error)}): the bag is read without it.")
+            files.notes.append(
+                f"{named(path / 'metadata.yaml')} cannot be used ({cause(error)}): the bag is read without it."
+            )
     if not parts:
         raise LogError(
             f"{named(path)}: expected a folder of ROS 2 with metadata.yaml, or with files *.mcap, *.db3 or *.bag, got none of these; name a file"
         )
     drives = {_drive(part) for part in parts}
     if len(drives) > 1:
-        names = ", ".join(named(part.name) for part in parts[:4]) + (", …" if len(parts) > 4 else "")
+        names = ", ".join(named(part.name) for part in parts[:4]) + (
+            ", …" if len(parts) > 4 else ""
+        )
         raise LogError(
             f"{named(path)}: expected the parts of one drive, as drive_0.db3 and drive_1.db3, got {names}; name one of the files, or ros2 bag reindex the folder"
         )
@@ -115,7 +129,11 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
             _open_part(part, files, folder, stack)
         except OSError as error:
             check_room(error, named(part))
-            unread.append(LogError(f"{named(part)}: expected a readable bag: {error.strerror or error}; check the path"))
+            unread.append(
+                LogError(
+                    f"{named(part)}: expected a readable bag: {error.strerror or error}; check the path"
+                )
+            )
         except LogError as error:
             unread.append(error)
     if not files.readers:
@@ -146,7 +164,9 @@ def _open_part(path: Path, files: Files, folder: Path, stack: ExitStack) -> None
         why = cause(error).replace(str(here), source)
     salvage = Salvage(here, files.format)
     if not salvage.count:
-        raise LogError(f"{source}: expected a bag ({files.format}), got one that cannot be opened ({why}); {REINDEX}")
+        raise LogError(
+            f"{source}: expected a bag ({files.format}), got one that cannot be opened ({why}); {REINDEX}"
+        )
     files.readers.append(salvage)
     files.notes.append(
         f"{source} is cut, or was never closed ({why}): its {salvage.count} whole messages are read, {salvage.seconds:.1f} s of the drive. What came after is lost."
@@ -169,7 +189,9 @@ def _copied(file: IO[bytes], here: Path, source: str) -> list[str]:
         try:
             copied(unpacked(file, source), copy, source)
         except damages() as error:
-            what = "ends too early" if isinstance(error, EOFError) else f"is damaged ({cause(error)})"
+            what = (
+                "ends too early" if isinstance(error, EOFError) else f"is damaged ({cause(error)})"
+            )
             return [f"{source} {what}: it was unpacked as far as it is whole."]
     return []
 
@@ -203,7 +225,9 @@ def _gaps(parts: list[Path]) -> list[str]:
     if not missing:
         return []
     listed = ", ".join(map(str, missing[:5])) + (", …" if len(missing) > 5 else "")
-    return [f"Of the drive that {named(parts[-1].name)} is a part of, these parts are not there: {listed}. What they hold is missing."]
+    return [
+        f"Of the drive that {named(parts[-1].name)} is a part of, these parts are not there: {listed}. What they hold is missing."
+    ]
 
 
 def _beside(path: Path) -> list[str]:
@@ -212,11 +236,20 @@ def _beside(path: Path) -> list[str]:
     if number < 0 or not NAMES.search(path.name):
         return []
     with_it = sorted(
-        (part for part in path.parent.iterdir() if part != path and NAMES.search(part.name) and _drive(part) == _drive(path)), key=_number
+        (
+            part
+            for part in path.parent.iterdir()
+            if part != path and NAMES.search(part.name) and _drive(part) == _drive(path)
+        ),
+        key=_number,
     )
     if with_it:
-        names = ", ".join(named(part.name) for part in with_it[:3]) + (", …" if len(with_it) > 3 else "")
-        return [f"{named(path)} is one part of a drive, and is read alone. Beside it lie {names}: name the folder to read all of them."]
+        names = ", ".join(named(part.name) for part in with_it[:3]) + (
+            ", …" if len(with_it) > 3 else ""
+        )
+        return [
+            f"{named(path)} is one part of a drive, and is read alone. Beside it lie {names}: name the folder to read all of them."
+        ]
     return _gaps([path])
 
 

@@ -77,8 +77,15 @@ class Bag:
     """An open bag."""
 
     def __init__(self, files: bag_files.Files, store: Any, source: str) -> None:
-        self.readers, self.format, self.notes, self.source = files.readers, files.format, files.notes, source
-        self.deserialize = store.deserialize_ros1 if files.format == "ros1" else store.deserialize_cdr
+        self.readers, self.format, self.notes, self.source = (
+            files.readers,
+            files.format,
+            files.notes,
+            source,
+        )
+        self.deserialize = (
+            store.deserialize_ros1 if files.format == "ros1" else store.deserialize_cdr
+        )
 
     @property
     def connections(self) -> list[Any]:
@@ -94,8 +101,12 @@ class Bag:
 
     def listed(self) -> str:
         """All topics with their kinds, as messages list them."""
-        topics = dict.fromkeys(f"{c.topic} ({c.msgtype.rpartition('/')[2]})" for c in self.connections)
-        return ", ".join(list(topics)[:20]) + (", …" if len(topics) > 20 else "") if topics else "none"
+        topics = dict.fromkeys(
+            f"{c.topic} ({c.msgtype.rpartition('/')[2]})" for c in self.connections
+        )
+        return (
+            ", ".join(list(topics)[:20]) + (", …" if len(topics) > 20 else "") if topics else "none"
+        )
 
     def messages(self, topics: set[str]) -> Iterator[tuple[Any, int, float, Any]]:
         """The messages of some topics: connection, number among those of the topic, time of recording, and the message, or the Damage that it is."""
@@ -120,7 +131,12 @@ class Bag:
                 topic = connection.topic
                 numbers[topic] += 1
                 try:
-                    yield connection, numbers[topic], time * NANO, self.deserialize(raw, connection.msgtype)
+                    yield (
+                        connection,
+                        numbers[topic],
+                        time * NANO,
+                        self.deserialize(raw, connection.msgtype),
+                    )
                 except (SerdeError, ValueError, IndexError) as error:
                     what = f"{topic}: expected a message {connection.msgtype.rpartition('/')[2]}, got damaged data ({cause(error)})"
                     yield connection, numbers[topic], time * NANO, Damage(numbers[topic], what)
@@ -135,7 +151,9 @@ def opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
         store = get_typestore(Stores.ROS1_NOETIC if files.format == "ros1" else Stores.ROS2_HUMBLE)
         for kind in TRANSFORMS:
             if kind not in store.fielddefs:
-                store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
+                store.register(
+                    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind)
+                )
         yield Bag(files, store, named(path))
 
 
@@ -164,7 +182,9 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Readin
         called = odometers
     else:
         odometer, odom, base = _odometer_of_transforms(bag, frames, frame)
-        notes.append(f"Scans are those of {said}. There are no messages Odometry: odometry is the transform from {odom} to {base}.")
+        notes.append(
+            f"Scans are those of {said}. There are no messages Odometry: odometry is the transform from {odom} to {base}."
+        )
         called = f"the transforms from {odom} to {base}"
     odometer = _of_one_source(odometer, called, notes)
     assumed: dict[str, str] = {}
@@ -173,14 +193,27 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Readin
         notes.append(
             f"The scans are of several frames ({', '.join(f'{count} of {name}' for name, count in seen.most_common())}): each is mounted as its own frame says."
         )
-    above = [track for child in _ancestors(frames, odom) if (track := _parent(frames, child).track) is not None]
+    above = [
+        track
+        for child in _ancestors(frames, odom)
+        if (track := _parent(frames, child).track) is not None
+    ]
     corrections = {f"the transforms above {odom}": track for track in above}
-    clocks = {called: odometer.table()[:, :2], **times, **{name: track.table()[:, :2] for name, track in corrections.items()}}
+    clocks = {
+        called: odometer.table()[:, :2],
+        **times,
+        **{name: track.table()[:, :2] for name, track in corrections.items()},
+    }
     by_stamp, contradictions = clock_of(clocks)
     notes += contradictions
     if above:
         notes.append(f"Corrected poses are those of the transforms above {odom}.")
-    where = _Where(Poses.of(odometer, by_stamp), [Poses.of(track, by_stamp) for track in above], mounts, by_stamp)
+    where = _Where(
+        Poses.of(odometer, by_stamp),
+        [Poses.of(track, by_stamp) for track in above],
+        mounts,
+        by_stamp,
+    )
     return Reading(bag.format, tuple(notes), _scans(bag, set(scans), where, damaged), assumed)
 
 
@@ -188,7 +221,9 @@ def _scan_topics(bag: Bag, named: Sequence[str]) -> list[str]:
     """The topics of the scans. Raises LogError where there are none, or several and none is named."""
     found = [_chosen(bag, SCANS, name, "scan") for name in named or (None,)]
     if found == [None]:
-        raise LogError(f"{bag.source}: expected scans (messages LaserScan), got none; topics: {bag.listed()}; record the laser, too")
+        raise LogError(
+            f"{bag.source}: expected scans (messages LaserScan), got none; topics: {bag.listed()}; record the laser, too"
+        )
     return list(dict.fromkeys(topic for topic in found if topic is not None))
 
 
@@ -196,15 +231,22 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
     """The topic of some kinds: the one that is named, or the only one; None where there is none."""
     counts = {topic: count for topic, count in bag.topics(*kinds).items() if count}
     short = kinds[0].rpartition("/")[2]
-    listed = ", ".join(f"{topic} ({count} messages)" for topic, count in sorted(counts.items())) or "none"
+    listed = (
+        ", ".join(f"{topic} ({count} messages)" for topic, count in sorted(counts.items()))
+        or "none"
+    )
     if name is not None:
         match = [topic for topic in counts if topic.strip("/") == name.strip("/")]
         if not match:
-            raise LogError(f"{bag.source}: --{option}-topic: expected a topic of {short}, got {brief(name)}; those in the bag: {listed}")
+            raise LogError(
+                f"{bag.source}: --{option}-topic: expected a topic of {short}, got {brief(name)}; those in the bag: {listed}"
+            )
         return match[0]
     if len(counts) > 1:
         several = ", once for each that is to be read" if option == "scan" else ""
-        raise LogError(f"{bag.source}: expected one topic of {short}, got {len(counts)}: {listed}; name one with --{option}-topic{several}")
+        raise LogError(
+            f"{bag.source}: expected one topic of {short}, got {len(counts)}: {listed}; name one with --{option}-topic{several}"
+        )
     return next(iter(counts), None)
 
 
@@ -217,11 +259,15 @@ def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float
             times.setdefault(connection.topic, []).append((_stamp(message.header), recorded))
             frames[_name(message.header.frame_id)] += 1
     if not frames:
-        raise LogError(f"{bag.source}: expected scans in {' and '.join(topics)}, got none that can be read")
+        raise LogError(
+            f"{bag.source}: expected scans in {' and '.join(topics)}, got none that can be read"
+        )
     return {topic: np.array(both) for topic, both in times.items()}, frames
 
 
-def _odometer(bag: Bag, topic: str, damaged: list[Damage], notes: list[str]) -> tuple[Track, str, str]:
+def _odometer(
+    bag: Bag, topic: str, damaged: list[Damage], notes: list[str]
+) -> tuple[Track, str, str]:
     """The odometer's poses, the frame in which they are, and the robot's frame. Raises LogError."""
     tracks: dict[tuple[str, str, str], Track] = {}
     for connection, number, recorded, message in bag.messages({topic}):
@@ -234,7 +280,11 @@ def _odometer(bag: Bag, topic: str, damaged: list[Damage], notes: list[str]) -> 
         except _Damaged as damage:
             damaged.append(Damage(number, f"{topic}: {damage}"))
             continue
-        source = _name(message.header.frame_id), _name(message.child_frame_id), getattr(connection.ext, "callerid", "") or ""
+        source = (
+            _name(message.header.frame_id),
+            _name(message.child_frame_id),
+            getattr(connection.ext, "callerid", "") or "",
+        )
         tracks.setdefault(source, Track()).add(_stamp(message.header), recorded, flat)
     if not tracks:
         raise LogError(f"{bag.source}: expected odometry in {topic}, got none that can be read")
@@ -245,8 +295,12 @@ def _odometer(bag: Bag, topic: str, damaged: list[Damage], notes: list[str]) -> 
             odom, base, sender = source
             return f"from {odom} to {base}{f' by {sender}' if sender else ''}"
 
-        listed = ", ".join(f"{len(track.table())} {told(source)}" for source, track in tracks.items())
-        notes.append(f"Several sources publish {topic}: {listed}. Those {told(best)} are read; record each source to a topic of its own.")
+        listed = ", ".join(
+            f"{len(track.table())} {told(source)}" for source, track in tracks.items()
+        )
+        notes.append(
+            f"Several sources publish {topic}: {listed}. Those {told(best)} are read; record each source to a topic of its own."
+        )
     return tracks[best], best[0], best[1]
 
 
@@ -254,7 +308,9 @@ def _odometer_of_transforms(bag: Bag, frames: _Frames, frame: str) -> tuple[Trac
     """The same of the transforms from `odom` to the robot. Raises LogError."""
     chain = [(child, _parent(frames, child)) for child in _ancestors(frames, frame)]
     moving = [(child, one) for child, one in chain if one.track is not None]
-    found = next(((child, one) for child, one in moving if "odom" in one.parent.rpartition("/")[2]), None) or next(iter(moving), None)
+    found = next(
+        ((child, one) for child, one in moving if "odom" in one.parent.rpartition("/")[2]), None
+    ) or next(iter(moving), None)
     if found is None:
         raise LogError(
             f"{bag.source}: expected odometry (messages Odometry, or transforms from odom to the frame {frame!r} of the scans), got none; topics: {bag.listed()}"
@@ -301,8 +357,14 @@ def _frames(bag: Bag, seen: set[str], damaged: list[Damage]) -> _Frames:
                 except _Damaged as damage:
                     damaged.append(Damage(number, f"{connection.topic}: {child}: {damage}"))
                     continue
-                if edge.track is not None and (edge.count == 1 or any(child in _ancestors(frames, frame) for frame in seen)):
-                    edge.track.add(_stamp(stamped.header), recorded, _flat(stamped.transform.translation, stamped.transform.rotation))
+                if edge.track is not None and (
+                    edge.count == 1 or any(child in _ancestors(frames, frame) for frame in seen)
+                ):
+                    edge.track.add(
+                        _stamp(stamped.header),
+                        recorded,
+                        _flat(stamped.transform.translation, stamped.transform.rotation),
+                    )
     return frames
 
 
@@ -340,13 +402,21 @@ def _ancestors(frames: _Frames, frame: str) -> list[str]:
     return chain
 
 
-def _mount(frames: _Frames, odom: str, base: str, frame: str, notes: list[str], assumed: dict[str, str]) -> tuple[Pose, bool]:
+def _mount(
+    frames: _Frames, odom: str, base: str, frame: str, notes: list[str], assumed: dict[str, str]
+) -> tuple[Pose, bool]:
     """The laser's pose in the frame of the robot, and whether it hangs upside down."""
     if base == frame:
         return (0.0, 0.0, 0.0), False
     chain = _ancestors(frames, frame)
     parents = [_parent(frames, child).parent for child in chain]
-    top = parents.index(base) if base in parents else parents.index(odom) - 1 if odom in parents else None
+    top = (
+        parents.index(base)
+        if base in parents
+        else parents.index(odom) - 1
+        if odom in parents
+        else None
+    )
     if top is None:
         assumed["mount"] = (f"{assumed['mount']} " if "mount" in assumed else "") + (
             f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser ({frame}): the laser is taken to sit in the robot's middle and to look ahead. "
@@ -364,8 +434,12 @@ def _mount(frames: _Frames, odom: str, base: str, frame: str, notes: list[str], 
                 f"The {edge.count} transforms from {edge.parent} to {child}, by which the laser is mounted, contradict each other by up to {off:.2f} m and {angle:.0f} degrees: the last one is used."
             )
         if len(frames[child]) > 1:
-            others = ", ".join(f"{one.parent} ({one.count} transforms)" for one in frames[child].values())
-            notes.append(f"The frame {child} has several parents, {others}: that from {edge.parent} is used for the laser's mount.")
+            others = ", ".join(
+                f"{one.parent} ({one.count} transforms)" for one in frames[child].values()
+            )
+            notes.append(
+                f"The frame {child} has several parents, {others}: that from {edge.parent} is used for the laser's mount."
+            )
     heading = math.atan2(rotation[1, 0], rotation[0, 0])
     x, y, angle = (round(float(v), 6) for v in (translation[0], translation[1], heading))
     return (x, y, angle), bool(rotation[2, 2] < 0)
@@ -388,7 +462,9 @@ class _Where:
         """The pose by the odometer, and the corrected one. Raises _Damaged."""
         if not self.odometry.tells(time):
             begin, end = self.odometry.times[[0, -1]]
-            raise _Damaged(f"expected odometry at the time of the scan, {time:.3f} s, got it from {begin:.3f} to {end:.3f} s")
+            raise _Damaged(
+                f"expected odometry at the time of the scan, {time:.3f} s, got it from {begin:.3f} to {end:.3f} s"
+            )
         pose = self.odometry.at(time)
         corrected: Pose | None = pose if self.corrections else None
         for correction in self.corrections:
@@ -397,7 +473,9 @@ class _Where:
         return pose, corrected
 
 
-def _scans(bag: Bag, topics: set[str], where: _Where, damaged: list[Damage]) -> Iterator[Scan | Damage]:
+def _scans(
+    bag: Bag, topics: set[str], where: _Where, damaged: list[Damage]
+) -> Iterator[Scan | Damage]:
     yield from damaged
     for connection, number, recorded, message in bag.messages(topics):
         if isinstance(message, Damage):
@@ -413,22 +491,37 @@ def _scans(bag: Bag, topics: set[str], where: _Where, damaged: list[Damage]) -> 
 
 
 def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[NDArray[np.float64], Laser]:
-    first, step, nearest, reach = (float(v) for v in (message.angle_min, message.angle_increment, message.range_min, message.range_max))
+    first, step, nearest, reach = (
+        float(v)
+        for v in (message.angle_min, message.angle_increment, message.range_min, message.range_max)
+    )
     if message.__msgtype__ == SCANS[0]:
         ranges = np.array(message.ranges, dtype=np.float64)
     else:  # where nothing came back there is no echo
-        ranges = np.array([beam.echoes[0] if len(beam.echoes) else np.inf for beam in message.ranges], dtype=np.float64)
+        ranges = np.array(
+            [beam.echoes[0] if len(beam.echoes) else np.inf for beam in message.ranges],
+            dtype=np.float64,
+        )
     if not len(ranges):
         raise _Damaged("expected at least one range, got none")
     if not math.isfinite(first) or not 0 < abs(step) <= math.tau:
         raise _Damaged(f"expected a first angle and a step in radians, got {first:g} and {step:g}")
     if is_flipped:
         first, step = -first, -step
-    return ranges, _laser(first, step, len(ranges), reach if reach > 0 else math.inf, mount, nearest if 0 < nearest < math.inf else 0.0)
+    return ranges, _laser(
+        first,
+        step,
+        len(ranges),
+        reach if reach > 0 else math.inf,
+        mount,
+        nearest if 0 < nearest < math.inf else 0.0,
+    )
 
 
 @lru_cache(maxsize=64)
-def _laser(first: float, step: float, beams: int, reach: float, mount: Pose, nearest: float) -> Laser:
+def _laser(
+    first: float, step: float, beams: int, reach: float, mount: Pose, nearest: float
+) -> Laser:
     return Laser(first, step, beams, reach, mount, nearest)
 
 
@@ -437,7 +530,9 @@ def _flat(position: Any, orientation: Any) -> Pose:
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
     numbers = position.x, position.y, position.z, x, y, z, w
     if not all(map(math.isfinite, numbers)) or x * x + y * y + z * z + w * w < 0.5:
-        raise _Damaged(f"expected a position in metres and a quaternion, got {', '.join(f'{v:g}' for v in numbers)}")
+        raise _Damaged(
+            f"expected a position in metres and a quaternion, got {', '.join(f'{v:g}' for v in numbers)}"
+        )
     return position.x, position.y, math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 

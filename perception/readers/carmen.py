@@ -137,21 +137,35 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
     """
     found = _survey(file, source, format != "carmen")
     if format == "g2o" and not found.graph.vertices:
-        raise LogError(f"{source}: expected vertices in lines VERTEX2 or VERTEX_SE2, got none; leave the format out, or name carmen")
+        raise LogError(
+            f"{source}: expected vertices in lines VERTEX2 or VERTEX_SE2, got none; leave the format out, or name carmen"
+        )
     if not found.kinds:
         tags = ", ".join(f"{count} {tag}" for tag, count in found.tags.most_common(5)) or "none"
         why = found.damage or "record the laser, too"
-        raise LogError(f"{source}: expected scans in lines {', '.join(KINDS)}, got none that can be read (lines: {tags}); {why}")
+        raise LogError(
+            f"{source}: expected scans in lines {', '.join(KINDS)}, got none that can be read (lines: {tags}); {why}"
+        )
     most = max(survey.scans for survey in found.kinds.values())
-    kind = next(kind for kind in KINDS if kind in found.kinds and 2 * found.kinds[kind].scans >= most)
+    kind = next(
+        kind for kind in KINDS if kind in found.kinds and 2 * found.kinds[kind].scans >= most
+    )
     survey, notes = found.kinds[kind], []
-    others = [other for other in (*KINDS, "RLASER", "ROBOTLASER2") if other != kind and (other in found.kinds or found.tags[other])]
+    others = [
+        other
+        for other in (*KINDS, "RLASER", "ROBOTLASER2")
+        if other != kind and (other in found.kinds or found.tags[other])
+    ]
     if others:
-        notes.append(f"The scans are those of the lines {kind}; those of {', '.join(others)} are not read.")
+        notes.append(
+            f"The scans are those of the lines {kind}; those of {', '.join(others)} are not read."
+        )
     meaning = _meaning(found, survey, kind, source, notes)
     is_corrected = meaning != "edges" or found.graph.is_corrected(CORRECTED)
     if not is_corrected:
-        notes.append("The poses of the vertices have not been corrected: they are the chain of the edges.")
+        notes.append(
+            "The poses of the vertices have not been corrected: they are the chain of the edges."
+        )
     assumed: dict[str, str] = {}
     mount = _mount(found, survey, meaning, kind)
     reach = _reach(found, survey, kind, assumed)
@@ -168,7 +182,9 @@ def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list
     is_same = survey.same >= MOST_SCANS * survey.scans
     if kind == "RAWLASER1":
         if not found.tags["ODOM"]:
-            raise LogError(f"{source}: expected odometry, got neither ODOM lines nor poses in {kind}; record the odometer, too")
+            raise LogError(
+                f"{source}: expected odometry, got neither ODOM lines nor poses in {kind}; record the odometer, too"
+            )
         return "lines"
     if found.graph.vertices:
         return _meaning_beside_graph(found.graph, survey, kind, source, notes)
@@ -187,15 +203,21 @@ def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list
             )
         return "restarts"
     if survey.wandered > (1 - MOST_SCANS) * survey.scans:
-        notes.append(f"The first pose in {kind} wanders from the second: the first is taken for a corrected one, the second for odometry.")
+        notes.append(
+            f"The first pose in {kind} wanders from the second: the first is taken for a corrected one, the second for odometry."
+        )
         return "first corrected"
     return "raw"
 
 
-def _meaning_beside_graph(graph: Graph, survey: _Survey, kind: str, source: str, notes: list[str]) -> Meaning:
+def _meaning_beside_graph(
+    graph: Graph, survey: _Survey, kind: str, source: str, notes: list[str]
+) -> Meaning:
     """What the poses of the scans are where there are vertices. Raises LogError."""
     if graph.share_at_vertices(survey.poses) < MOST_SCANS:
-        notes.append(f"The poses in {kind} differ from those of VERTEX2: the former are taken for odometry, the latter for corrected ones.")
+        notes.append(
+            f"The poses in {kind} differ from those of VERTEX2: the former are taken for odometry, the latter for corrected ones."
+        )
         return "raw"
     if not graph.edges:
         raise LogError(
@@ -205,18 +227,27 @@ def _meaning_beside_graph(graph: Graph, survey: _Survey, kind: str, source: str,
         f"The robot's poses in {kind} are those of VERTEX2, and so corrected ones. Odometry is the chain of the EDGE2 from each vertex to the next."
     )
     if gaps := graph.chain.gaps:
-        notes.append(f"No EDGE2 tells how the robot moved before these vertices, so that it seems to have stood still: {_listed(gaps)}.")
+        notes.append(
+            f"No EDGE2 tells how the robot moved before these vertices, so that it seems to have stood still: {_listed(gaps)}."
+        )
     return "edges"
 
 
 def _listed(numbers: list[int] | tuple[int, ...]) -> str:
-    return ", ".join(map(str, numbers[:5])) + (f" and {len(numbers) - 5} more" if len(numbers) > 5 else "")
+    return ", ".join(map(str, numbers[:5])) + (
+        f" and {len(numbers) - 5} more" if len(numbers) > 5 else ""
+    )
 
 
 def _mount(found: _Found, survey: _Survey, meaning: Meaning, kind: str) -> Pose:
     """The pose of the laser in the frame of the robot: what its poses say, else what the parameters say."""
     own = survey.mount
-    if own is not None and meaning in ("raw", "edges") and max(map(abs, own)) > ROUNDED and survey.mounted >= MOST_SCANS * survey.scans:
+    if (
+        own is not None
+        and meaning in ("raw", "edges")
+        and max(map(abs, own)) > ROUNDED
+        and survey.mounted >= MOST_SCANS * survey.scans
+    ):
         x, y, angle = own
         return round(x, 4), round(y, 4), round(angle, 5)
     if kind == "ROBOTLASER1" and meaning in ("raw", "edges"):
@@ -231,7 +262,9 @@ def _reach(found: _Found, survey: _Survey, kind: str, assumed: dict[str, str]) -
         return math.inf
     if (reach := found.parameters.get("reach", 0.0)) > 0:
         return reach
-    reach = _without_codes(survey.most if survey.repeated > 2 or survey.most > SICK_REACH else math.ceil(survey.most))
+    reach = _without_codes(
+        survey.most if survey.repeated > 2 or survey.most > SICK_REACH else math.ceil(survey.most)
+    )
     assumed["no_return"] = (
         f"The log does not say how far the laser reaches. By its largest range, {survey.most:g} m, which came {survey.repeated} times, it is {reach:g} m."
     )
@@ -268,7 +301,9 @@ def _survey(file: IO[bytes], source: str, with_graph: bool) -> _Found:
             elif (line := scan_line(tokens)) is not None:
                 survey = found.kinds.setdefault(line.kind, _Survey())
                 _count(survey, line)
-                if since.get(line.kind, 2) < 2:  # the first only repeats the pose of the scan before
+                if (
+                    since.get(line.kind, 2) < 2
+                ):  # the first only repeats the pose of the scan before
                     survey.unmoved.append(number)
                 since[line.kind] = 0
                 waiting = survey, line, odometer
@@ -281,7 +316,13 @@ def _survey(file: IO[bytes], source: str, with_graph: bool) -> _Found:
     return found
 
 
-def _count_restart(survey: _Survey, line: ScanLine, before: tuple[Pose, float | None] | None, pose: Pose, time: float | None) -> None:
+def _count_restart(
+    survey: _Survey,
+    line: ScanLine,
+    before: tuple[Pose, float | None] | None,
+    pose: Pose,
+    time: float | None,
+) -> None:
     """Take in an ODOM line that follows a scan."""
     if line.second is None or before is None or before[0] == line.second:
         return
@@ -310,11 +351,17 @@ def _count(survey: _Survey, line: ScanLine) -> None:
     survey.wandered += math.hypot(x, y) > WANDERED[0] or abs(angle) > WANDERED[1]
 
 
-def _scans(file: IO[bytes], source: str, odometer: _Odometer, kind: str, mount: Pose, reach: float) -> Iterator[Scan | Damage]:
+def _scans(
+    file: IO[bytes], source: str, odometer: _Odometer, kind: str, mount: Pose, reach: float
+) -> Iterator[Scan | Damage]:
     """The scans, and what was skipped."""
-    waiting: list[Scan | Damage] = []  # what waits for the next ODOM line, where the scans have no poses
+    waiting: list[
+        Scan | Damage
+    ] = []  # what waits for the next ODOM line, where the scans have no poses
     fov = odometer.found.parameters.get("fov", math.pi)
-    fov = math.radians(fov) if math.tau < fov <= 360 else fov if 0 < fov <= math.tau else math.pi  # some give degrees
+    fov = (
+        math.radians(fov) if math.tau < fov <= 360 else fov if 0 < fov <= math.tau else math.pi
+    )  # some give degrees
     for number, raw in lines(file, source):
         tag = b""
         try:
@@ -325,7 +372,14 @@ def _scans(file: IO[bytes], source: str, odometer: _Odometer, kind: str, mount: 
             if tag != kind.encode():
                 odometer.hear(tag, tokens)
             elif (line := scan_line(tokens)) is not None:
-                waiting.append(Scan(*_measured(line, mount, reach, fov), *odometer.place(line), line.time, number))
+                waiting.append(
+                    Scan(
+                        *_measured(line, mount, reach, fov),
+                        *odometer.place(line),
+                        line.time,
+                        number,
+                    )
+                )
         except Damaged as damage:
             odometer.mishear(tag)
             waiting.append(Damage(number, str(damage)))
@@ -374,7 +428,9 @@ class _Odometer:
         elif tag == b"TRUEPOS":
             self.truth = pose_at(tokens, 1), pose_at(tokens, 4)
         elif tag == b"PARAM":
-            parameters_of(tokens)  # which the survey took, as it took the edges, without a word of what is damaged
+            parameters_of(
+                tokens
+            )  # which the survey took, as it took the edges, without a word of what is damaged
         elif self.found.graph.vertices and tag in EDGES:
             edge_of(tokens)
         elif self.found.graph.vertices and tag in VERTICES:
@@ -395,7 +451,9 @@ class _Odometer:
         if self.meaning == "edges":
             index = self.found.graph.index_at(second, self.vertex)
             if index is None:
-                raise Damaged(f"expected the pose of a vertex in {line.kind}, got another; the line of its vertex is missing or damaged")
+                raise Damaged(
+                    f"expected the pose of a vertex in {line.kind}, got another; the line of its vertex is missing or damaged"
+                )
             return self.found.graph.chain.poses[index], second if self.is_corrected else None
         if self.meaning == "restarts":
             self.last, self.restarts, self.behind = (second, line.time), True, self.chain
@@ -409,7 +467,13 @@ class _Odometer:
         if self.meaning != "lines" or isinstance(item, Damage) or self.last is None:
             return item
         (start, began), (end, ended) = self.before or self.last, self.last
-        if began is None or ended is None or item.time is None or not began <= item.time <= ended or began == ended:
+        if (
+            began is None
+            or ended is None
+            or item.time is None
+            or not began <= item.time <= ended
+            or began == ended
+        ):
             share = 0.0  # times that are cut, or run backwards, tell nothing
         else:
             share = (item.time - began) / (ended - began)
@@ -419,10 +483,16 @@ class _Odometer:
 
     def _truly(self, odometry: Pose) -> Pose | None:
         """Where the robot was, by the last corrected pose and what the odometer says since."""
-        return moved(self.truth[0], between(self.truth[1], odometry)) if self.truth is not None else None
+        return (
+            moved(self.truth[0], between(self.truth[1], odometry))
+            if self.truth is not None
+            else None
+        )
 
 
-def _measured(line: ScanLine, mount: Pose, reach: float, fov: float) -> tuple[NDArray[np.float64], Laser]:
+def _measured(
+    line: ScanLine, mount: Pose, reach: float, fov: float
+) -> tuple[NDArray[np.float64], Laser]:
     beams = len(line.ranges)
     if line.shape is None:
         laser = _conventional(beams, fov, _without_codes(reach), mount)

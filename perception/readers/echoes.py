@@ -80,12 +80,22 @@ class Told:
             )
         if self.mount is not None:
             values = tuple(self.mount) if isinstance(self.mount, Sequence | np.ndarray) else ()
-            if len(values) != 3 or not all(map(is_finite, values)) or max(map(abs, values[:2])) > FARTHEST_MOUNT:
-                raise LogError(f"mount: expected metres ahead, metres to the left, and degrees, got {brief(self.mount)}; name these three")
+            if (
+                len(values) != 3
+                or not all(map(is_finite, values))
+                or max(map(abs, values[:2])) > FARTHEST_MOUNT
+            ):
+                raise LogError(
+                    f"mount: expected metres ahead, metres to the left, and degrees, got {brief(self.mount)}; name these three"
+                )
         if self.no_return is not None and not (is_finite(self.no_return) and self.no_return > 0):
-            raise LogError(f"no_return: expected metres above 0, got {brief(self.no_return)}; name the range that means nothing came back")
+            raise LogError(
+                f"no_return: expected metres above 0, got {brief(self.no_return)}; name the range that means nothing came back"
+            )
         if self.zero_is is not None and self.zero_is not in MEANINGS:
-            raise LogError(f"zero_is: expected {' or '.join(MEANINGS)}, got {brief(self.zero_is)}; name one of these")
+            raise LogError(
+                f"zero_is: expected {' or '.join(MEANINGS)}, got {brief(self.zero_is)}; name one of these"
+            )
 
     def placed(self, scan: Scan) -> Scan:
         """A scan whose laser looks where the user says."""
@@ -152,7 +162,9 @@ def understood(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], tup
         meaning, said = _surveyed([kept[i] for i in some], told)
         meanings |= dict.fromkeys(members, meaning)
         notes += said
-    return tuple(_measured(scan, meanings[i]) for i, scan in enumerate(placed)), tuple(dict.fromkeys(notes))
+    return tuple(_measured(scan, meanings[i]) for i, scan in enumerate(placed)), tuple(
+        dict.fromkeys(notes)
+    )
 
 
 def as_told(scan: Scan, told: Told) -> Scan:
@@ -187,7 +199,11 @@ def _measured(scan: Scan, meaning: Meaning) -> Scan:
         ranges[scan.ranges <= max(scan.laser.nearest, 0.0)] = np.nan
     for kind in meaning.free:
         ranges[kinds[kind]] = np.inf
-    laser = scan.laser if scan.laser.reach == meaning.reach else replace(scan.laser, reach=meaning.reach)
+    laser = (
+        scan.laser
+        if scan.laser.reach == meaning.reach
+        else replace(scan.laser, reach=meaning.reach)
+    )
     return replace(scan, ranges=ranges, laser=laser)
 
 
@@ -206,7 +222,11 @@ def _surveyed(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
     reach = told.reach(laser.reach)
     if told.no_return is None and (repeated := _repeated(scans)) is not None:
         reach, share = repeated
-        but = f", though the laser is said to reach {laser.reach:g} m" if math.isfinite(laser.reach) else ""
+        but = (
+            f", though the laser is said to reach {laser.reach:g} m"
+            if math.isfinite(laser.reach)
+            else ""
+        )
         notes.append(
             f"Ranges of {reach:.4g} m repeat in {_percent(share)} of the beams, and hardly any are longer{but}. "
             "They are taken to mean that nothing came back. If they are walls, "
@@ -214,7 +234,10 @@ def _surveyed(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
         )
     if not math.isfinite(reach):
         # The largest range itself was measured.
-        most = max((float(r.max()) for scan in scans if len(r := scan.ranges[np.isfinite(scan.ranges)])), default=0.0)
+        most = max(
+            (float(r.max()) for scan in scans if len(r := scan.ranges[np.isfinite(scan.ranges)])),
+            default=0.0,
+        )
         reach = float(np.nextafter(most, math.inf)) if most > 0 else math.inf
         if most > 0:
             notes.append(
@@ -234,7 +257,10 @@ def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
     """
     laser = scans[0].laser
     with np.errstate(invalid="ignore"):
-        kept = [scan.ranges[(scan.ranges > max(laser.nearest, 0.0)) & (scan.ranges < laser.reach)] for scan in scans]
+        kept = [
+            scan.ranges[(scan.ranges > max(laser.nearest, 0.0)) & (scan.ranges < laser.reach)]
+            for scan in scans
+        ]
     ranges = np.sort(np.concatenate(kept))
     beams = sum(len(scan.ranges) for scan in scans)
     few = math.ceil(BEAMS * beams)
@@ -245,7 +271,9 @@ def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
         middle = float(ranges[-few])
         width = noise * middle
         for _ in range(5):
-            middle = float(np.median(ranges[(ranges >= middle - width) & (ranges <= middle + width)]))
+            middle = float(
+                np.median(ranges[(ranges >= middle - width) & (ranges <= middle + width)])
+            )
         beyond = ranges >= middle - width
         inside = int((beyond & (ranges <= middle + width)).sum())
         below = int((~beyond & (ranges >= middle - 3 * width)).sum())
@@ -283,9 +311,15 @@ def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset
         if count < WORTH_A_NOTE * beams:
             continue
         typical = float(np.median(np.concatenate(beside[kind]))) if beside[kind] else 0.0
-        is_free = bool(len(everything)) and math.isfinite(reach) and float((everything < typical).mean()) >= LONG
+        is_free = (
+            bool(len(everything))
+            and math.isfinite(reach)
+            and float((everything < typical).mean()) >= LONG
+        )
         free |= {kind} if is_free else set()
-        taken, other = ("nothing came back", "unknown") if is_free else ("nothing is known there", "free")
+        taken, other = (
+            ("nothing came back", "unknown") if is_free else ("nothing is known there", "free")
+        )
         notes.append(
             f"{_percent(count / beams)} of the beams are {kind}. The beams beside them are {typical:.2g} m long, where "
             f"{usual:.2g} m is usual. So they are taken to mean that {taken}. If that is wrong, say --zero-is {other}."

@@ -92,7 +92,10 @@ class Graph:
         """Of some poses, whose numbers follow each other, the share that vertices have."""
         table: NDArray[np.float64] = np.reshape(poses, (-1, 3))
         last = len(self.vertices) - 1
-        at = sum(self.index_at((x, y, heading), min(i, last)) is not None for i, (x, y, heading) in enumerate(table.tolist()))
+        at = sum(
+            self.index_at((x, y, heading), min(i, last)) is not None
+            for i, (x, y, heading) in enumerate(table.tolist())
+        )
         return at / max(1, len(table))
 
     @cached_property

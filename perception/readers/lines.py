@@ -59,7 +59,9 @@ def opened(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
 
 
 def _unreadable(path: str | os.PathLike[str], error: OSError) -> LogError:
-    return LogError(f"{named(path)}: expected a readable log: {error.strerror or error}; check the path")
+    return LogError(
+        f"{named(path)}: expected a readable log: {error.strerror or error}; check the path"
+    )
 
 
 def copied(file: IO[bytes], copy: IO[bytes], source: str) -> None:
@@ -90,7 +92,10 @@ def no_room(source: str) -> LogError:
 
 def is_full(error: BaseException) -> bool:
     """Whether an error, SQLite's too, says that a disk is full."""
-    return getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or type(error).__name__ == "FullError"
+    return (
+        getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+        or type(error).__name__ == "FullError"
+    )
 
 
 def packer(file: IO[bytes]) -> str | None:
@@ -117,7 +122,11 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
     file.seek(0)
     if found is None:
         return file
-    openers: dict[str, Callable[[IO[bytes]], Any]] = {"gzip": lambda f: gzip.GzipFile(fileobj=f), "bzip2": bz2.BZ2File, "xz": lzma.LZMAFile}
+    openers: dict[str, Callable[[IO[bytes]], Any]] = {
+        "gzip": lambda f: gzip.GzipFile(fileobj=f),
+        "bzip2": bz2.BZ2File,
+        "xz": lzma.LZMAFile,
+    }
     if found == "zstd":
         if (zstd := zstd_module()) is None:
             raise LogError(
@@ -130,7 +139,14 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
 def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
     """The errors by which the streams of `unpacked` say that packed data are cut (EOFError) or damaged, and some others."""
     zstd = zstd_module()
-    return (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, *((zstd.ZstdError,) if zstd else ()), *others)
+    return (
+        EOFError,
+        gzip.BadGzipFile,
+        zlib.error,
+        lzma.LZMAError,
+        *((zstd.ZstdError,) if zstd else ()),
+        *others,
+    )
 
 
 def zstd_module() -> Any:

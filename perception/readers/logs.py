@@ -24,7 +24,11 @@ LINES = {
     "carmen": "lines of CARMEN: FLASER, ROBOTLASER1 or RAWLASER1, and ODOM",
     "g2o": "lines of g2o or TORO: VERTEX2, EDGE2 and ROBOTLASER1",
 }
-BAGS = {"ros1": "a bag of ROS 1", "ros2": "a bag of ROS 2: a folder, or its file", "mcap": "a file of MCAP"}
+BAGS = {
+    "ros1": "a bag of ROS 1",
+    "ros2": "a bag of ROS 2: a folder, or its file",
+    "mcap": "a file of MCAP",
+}
 FORMATS = {**LINES, **BAGS}
 # So many bytes at the beginning of a file tell its format.
 HEAD = 2**16
@@ -64,7 +68,13 @@ def read_log(
         )
     meant, found_out = understood(scans, told)
     assumed = (note for option, note in reading.assumed.items() if getattr(told, option) is None)
-    log = RobotLog(meant, tuple(damaged), reading.format, os.fspath(path), (*reading.notes, *assumed, *found_out))
+    log = RobotLog(
+        meant,
+        tuple(damaged),
+        reading.format,
+        os.fspath(path),
+        (*reading.notes, *assumed, *found_out),
+    )
     for warning in log.warnings:
         _log.warning("%s: %s", named(path), warning)
     return log
@@ -93,14 +103,19 @@ def stream_log(
 
 @contextmanager
 def _reading(
-    path: str | os.PathLike[str], format: str | None, scan_topic: str | Sequence[str] | None, odom_topic: str | None
+    path: str | os.PathLike[str],
+    format: str | None,
+    scan_topic: str | Sequence[str] | None,
+    odom_topic: str | None,
 ) -> Iterator[Reading]:
     topics = [scan_topic] if isinstance(scan_topic, str) else list(scan_topic or ())
     if format is not None and format not in FORMATS:
         raise LogError(f"format: expected one of {', '.join(FORMATS)}, got {brief(format)}")
     if _is_folder(path):
         if format in LINES:
-            raise LogError(f"{named(path)}: expected a file of the format {format}, got a folder; name the file")
+            raise LogError(
+                f"{named(path)}: expected a file of the format {format}, got a folder; name the file"
+            )
         with bags.opened(path, "ros2") as bag:
             yield bags.read(bag, topics, odom_topic)
         return
@@ -108,7 +123,9 @@ def _reading(
         found = format or _format(file, named(path))
         if found in LINES:
             if topics or odom_topic is not None:
-                raise LogError(f"{named(path)}: expected a bag, as a topic is named, got the format {found}; leave the topics out")
+                raise LogError(
+                    f"{named(path)}: expected a bag, as a topic is named, got the format {found}; leave the topics out"
+                )
             yield carmen.read(file, named(path), format)
             return
     with bags.opened(path, found) as bag:

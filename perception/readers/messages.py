@@ -72,7 +72,11 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
     else:
         if len(tokens) < 9:
             raise Damaged(f"expected at least 8 values after {kind}, got {len(tokens) - 1}")
-        start, step, reach = number_of(tokens[2]), number_of(tokens[4]), number_of(tokens[5], may_be_infinite=True)
+        start, step, reach = (
+            number_of(tokens[2]),
+            number_of(tokens[4]),
+            number_of(tokens[5], may_be_infinite=True),
+        )
         if not 0 < abs(step) <= math.tau or abs(start) > 2 * math.tau:
             raise Damaged(f"expected a start and a step in radians, got {start:g} and {step:g}")
         shape = start, step, reach if reach > 0 else math.inf
@@ -80,8 +84,14 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
         poses = after + 1 + _whole(tokens[after] if after < len(tokens) else b"", "remissions")
         end = poses if kind == "RAWLASER1" else poses + 11
     if not end <= len(tokens) <= end + 3:
-        raise Damaged(f"expected {end} to {end + 3} words in a {kind} of {len(beams)} beams, got {len(tokens)}")
-    first, second = (None, None) if kind == "RAWLASER1" else (pose_at(tokens, poses), pose_at(tokens, poses + 3))
+        raise Damaged(
+            f"expected {end} to {end + 3} words in a {kind} of {len(beams)} beams, got {len(tokens)}"
+        )
+    first, second = (
+        (None, None)
+        if kind == "RAWLASER1"
+        else (pose_at(tokens, poses), pose_at(tokens, poses + 3))
+    )
     return ScanLine(kind, beams, shape, first, second, time_at(tokens, end))
 
 
@@ -103,7 +113,9 @@ def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
 
 def pose_at(tokens: list[bytes], at: int) -> Pose:
     if len(tokens) < at + 3:
-        raise Damaged(f"expected a pose of three numbers after word {at}, got {max(0, len(tokens) - at)}")
+        raise Damaged(
+            f"expected a pose of three numbers after word {at}, got {max(0, len(tokens) - at)}"
+        )
     x, y, heading = map(number_of, tokens[at : at + 3])
     if max(abs(x), abs(y)) > FARTHEST or abs(heading) > FARTHEST:
         raise Damaged(f"expected a pose in metres and radians, got {x:g} {y:g} {heading:g}")

@@ -78,13 +78,19 @@ def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
         Whether the times of the headers are to be used, and what is to be said of the clocks.
     """
     wrong = [text for name, times in topics.items() if (text := _wrong_stamps(name, times[:, 0]))]
-    held = [text for name, times in topics.items() if (text := _wrong_recording(name, times, bool(wrong)))]
+    held = [
+        text
+        for name, times in topics.items()
+        if (text := _wrong_recording(name, times, bool(wrong)))
+    ]
     if not held and not wrong:
         wrong = _apart(topics)
     if not wrong and not held:
         return True, ()
     if not wrong:
-        return True, (f"The times of recording are of no use: {'; '.join(held)}. The times in the headers are used.",)
+        return True, (
+            f"The times of recording are of no use: {'; '.join(held)}. The times in the headers are used.",
+        )
     said = f"The times in the headers contradict themselves: {'; '.join(wrong)}."
     if held:
         return False, (
@@ -126,7 +132,9 @@ def _apart(topics: Mapping[str, Array]) -> list[str]:
     """What is to be said of topics whose clocks part from that of the first one, or never were the same."""
     begin = min(times[:, 1].min() for times in topics.values())
     every = max(COMPARED, (max(times[:, 1].max() for times in topics.values()) - begin) / TIMES)
-    (first, reference), *others = ((name, _ahead(times, begin, every)) for name, times in topics.items())
+    (first, reference), *others = (
+        (name, _ahead(times, begin, every)) for name, times in topics.items()
+    )
     said = []
     for name, (when, ahead) in others:
         off = ahead - np.interp(when, *reference)
@@ -145,7 +153,9 @@ def _ahead(times: Array, begin: float, every: float) -> tuple[Array, Array]:
     ahead = times[:, 0] - times[:, 1]
     part = (recorded / every).astype(int)
     parts = np.unique(part)
-    return np.array([recorded[part == k].mean() for k in parts]), np.array([np.median(ahead[part == k]) for k in parts])
+    return np.array([recorded[part == k].mean() for k in parts]), np.array(
+        [np.median(ahead[part == k]) for k in parts]
+    )
 
 
 def sources_of(track: Track) -> list[NDArray[np.intp]]:
@@ -162,7 +172,10 @@ def sources_of(track: Track) -> list[NDArray[np.intp]]:
     heads: list[list[float]] = []
     of: list[int] = []
     for pose in poses.tolist():
-        far = [math.hypot(pose[0] - x, pose[1] - y) + abs(math.remainder(pose[2] - heading, math.tau)) for x, y, heading in heads]
+        far = [
+            math.hypot(pose[0] - x, pose[1] - y) + abs(math.remainder(pose[2] - heading, math.tau))
+            for x, y, heading in heads
+        ]
         k = min(range(len(far)), key=far.__getitem__, default=0)
         if not far or (far[k] > near and len(heads) < SOURCES):
             k = len(heads)

@@ -78,12 +78,15 @@ class Salvage:
             counts[message.connection] += 1
             first, last = message.time if first is None else first, message.time
         self.connections = [
-            Connection(number, topic, kind, counts[number], _Sender(sender)) for number, (topic, kind, sender) in found.items()
+            Connection(number, topic, kind, counts[number], _Sender(sender))
+            for number, (topic, kind, sender) in found.items()
         ]
         self.count = counts.total()
         self.seconds = (last - (first or 0)) / NANO
 
-    def messages(self, connections: Collection[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
+    def messages(
+        self, connections: Collection[Connection]
+    ) -> Iterator[tuple[Connection, int, bytes]]:
         asked = {connection.id: connection for connection in connections}
         for message in self._messages():
             if message.connection in asked:
@@ -145,7 +148,11 @@ def _ros1(path: Path) -> Iterator[Message]:
             if kind == CONNECTION:
                 told = _fields(data)
                 package, _, name = told[b"type"].decode().partition("/")
-                connections[number] = header[b"topic"].decode(), f"{package}/msg/{name}", told.get(b"callerid", b"").decode()
+                connections[number] = (
+                    header[b"topic"].decode(),
+                    f"{package}/msg/{name}",
+                    told.get(b"callerid", b"").decode(),
+                )
             elif number in connections:
                 seconds, nano = struct.unpack("<II", header[b"time"])
                 yield Message(number, *connections[number], seconds * NANO + nano, data)
@@ -175,15 +182,28 @@ def _ros1_records(stream: IO[bytes], size: int) -> Iterator[tuple[dict[bytes, by
 
 
 def _sqlite(path: Path) -> Iterator[Message]:
-    with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro&immutable=1", uri=True)) as database:
-        database.execute("PRAGMA writable_schema=ON")  # else SQLite refuses a file that is shorter than its first page says
-        topics = {number: (topic, kind) for number, topic, kind in database.execute("SELECT id, name, type FROM topics")}
-        for number, time, data in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"):
+    with closing(
+        sqlite3.connect(f"file:{quote(str(path))}?mode=ro&immutable=1", uri=True)
+    ) as database:
+        database.execute(
+            "PRAGMA writable_schema=ON"
+        )  # else SQLite refuses a file that is shorter than its first page says
+        topics = {
+            number: (topic, kind)
+            for number, topic, kind in database.execute("SELECT id, name, type FROM topics")
+        }
+        for number, time, data in database.execute(
+            "SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"
+        ):
             if number in topics and isinstance(data, bytes):
                 yield Message(number, *topics[number], "", time, data)
 
 
-READERS: dict[str, Callable[[Path], Iterator[Message]]] = {"mcap": _mcap, "ros1": _ros1, "ros2": _sqlite}
+READERS: dict[str, Callable[[Path], Iterator[Message]]] = {
+    "mcap": _mcap,
+    "ros1": _ros1,
+    "ros2": _sqlite,
+}
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:

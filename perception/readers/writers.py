@@ -50,7 +50,11 @@ NANO = 1_000_000_000
 PLANAR = (0, 1, 5)
 
 
-def write_carmen(path: str | os.PathLike[str], scans: Iterable[Scan], parameters: Mapping[str, float] | None = None) -> None:
+def write_carmen(
+    path: str | os.PathLike[str],
+    scans: Iterable[Scan],
+    parameters: Mapping[str, float] | None = None,
+) -> None:
     """Write scans as a log of CARMEN, gzipped where the file's name ends in .gz. The file appears whole or not at all.
 
     parameters  numbers by their names, such as the noise of the odometry, for lines PARAM at the head of the log
@@ -58,7 +62,9 @@ def write_carmen(path: str | os.PathLike[str], scans: Iterable[Scan], parameters
     A scan is a line ROBOTLASER1, which says how the laser is made and mounted, behind a line ODOM and, where its true pose is known, a line TRUEPOS, as CARMEN's simulator writes.
     Ranges beyond the laser's reach are written as its reach, those that are no measurement as 0. Raises LogError.
     """
-    head = HEADER + "".join(f"PARAM {name} {value:g} 0 localhost 0\n" for name, value in (parameters or {}).items())
+    head = HEADER + "".join(
+        f"PARAM {name} {value:g} 0 localhost 0\n" for name, value in (parameters or {}).items()
+    )
     text = head + "".join(map(_carmen_lines, *_numbered(scans)))
     data = text.encode("ascii")
     try:
@@ -69,7 +75,11 @@ def write_carmen(path: str | os.PathLike[str], scans: Iterable[Scan], parameters
         ) from None
 
 
-def write_bag(path: str | os.PathLike[str], scans: Iterable[Scan], covariances: NDArray[np.float64] | None = None) -> None:
+def write_bag(
+    path: str | os.PathLike[str],
+    scans: Iterable[Scan],
+    covariances: NDArray[np.float64] | None = None,
+) -> None:
     """Write scans as a ROS bag: a file of ROS 1 where the name ends in .bag, a file of MCAP where it ends in .mcap, else a folder of ROS 2. What is written appears whole or not at all.
 
     Topics: /scan (LaserScan), /odom (Odometry), /tf (from odom to base_link and, where the true poses are known, from map to odom) and /tf_static (from base_link to laser).
@@ -78,7 +88,9 @@ def write_bag(path: str | os.PathLike[str], scans: Iterable[Scan], covariances: 
     """
     target = Path(path)
     if target.is_dir():
-        raise LogError(f"{named(path)}: expected a folder that is not there yet, got one that is; name another, or remove it")
+        raise LogError(
+            f"{named(path)}: expected a folder that is not there yet, got one that is; name another, or remove it"
+        )
     try:
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".bag-") as draft:
             written = _write_bag(Path(draft) / target.name, scans, covariances)
@@ -90,9 +102,13 @@ def write_bag(path: str | os.PathLike[str], scans: Iterable[Scan], covariances: 
     except LogError:
         raise
     except OSError as error:
-        raise LogError(f"{named(path)}: expected a bag that can be written: {error.strerror or error}; check the path") from None
+        raise LogError(
+            f"{named(path)}: expected a bag that can be written: {error.strerror or error}; check the path"
+        ) from None
     except Exception as error:  # whatever SQLite, which rosbags writes with, runs into
-        raise LogError(f"{named(path)}: expected a bag that can be written: {error}; check the disk and the path") from None
+        raise LogError(
+            f"{named(path)}: expected a bag that can be written: {error}; check the disk and the path"
+        ) from None
 
 
 def _numbered(scans: Iterable[Scan]) -> tuple[list[Scan], list[float]]:
@@ -108,10 +124,18 @@ def _carmen_lines(scan: Scan, time: float) -> str:
     stamp = f"{time:.6f} localhost {time:.6f}\n"
     odometry = _numbers(scan.odometry)
     laser = scan.laser
-    reach = laser.reach if math.isfinite(laser.reach) else float(np.max(scan.ranges, where=np.isfinite(scan.ranges), initial=0.0)) + 1.0
+    reach = (
+        laser.reach
+        if math.isfinite(laser.reach)
+        else float(np.max(scan.ranges, where=np.isfinite(scan.ranges), initial=0.0)) + 1.0
+    )
     ranges = " ".join(f"{r:.4f}" for r in np.nan_to_num(np.minimum(scan.ranges, reach), nan=0.0))
     shape = f"{laser.first:.9f} {laser.step * laser.beams:.9f} {laser.step:.9f} {reach:.4f} 0.01 0"
-    truth = f"TRUEPOS {_numbers(scan.corrected)} {odometry} {stamp}" if scan.corrected is not None else ""
+    truth = (
+        f"TRUEPOS {_numbers(scan.corrected)} {odometry} {stamp}"
+        if scan.corrected is not None
+        else ""
+    )
     return (
         f"{truth}ODOM {odometry} 0 0 0 {stamp}"
         f"ROBOTLASER1 0 {shape} {laser.beams} {ranges} 0 {_numbers(moved(scan.odometry, laser.mount))} {odometry} 0 0 0 0 0 {stamp}"
@@ -128,44 +152,78 @@ def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float6
         from rosbags import rosbag1, rosbag2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
-        raise LogError("bag: expected the package rosbags, got none; pip install 'ssh-abduction[ros]'") from None
+        raise LogError(
+            "bag: expected the package rosbags, got none; pip install 'ssh-abduction[ros]'"
+        ) from None
     is_ros1 = path.suffix == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     transforms = "tf2_msgs/msg/TFMessage"
     if transforms not in store.fielddefs:
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", transforms))
-    kinds = {"/scan": "sensor_msgs/msg/LaserScan", "/odom": "nav_msgs/msg/Odometry", "/tf": transforms, "/tf_static": transforms}
+        store.register(
+            get_types_from_msg("geometry_msgs/TransformStamped[] transforms", transforms)
+        )
+    kinds = {
+        "/scan": "sensor_msgs/msg/LaserScan",
+        "/odom": "nav_msgs/msg/Odometry",
+        "/tf": transforms,
+        "/tf_static": transforms,
+    }
     plugin = rosbag2.StoragePlugin.MCAP if path.suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
-    writer: Any = rosbag1.Writer(path) if is_ros1 else rosbag2.Writer(path, version=8, storage_plugin=plugin)
+    writer: Any = (
+        rosbag1.Writer(path) if is_ros1 else rosbag2.Writer(path, version=8, storage_plugin=plugin)
+    )
     serialize = store.serialize_ros1 if is_ros1 else store.serialize_cdr
     with writer:
-        topics = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
+        topics = {
+            topic: writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in kinds.items()
+        }
         for topic, time, message in _messages(store, scans, covariances, is_ros1):
             writer.write(topics[topic], time, serialize(message, kinds[topic]))
     return next(path.glob("*.mcap")) if path.suffix == ".mcap" else path
 
 
-def _messages(store: Any, scans: Iterable[Scan], covariances: NDArray[np.float64] | None, is_ros1: bool) -> Iterator[tuple[str, int, Any]]:
+def _messages(
+    store: Any, scans: Iterable[Scan], covariances: NDArray[np.float64] | None, is_ros1: bool
+) -> Iterator[tuple[str, int, Any]]:
     """The messages of all scans: topic, time in nanoseconds, and message."""
     types = store.types
     mounted: set[Pose] = set()
     for number, (scan, seconds) in enumerate(zip(*_numbered(scans), strict=True)):
         time = round(seconds * NANO)
         if time < 0:
-            raise LogError(f"scan {number}: expected a time from 0 on, as bags count it, got {seconds:g}; shift the times")
+            raise LogError(
+                f"scan {number}: expected a time from 0 on, as bags count it, got {seconds:g}; shift the times"
+            )
         make = _Maker(
-            types, types["builtin_interfaces/msg/Time"](sec=time // NANO, nanosec=time % NANO), {"seq": number} if is_ros1 else {}
+            types,
+            types["builtin_interfaces/msg/Time"](sec=time // NANO, nanosec=time % NANO),
+            {"seq": number} if is_ros1 else {},
         )
         laser = scan.laser
         if laser.mount not in mounted:
             if mounted:
-                raise LogError(f"scan {number}: expected one mount of the laser in a bag, got another; write two bags")
+                raise LogError(
+                    f"scan {number}: expected one mount of the laser in a bag, got another; write two bags"
+                )
             mounted.add(laser.mount)
             yield "/tf_static", time, make.transform(BASE, LASER, laser.mount)
         yield "/tf", time, make.transform(ODOM, BASE, scan.odometry)
         if scan.corrected is not None:
-            yield "/tf", time, make.transform(MAP, ODOM, moved(scan.corrected, between(scan.odometry, (0.0, 0.0, 0.0))))
-        yield "/odom", time, make.odometry(scan.odometry, np.zeros((3, 3)) if covariances is None else covariances[number])
+            yield (
+                "/tf",
+                time,
+                make.transform(
+                    MAP, ODOM, moved(scan.corrected, between(scan.odometry, (0.0, 0.0, 0.0)))
+                ),
+            )
+        yield (
+            "/odom",
+            time,
+            make.odometry(
+                scan.odometry, np.zeros((3, 3)) if covariances is None else covariances[number]
+            ),
+        )
         yield "/scan", time, make.scan(scan.ranges, laser)
 
 
@@ -180,8 +238,12 @@ class _Maker:
 
     def transform(self, parent: str, child: str, pose: Pose) -> Any:
         geometry = "geometry_msgs/msg/"
-        move = self.types[geometry + "Transform"](translation=self.vector(pose[0], pose[1]), rotation=self.turned(pose[2]))
-        stamped = self.types[geometry + "TransformStamped"](header=self.header(parent), child_frame_id=child, transform=move)
+        move = self.types[geometry + "Transform"](
+            translation=self.vector(pose[0], pose[1]), rotation=self.turned(pose[2])
+        )
+        stamped = self.types[geometry + "TransformStamped"](
+            header=self.header(parent), child_frame_id=child, transform=move
+        )
         return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
 
     def odometry(self, pose: Pose, covariance: NDArray[np.float64]) -> Any:
@@ -189,9 +251,12 @@ class _Maker:
         known = np.zeros((6, 6))
         known[np.ix_(PLANAR, PLANAR)] = covariance
         at = self.types[geometry + "Pose"](
-            position=self.types[geometry + "Point"](x=pose[0], y=pose[1], z=0.0), orientation=self.turned(pose[2])
+            position=self.types[geometry + "Point"](x=pose[0], y=pose[1], z=0.0),
+            orientation=self.turned(pose[2]),
         )
-        still = self.types[geometry + "Twist"](linear=self.vector(0.0, 0.0), angular=self.vector(0.0, 0.0))
+        still = self.types[geometry + "Twist"](
+            linear=self.vector(0.0, 0.0), angular=self.vector(0.0, 0.0)
+        )
         return self.types["nav_msgs/msg/Odometry"](
             header=self.header(ODOM),
             child_frame_id=BASE,
@@ -217,4 +282,6 @@ class _Maker:
         return self.types["geometry_msgs/msg/Vector3"](x=x, y=y, z=0.0)
 
     def turned(self, angle: float) -> Any:
-        return self.types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=math.sin(angle / 2), w=math.cos(angle / 2))
+        return self.types["geometry_msgs/msg/Quaternion"](
+            x=0.0, y=0.0, z=math.sin(angle / 2), w=math.cos(angle / 2)
+        )

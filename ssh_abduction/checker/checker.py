@@ -78,7 +78,9 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
     """
     theory = checked_theory(theory).resolve(checked_trace(trace))
     if not isinstance(ssh_map, SSHMap):
-        raise MapError(f"map: expected an SSHMap, got {brief(ssh_map)}; take one of a solution, or SSHMap.load")
+        raise MapError(
+            f"map: expected an SSHMap, got {brief(ssh_map)}; take one of a solution, or SSHMap.load"
+        )
     return tuple(violations(trace, ssh_map, theory))
 
 
@@ -94,7 +96,9 @@ def violations(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Violat
         Each violation, in the order of `check`.
     """
     reading = _Reading(trace, ssh_map, theory)
-    checks = [(COHERENCE, test) for test in _COHERENCE] + [(name, AXIOMS[name]) for name in theory.axioms if name in AXIOMS]
+    checks = [(COHERENCE, test) for test in _COHERENCE] + [
+        (name, AXIOMS[name]) for name in theory.axioms if name in AXIOMS
+    ]
     for name, test in checks:
         look_at_clock()
         for steps, message in test(reading):
@@ -107,7 +111,9 @@ def turned(trace: Trace, ssh_map: SSHMap, theory: Theory) -> SSHMap | None:
     found = headings(*reading.sights, reading.axioms)
     if any(s.place is not None and s.id not in found for s in ssh_map.dstates):
         return None
-    return replace(ssh_map, dstates=tuple(replace(s, heading=found.get(s.id)) for s in ssh_map.dstates))
+    return replace(
+        ssh_map, dstates=tuple(replace(s, heading=found.get(s.id)) for s in ssh_map.dstates)
+    )
 
 
 def unchecked(theory: Theory) -> tuple[str, ...]:
@@ -172,15 +178,30 @@ class _Order:
     left out, what the travels say outweighs the list. Without the axiom on_path no place is known to be on the path, so a total order orders none.
     """
 
-    def __init__(self, listed: Sequence[int], travels: Mapping[tuple[int, int], _Move], axioms: frozenset[str]) -> None:
+    def __init__(
+        self,
+        listed: Sequence[int],
+        travels: Mapping[tuple[int, int], _Move],
+        axioms: frozenset[str],
+    ) -> None:
         self.listed, self.travels = listed, travels
         self.total = {"path_order_total", "on_path"} <= axioms
-        self.asymmetric, self.transitive = "order_asymmetric" in axioms, "order_transitive" in axioms
+        self.asymmetric, self.transitive = (
+            "order_asymmetric" in axioms,
+            "order_transitive" in axioms,
+        )
         self.position = {p: i for i, p in reversed(list(enumerate(listed)))}
-        self.next: dict[int, defaultdict[int, dict[int, None]]] = {1: defaultdict(dict), -1: defaultdict(dict)}
+        self.next: dict[int, defaultdict[int, dict[int, None]]] = {
+            1: defaultdict(dict),
+            -1: defaultdict(dict),
+        }
         for p, q in travels:
             self.next[1][p][q] = self.next[-1][q][p] = None
-        self.backward = [(p, q) for p, q in travels if self.position.get(p, len(listed)) >= self.position.get(q, -1)]
+        self.backward = [
+            (p, q)
+            for p, q in travels
+            if self.position.get(p, len(listed)) >= self.position.get(q, -1)
+        ]
         self.rings = self._rings()
         self.can_be_listed = self.asymmetric and self.transitive
         self.is_listed = self.total and (self.can_be_listed or not self.backward)
@@ -216,7 +237,12 @@ class _Order:
     def between(self, p: int, q: int, direction: int) -> set[int]:
         """The places after p and before q, for somebody who goes in this direction."""
         i, j = self.position.get(p), self.position.get(q)
-        if (self.is_listed or not self.backward) and i is not None and j is not None and abs(i - j) <= 1:
+        if (
+            (self.is_listed or not self.backward)
+            and i is not None
+            and j is not None
+            and abs(i - j) <= 1
+        ):
             return set()  # neighbours in the list have nothing between them, and to see that here spares a walk along the path
         return set(self.after(p, direction)) & set(self.after(q, -direction)) - {p, q}
 
@@ -238,7 +264,11 @@ class _Order:
 
     def ring_steps(self, ring: Sequence[int]) -> list[int]:
         """The steps of the travels round a ring of places."""
-        return [step for edge in zip(ring, [*ring[1:], ring[0]], strict=True) for step in self.travels[edge].steps]
+        return [
+            step
+            for edge in zip(ring, [*ring[1:], ring[0]], strict=True)
+            for step in self.travels[edge].steps
+        ]
 
     def _later(self, p: int, direction: int) -> Sequence[int]:
         """The places after p in the list."""
@@ -251,7 +281,10 @@ class _Order:
         """The places that a travel or, if the order is total, the list puts after p; where they disagree, the travel counts."""
         travelled = self.next[direction].get(p, {})
         later = self._later(p, direction) if self.total else ()
-        return [*travelled, *(q for q in later if q not in travelled and p not in self.next[direction].get(q, ()))]
+        return [
+            *travelled,
+            *(q for q in later if q not in travelled and p not in self.next[direction].get(q, ())),
+        ]
 
 
 class _Reading:
@@ -275,12 +308,18 @@ class _Reading:
 
     def _read(self) -> None:
         labels, with_stars = self.map.labels, self.theory.star in ("pattern", "frame")
-        doubted = {(fault.kind, fault.step) for fault in self.map.faults}  # whether the theory allows these faults is judged apart
+        doubted = {
+            (fault.kind, fault.step) for fault in self.map.faults
+        }  # whether the theory allows these faults is judged apart
         for i, (label, step) in enumerate(zip(labels, self.trace.steps, strict=False)):
             self.first.setdefault(label, i)
             if ("misread", i) not in doubted and step.view is not None:
                 self.views.setdefault((label, step.view), i)
-            if with_stars and ("misseen", i) not in doubted and (openings := step.openings) is not None:
+            if (
+                with_stars
+                and ("misseen", i) not in doubted
+                and (openings := step.openings) is not None
+            ):
                 self.stars.setdefault((label, openings), i)
             if step.action is not None and i + 1 < len(labels) and ("slipped", i) not in doubted:
                 self.links.setdefault((label, step.action.name, labels[i + 1]), i)
@@ -292,8 +331,15 @@ class _Reading:
 
     @cached_property
     def moves(self) -> list[_Move]:
-        known = [(i, source, name, target) for (source, name, target), i in self.links.items() if {source, target} <= self.states.keys()]
-        return [_Move(i, self.states[source], self.actions[name], self.states[target]) for i, source, name, target in known]
+        known = [
+            (i, source, name, target)
+            for (source, name, target), i in self.links.items()
+            if {source, target} <= self.states.keys()
+        ]
+        return [
+            _Move(i, self.states[source], self.actions[name], self.states[target])
+            for i, source, name, target in known
+        ]
 
     @cached_property
     def travels(self) -> list[_Move]:
@@ -330,7 +376,9 @@ class _Reading:
     def orders(self) -> dict[int, _Order]:
         """The order of each path that the map has, or that one of its dstates is along."""
         edges: dict[int, dict[tuple[int, int], _Move]] = defaultdict(dict)
-        for move, (path, direction), p, q in self.along_travels if "travel_orders" in self.axioms else ():
+        for move, (path, direction), p, q in (
+            self.along_travels if "travel_orders" in self.axioms else ()
+        ):
             edges[path].setdefault((p, q) if direction == 1 else (q, p), move)
         listed: dict[int, tuple[int, ...]] = {}
         for h in self.map.paths:
@@ -343,7 +391,13 @@ class _Reading:
         found = []
         for m in self.travels:
             course, p, q = _course(m.source), m.source.place, m.target.place
-            if course and course == _course(m.target) and p is not None and q is not None and p != q:
+            if (
+                course
+                and course == _course(m.target)
+                and p is not None
+                and q is not None
+                and p != q
+            ):
                 found.append((m, course, p, q))
         return found
 
@@ -361,14 +415,23 @@ class _Reading:
         found: dict[tuple[int, Course, Course], _Branch] = {}
         for m in self.turns:
             (p, here, there) = m.source.place, _course(m.source), _course(m.target)
-            if p is not None and here and there and here[0] != there[0] and m.action.turn in ("right", "left"):
+            if (
+                p is not None
+                and here
+                and there
+                and here[0] != there[0]
+                and m.action.turn in ("right", "left")
+            ):
                 course = here if m.action.turn == "right" else _opposite(here)
                 found.setdefault((p, course, there), _Branch(p, course, there, m, mirrored=False))
         if "symmetric_sides" in self.axioms:
             for b in list(found.values()):
                 back, away = _opposite(b.course), _opposite(b.branch)
                 for course, branch in ((back, away), (b.branch, back), (away, b.course)):
-                    found.setdefault((b.place, course, branch), _Branch(b.place, course, branch, b.turn, mirrored=True))
+                    found.setdefault(
+                        (b.place, course, branch),
+                        _Branch(b.place, course, branch, b.turn, mirrored=True),
+                    )
         return list(found.values())
 
     @cached_property
@@ -377,13 +440,21 @@ class _Reading:
         found: dict[Course, dict[int, _Branch]] = defaultdict(dict)
         for b in self.branches if "side_of_branch" in self.axioms else ():
             if frozenset((b.course[0], b.branch[0])) not in self.excused:
-                for q in self.orders[b.branch[0]].after(b.place, b.branch[1]) if b.branch[0] in self.orders else ():
+                for q in (
+                    self.orders[b.branch[0]].after(b.place, b.branch[1])
+                    if b.branch[0] in self.orders
+                    else ()
+                ):
                     found[b.course].setdefault(q, b)
         return found
 
     @cached_property
     def excused(self) -> set[frozenset[int]]:
-        return {frozenset(pair) for pair in self.map.excused if _is_pair(pair)} if self.theory.boundary == "defeasible" else set()
+        return (
+            {frozenset(pair) for pair in self.map.excused if _is_pair(pair)}
+            if self.theory.boundary == "defeasible"
+            else set()
+        )
 
     @cached_property
     def sights(self) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
@@ -395,7 +466,9 @@ class _Reading:
         for i, (label, step) in enumerate(zip(self.map.labels, self.trace.steps, strict=False)):
             s, star = self.states.get(label), step.gateways or Star(())
             if s and (label, star) not in sights:
-                sights[label, star] = Sight(s, star, i, label not in shown, s.place not in places, self._onward(s))
+                sights[label, star] = Sight(
+                    s, star, i, label not in shown, s.place not in places, self._onward(s)
+                )
                 shown.add(label)
                 places.add(s.place)
             seen.append(sights.get((label, star)))
@@ -411,7 +484,11 @@ class _Reading:
         if course is None or s.place is None or course[0] not in self.orders:
             return ()
         path, direction = course
-        return tuple(towards for towards, way in ((0, direction), (180, -direction)) if self.orders[path].after(s.place, way))
+        return tuple(
+            towards
+            for towards, way in ((0, direction), (180, -direction))
+            if self.orders[path].after(s.place, way)
+        )
 
     @cached_property
     def clashes(self) -> list[Clash]:
@@ -432,15 +509,29 @@ def _both_sides(m: _Reading) -> Iterator[_Conflict]:
         for q in places.keys() & other.keys():
             b, c = places[q], other[q]
             steps = (*b.turn.steps, *c.turn.steps, *_seen(m, q))
-            yield _Conflict("sides_disjoint", (b, c), steps, f"Place {q} would lie both right and left of path {h}: it is {b}, and {c}.")
+            yield _Conflict(
+                "sides_disjoint",
+                (b, c),
+                steps,
+                f"Place {q} would lie both right and left of path {h}: it is {b}, and {c}.",
+            )
 
 
 def _on_and_beside(m: _Reading) -> Iterator[_Conflict]:
     for (h, _direction), places in list(m.right.items()):
         for q in places.keys() & m.on(h):
             b = places[q]
-            steps = (*b.turn.steps, *_seen(m, q), *m.steps_of(*([m.along[h][q]] if q in m.along.get(h, ()) else [])))
-            yield _Conflict("path_between_sides", (b,), steps, f"Place {q} is on path {h} and would lie beside it: it is {b}.")
+            steps = (
+                *b.turn.steps,
+                *_seen(m, q),
+                *m.steps_of(*([m.along[h][q]] if q in m.along.get(h, ()) else [])),
+            )
+            yield _Conflict(
+                "path_between_sides",
+                (b,),
+                steps,
+                f"Place {q} is on path {h} and would lie beside it: it is {b}.",
+            )
 
 
 def _seen(m: _Reading, place: int) -> list[int]:
@@ -486,7 +577,10 @@ def _labels_are_dstates(m: _Reading) -> Found:
     """Each step has a label, and each label is the id of a dstate."""
     steps, labels = len(m.trace), len(m.map.labels)
     if steps != labels:
-        yield [min(steps, labels)] if labels < steps else [], f"The map labels {labels} steps, but the trace has {steps}."
+        yield (
+            [min(steps, labels)] if labels < steps else [],
+            f"The map labels {labels} steps, but the trace has {steps}.",
+        )
     for label, i in m.first.items():
         if label not in m.records:
             yield [i], f"Step {i} is labelled {label}, but the map has no dstate {label}."
@@ -494,7 +588,9 @@ def _labels_are_dstates(m: _Reading) -> Found:
 
 def _numbered_by_first_visit(m: _Reading) -> Found:
     """All dstates, places and paths are visited, are numbered 0, 1, 2, … by first visit, and each path is first faced in direction +1."""
-    yield from _numbered("dstates", [s.id for s in m.map.dstates], [(i, s.id) for i, s in m.visited])
+    yield from _numbered(
+        "dstates", [s.id for s in m.map.dstates], [(i, s.id) for i, s in m.visited]
+    )
     if m.theory.level == "causal":
         return
     yield from _numbered("places", m.map.places, [(i, s.place) for i, s in m.visited])
@@ -504,7 +600,10 @@ def _numbered_by_first_visit(m: _Reading) -> Found:
         if (course := _course(s)) and course[0] not in faced:
             faced.add(course[0])
             if course[1] != 1:
-                yield [i], f"Path {course[0]} is first faced at step {i}, in direction -1 instead of +1."
+                yield (
+                    [i],
+                    f"Path {course[0]} is first faced at step {i}, in direction -1 instead of +1.",
+                )
 
 
 def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | None]]) -> Found:
@@ -519,7 +618,10 @@ def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | N
         yield [], f"The map lists {x} among its {what}, but no step is there."
     for number, (i, x) in enumerate(sorted((i, x) for x, i in used.items())):
         if x != number:
-            yield [i], f"The {what} are not numbered by first visit: {x} is number {number} to be visited, at step {i}."
+            yield (
+                [i],
+                f"The {what} are not numbered by first visit: {x} is number {number} to be visited, at step {i}.",
+            )
             return
 
 
@@ -531,7 +633,11 @@ def _dstates_look_as_seen(m: _Reading) -> Found:
     for first, s in m.visited:
         view, i = shown.get(s.id, (None, first))
         if s.view != view:
-            said = f"looks like {view!r} at step {i}" if s.id in shown else "is unknown or misread wherever it is visited"
+            said = (
+                f"looks like {view!r} at step {i}"
+                if s.id in shown
+                else "is unknown or misread wherever it is visited"
+            )
             yield [i], f"Dstate {s.id} has the view {s.view!r} in the map, but {said}."
 
 
@@ -540,7 +646,12 @@ def _faults_are_allowed(m: _Reading) -> Found:
     named: set[tuple[str, int]] = set()
     for fault in m.map.faults:
         i, kind = fault.step, fault.kind
-        prices = {"misread": m.theory.misread, "misseen": m.theory.misread, "slipped": m.theory.slipped, "jumped": m.theory.jumped}
+        prices = {
+            "misread": m.theory.misread,
+            "misseen": m.theory.misread,
+            "slipped": m.theory.slipped,
+            "jumped": m.theory.jumped,
+        }
         allowed = prices.get(kind, 0)
         steps = m.trace.steps
         if not allowed or (kind == "misseen" and m.theory.star not in ("pattern", "frame")):
@@ -551,17 +662,30 @@ def _faults_are_allowed(m: _Reading) -> Found:
             or (kind == "slipped" and m.trace.steps[i].action is None)
             or (kind == "jumped" and m.trace.steps[i].displacement is None)
         ):
-            yield [], f"The map disbelieves step {i} ({kind}), where there is nothing to disbelieve."
+            yield (
+                [],
+                f"The map disbelieves step {i} ({kind}), where there is nothing to disbelieve.",
+            )
         elif (kind, i) in named:
             yield [i], f"The map names the fault of step {i} ({kind}) twice."
         elif kind == "misread":
             s, seen = m.states.get(m.map.labels[i]), m.trace.steps[i].view
             if fault.seen != seen or (s and fault.expected != s.view) or seen == fault.expected:
-                yield [i], f"The map says that {fault}, but the trace has {seen!r} there, and the dstate {s.view if s else None!r}."
+                yield (
+                    [i],
+                    f"The map says that {fault}, but the trace has {seen!r} there, and the dstate {s.view if s else None!r}.",
+                )
         elif kind == "slipped" and fault.seen != (m.trace.steps[i].action or Action("")).name:
             yield [i], f"The map says that {fault}, but the trace has another action there."
-        if allowed and 0 <= i < len(steps) and round(10 * fault.cost) != (price := m.theory.fault_tenths(kind, steps[i])):
-            yield [i], f"The fault of step {i} ({kind}) costs {fault.cost:g} dstates in the map, and {price / 10:g} by the theory."
+        if (
+            allowed
+            and 0 <= i < len(steps)
+            and round(10 * fault.cost) != (price := m.theory.fault_tenths(kind, steps[i]))
+        ):
+            yield (
+                [i],
+                f"The fault of step {i} ({kind}) costs {fault.cost:g} dstates in the map, and {price / 10:g} by the theory.",
+            )
         named.add((kind, i))
 
 
@@ -583,9 +707,15 @@ def _has_what_the_theory_has(m: _Reading) -> Found:
         yield [], "The map has places or paths, but the theory is causal."
     for s in m.map.dstates:
         if causal and (s.place, s.path, s.direction) != (None, None, None):
-            yield m.steps_of(s.id), f"Dstate {s.id} has a place, path or direction, but the theory is causal."
+            yield (
+                m.steps_of(s.id),
+                f"Dstate {s.id} has a place, path or direction, but the theory is causal.",
+            )
         if m.theory.star not in ("frame", "gateways") and s.heading is not None:
-            yield m.steps_of(s.id), f"Dstate {s.id} has a heading, but the places of the theory have no frames."
+            yield (
+                m.steps_of(s.id),
+                f"Dstate {s.id} has a heading, but the places of the theory have no frames.",
+            )
     if m.map.excused and m.theory.boundary != "defeasible":
         yield [], "The map excuses pairs of paths, but the theory excuses none."
 
@@ -614,7 +744,10 @@ def _frames_start_at_first_visit(m: _Reading) -> Found:
     for p, i in m.place_seen.items():
         s = m.states[m.map.labels[i]]
         if heading := s.heading if m.theory.star == "gateways" else _heading(s):
-            yield [i], f"Place {p} is first visited at step {i} with heading {heading} instead of 0."
+            yield (
+                [i],
+                f"Place {p} is first visited at step {i} with heading {heading} instead of 0.",
+            )
 
 
 _COHERENCE: tuple[Check, ...] = (
@@ -639,7 +772,10 @@ def _functional_view(m: _Reading) -> Found:
     for (s, view), i in m.views.items():
         first, at = known.setdefault(s, (view, i))
         if view != first:
-            yield (at, i), f"Dstate {s} looks like {first!r} at step {at} and like {view!r} at step {i}."
+            yield (
+                (at, i),
+                f"Dstate {s} looks like {first!r} at step {at} and like {view!r} at step {i}.",
+            )
 
 
 def _deterministic(m: _Reading) -> Found:
@@ -671,7 +807,10 @@ def _turn_stays(m: _Reading) -> Found:
     """A turn stays at its place (T2)."""
     for t in m.turns:
         if t.source.place != t.target.place:
-            yield t.steps, f"{t} is a turn, but leads from place {t.source.place} to place {t.target.place}."
+            yield (
+                t.steps,
+                f"{t} is a turn, but leads from place {t.source.place} to place {t.target.place}.",
+            )
 
 
 def _travel_leaves(m: _Reading) -> Found:
@@ -685,7 +824,10 @@ def _travel_follows_path(m: _Reading) -> Found:
     """A travel starts and ends along the same path in the same direction (T4)."""
     for t in m.travels:
         if _course(t.source) is None or _course(t.source) != _course(t.target):
-            yield t.steps, f"{t} is a travel, but starts along {_going(t.source)} and ends along {_going(t.target)}."
+            yield (
+                t.steps,
+                f"{t} is a travel, but starts along {_going(t.source)} and ends along {_going(t.target)}.",
+            )
 
 
 def _one_course(m: _Reading) -> Found:
@@ -695,7 +837,10 @@ def _one_course(m: _Reading) -> Found:
             yield m.steps_of(s), f"Dstate {s} is along several paths or directions."
         for r in records:
             if (r.path, r.direction) != (None, None) and _course(r) is None:
-                yield m.steps_of(s), f"Dstate {s} has path {r.path} and direction {r.direction}, which is not one path in one direction."
+                yield (
+                    m.steps_of(s),
+                    f"Dstate {s} has path {r.path} and direction {r.direction}, which is not one path in one direction.",
+                )
 
 
 def _turn_around_reverses(m: _Reading) -> Found:
@@ -703,7 +848,10 @@ def _turn_around_reverses(m: _Reading) -> Found:
     for t in m.turns:
         course, other = _course(t.source), _course(t.target)
         if t.action.turn == "around" and other != (course and _opposite(course)):
-            yield t.steps, f"{t} is a turn around, but leads from {_going(t.source)} to {_going(t.target)}."
+            yield (
+                t.steps,
+                f"{t} is a turn around, but leads from {_going(t.source)} to {_going(t.target)}.",
+            )
 
 
 def _turn_changes_path(m: _Reading) -> Found:
@@ -711,7 +859,10 @@ def _turn_changes_path(m: _Reading) -> Found:
     for t in m.turns:
         course, other = _course(t.source), _course(t.target)
         if t.action.turn in ("right", "left") and course and other and course[0] == other[0]:
-            yield t.steps, f"{t} is a turn {t.action.turn}, but both dstates are along path {course[0]}."
+            yield (
+                t.steps,
+                f"{t} is a turn {t.action.turn}, but both dstates are along path {course[0]}.",
+            )
 
 
 def _one_dstate_per_course(m: _Reading) -> Found:
@@ -721,7 +872,10 @@ def _one_dstate_per_course(m: _Reading) -> Found:
         if s.place is not None and (course := _course(s)):
             first = known.setdefault((s.place, course), s.id)
             if first != s.id:
-                yield m.steps_of(first, s.id), f"Dstates {first} and {s.id} are both at place {s.place} along {_along(course)}."
+                yield (
+                    m.steps_of(first, s.id),
+                    f"Dstates {first} and {s.id} are both at place {s.place} along {_along(course)}.",
+                )
 
 
 def _on_path(m: _Reading) -> Found:
@@ -731,7 +885,10 @@ def _on_path(m: _Reading) -> Found:
         for p in set(order.listed) - there.keys():
             yield _seen(m, p), f"Path {h} lists place {p}, but no dstate there is along the path."
         for p in there.keys() - set(order.listed):
-            yield m.steps_of(there[p]), f"Dstate {there[p]} at place {p} is along path {h}, but the path does not list the place."
+            yield (
+                m.steps_of(there[p]),
+                f"Dstate {there[p]} at place {p} is along path {h}, but the path does not list the place.",
+            )
 
 
 def _travel_orders(m: _Reading) -> Found:
@@ -740,7 +897,10 @@ def _travel_orders(m: _Reading) -> Found:
         for p, q in order.backward if order.can_be_listed else ():
             if {p, q} <= order.position.keys():
                 t = order.travels[p, q]
-                yield t.steps, f"Path {h} lists place {q} before place {p}, but {t} along {_going(t.source)} says the reverse."
+                yield (
+                    t.steps,
+                    f"Path {h} lists place {q} before place {p}, but {t} along {_going(t.source)} says the reverse.",
+                )
 
 
 def _order_asymmetric(m: _Reading) -> Found:
@@ -748,7 +908,10 @@ def _order_asymmetric(m: _Reading) -> Found:
     for h, order in m.orders.items():
         for ring in order.rings:
             if not order.allows(ring):
-                yield order.ring_steps(ring), f"On path {h} the travels make places {ring[0]} and {ring[-1]} come before each other."
+                yield (
+                    order.ring_steps(ring),
+                    f"On path {h} the travels make places {ring[0]} and {ring[-1]} come before each other.",
+                )
 
 
 def _order_transitive(m: _Reading) -> Found:
@@ -757,7 +920,10 @@ def _order_transitive(m: _Reading) -> Found:
         for ring in order.rings:
             if not order.allows(ring) and len(ring) > 2:
                 way = ", ".join(map(str, ring))
-                yield order.ring_steps(ring), f"On path {h} the travels lead through places {way}, but the last comes before the first."
+                yield (
+                    order.ring_steps(ring),
+                    f"On path {h} the travels lead through places {way}, but the last comes before the first.",
+                )
 
 
 def _path_order_total(m: _Reading) -> Found:
@@ -767,7 +933,10 @@ def _path_order_total(m: _Reading) -> Found:
         for p in sorted(places - order.position.keys(), key=str):
             if apart := places - {p, *order.after(p, 1), *order.after(p, -1)}:
                 q = min(apart, key=str)
-                yield [*_seen(m, p), *_seen(m, q)], f"Places {p} and {q} are on path {h}, but neither comes before the other."
+                yield (
+                    [*_seen(m, p), *_seen(m, q)],
+                    f"Places {p} and {q} are on path {h}, but neither comes before the other.",
+                )
                 break
 
 
@@ -776,7 +945,10 @@ def _next_place(m: _Reading) -> Found:
     for t, (h, direction), p, q in m.along_travels:
         if h in m.orders and (between := m.orders[h].between(p, q, direction)):
             r = min(between, key=str)
-            yield [*t.steps, *_seen(m, r)], f"{t} leads from place {p} to place {q}, but place {r} lies between them on path {h}."
+            yield (
+                [*t.steps, *_seen(m, r)],
+                f"{t} leads from place {p} to place {q}, but place {r} lies between them on path {h}.",
+            )
 
 
 def _all_on_paths(m: _Reading) -> Found:
@@ -822,12 +994,19 @@ def _sides(name: str, m: _Reading) -> Found:
 
 def _star_pattern(m: _Reading) -> Found:
     """All stars seen at a place are one star, turned."""
-    yield from _one_star(((s, min(_turned(star, k) for k in range(4)), i) for s, star, i in _stars(m)), "however turned")
+    yield from _one_star(
+        ((s, min(_turned(star, k) for k in range(4)), i) for s, star, i in _stars(m)),
+        "however turned",
+    )
 
 
 def _star_frame(m: _Reading) -> Found:
     """The stars seen at a place agree when each is turned by its heading."""
-    framed = ((s, _turned(star, heading), i) for s, star, i in _stars(m) if (heading := _heading(s)) is not None)
+    framed = (
+        (s, _turned(star, heading), i)
+        for s, star, i in _stars(m)
+        if (heading := _heading(s)) is not None
+    )
     yield from _one_star(framed, "turned by their headings")
 
 
@@ -841,7 +1020,10 @@ def _one_star(seen: Iterable[tuple[DState, Openings, int]], how: str) -> Found:
         if s.place is not None:
             first, at = known.setdefault(s.place, (star, i))
             if star != first:
-                yield (at, i), f"The stars seen at place {s.place} at steps {at} and {i} differ, {how}."
+                yield (
+                    (at, i),
+                    f"The stars seen at place {s.place} at steps {at} and {i} differ, {how}.",
+                )
 
 
 def _one_heading(m: _Reading) -> Found:
@@ -851,17 +1033,28 @@ def _one_heading(m: _Reading) -> Found:
             yield m.steps_of(s), f"Dstate {s} has several headings."
         for r in records:
             if _heading(r) is None:
-                yield m.steps_of(s), f"Dstate {s} has the heading {r.heading}, which is none of the slots 0 to 3."
+                yield (
+                    m.steps_of(s),
+                    f"Dstate {s} has the heading {r.heading}, which is none of the slots 0 to 3.",
+                )
 
 
 def _turn_rotates(m: _Reading) -> Found:
     """A turn right, around or left adds one, two or three quarters to the heading."""
     for t in m.turns:
         before, after = _heading(t.source), _heading(t.target)
-        if before is None or after is None or t.action.turn is None or t.source.place != t.target.place:
+        if (
+            before is None
+            or after is None
+            or t.action.turn is None
+            or t.source.place != t.target.place
+        ):
             continue  # headings at two places are in two frames; a turn between places is reported under turn_stays
         if (before + QUARTERS[t.action.turn]) % 4 != after:
-            yield t.steps, f"{t} is a turn {t.action.turn}, but leads from heading {before} to heading {after}."
+            yield (
+                t.steps,
+                f"{t} is a turn {t.action.turn}, but leads from heading {before} to heading {after}.",
+            )
 
 
 def _one_dstate_per_heading(m: _Reading) -> Found:
@@ -872,7 +1065,10 @@ def _one_dstate_per_heading(m: _Reading) -> Found:
         if s.place is not None and heading is not None:
             first = known.setdefault((s.place, heading), s.id)
             if first != s.id:
-                yield m.steps_of(first, s.id), f"Dstates {first} and {s.id} both face slot {heading} of place {s.place}."
+                yield (
+                    m.steps_of(first, s.id),
+                    f"Dstates {first} and {s.id} both face slot {heading} of place {s.place}.",
+                )
 
 
 def _path_goes_straight(m: _Reading) -> Found:
@@ -904,7 +1100,10 @@ def _gateways(name: str, m: _Reading) -> Found:
         if name in clash.axioms:
             steps = ", ".join(map(str, clash.steps))
             if name == "gateway_end" and len(clash.axioms) == 1:
-                yield clash.steps, f"The path goes on from place {clash.place}, but at steps {steps} no gateway is seen that leads on."
+                yield (
+                    clash.steps,
+                    f"The path goes on from place {clash.place}, but at steps {steps} no gateway is seen that leads on.",
+                )
                 continue
             yield (
                 clash.steps,
@@ -919,8 +1118,16 @@ def _planar(m: _Reading) -> Found:
     """Paths meet at places only: the map can be drawn in the plane, with turns right to the right, without a crossing."""
     place_of = {s.id: s.place for s in m.states.values() if s.place is not None}
     headings = {s: heading for s in place_of if (heading := _heading(m.states[s])) is not None}
-    turns = [(t.source.id, t.action.turn, t.target.id) for t in m.turns if t.action.turn and {t.source.id, t.target.id} <= place_of.keys()]
-    stars = {s: [star for state, star, _ in _stars(m) if state.id == s] for s in place_of} if "star_frame" in m.axioms else {}
+    turns = [
+        (t.source.id, t.action.turn, t.target.id)
+        for t in m.turns
+        if t.action.turn and {t.source.id, t.target.id} <= place_of.keys()
+    ]
+    stars = (
+        {s: [star for state, star, _ in _stars(m) if state.id == s] for s in place_of}
+        if "star_frame" in m.axioms
+        else {}
+    )
 
     def cross(travels: Sequence[_Move]) -> bool:
         edges = Edges([(t.source.id, t.target.id) for t in travels], turns, place_of)
@@ -928,7 +1135,10 @@ def _planar(m: _Reading) -> Found:
             return not edges.can_be_drawn(crossing=m.theory.symmetric_sides)
         if headings.keys() == place_of.keys() and edges.can_be_drawn_by(headings):
             return False
-        turned, distinct = {"turn_rotates", "one_heading"} <= m.axioms, "one_dstate_per_heading" in m.axioms
+        turned, distinct = (
+            {"turn_rotates", "one_heading"} <= m.axioms,
+            "one_dstate_per_heading" in m.axioms,
+        )
         return not edges.can_be_drawn_in_frames(stars, turned=turned, distinct=distinct)
 
     kept = [t for t in m.travels if {t.source.id, t.target.id} <= place_of.keys()]
@@ -950,16 +1160,28 @@ def _planar(m: _Reading) -> Found:
 def _asserted(m: _Reading) -> Found:
     """What somebody asserts of pairs of steps holds in the map."""
     labels, theory = m.map.labels, m.theory
-    told = [("one dstate", theory.same), ("different dstates", theory.different), ("at different places", theory.elsewhere)]
-    for said, (i, j) in ((said, pair) for said, pairs in told for pair in pairs if max(pair) < len(labels)):
+    told = [
+        ("one dstate", theory.same),
+        ("different dstates", theory.different),
+        ("at different places", theory.elsewhere),
+    ]
+    for said, (i, j) in (
+        (said, pair) for said, pairs in told for pair in pairs if max(pair) < len(labels)
+    ):
         here, there = labels[i], labels[j]
         places = {m.states[label].place for label in (here, there) if label in m.states}
         if said == "one dstate" and here != there:
-            yield [i, j], f"Steps {i} and {j} are dstates {here} and {there}, but are said to be one dstate."
+            yield (
+                [i, j],
+                f"Steps {i} and {j} are dstates {here} and {there}, but are said to be one dstate.",
+            )
         elif said != "one dstate" and here == there:
             yield [i, j], f"Steps {i} and {j} are one dstate, {here}, but are said to be {said}."
         elif said == "at different places" and len(places) == 1 and None not in places:
-            yield [i, j], f"Steps {i} and {j} are at one place, {min(places, key=str)}, but are said to be {said}."
+            yield (
+                [i, j],
+                f"Steps {i} and {j} are at one place, {min(places, key=str)}, but are said to be {said}.",
+            )
 
 
 def _star_of_dstate(m: _Reading) -> Found:
@@ -969,7 +1191,10 @@ def _star_of_dstate(m: _Reading) -> Found:
         stars, star = seen.setdefault(label, {}), step.gateways or Star(())
         for other, i in stars.items() if star not in stars else ():
             if not may_show_the_same(other, star):
-                yield [i, t], f"Steps {i} and {t} are one dstate, {label}, but the gateways seen there are not in the same directions."
+                yield (
+                    [i, t],
+                    f"Steps {i} and {t} are one dstate, {label}, but the gateways seen there are not in the same directions.",
+                )
         stars.setdefault(star, t)
 
 
@@ -977,9 +1202,14 @@ def _one_pose(m: _Reading) -> Found:
     """A dstate has one pose, a place one position, with which the displacements agree within their covariance."""
     from ssh_abduction.checker.geometry import refused_returns  # loads numpy
 
-    trusted = m.trace.without_displacements_at([fault.step for fault in m.map.faults if fault.kind == "jumped"])
+    trusted = m.trace.without_displacements_at(
+        [fault.step for fault in m.map.faults if fault.kind == "jumped"]
+    )
     for refused in refused_returns(trusted, m.map, m.theory):
-        said = " and ".join(f"steps {i} and {j} are at one {'place' if freedom == 2 else 'dstate'}" for i, j, freedom in refused.returns)
+        said = " and ".join(
+            f"steps {i} and {j} are at one {'place' if freedom == 2 else 'dstate'}"
+            for i, j, freedom in refused.returns
+        )
         steps = [t for i, j, _ in refused.returns for t in (i, j)]
         yield (
             steps,

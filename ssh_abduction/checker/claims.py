@@ -19,10 +19,18 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.theory.theory import COUNTS, Theory
 
 STATUSES = ("optimal", "feasible", "unsatisfiable", "unknown")
-REASONS = ("time limit", "memory limit", "interrupted", "maps limit", "no proof")  # why a search may have been stopped
+REASONS = (
+    "time limit",
+    "memory limit",
+    "interrupted",
+    "maps limit",
+    "no proof",
+)  # why a search may have been stopped
 
 
-def false_claims(answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int) -> tuple[str, ...]:
+def false_claims(
+    answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int
+) -> tuple[str, ...]:
     """What is wrong with the claims of an answer, a sentence each. None of the claims is taken for granted.
 
     answer  as `solve --json` prints it (docs/formats.md)
@@ -32,21 +40,45 @@ def false_claims(answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, 
     proven  the number of dstates that its certificate proves, if clingo's part in it is believed
     """
     claims = _Claims(answer, maps, steps, theory, proven)
-    return tuple(fault for check in (claims.sizes, claims.twice, claims.status, claims.cost, claims.bound) for fault in check())
+    return tuple(
+        fault
+        for check in (claims.sizes, claims.twice, claims.status, claims.cost, claims.bound)
+        for fault in check()
+    )
 
 
-def contradictions(answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory) -> Iterator[str]:
+def contradictions(
+    answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory
+) -> Iterator[str]:
     """In what an answer contradicts itself, a sentence each. Its certificate is taken for granted, as only the trace could tell. Parameters as of `false_claims`."""
     claims = _Claims(answer, maps, steps, theory, sys.maxsize)
-    for check in (claims.sizes, claims.twice, claims.status, *(() if theory.has_faults else (claims.cost, claims.bound))):
+    for check in (
+        claims.sizes,
+        claims.twice,
+        claims.status,
+        *(() if theory.has_faults else (claims.cost, claims.bound)),
+    ):
         yield from check()
 
 
 class _Claims:
     """The claims of an answer. Each method yields what is wrong with some of them."""
 
-    def __init__(self, answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int) -> None:
-        self.answer, self.maps, self.steps, self.theory, self.proven = answer, maps, steps, theory, proven
+    def __init__(
+        self,
+        answer: Mapping[str, Any],
+        maps: Sequence[SSHMap],
+        steps: int,
+        theory: Theory,
+        proven: int,
+    ) -> None:
+        self.answer, self.maps, self.steps, self.theory, self.proven = (
+            answer,
+            maps,
+            steps,
+            theory,
+            proven,
+        )
         self.counts = [_counts(ssh_map) for ssh_map in maps]
         self.first = next(iter(theory.priorities), None)
         self.is_optimal = answer.get("status") == "optimal"
@@ -72,12 +104,18 @@ class _Claims:
 
     def status(self) -> Iterator[str]:
         """The status, whether the list is complete, and why the search ended fit together and fit the maps."""
-        status, complete, stopped = (self.answer.get(name) for name in ("status", "complete", "stopped"))
+        status, complete, stopped = (
+            self.answer.get(name) for name in ("status", "complete", "stopped")
+        )
         if "status" in self.answer:
             if status not in STATUSES:
                 yield f"status: expected one of {', '.join(STATUSES)}, got {brief(status)}"
             elif bool(self.maps) != (status in ("optimal", "feasible")):
-                expected = "optimal or feasible, as there is a map" if self.maps else "unsatisfiable or unknown, as there is no map"
+                expected = (
+                    "optimal or feasible, as there is a map"
+                    if self.maps
+                    else "unsatisfiable or unknown, as there is no map"
+                )
                 yield f"status: expected {expected}, got {status}"
             elif status == "feasible" and len(self.maps) > 1:
                 yield f"maps: expected one, as the status is feasible, got {len(self.maps)}"
@@ -98,7 +136,11 @@ class _Claims:
         """The claimed cost is that of the first map, and the other maps are as good."""
         if "cost" in self.answer:
             cost = self.answer["cost"]
-            expected = {k: v for k, v in self._least(cost).items() if v or k != "excuses"} if self.maps else None
+            expected = (
+                {k: v for k, v in self._least(cost).items() if v or k != "excuses"}
+                if self.maps
+                else None
+            )
             whole = isinstance(cost, Mapping) and all(is_whole(value) for value in cost.values())
             if cost != expected or (expected is not None and not whole):
                 because = "as map 1 has these" if self.maps else "as there is no map"
@@ -116,7 +158,9 @@ class _Claims:
 
     def _preferred(self, i: int) -> list[int]:
         """What a map has of what the theory prefers, first to last; nothing, where there is no such map."""
-        return [counts[name] for counts in self.counts[i : i + 1] for name in self.theory.priorities]
+        return [
+            counts[name] for counts in self.counts[i : i + 1] for name in self.theory.priorities
+        ]
 
     def _costs_within(self, within: Any) -> Iterator[str]:
         """Maps come by their number of dstates, or of what else the theory prefers first, excuses aside: none has too many, those that have equally many
@@ -131,22 +175,31 @@ class _Claims:
             most = self.counts[0][counted] + within if counted else 0
             if counted and not last[counted] <= counts[counted] <= most:
                 yield f"maps: expected {last[counted]} to {most} {counted} in map {i + 1}, as within is {within}, got {counts[counted]}"
-            elif (not counted or last[counted] == counts[counted]) and self._preferred(i) != self._preferred(max(i - 1, 0)):
+            elif (not counted or last[counted] == counts[counted]) and self._preferred(
+                i
+            ) != self._preferred(max(i - 1, 0)):
                 best, here = self._preferred(i - 1), self._preferred(i)
                 preferred = ", ".join(self.theory.priorities)
                 yield f"maps: expected equal numbers of {preferred}, as those of one level have, got {best} in map {i} and {here} in map {i + 1}"
         shown = [{k: v for k, v in counts.items() if v or k != "excuses"} for counts in self.counts]
         yield from self._costs_of_each(shown)
-        begins = [i for i in range(len(shown)) if i == 0 or self._preferred(i) != self._preferred(i - 1)]
+        begins = [
+            i for i in range(len(shown)) if i == 0 or self._preferred(i) != self._preferred(i - 1)
+        ]
         ends = [*begins[1:], len(shown)]
-        levels = [{"cost": shown[begin], "count": end - begin} for begin, end in zip(begins, ends, strict=False)]
+        levels = [
+            {"cost": shown[begin], "count": end - begin}
+            for begin, end in zip(begins, ends, strict=False)
+        ]
         if "levels" in self.answer and self.answer["levels"] != levels:
             yield f"levels: expected {brief(levels)}, as the maps have these, got {brief(self.answer['levels'])}"
 
     def _costs_of_each(self, shown: Sequence[Mapping[str, int]]) -> Iterator[str]:
         """Each map costs what it is said to cost."""
         listed = self.answer.get("maps")
-        for i, (said, counts) in enumerate(zip(listed if isinstance(listed, Sequence) else (), shown, strict=False)):
+        for i, (said, counts) in enumerate(
+            zip(listed if isinstance(listed, Sequence) else (), shown, strict=False)
+        ):
             if isinstance(said, Mapping) and said.get("cost", counts) != counts:
                 yield f"maps[{i}].cost: expected {_text(counts)}, as the map has these, got {_text(said['cost'])}"
 
@@ -155,25 +208,41 @@ class _Claims:
         shown = self.counts[0]
         if not self.theory.without or not isinstance(cost, Mapping):
             return shown
-        more = {k: cost[k] for k in self.theory.priorities if is_whole(cost.get(k)) and cost[k] >= shown[k]}
+        more = {
+            k: cost[k]
+            for k in self.theory.priorities
+            if is_whole(cost.get(k)) and cost[k] >= shown[k]
+        }
         return shown | more
 
     def bound(self) -> Iterator[str]:
         """No map is below a claimed bound, the certificate proves the bound on dstates, and where the status is optimal the bound is the cost."""
         bound = self.answer.get("bound", {})
-        if not isinstance(bound, Mapping) or not all(name in COUNTS and is_whole(value) and value >= 0 for name, value in bound.items()):
+        if not isinstance(bound, Mapping) or not all(
+            name in COUNTS and is_whole(value) and value >= 0 for name, value in bound.items()
+        ):
             yield f"bound: expected numbers of {', '.join(COUNTS)}, got {brief(bound)}"
             return
         for name, value in bound.items():
             if name not in ("dstates", self.first):
-                preferred = f"the theory minimises {self.first} first" if self.first else "the theory prefers nothing"
+                preferred = (
+                    f"the theory minimises {self.first} first"
+                    if self.first
+                    else "the theory prefers nothing"
+                )
                 yield f"bound: expected none of {name}, as {preferred}, got {value}"
             below = [i for i, counts in enumerate(self.counts) if counts[name] < value]
             if below and not self.theory.without:
                 yield f"bound: expected at most {self.counts[below[0]][name]} {name}, as map {below[0] + 1} has no more, got {value}"
         if bound.get("dstates", 0) > self.proven:
             yield f"bound: expected at most {self.proven} dstates, as the certificate proves no more, got {bound['dstates']}"
-        if self.is_optimal and self.maps and self.first and not self.theory.without and "bound" in self.answer:
+        if (
+            self.is_optimal
+            and self.maps
+            and self.first
+            and not self.theory.without
+            and "bound" in self.answer
+        ):
             least = self.counts[0][self.first]
             if bound.get(self.first, 0) < least:
                 got = bound.get(self.first, "none")
@@ -181,7 +250,12 @@ class _Claims:
 
 
 def _counts(ssh_map: SSHMap) -> dict[str, int]:
-    return {"dstates": len(ssh_map.dstates), "places": len(ssh_map.places), "paths": len(ssh_map.paths), "excuses": len(ssh_map.excused)}
+    return {
+        "dstates": len(ssh_map.dstates),
+        "places": len(ssh_map.places),
+        "paths": len(ssh_map.paths),
+        "excuses": len(ssh_map.excused),
+    }
 
 
 def _is(value: Any, number: int) -> bool:
@@ -189,4 +263,8 @@ def _is(value: Any, number: int) -> bool:
 
 
 def _text(counts: Any) -> str:
-    return ", ".join(f"{value} {name}" for name, value in counts.items()) if isinstance(counts, Mapping) and counts else brief(counts)
+    return (
+        ", ".join(f"{value} {name}" for name, value in counts.items())
+        if isinstance(counts, Mapping) and counts
+        else brief(counts)
+    )

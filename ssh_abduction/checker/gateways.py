@@ -22,7 +22,14 @@ from ssh_abduction.data.maps import DState
 from ssh_abduction.data.star import SPREAD, Frame, Star
 from ssh_abduction.data.trace import Action
 
-AXIOMS = ("gateway_frame", "gateway_heading", "gateway_turn", "gateway_dstate", "gateway_path", "gateway_end")
+AXIOMS = (
+    "gateway_frame",
+    "gateway_heading",
+    "gateway_turn",
+    "gateway_dstate",
+    "gateway_path",
+    "gateway_end",
+)
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,11 @@ def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> I
         for sight in reversed(seen):
             rest = [other for other in core if other is not sight]
             core = core if _reading(rest, turns, hard) is not None else rest
-        to_blame = [name for name in hard if _reading(core, turns, [other for other in hard if other != name]) is not None]
+        to_blame = [
+            name
+            for name in hard
+            if _reading(core, turns, [other for other in hard if other != name]) is not None
+        ]
         yield Clash(place, tuple(sight.step for sight in core), tuple(to_blame or hard))
 
 
@@ -93,7 +104,9 @@ def _by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
     return there
 
 
-def _reading(sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_shown: bool = True) -> list[_Turned] | None:
+def _reading(
+    sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_shown: bool = True
+) -> list[_Turned] | None:
     """A frame and a shift for each sight such that all pairs of sights satisfy the axioms, or None.
 
     as_shown  whether the headings have to be those that the dstates show
@@ -104,13 +117,18 @@ def _reading(sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_
             return chosen
         sight = sights[len(chosen)]
         for frame in sight.star.frames:
-            if "gateway_end" in axioms and not all(_leads(frame, towards) for towards in sight.onward):
+            if "gateway_end" in axioms and not all(
+                _leads(frame, towards) for towards in sight.onward
+            ):
                 continue
             for shift in range(max(frame.slots, 1)) if chosen else (0,):
                 look_at_clock()
                 here = (frame, shift)
                 before = zip([*sights[: len(chosen)], sight], [*chosen, here], strict=True)
-                if all(_allowed(other, turned, sight, here, turns, axioms, as_shown) for other, turned in before):
+                if all(
+                    _allowed(other, turned, sight, here, turns, axioms, as_shown)
+                    for other, turned in before
+                ):
                     read = extended([*chosen, here])
                     if read is not None:
                         return read
@@ -127,7 +145,15 @@ def _middle(found: Collection[int]) -> int:
     return (-start + (length - 1) // 2) % 360
 
 
-def _allowed(a: Sight, seen_a: _Turned, b: Sight, seen_b: _Turned, turns: Turns, axioms: Collection[str], as_shown: bool) -> bool:
+def _allowed(
+    a: Sight,
+    seen_a: _Turned,
+    b: Sight,
+    seen_b: _Turned,
+    turns: Turns,
+    axioms: Collection[str],
+    as_shown: bool,
+) -> bool:
     """Whether the axioms allow two sights at one place, the first of which comes first, to see so."""
     (first, back), (then, on) = seen_a, seen_b
     shift = (on - back) % max(first.slots, 1)
@@ -136,7 +162,10 @@ def _allowed(a: Sight, seen_a: _Turned, b: Sight, seen_b: _Turned, turns: Turns,
         return False
     if "gateway_turn" in axioms and not (
         all(_turns_so(action, first, found) for action in turns.get((a, b), ()))
-        and all(_turns_so(action, then, frozenset(-r % 360 for r in found)) for action in turns.get((b, a), ()))
+        and all(
+            _turns_so(action, then, frozenset(-r % 360 for r in found))
+            for action in turns.get((b, a), ())
+        )
     ):
         return False
     alike, opposite = _ways(first, then, shift, found)
@@ -144,14 +173,25 @@ def _allowed(a: Sight, seen_a: _Turned, b: Sight, seen_b: _Turned, turns: Turns,
     s, x = a.dstate, b.dstate
     if "gateway_heading" in axioms and s.id == x.id and not alike:
         return False
-    if "gateway_heading" in axioms and as_shown and a.first and b.shows and not _is_shown(x.heading, found):
+    if (
+        "gateway_heading" in axioms
+        and as_shown
+        and a.first
+        and b.shows
+        and not _is_shown(x.heading, found)
+    ):
         return False
     if "gateway_dstate" in axioms and s.id != x.id and alike and (sure or 0 not in found):
         return False
     if "gateway_path" in axioms and s.path is not None and x.path is not None:
-        same, reverse = s.path == x.path and s.direction == x.direction, s.path == x.path and s.direction != x.direction
+        same, reverse = (
+            s.path == x.path and s.direction == x.direction,
+            s.path == x.path and s.direction != x.direction,
+        )
         for way, on_course, towards in ((alike, same, 0), (opposite, reverse, 180)):
-            if (on_course and not way) or (way and not on_course and (sure or towards not in found)):
+            if (on_course and not way) or (
+                way and not on_course and (sure or towards not in found)
+            ):
                 return False
     return True
 
@@ -175,7 +215,10 @@ def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
     return frozenset(
         r
         for r in range(360)
-        if all(_between(first.bearings[j], then.bearings[k] + r) <= first.spreads[j] + then.spreads[k] for j, k in pairs)
+        if all(
+            _between(first.bearings[j], then.bearings[k] + r) <= first.spreads[j] + then.spreads[k]
+            for j, k in pairs
+        )
     )
 
 
@@ -192,7 +235,10 @@ def may_show_the_same(one: Star, other: Star) -> bool:
     off = np.abs((bearings[0][:, None] - bearings[1] + 180) % 360 - 180)
     near = off <= spreads[0][:, None] + spreads[1]
     taken_in = np.where(near, seen[0][:, None] + seen[1], 0)
-    return bool(taken_in[linear_sum_assignment(taken_in, maximize=True)].sum() == sum(row.sum() for row in seen))
+    return bool(
+        taken_in[linear_sum_assignment(taken_in, maximize=True)].sum()
+        == sum(row.sum() for row in seen)
+    )
 
 
 def _between(a: float, b: float) -> float:
@@ -206,20 +252,27 @@ def _turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
         return any(_between(r, round(action.bearing)) <= SPREAD for r in found)
     if action.gateway is not None:
         beside = [
-            (bearing, spread) for bearing, spread in zip(before.bearings, before.spreads, strict=True) if _between(bearing, 0) > spread
+            (bearing, spread)
+            for bearing, spread in zip(before.bearings, before.spreads, strict=True)
+            if _between(bearing, 0) > spread
         ]
         if action.turn == "left":
             beside.reverse()
         return action.gateway <= len(beside) and any(
-            _between(r, beside[action.gateway - 1][0]) <= beside[action.gateway - 1][1] for r in found
+            _between(r, beside[action.gateway - 1][0]) <= beside[action.gateway - 1][1]
+            for r in found
         )
     if action.turn == "around":
         behind = [
             (before.bearings[other], before.spreads[other])
-            for bearing, spread, other in zip(before.bearings, before.spreads, before.opposite, strict=True)
+            for bearing, spread, other in zip(
+                before.bearings, before.spreads, before.opposite, strict=True
+            )
             if other is not None and _between(bearing, 0) <= spread
         ][:1]
-        return any(_between(r, bearing) <= spread for r in found for bearing, spread in [(180, 0), *behind])
+        return any(
+            _between(r, bearing) <= spread for r in found for bearing, spread in [(180, 0), *behind]
+        )
     sides = (r if action.turn == "right" else 360 - r for r in found)
     return any(2 * SPREAD < side < 180 - 2 * SPREAD for side in sides)
 
@@ -240,13 +293,19 @@ def _ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple
 def _leads(frame: Frame, towards: int) -> bool:
     """Whether some gateway may be that of the robot's path, ahead (0) or behind (180)."""
     return _passes(frame) is not None or any(
-        _between(bearing, towards) <= 2 * spread for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
+        _between(bearing, towards) <= 2 * spread
+        for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
     )
 
 
 def _passes(frame: Frame) -> tuple[int, int] | None:
     """The gateways ahead and behind on a path that bends, if the robot faces one of them, or came through the other."""
-    for k, (bearing, spread, other) in enumerate(zip(frame.bearings, frame.spreads, frame.opposite, strict=True)):
-        if other is not None and (_between(bearing, 0) <= spread or _between(frame.bearings[other], 180) <= frame.spreads[other]):
+    for k, (bearing, spread, other) in enumerate(
+        zip(frame.bearings, frame.spreads, frame.opposite, strict=True)
+    ):
+        if other is not None and (
+            _between(bearing, 0) <= spread
+            or _between(frame.bearings[other], 180) <= frame.spreads[other]
+        ):
             return k, other
     return None

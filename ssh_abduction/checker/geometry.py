@@ -34,8 +34,12 @@ from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]
-Return: TypeAlias = tuple[int, int, int]  # two steps, and the degrees of freedom: 2 at one place, 3 at one dstate
-_Found: TypeAlias = tuple[tuple[Return, ...], float, float]  # returns that are refused, their chi-square and the threshold
+Return: TypeAlias = tuple[
+    int, int, int
+]  # two steps, and the degrees of freedom: 2 at one place, 3 at one dstate
+_Found: TypeAlias = tuple[
+    tuple[Return, ...], float, float
+]  # returns that are refused, their chi-square and the threshold
 
 # What docs/theory.md says of one_pose: the errors of heading that are reckoned with, the uncertainty at which a heading is lost, the steps in which a drift is tried and how far.
 SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
@@ -72,10 +76,17 @@ class Refused:
     def __str__(self) -> str:
         """In words: how far apart the steps of one return are, or how far off the loops of two close."""
         if len(self.closings) == 2:
-            ways, sizes = (" and ".join(f"{value:{form}} m" for value in values) for form, values in self._of_loops())
+            ways, sizes = (
+                " and ".join(f"{value:{form}} m" for value in values)
+                for form, values in self._of_loops()
+            )
             return f"the loops of {ways} close {sizes} off"
         closing, (_, _, freedom) = self.closings[0], self.returns[0]
-        turned = f" and {closing.turned:.0f} ± {closing.turned_sigma:.0f} degrees" if freedom == 3 else ""
+        turned = (
+            f" and {closing.turned:.0f} ± {closing.turned_sigma:.0f} degrees"
+            if freedom == 3
+            else ""
+        )
         return f"they are {closing.size:.1f} ± {closing.size_sigma:.1f} m{turned} apart"
 
     def _of_loops(self) -> Iterator[tuple[str, list[float]]]:
@@ -100,7 +111,9 @@ def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: _Drifts) -> 
     """What is refused alone comes first: it is found fast, and a caller may need no more."""
     yield from _refused_alone(list(_returns(trace, ssh_map, theory, drifts)), drifts, theory)
     if theory.joint > 1:
-        yield from _refused_together(list(_returns(trace, ssh_map, theory, drifts, of_arrivals=True)), drifts, theory)
+        yield from _refused_together(
+            list(_returns(trace, ssh_map, theory, drifts, of_arrivals=True)), drifts, theory
+        )
 
 
 def _closing(trace: Trace, first: int, last: int) -> Closing:
@@ -111,7 +124,11 @@ def _closing(trace: Trace, first: int, last: int) -> Closing:
     size = float(np.hypot(*off[:2]))
     ahead = off[:2] / size if size else np.array([1.0, 0.0])
     return Closing(
-        way=math.fsum(math.hypot(*step.displacement[:2]) for step in trace.steps[first + 1 : last + 1] if step.displacement),
+        way=math.fsum(
+            math.hypot(*step.displacement[:2])
+            for step in trace.steps[first + 1 : last + 1]
+            if step.displacement
+        ),
         size=size,
         size_sigma=math.sqrt(ahead @ covariance[:2, :2] @ ahead),
         turned=math.degrees(abs(off[2])),
@@ -126,7 +143,9 @@ class _Filter:
         size = len(trace)
         self.pose = np.zeros((size, 3))
         self.white = np.zeros((size, 3, 3))  # covariance of the error of the pose by noise alone
-        self.repeated = np.zeros((size, 3, 2))  # how the pose moves with the scale, and with the drift
+        self.repeated = np.zeros(
+            (size, 3, 2)
+        )  # how the pose moves with the scale, and with the drift
         self.broken = np.zeros(size, dtype=int)  # displacements that are missing so far
         self.sigma = np.array([odometry.scale, drift])
         self.at_ends = (
@@ -139,7 +158,11 @@ class _Filter:
             displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
             self.broken[t] = self.broken[t - 1] + (displacement is None)
             if displacement is None or covariance is None:
-                self.pose[t], self.white[t], self.repeated[t] = self.pose[t - 1], self.white[t - 1], self.repeated[t - 1]
+                self.pose[t], self.white[t], self.repeated[t] = (
+                    self.pose[t - 1],
+                    self.white[t - 1],
+                    self.repeated[t - 1],
+                )
                 continue
             dx, dy, turned = displacement
             way = math.hypot(dx, dy)
@@ -149,8 +172,12 @@ class _Filter:
             onward = _onward(moved)
             cos, sin = math.cos(heading), math.sin(heading)
             turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-            self.white[t] = onward @ self.white[t - 1] @ onward.T + turn @ np.array(covariance) @ turn.T
-            new = np.array([[moved[0], -moved[1] * way / 2], [moved[1], moved[0] * way / 2], [0.0, way]])
+            self.white[t] = (
+                onward @ self.white[t - 1] @ onward.T + turn @ np.array(covariance) @ turn.T
+            )
+            new = np.array(
+                [[moved[0], -moved[1] * way / 2], [moved[1], moved[0] * way / 2], [0.0, way]]
+            )
             self.repeated[t] = onward @ self.repeated[t - 1] + new
 
     def onward(self, first: Any, last: Any) -> Array:
@@ -167,12 +194,16 @@ class _Filter:
         """The covariance, by noise alone, that what went wrong up to each step has at step `end`, m x 9."""
         steps = np.arange(end + 1)
         onward = self.onward(steps, np.full(end + 1, end))
-        covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(-1, 9)
+        covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(
+            -1, 9
+        )
         return covariance
 
     def repeated_since(self, first: Any, last: Any) -> Array:
         """How a loop moves with the scale and the drift, times the standard deviation of these: m x 3 x 2."""
-        moved: Array = (self.repeated[last] - self.onward(first, last) @ self.repeated[first]) * self.sigma
+        moved: Array = (
+            self.repeated[last] - self.onward(first, last) @ self.repeated[first]
+        ) * self.sigma
         return moved
 
     def covariance(self, first: Any, last: Any) -> Array:
@@ -181,13 +212,19 @@ class _Filter:
         heading = self.lost(first, last)
         moved = self._moved_by_heading(first, last) + (repeated[..., :2, 1] ** 2).sum(-1)
         bent = (SIGMAS / 2) ** 2 * heading * moved + ROUNDED**2
-        added = bent[..., None, None] * np.diag([1.0, 1.0, 0.0]) + ROUNDED**2 * np.diag([0.0, 0.0, 1.0]) + self.at_ends
+        added = (
+            bent[..., None, None] * np.diag([1.0, 1.0, 0.0])
+            + ROUNDED**2 * np.diag([0.0, 0.0, 1.0])
+            + self.at_ends
+        )
         total: Array = white + repeated @ repeated.swapaxes(-1, -2) + added
         return total
 
     def lost(self, first: Any, last: Any) -> Array:
         """The variance of the heading at the end of loops."""
-        variance: Array = self.since(first, last)[..., 2, 2] + self.repeated_since(first, last)[..., 2, 1] ** 2
+        variance: Array = (
+            self.since(first, last)[..., 2, 2] + self.repeated_since(first, last)[..., 2, 1] ** 2
+        )
         return variance
 
     def _moved_by_heading(self, first: Any, last: Any) -> Array:
@@ -196,12 +233,17 @@ class _Filter:
         x, y = self.pose[:, 0], self.pose[:, 1]
         sums = [np.cumsum(angle * factor) for factor in (np.ones_like(x), x, y, x * x + y * y)]
         one, by_x, by_y, square = (s[last] - s[first] for s in sums)
-        moved: Array = np.maximum(square - 2 * (by_x * x[last] + by_y * y[last]) + one * (x[last] ** 2 + y[last] ** 2), 0.0)
+        moved: Array = np.maximum(
+            square - 2 * (by_x * x[last] + by_y * y[last]) + one * (x[last] ** 2 + y[last] ** 2),
+            0.0,
+        )
         return moved
 
     def is_known(self, first: Any, last: Any) -> NDArray[np.bool_]:
         """Whether loops have all their displacements, and the heading is not lost along any loop that ends where they do and begins later."""
-        known: NDArray[np.bool_] = (self.broken[first] == self.broken[last]) & (self.lost(first, last) <= LOST**2)
+        known: NDArray[np.bool_] = (self.broken[first] == self.broken[last]) & (
+            self.lost(first, last) <= LOST**2
+        )
         return known
 
     def closing(self, first: Any, last: Any) -> Array:
@@ -238,13 +280,19 @@ class _Drifts:
         return self._made[number]
 
     def __iter__(self) -> Iterator[tuple[_Filter, float]]:
-        numbers = range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1) if self._odometry.bend else [0]
+        numbers = (
+            range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1)
+            if self._odometry.bend
+            else [0]
+        )
         for n in sorted(numbers, key=lambda n: (abs(n), n)):
             look_at_clock()
             yield self._filter(n), max(abs(n) - 0.5, 0.0) ** 2 / BENDS_A_SIGMA**2
 
 
-def _returns(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: _Drifts, of_arrivals: bool = False) -> Iterator[Return]:
+def _returns(
+    trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: _Drifts, of_arrivals: bool = False
+) -> Iterator[Return]:
     """The returns of a map about which displacements say something; all of them, or those between the first steps of visits."""
     place = {s.id: s.place for s in ssh_map.dstates}
     size = min(len(trace), len(ssh_map.labels))
@@ -263,7 +311,10 @@ def _returns(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: _Drifts, of_
                 look_at_clock()
             if number:
                 first = np.array(steps[:number], dtype=int)
-                yield from ((int(i), last, freedom) for i in first[drifts.none.is_known(first, np.full(number, last))])
+                yield from (
+                    (int(i), last, freedom)
+                    for i in first[drifts.none.is_known(first, np.full(number, last))]
+                )
 
 
 def _most(theory: Theory, freedom: int, together: bool) -> float:
@@ -282,14 +333,21 @@ def _refused_alone(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -
             if not len(left):
                 break
             first, last = rows[left, 0], rows[left, 1]
-            square = _square(filtered.closing(first, last)[:, :freedom], filtered.covariance(first, last)[:, :freedom, :freedom])
-            least[left] = np.minimum(least[left], np.where(filtered.is_known(first, last), square + unlikely, 0.0))
+            square = _square(
+                filtered.closing(first, last)[:, :freedom],
+                filtered.covariance(first, last)[:, :freedom, :freedom],
+            )
+            least[left] = np.minimum(
+                least[left], np.where(filtered.is_known(first, last), square + unlikely, 0.0)
+            )
         if len(rows) and least.max() > most:
             worst = int(least.argmax())
             yield (returns_row(rows[worst]),), float(least[worst]), most
 
 
-def _refused_together(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -> Iterator[_Found]:
+def _refused_together(
+    returns: Sequence[Return], drifts: _Drifts, theory: Theory
+) -> Iterator[_Found]:
     """The set of two that is refused most clearly. Of more than MOST_SETS sets that the bound does not pass, as many are looked at, evenly spread."""
     if len(returns) < 2:
         return
@@ -303,11 +361,17 @@ def _refused_together(returns: Sequence[Return], drifts: _Drifts, theory: Theory
             left = np.flatnonzero(least > most)
             if not len(left):
                 break
-            least[left] = np.minimum(least[left], _square_together(filtered, rows, first[left], second[left]) + unlikely)
+            least[left] = np.minimum(
+                least[left], _square_together(filtered, rows, first[left], second[left]) + unlikely
+            )
         excess = least - most
         if len(excess) and excess.max() > (worst[1] - worst[2] if worst else 0.0):
             k = int(excess.argmax())
-            worst = (returns_row(rows[first[k]]), returns_row(rows[second[k]])), float(least[k]), float(most[k])
+            worst = (
+                (returns_row(rows[first[k]]), returns_row(rows[second[k]])),
+                float(least[k]),
+                float(most[k]),
+            )
     if worst:
         yield worst
 
@@ -337,26 +401,43 @@ class _Alone:
     def __init__(self, filtered: _Filter, rows: Steps) -> None:
         first, last = rows[:, 0], rows[:, 1]
         places = rows[:, 2] == 2
-        off, covariance, repeated = filtered.closing(first, last), filtered.covariance(first, last), filtered.repeated_since(first, last)
+        off, covariance, repeated = (
+            filtered.closing(first, last),
+            filtered.covariance(first, last),
+            filtered.repeated_since(first, last),
+        )
         covariance[places, 2, :] = covariance[places, :, 2] = 0.0
         covariance[places, 2, 2] = 1.0
         inverse = np.linalg.inv(covariance)
         inverse[places, 2, 2] = 0.0  # the heading of a return to a place is not asked for
         self.square = np.einsum("mi,mij,mj->m", off, inverse, off)
-        self.inverse, self.repeated = inverse.reshape(-1, 9), (repeated @ repeated.swapaxes(1, 2)).reshape(-1, 9)
+        self.inverse, self.repeated = (
+            inverse.reshape(-1, 9),
+            (repeated @ repeated.swapaxes(1, 2)).reshape(-1, 9),
+        )
 
 
-def _unsafe(filtered: _Filter, rows: Steps, alone: _Alone, end: int, most: float) -> tuple[Steps, Steps]:
+def _unsafe(
+    filtered: _Filter, rows: Steps, alone: _Alone, end: int, most: float
+) -> tuple[Steps, Steps]:
     """The sets of a row that ends at a step and another one that ends no later, if the bound does not pass them."""
     later = np.arange(*np.searchsorted(rows[:, 1], [end, end + 1]))
-    earlier = np.arange(np.searchsorted(rows[:, 1], rows[later, 0].min(), side="right"), later[-1] + 1)
+    earlier = np.arange(
+        np.searchsorted(rows[:, 1], rows[later, 0].min(), side="right"), later[-1] + 1
+    )
     first, stop = rows[later, 0], rows[earlier, 1, None]
     new = filtered.new_until(end)
     table = new @ alone.inverse[later].T
     begin = np.maximum(rows[earlier, 0, None], first)
-    trace = table[rows[earlier, 1]] - np.take_along_axis(table, begin, axis=0) + (alone.inverse[later] * alone.repeated[later]).sum(1)
+    trace = (
+        table[rows[earlier, 1]]
+        - np.take_along_axis(table, begin, axis=0)
+        + (alone.inverse[later] * alone.repeated[later]).sum(1)
+    )
     squares = alone.square[earlier, None] + alone.square[later]
-    others, these = np.nonzero(~_is_safe(trace, squares, most) & (stop > first) & (earlier[:, None] < later))
+    others, these = np.nonzero(
+        ~_is_safe(trace, squares, most) & (stop > first) & (earlier[:, None] < later)
+    )
     share = new[rows[earlier[others], 1]] - new[begin[others, these]] + alone.repeated[later[these]]
     share = alone.inverse[later[these]].reshape(-1, 3, 3) @ share.reshape(-1, 3, 3)
     norm = np.sqrt(np.maximum(np.einsum("mij,mji->m", share, share), 0.0))
@@ -374,24 +455,35 @@ def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
 def _square_together(filtered: _Filter, rows: Steps, here: Steps, others: Steps) -> Array:
     """The chi-square of rows together with other rows; 0 where nothing is known of one of the two."""
     m = len(others)
-    begin, end = np.maximum(rows[others, 0], rows[here, 0]), np.minimum(rows[others, 1], rows[here, 1])
-    common = filtered.since(begin, end)
-    mixed = filtered.onward(end, rows[here, 1]) @ common @ filtered.onward(end, rows[others, 1]).swapaxes(1, 2)
-    mixed += filtered.repeated_since(rows[here, 0], rows[here, 1]) @ filtered.repeated_since(rows[others, 0], rows[others, 1]).swapaxes(
-        1, 2
+    begin, end = (
+        np.maximum(rows[others, 0], rows[here, 0]),
+        np.minimum(rows[others, 1], rows[here, 1]),
     )
+    common = filtered.since(begin, end)
+    mixed = (
+        filtered.onward(end, rows[here, 1])
+        @ common
+        @ filtered.onward(end, rows[others, 1]).swapaxes(1, 2)
+    )
+    mixed += filtered.repeated_since(rows[here, 0], rows[here, 1]) @ filtered.repeated_since(
+        rows[others, 0], rows[others, 1]
+    ).swapaxes(1, 2)
     joint, off = np.zeros((m, 6, 6)), np.zeros((m, 6))
     for k, which in enumerate((here, others)):
         part = slice(3 * k, 3 * k + 3)
         off[:, part] = filtered.closing(rows[which, 0], rows[which, 1])
         joint[:, part, part] = filtered.covariance(rows[which, 0], rows[which, 1])
     joint[:, :3, 3:], joint[:, 3:, :3] = mixed, mixed.swapaxes(1, 2)
-    for k, which in enumerate((here, others)):  # the heading of a return to a place is not asked for
+    for k, which in enumerate(
+        (here, others)
+    ):  # the heading of a return to a place is not asked for
         free = rows[which, 2] == 2
         off[free, 3 * k + 2] = 0.0
         joint[free, 3 * k + 2, :] = joint[free, :, 3 * k + 2] = 0.0
         joint[free, 3 * k + 2, 3 * k + 2] = 1.0
-    known = filtered.is_known(rows[here, 0], rows[here, 1]) & filtered.is_known(rows[others, 0], rows[others, 1])
+    known = filtered.is_known(rows[here, 0], rows[here, 1]) & filtered.is_known(
+        rows[others, 0], rows[others, 1]
+    )
     square: Array = np.where(known, _square(off, joint), 0.0)
     return square
 

@@ -24,7 +24,9 @@ from ssh_abduction.data.star import Openings
 from ssh_abduction.theory.planarity import can_be_drawn
 
 Arm: TypeAlias = tuple[int, int]  # of a dstate, ahead (1) or behind (-1)
-Option: TypeAlias = Mapping[Arm, int]  # the position of each arm around its place, clockwise; those of one gateway have one
+Option: TypeAlias = Mapping[
+    Arm, int
+]  # the position of each arm around its place, clockwise; those of one gateway have one
 
 QUARTERS = {"right": 1, "around": 2, "left": 3}
 
@@ -37,7 +39,12 @@ class Edges:
     place_of  the place of each dstate
     """
 
-    def __init__(self, travels: Iterable[tuple[int, int]], turns: Iterable[tuple[int, str, int]], place_of: Mapping[int, int]) -> None:
+    def __init__(
+        self,
+        travels: Iterable[tuple[int, int]],
+        turns: Iterable[tuple[int, str, int]],
+        place_of: Mapping[int, int],
+    ) -> None:
         self.travels = list(travels)
         self.place_of = place_of
         self.turns = [(s, turn, t) for s, turn, t in turns if place_of[s] == place_of[t]]
@@ -48,9 +55,13 @@ class Edges:
 
     def can_be_drawn_by(self, headings: Mapping[int, int]) -> bool:
         """Whether these slots of a frame of four, one for each dstate, make a drawing without a crossing."""
-        return self._is_drawing({(s, side): (headings[s] + (1 - side)) % 4 for s in self.place_of for side in (1, -1)})
+        return self._is_drawing(
+            {(s, side): (headings[s] + (1 - side)) % 4 for s in self.place_of for side in (1, -1)}
+        )
 
-    def can_be_drawn_in_frames(self, stars: Mapping[int, Iterable[Openings]], *, turned: bool, distinct: bool) -> bool:
+    def can_be_drawn_in_frames(
+        self, stars: Mapping[int, Iterable[Openings]], *, turned: bool, distinct: bool
+    ) -> bool:
         """Whether some headings make such a drawing.
 
         stars     seen at each dstate; those at one place agree in its frame
@@ -59,15 +70,38 @@ class Edges:
         """
         options: list[list[Option]] = []
         for here in self._at.values():
-            turns = [(s, QUARTERS[turn], t) for s, turn, t in self.turns if s in here] if turned else []
+            turns = (
+                [(s, QUARTERS[turn], t) for s, turn, t in self.turns if s in here] if turned else []
+            )
             headings: list[dict[int, int]] = [{here[0]: 0}]
             for t in here[1:]:
-                headings = [{**faced, t: k} for faced in headings for k in range(4) if not (distinct and k in faced.values())]
-                headings = [faced for faced in headings if all(_is_turned(faced, turn) for turn in turns)]
+                headings = [
+                    {**faced, t: k}
+                    for faced in headings
+                    for k in range(4)
+                    if not (distinct and k in faced.values())
+                ]
+                headings = [
+                    faced for faced in headings if all(_is_turned(faced, turn) for turn in turns)
+                ]
             found: dict[tuple[int, ...], Option] = {}
             for faced in headings:
-                if len({tuple(star[(k - faced[s]) % 4] for k in range(4)) for s in here for star in stars.get(s, ())}) <= 1:
-                    option = {(s, side): (faced[s] + (1 - side)) % 4 for s in here for side in (1, -1) if (s, side) in self._used}
+                if (
+                    len(
+                        {
+                            tuple(star[(k - faced[s]) % 4] for k in range(4))
+                            for s in here
+                            for star in stars.get(s, ())
+                        }
+                    )
+                    <= 1
+                ):
+                    option = {
+                        (s, side): (faced[s] + (1 - side)) % 4
+                        for s in here
+                        for side in (1, -1)
+                        if (s, side) in self._used
+                    }
                     first = next(iter(option.values()), 0)
                     found.setdefault(tuple((k - first) % 4 for k in option.values()), option)
             options.append(list(found.values()))
@@ -82,22 +116,45 @@ class Edges:
         if one is None:
             return False
         at_edge = {s for s, _ in self._used}
-        while more := {x for s, turn, t in self.turns if turn == "around" and {s, t} & at_edge for x in (s, t)} - at_edge:
+        while (
+            more := {
+                x
+                for s, turn, t in self.turns
+                if turn == "around" and {s, t} & at_edge
+                for x in (s, t)
+            }
+            - at_edge
+        ):
             at_edge |= more
-        told: dict[int, list[list[Arm]]] = defaultdict(list)  # gateways of each place that are met one after another, clockwise
+        told: dict[int, list[list[Arm]]] = defaultdict(
+            list
+        )  # gateways of each place that are met one after another, clockwise
         for s, turn, t in self.turns:
             if turn != "around" and {s, t} <= at_edge:
                 side = 1 if turn == "right" else -1
                 arms = [(s, 1), (t, side), (s, -1), (t, -side)]
-                told[self.place_of[s]].append([one[arm] for arm in arms if crossing or arm != (t, -1)])
-        edges = {frozenset(((self.place_of[s], one[s, 1]), (self.place_of[t], one[t, -1]))) for s, t in self.travels}
+                told[self.place_of[s]].append(
+                    [one[arm] for arm in arms if crossing or arm != (t, -1)]
+                )
+        edges = {
+            frozenset(((self.place_of[s], one[s, 1]), (self.place_of[t], one[t, -1])))
+            for s, t in self.travels
+        }
         ends = [choose(edge, key=repr) for edge in edges for choose in (min, max)]
-        orders = {p: _orders(sorted({arm for arms in told[p] for arm in arms}, key=repr), told[p]) for p in self._at}
+        orders = {
+            p: _orders(sorted({arm for arms in told[p] for arm in arms}, key=repr), told[p])
+            for p in self._at
+        }
 
         def allows(place: int, some: Sequence[int]) -> bool:
-            return any(_goes_round(order, list(dict.fromkeys(ends[end][1] for end in some))) for order in orders[place])
+            return any(
+                _goes_round(order, list(dict.fromkeys(ends[end][1] for end in some)))
+                for order in orders[place]
+            )
 
-        return can_be_drawn([(p, q) for (p, _), (q, _) in zip(ends[::2], ends[1::2], strict=True)], allows)
+        return can_be_drawn(
+            [(p, q) for (p, _), (q, _) in zip(ends[::2], ends[1::2], strict=True)], allows
+        )
 
     def _gateways(self) -> dict[Arm, Arm] | None:
         """For each arm, one that stands for its gateway: who turns around faces what was behind, and a gateway leads to one gateway. None if it leads to two places."""
@@ -139,7 +196,11 @@ class Edges:
             level, chosen = choices.pop()
             if level == len(others):
                 return True
-            choices += [(level + 1, more) for option in others[level] if self._is_drawing(more := {**chosen, **option})]
+            choices += [
+                (level + 1, more)
+                for option in others[level]
+                if self._is_drawing(more := {**chosen, **option})
+            ]
         return False
 
     def _is_drawing(self, position: Option) -> bool:
@@ -158,9 +219,17 @@ class Edges:
         around: dict[int, list[tuple[int, int]]] = defaultdict(list)
         for gateway in sorted(beyond):
             around[gateway[0]].append(gateway)
-        after = {gateway: gateways[i - 1] for gateways in around.values() for i, gateway in enumerate(gateways)}  # counterclockwise
-        places = len(around) + sum(len(edge) == 1 for edge in joined)  # an edge that leads back to its gateway turns at a place of its own
-        return places - len(joined) + _cycles({gateway: after[other] for gateway, other in beyond.items()}) == 2 * _parts(around, beyond)
+        after = {
+            gateway: gateways[i - 1]
+            for gateways in around.values()
+            for i, gateway in enumerate(gateways)
+        }  # counterclockwise
+        places = len(around) + sum(
+            len(edge) == 1 for edge in joined
+        )  # an edge that leads back to its gateway turns at a place of its own
+        return places - len(joined) + _cycles(
+            {gateway: after[other] for gateway, other in beyond.items()}
+        ) == 2 * _parts(around, beyond)
 
 
 def _cycles(following: Mapping[tuple[int, int], tuple[int, int]]) -> int:
@@ -173,7 +242,10 @@ def _cycles(following: Mapping[tuple[int, int], tuple[int, int]]) -> int:
     return cycles
 
 
-def _parts(around: Mapping[int, Sequence[tuple[int, int]]], beyond: Mapping[tuple[int, int], tuple[int, int]]) -> int:
+def _parts(
+    around: Mapping[int, Sequence[tuple[int, int]]],
+    beyond: Mapping[tuple[int, int], tuple[int, int]],
+) -> int:
     left, parts = set(around), 0
     while left:
         parts += 1
@@ -194,13 +266,24 @@ def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
 def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
     """Whether what is there already of some gateways, which have to be different, comes in this order going round once."""
     there = [order.index(gateway) for gateway in told if gateway in order]
-    return len(set(told)) == len(told) and sum(j < i for i, j in zip(there, [*there[1:], *there[:1]], strict=True)) <= 1
+    return (
+        len(set(told)) == len(told)
+        and sum(j < i for i, j in zip(there, [*there[1:], *there[:1]], strict=True)) <= 1
+    )
 
 
 def _orders(gateways: Sequence[Arm], told: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
     """The clockwise orders of some gateways, the first one first, that agree with what is told."""
     orders: list[tuple[Arm, ...]] = [()]
     for gateway in gateways:
-        longer = ((*order[:gap], gateway, *order[gap:]) for order in orders for gap in range(min(1, len(order)), len(order) + 1))
-        orders = [order for order in each_looking(longer) if all(_goes_round(order, some) for some in told)]
+        longer = (
+            (*order[:gap], gateway, *order[gap:])
+            for order in orders
+            for gap in range(min(1, len(order)), len(order) + 1)
+        )
+        orders = [
+            order
+            for order in each_looking(longer)
+            if all(_goes_round(order, some) for some in told)
+        ]
     return orders

@@ -40,28 +40,54 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
     all, the word of a pair is what was done after both steps. Raises MapError where the certificate is malformed.
     """
     if not isinstance(certificate, Mapping):
-        raise MapError(f"certificate: expected an object, got {brief(certificate)}; write it with solve --json")
+        raise MapError(
+            f"certificate: expected an object, got {brief(certificate)}; write it with solve --json"
+        )
     if "clique" not in certificate:
         raise MapError("certificate: clique: expected one, got none; write it with solve --json")
     steps, words, refuted = (certificate.get(name, []) for name in ("clique", "words", "refuted"))
-    if not _integers(steps) or not all(0 <= step < len(trace) for step in steps) or len(set(steps)) < len(steps):
-        raise MapError(f"certificate: clique: expected different steps, 0 to {len(trace) - 1}, got {brief(steps)}")
+    if (
+        not _integers(steps)
+        or not all(0 <= step < len(trace) for step in steps)
+        or len(set(steps)) < len(steps)
+    ):
+        raise MapError(
+            f"certificate: clique: expected different steps, 0 to {len(trace) - 1}, got {brief(steps)}"
+        )
     if not _integers(refuted) or refuted != list(range(len(steps), len(steps) + len(refuted))):
-        raise MapError(f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got {brief(refuted)}")
+        raise MapError(
+            f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got {brief(refuted)}"
+        )
     word_of: dict[frozenset[int], list[str]] = {}
     has_words = "words" in certificate
     for entry in words if isinstance(words, list) else [words]:
-        if not isinstance(entry, list) or len(entry) != 3 or not _integers(entry[:2]) or not isinstance(entry[2], list):
-            raise MapError(f"certificate: words: expected [step, step, [action, …]], got {brief(entry)}")
+        if (
+            not isinstance(entry, list)
+            or len(entry) != 3
+            or not _integers(entry[:2])
+            or not isinstance(entry[2], list)
+        ):
+            raise MapError(
+                f"certificate: words: expected [step, step, [action, …]], got {brief(entry)}"
+            )
         word_of[frozenset(entry[:2])] = entry[2]
     pairs = list(combinations(steps, 2))
-    told = (word_of.get(frozenset(pair), []) if has_words else _common_actions(trace, *pair) for pair in pairs)
-    faults = [fault for (i, j), word in zip(pairs, told, strict=True) if (fault := _not_apart(trace, i, j, word))]
+    told = (
+        word_of.get(frozenset(pair), []) if has_words else _common_actions(trace, *pair)
+        for pair in pairs
+    )
+    faults = [
+        fault
+        for (i, j), word in zip(pairs, told, strict=True)
+        if (fault := _not_apart(trace, i, j, word))
+    ]
     return ProvenBound(len(steps), tuple(refuted), tuple(faults))
 
 
 def _integers(values: Any) -> bool:
-    return isinstance(values, list) and all(isinstance(value, int) and not isinstance(value, bool) for value in values)
+    return isinstance(values, list) and all(
+        isinstance(value, int) and not isinstance(value, bool) for value in values
+    )
 
 
 def _look_different(here: Step, there: Step) -> bool:
@@ -73,7 +99,12 @@ def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
     """The actions done after both steps, until the views differ, the actions differ, or the trace ends: the word of a pair if a certificate has no words."""
     word: list[str] = []
     for here, there in zip(trace.steps[i:], trace.steps[j:], strict=False):
-        if _look_different(here, there) or here.action is None or there.action is None or here.action.name != there.action.name:
+        if (
+            _look_different(here, there)
+            or here.action is None
+            or there.action is None
+            or here.action.name != there.action.name
+        ):
             break
         word.append(here.action.name)
     return word[: len(trace) - 1 - max(i, j)]
@@ -87,6 +118,10 @@ def _not_apart(trace: Trace, i: int, j: int, word: Sequence[str]) -> str | None:
             if action is None or action.name != name:
                 return f"steps {i} and {j}: {brief(name)} is not what was done at step {step}"
     if not _look_different(trace.steps[i + len(word)], trace.steps[j + len(word)]):
-        led = "the same view" if trace.steps[i + len(word)].view == trace.steps[j + len(word)].view else "a view that is unknown"
+        led = (
+            "the same view"
+            if trace.steps[i + len(word)].view == trace.steps[j + len(word)].view
+            else "a view that is unknown"
+        )
         return f"steps {i} and {j}: {' '.join(word) or 'nothing done'} leads to {led} from both"
     return None

@@ -60,7 +60,13 @@ MENDS = {
     errno.EISDIR: "take another name",
     errno.ENOTDIR: "take another name",
 }
-FOR_PROGRAMS = ("json", "facts", "dot", "graphml", "svg")  # forms that other programs read, in UTF-8 wherever they are printed
+FOR_PROGRAMS = (
+    "json",
+    "facts",
+    "dot",
+    "graphml",
+    "svg",
+)  # forms that other programs read, in UTF-8 wherever they are printed
 
 
 class _Parser(argparse.ArgumentParser):
@@ -70,7 +76,9 @@ class _Parser(argparse.ArgumentParser):
         try:
             super()._check_value(action, value)
         except argparse.ArgumentError as error:
-            raise argparse.ArgumentError(action, f"{error.message}{_meant(value, map(str, action.choices or ()))}") from None
+            raise argparse.ArgumentError(
+                action, f"{error.message}{_meant(value, map(str, action.choices or ()))}"
+            ) from None
 
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """As argparse does, but what is unknown to a verb is an error of that verb, with the option that was perhaps meant."""
@@ -78,13 +86,22 @@ class _Parser(argparse.ArgumentParser):
         if unknown:
             verb = self.verbs[options.verb] if getattr(options, "verb", None) else self
             wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
-            verb.error(f"unrecognized arguments: {' '.join(unknown)}{_meant(wrong.partition('=')[0], verb.names)}")
+            verb.error(
+                f"unrecognized arguments: {' '.join(unknown)}{_meant(wrong.partition('=')[0], verb.names)}"
+            )
         return options
 
     @property
     def verbs(self) -> Mapping[str, _Parser]:
         """The parsers of the verbs."""
-        return next((action.choices for action in self._actions if isinstance(action, argparse._SubParsersAction)), {})
+        return next(
+            (
+                action.choices
+                for action in self._actions
+                if isinstance(action, argparse._SubParsersAction)
+            ),
+            {},
+        )
 
     @property
     def names(self) -> list[str]:
@@ -149,7 +166,9 @@ def unwritten(error: OSError, output: object) -> str:
         output: What was to be written, for errors that name no file.
     """
     mend = MENDS.get(error.errno or 0, "check the path")
-    return f"{named(error.filename or output)}: cannot be written: {error.strerror or error}; {mend}"
+    return (
+        f"{named(error.filename or output)}: cannot be written: {error.strerror or error}; {mend}"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -158,7 +177,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = _main(arguments)
     except KeyboardInterrupt:
         return program.interrupted_code()
-    return program.interrupted_code() if program.raised else code  # a search may take Ctrl-C for its own end, and its verb goes on
+    return (
+        program.interrupted_code() if program.raised else code
+    )  # a search may take Ctrl-C for its own end, and its verb goes on
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -178,19 +199,29 @@ def _main(arguments: Sequence[str] | None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that knows no "→" shows "?"
-    for_programs = any(getattr(options, form, False) for form in FOR_PROGRAMS) or getattr(options, "output", None) == "-"
+    for_programs = (
+        any(getattr(options, form, False) for form in FOR_PROGRAMS)
+        or getattr(options, "output", None) == "-"
+    )
     if isinstance(sys.stdout, io.TextIOWrapper) and for_programs:
-        sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")  # what is left is half a character, which JSON writes so
+        sys.stdout.reconfigure(
+            encoding="utf-8", errors="backslashreplace"
+        )  # what is left is half a character, which JSON writes so
     try:
         if sys.stdout is None:
-            raise AbductionError("standard output: expected a place to print to, got a closed stream; open it, or send it to a file")
+            raise AbductionError(
+                "standard output: expected a place to print to, got a closed stream; open it, or send it to a file"
+            )
         with telling(options, for_programs), warnings.catch_warnings(record=True) as caught:
             try:
                 with Guard(lambda: None, lambda _: ("", program.interrupted_code()), None, None):
                     code = int(options.run(options))
             finally:
                 for warning in caught:
-                    print(f"ssh-abduction: warning: {printable(str(warning.message))}", file=sys.stderr)
+                    print(
+                        f"ssh-abduction: warning: {printable(str(warning.message))}",
+                        file=sys.stderr,
+                    )
         sys.stdout.flush()
     except AbductionError as error:
         print(f"ssh-abduction: {error}", file=sys.stderr)
@@ -200,7 +231,10 @@ def _main(arguments: Sequence[str] | None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        print(f"ssh-abduction: {unwritten(error, getattr(options, 'output', None) or 'standard output')}", file=sys.stderr)
+        print(
+            f"ssh-abduction: {unwritten(error, getattr(options, 'output', None) or 'standard output')}",
+            file=sys.stderr,
+        )
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_ERROR

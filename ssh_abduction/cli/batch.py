@@ -60,9 +60,7 @@ GUARDED, OVERDUE = (
     1.2,
     3.0,
 )  # times the time limit, and seconds beyond that, or after Ctrl-C, after which a process has no answer: its own guard ends it before
-LATE = (
-    "process: expected an answer in time, got none, as happens when memory is swapped; set --memory-limit, or solve fewer traces at a time"
-)
+LATE = "process: expected an answer in time, got none, as happens when memory is swapped; set --memory-limit, or solve fewer traces at a time"
 LOST = "scheduler: expected an answer, got disconnected; see whether it still runs, and solve this trace again"
 
 
@@ -90,7 +88,15 @@ class Stop:
 
 def in_a_line(error: Exception) -> str:
     """What went wrong, in one line."""
-    return printable(" ".join((str(error) if isinstance(error, AbductionError) else f"{type(error).__name__}: {error}").split()))
+    return printable(
+        " ".join(
+            (
+                str(error)
+                if isinstance(error, AbductionError)
+                else f"{type(error).__name__}: {error}"
+            ).split()
+        )
+    )
 
 
 class Asked(Protocol):
@@ -146,11 +152,19 @@ class Question:
         """What goes along to a worker: the trace, so that workers need not share the disk."""
         return Trace.load(path)
 
-    def answer(self, number: int, path: str, trace: Trace | None = None, given_up: Callable[[], bool] = lambda: False) -> Answer:
+    def answer(
+        self,
+        number: int,
+        path: str,
+        trace: Trace | None = None,
+        given_up: Callable[[], bool] = lambda: False,
+    ) -> Answer:
         """Solve a trace, read from its file if it did not come along. Whatever goes wrong is the answer. Stops when it is given up."""
         try:
             return self._solved(number, path, trace or Trace.load(path), given_up)
-        except Exception as error:  # of any kind, such as no memory left: the other traces must not suffer
+        except (
+            Exception
+        ) as error:  # of any kind, such as no memory left: the other traces must not suffer
             return self.failed(number, path, error)
 
     def _solved(self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]) -> Answer:
@@ -179,21 +193,37 @@ class Question:
                 maps += [given_by(search, ssh_map)] if self.json else []
             explanation = explained(search)
             solution = search.solution(tuple(ssh_map for ssh_map, _ in maps))
-            return self._told(number, path, search, solution, all_given(solution), explanation, search.backbone)
+            return self._told(
+                number, path, search, solution, all_given(solution), explanation, search.backbone
+            )
 
     def _guarded(
-        self, number: int, path: str, search: Search, maps: list[Given], given_up: Callable[[], bool]
+        self,
+        number: int,
+        path: str,
+        search: Search,
+        maps: list[Given],
+        given_up: Callable[[], bool],
     ) -> contextlib.AbstractContextManager[object]:
         """What answers in time, in a process that does nothing else, where the search cannot be ended."""
 
         def last_words(why: SearchStop) -> tuple[Answer, int]:
             solution = search.snapshot(why)
             found = [*maps] or ([(ssh_map, None) for ssh_map in solution.maps] if self.json else [])
-            return self._told(number, path, search, solution, found, None, None), EXIT_ERROR  # of the process, which nobody reads
+            return self._told(
+                number, path, search, solution, found, None, None
+            ), EXIT_ERROR  # of the process, which nobody reads
 
         if not workers.serves():
             return contextlib.nullcontext()
-        return Guard(search.interrupt, last_words, self.limit, self.memory, given_up=given_up, print_last=workers.reply)
+        return Guard(
+            search.interrupt,
+            last_words,
+            self.limit,
+            self.memory,
+            given_up=given_up,
+            print_last=workers.reply,
+        )
 
     def _told(
         self,
@@ -208,7 +238,14 @@ class Question:
         if self.json:
             count = len(maps)
             maps_told = list(map(told, maps))
-            line = dump({"trace": path, **opening(search), "maps": maps_told, **ending(search, solution, explanation, count, backbone)})
+            line = dump(
+                {
+                    "trace": path,
+                    **opening(search),
+                    "maps": maps_told,
+                    **ending(search, solution, explanation, count, backbone),
+                }
+            )
         else:
             line = f"{named(path)}: {headline(solution, search.count, explanation)}"
         warnings = tuple(f"{named(path)}: {warning}" for warning in warnings_of(search, solution))
@@ -231,7 +268,11 @@ class Question:
     def failed(self, number: int, path: str, error: Exception) -> Answer:
         """The answer for a trace that was not solved."""
         message = in_a_line(error)
-        line = dump({"trace": path, "status": "error", "error": message}) if self.json else f"{named(path)}: error: {message}"
+        line = (
+            dump({"trace": path, "status": "error", "error": message})
+            if self.json
+            else f"{named(path)}: error: {message}"
+        )
         return Answer(number, line, EXIT_ERROR)
 
 
@@ -242,11 +283,21 @@ def run(options: argparse.Namespace) -> int:
             "-: expected files where there are several traces, --jobs or --scheduler, got standard input; save it to a file"
         )
     if options.jobs == 0:
-        raise AbductionError("--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; leave it out for 1")
+        raise AbductionError(
+            "--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; leave it out for 1"
+        )
     speedups = Speedups.without(options.without_speedups)
     if options.scheduler or options.jobs not in (None, 1):
         speedups = replace(speedups, threads=False)  # the processors have other traces to solve
-    question = Question(theory_of(options), options.time_limit, options.maps, options.memory_limit, speedups, options.json, options.within)
+    question = Question(
+        theory_of(options),
+        options.time_limit,
+        options.maps,
+        options.memory_limit,
+        speedups,
+        options.json,
+        options.within,
+    )
     stop = Stop()
     if options.scheduler is None:
         answers = here(question, paths, options.jobs or 1, stop)
@@ -255,10 +306,16 @@ def run(options: argparse.Namespace) -> int:
     codes = _printed(answers, len(paths), stop)
     if stop.is_set():
         missing = len(paths) - sum(code <= SIGNALLED for code in codes)
-        print(f"ssh-abduction: interrupted: {missing} of {len(paths)} traces not finished", file=sys.stderr)
+        print(
+            f"ssh-abduction: interrupted: {missing} of {len(paths)} traces not finished",
+            file=sys.stderr,
+        )
         return interrupted_code()
     if errors := codes.count(EXIT_ERROR):
-        print(f"ssh-abduction: errors in {errors} of {len(paths)} traces, on their lines", file=sys.stderr)
+        print(
+            f"ssh-abduction: errors in {errors} of {len(paths)} traces, on their lines",
+            file=sys.stderr,
+        )
         return EXIT_ERROR
     return max(codes)
 
@@ -308,23 +365,35 @@ def here(question: Asked, paths: Sequence[str], jobs: int, stop: Stop) -> Genera
     tasks = [(number, path, question) for number, path in enumerate(paths)]
     processes = min(effective_n_jobs(jobs), len(paths))
     with on_ctrl_c(end):
-        for answer in workers.answers(_solved_in_worker, tasks, processes, stop.is_set, question.overdue, question.patience):
+        for answer in workers.answers(
+            _solved_in_worker, tasks, processes, stop.is_set, question.overdue, question.patience
+        ):
             if not isinstance(answer, workers.Lost):
                 yield answer
             elif not stop.is_set():  # one that is given up has no answer, and that is no error
                 yield question.lost(answer, paths[answer.number])
 
 
-def on_cluster(question: Asked, paths: Sequence[str], address: str, jobs: int | None, stop: Stop) -> Generator[Any]:
+def on_cluster(
+    question: Asked, paths: Sequence[str], address: str, jobs: int | None, stop: Stop
+) -> Generator[Any]:
     """Answers from the workers of a Dask scheduler."""
     try:
         from distributed import Client
     except ImportError:
-        raise AbductionError("--scheduler: expected the package distributed, got none; pip install 'ssh-abduction[cluster]'") from None
+        raise AbductionError(
+            "--scheduler: expected the package distributed, got none; pip install 'ssh-abduction[cluster]'"
+        ) from None
     if not re.search(r"^inproc:|:\d+$", address):
-        raise AbductionError(f"--scheduler: expected an address with a port, such as tcp://host:8786, got {brief(address)}")
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what goes wrong is in the answers
-    warnings.filterwarnings("ignore", "Sending large graph")  # a long trace goes to one worker, once
+        raise AbductionError(
+            f"--scheduler: expected an address with a port, such as tcp://host:8786, got {brief(address)}"
+        )
+    logging.getLogger("distributed.client").setLevel(
+        logging.CRITICAL
+    )  # what goes wrong is in the answers
+    warnings.filterwarnings(
+        "ignore", "Sending large graph"
+    )  # a long trace goes to one worker, once
     try:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except Exception as error:  # whatever else listens there may answer anything
@@ -340,13 +409,19 @@ def on_cluster(question: Asked, paths: Sequence[str], address: str, jobs: int | 
             ) from None
         most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
         absence = Absence(lambda: len(client.ncores()), question.limit, address)
-        for answer in _answers(question, paths, partial(_on_workers, question, client, most, absence)):
+        for answer in _answers(
+            question, paths, partial(_on_workers, question, client, most, absence)
+        ):
             yield answer
             if stop.is_set():
                 return
 
 
-def _answers(question: Asked, paths: Sequence[str], attempt: Callable[[list[Task], list[Task]], Iterator[Any]]) -> Iterator[Any]:
+def _answers(
+    question: Asked,
+    paths: Sequence[str],
+    attempt: Callable[[list[Task], list[Task]], Iterator[Any]],
+) -> Iterator[Any]:
     """Answers as they are ready, in any order.
 
     `attempt` yields the answers for some traces, and puts those under way while a process was killed into its second list. Which of them was
@@ -373,7 +448,13 @@ class Absence:
         clock: Tells the time in seconds.
     """
 
-    def __init__(self, workers: Callable[[], int], limit: float | None, address: str, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        workers: Callable[[], int],
+        limit: float | None,
+        address: str,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._workers, self._limit, self._clock, self._address = workers, limit, clock, address
         self._looks_at = self._last_seen = clock()
         self._warned = False
@@ -399,7 +480,14 @@ class Absence:
         return self._limit is not None and absent >= max(PATIENCE, self._limit)
 
 
-def _on_workers(question: Asked, client: Client, most: int, absence: Absence, tasks: list[Task], killed: list[Task]) -> Iterator[Any]:
+def _on_workers(
+    question: Asked,
+    client: Client,
+    most: int,
+    absence: Absence,
+    tasks: list[Task],
+    killed: list[Task],
+) -> Iterator[Any]:
     """An attempt on Dask, with so many traces at most sent at a time. They are read here: workers need not share the disk.
 
     This is Dask's own interface, as joblib's backend for Dask waits for ever when a worker is killed.
@@ -433,7 +521,12 @@ def _on_workers(question: Asked, client: Client, most: int, absence: Absence, ta
                 yield question.failed(*task, SolverError(LOST))
             except Exception as error:  # of the cluster, as `answer` catches those of the trace
                 mend = "install the same ssh-abduction where the scheduler and its workers run"
-                yield question.failed(*task, SolverError(f"cluster: expected an answer, got {type(error).__name__}: {error}; {mend}"))
+                yield question.failed(
+                    *task,
+                    SolverError(
+                        f"cluster: expected an answer, got {type(error).__name__}: {error}; {mend}"
+                    ),
+                )
 
     for number, path in tasks:
         try:
@@ -441,7 +534,9 @@ def _on_workers(question: Asked, client: Client, most: int, absence: Absence, ta
                 raise SolverError(LOST)
             if absence.is_too_long():
                 raise SolverError(absence.sentence)
-            future = client.submit(_on_worker, question, number, path, question.load(path), pure=False)
+            future = client.submit(
+                _on_worker, question, number, path, question.load(path), pure=False
+            )
         except Exception as error:
             yield question.failed(number, path, error)
             continue
@@ -467,11 +562,15 @@ def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
         return question.answer(number, path, content, given_up)
     # Other traces may be under way in this process, which cannot be ended with one that does not heed its limits.
     work = [(number, path, question, content)]
-    answer: Any = next(workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, question.patience))
+    answer: Any = next(
+        workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, question.patience)
+    )
     return question.lost(answer, path) if isinstance(answer, workers.Lost) else answer
 
 
-def _solved_for_cluster(number: int, path: str, question: Asked, content: Any, given_up: Callable[[], bool]) -> Any:
+def _solved_for_cluster(
+    number: int, path: str, question: Asked, content: Any, given_up: Callable[[], bool]
+) -> Any:
     return question.answer(number, path, content, given_up)
 
 
@@ -494,7 +593,12 @@ def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], 
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=console, redirect_stdout=False) as progress:
         task = progress.add_task("traces", total=total)
 
@@ -506,4 +610,7 @@ def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], 
             progress.live.transient = False
             progress.start()
 
-        yield (say if sys.stdout.isatty() else partial(print, flush=True)), partial(progress.advance, task)
+        yield (
+            (say if sys.stdout.isatty() else partial(print, flush=True)),
+            partial(progress.advance, task),
+        )

@@ -26,7 +26,9 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser("check", help="do these maps satisfy the axioms?", description=text)
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument("maps", help="what solve --json printed, or one saved map")
-    parser.add_argument("--bound", action="store_true", help="check the proof that no map has fewer dstates, too")
+    parser.add_argument(
+        "--bound", action="store_true", help="check the proof that no map has fewer dstates, too"
+    )
     add_theory(parser, default="the theory of the maps, or topological")
     parser.set_defaults(run=run)
     parser.epilog = "Without --theory, the theory is the one that the file of maps was solved under; other flags are laid over it."
@@ -49,7 +51,11 @@ def run(options: argparse.Namespace) -> int:
         violations = check(trace, ssh_map, theory)
         broken += bool(violations)
         for v in violations:
-            steps = f"{'step' if len(v.steps) == 1 else 'steps'} {', '.join(map(str, v.steps))}: " if v.steps else ""
+            steps = (
+                f"{'step' if len(v.steps) == 1 else 'steps'} {', '.join(map(str, v.steps))}: "
+                if v.steps
+                else ""
+            )
             print(f"map {i + 1}: {v.axiom}: {steps}{printable(v.message)}")
     resolved = theory.resolve(trace)
     not_checked = unchecked(resolved)
@@ -74,11 +80,21 @@ def run(options: argparse.Namespace) -> int:
         doubt = "the file does not say of which theory"
     elif theory.resolve(trace).replace(prefer=()) != solved.resolve(trace).replace(prefer=()):
         doubt = "the file is of another theory"
-    proven = _bound(trace, data, theory, maps, doubt, (solved or theory).resolve(trace), bool(broken))
+    proven = _bound(
+        trace, data, theory, maps, doubt, (solved or theory).resolve(trace), bool(broken)
+    )
     return EXIT_VIOLATED if broken or not proven else 0
 
 
-def _bound(trace: Trace, data: Any, theory: Theory, maps: Sequence[SSHMap], doubt: str | None, solved: Theory, broken: bool) -> bool:
+def _bound(
+    trace: Trace,
+    data: Any,
+    theory: Theory,
+    maps: Sequence[SSHMap],
+    doubt: str | None,
+    solved: Theory,
+    broken: bool,
+) -> bool:
     """Print what the certificate of the file proves, and what the file says wrongly of itself. Says whether all of it holds.
 
     doubt   why clingo's verdict cannot be taken for one on this trace and theory, if so
@@ -87,13 +103,20 @@ def _bound(trace: Trace, data: Any, theory: Theory, maps: Sequence[SSHMap], doub
     """
     fewest = min((len(m.dstates) for m in maps), default=None)
     if RESTS_ON - set(theory.axioms):
-        raise MapError("bound: expected a theory with the axioms functional_view and deterministic, which the proof rests on")
+        raise MapError(
+            "bound: expected a theory with the axioms functional_view and deterministic, which the proof rests on"
+        )
     if not isinstance(data, dict) or "certificate" not in data:
-        raise MapError("certificate: expected one beside the maps, got none; use what solve --json printed")
+        raise MapError(
+            "certificate: expected one beside the maps, got none; use what solve --json printed"
+        )
     bound = check_bound(trace, data["certificate"])
     for fault in bound.faults:
         print(f"bound: {printable(fault)}")
-    false = [*false_claims(data, maps, len(trace), solved, bound.dstates + len(bound.refuted)), *_false_of_maps(data, maps, trace)]
+    false = [
+        *false_claims(data, maps, len(trace), solved, bound.dstates + len(bound.refuted)),
+        *_false_of_maps(data, maps, trace),
+    ]
     if not false and not broken and "theory" in data:
         false += _false_of_all(data, trace)
     for claim in false:
@@ -102,16 +125,32 @@ def _bound(trace: Trace, data: Any, theory: Theory, maps: Sequence[SSHMap], doub
         return False
     pairs = bound.dstates * (bound.dstates - 1) // 2
     states = counted(bound.dstates, "dstates")
-    print(f"at least {states}: as many steps, of which no two can be one dstate ({counted(pairs, 'pairs')} checked)")
+    print(
+        f"at least {states}: as many steps, of which no two can be one dstate ({counted(pairs, 'pairs')} checked)"
+    )
     total = bound.dstates + (0 if doubt else len(bound.refuted))
     if bound.refuted and doubt:
-        print(f"clingo's verdict on {counted(bound.refuted[0], 'dstates')} and more is left out: {doubt}")
+        print(
+            f"clingo's verdict on {counted(bound.refuted[0], 'dstates')} and more is left out: {doubt}"
+        )
     elif bound.refuted:
-        sizes = f"{bound.refuted[0]} to {total - 1}" if len(bound.refuted) > 1 else str(bound.refuted[0])
-        print(f"at least {counted(total, 'dstates')}, if clingo is right that there is no map of {sizes}")
+        sizes = (
+            f"{bound.refuted[0]} to {total - 1}"
+            if len(bound.refuted) > 1
+            else str(bound.refuted[0])
+        )
+        print(
+            f"at least {counted(total, 'dstates')}, if clingo is right that there is no map of {sizes}"
+        )
     if fewest is not None:
-        beyond = "fewer than that, so this bound or a map is wrong" if fewest < total else f"{fewest - total} more than proven"
-        print(f"the maps have {fewest}" + (": no map has fewer" if fewest == total else f", {beyond}"))
+        beyond = (
+            "fewer than that, so this bound or a map is wrong"
+            if fewest < total
+            else f"{fewest - total} more than proven"
+        )
+        print(
+            f"the maps have {fewest}" + (": no map has fewer" if fewest == total else f", {beyond}")
+        )
     return not false and (fewest is None or fewest >= total)
 
 
@@ -142,7 +181,9 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
     backbone = solution.backbone
     if backbone and backbone.proven and solution.minimal_listed:
         sharing = Sharing()
-        for ssh_map in solution.maps[: solution.levels[0].count] if solution.levels else solution.maps:
+        for ssh_map in (
+            solution.maps[: solution.levels[0].count] if solution.levels else solution.maps
+        ):
             sharing.absorb(ssh_map)
         right = sharing.backbone(proven=True)
         if backbone.to_dict() != right.to_dict():
@@ -156,7 +197,13 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
 def _is_near(said: Any, right: Any) -> bool:
     """Whether numbers that are nested alike are about the same, as machines round differently."""
     if isinstance(right, Mapping):
-        return isinstance(said, Mapping) and set(said) == set(right) and all(_is_near(said[k], right[k]) for k in right)
+        return (
+            isinstance(said, Mapping)
+            and set(said) == set(right)
+            and all(_is_near(said[k], right[k]) for k in right)
+        )
     if isinstance(right, list):
-        return isinstance(said, list) and len(said) == len(right) and all(map(_is_near, said, right))
+        return (
+            isinstance(said, list) and len(said) == len(right) and all(map(_is_near, said, right))
+        )
     return is_finite(said) and math.isclose(said, right, rel_tol=0.01, abs_tol=0.01)

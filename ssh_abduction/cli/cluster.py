@@ -25,12 +25,21 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser("cluster", help="cluster images into views", description=text)
     parser.add_argument("trace", help="trace file with images, or - for standard input")
     add_output(parser)
-    parser.add_argument("--k", type=int, help="number of views (default: the one with the largest M)")
-    parser.add_argument("--k-max", type=int, metavar="K", help="largest number of views to try (default: 20)")
+    parser.add_argument(
+        "--k", type=int, help="number of views (default: the one with the largest M)"
+    )
+    parser.add_argument(
+        "--k-max", type=int, metavar="K", help="largest number of views to try (default: 20)"
+    )
     by = "choose k by M, which stands on two distances, or by trimmed M, which compares medians of distances (default: M)"
     parser.add_argument("--by", choices=("M", "trimmed"), default="M", help=by)
     parser.add_argument("--seed", type=seed, default=0, help="seed of k-means (default: 0)")
-    parser.add_argument("--plot", type=picture_file, metavar="PNG", help="draw M, and U where the truth is known, against k")
+    parser.add_argument(
+        "--plot",
+        type=picture_file,
+        metavar="PNG",
+        help="draw M, and U where the truth is known, against k",
+    )
     parser.set_defaults(run=run)
 
 
@@ -46,30 +55,49 @@ def run(options: argparse.Namespace) -> int:
     logged, features = images_of(trace), features_of(trace)
     try:
         images = features.fit_transform(logged)
-        clusterer = ViewClusterer(k=options.k, k_max=options.k_max, random_state=options.seed, by=options.by).fit(images)
+        clusterer = ViewClusterer(
+            k=options.k, k_max=options.k_max, random_state=options.seed, by=options.by
+        ).fit(images)
     except AbductionError as error:
         raise AbductionError(f"{options.trace}: {error}") from None
     except ValueError as error:  # scikit-learn's own words for what cannot be clustered
-        raise AbductionError(f"{options.trace}: images: {error}; log more images, or others") from None
+        raise AbductionError(
+            f"{options.trace}: images: {error}; log more images, or others"
+        ) from None
     truth = true_dstates(trace)
     uncertainty: dict[int, float] = {}
     if truth is not None:
-        uncertainty = {k: uncertainty_coefficient(labels, truth) for k, labels in clusterer.labels_by_k_.items()}
-    beside = trace.images and os.path.relpath(Path(trace.source or ".").parent / trace.images, Path(options.output).parent)
+        uncertainty = {
+            k: uncertainty_coefficient(labels, truth)
+            for k, labels in clusterer.labels_by_k_.items()
+        }
+    beside = trace.images and os.path.relpath(
+        Path(trace.source or ".").parent / trace.images, Path(options.output).parent
+    )
     other = clusterer.runner_up_labels_
-    clustered = replace(trace.with_views(clusterer.labels_.tolist(), clusterer.confidence_.round(4).tolist()), images=beside)
+    clustered = replace(
+        trace.with_views(clusterer.labels_.tolist(), clusterer.confidence_.round(4).tolist()),
+        images=beside,
+    )
     clustered = with_runner_up(clustered, None if other is None else other.tolist())
     rows = [
         [
             k,
-            *("–" if math.isnan(m) else f"{m:.3f}" for m in (clusterer.quality_[k], clusterer.trimmed_[k])),
+            *(
+                "–" if math.isnan(m) else f"{m:.3f}"
+                for m in (clusterer.quality_[k], clusterer.trimmed_[k])
+            ),
             *([f"{uncertainty[k]:.3f}"] if uncertainty else []),
             {clusterer.k_: "chosen", clusterer.runner_up_: "runner-up"}.get(k, ""),
         ]
         for k in clusterer.quality_
     ]
     chosen = table(["k", "M", "trimmed", *(["U"] if uncertainty else []), ""], rows)
-    write(clustered, options.output, f"{chosen}\n{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}")
+    write(
+        clustered,
+        options.output,
+        f"{chosen}\n{counted(clusterer.k_, 'views')} of {counted(len(images), 'images')}",
+    )
     warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
     warn(doubts(clustered))
     if options.plot:
@@ -82,9 +110,15 @@ def run(options: argparse.Namespace) -> int:
 
 def doubts(trace: Trace) -> list[str]:
     """What is said of the runner-up of a trace that was clustered, if it gives another map: by the default theory, or the causal one where actions have no kind."""
-    theory = Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()
+    theory = (
+        Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()
+    )
     try:
-        found = second_map(trace, solve(trace, theory, time_limit=SECONDS).maps, theory) if runner_up(trace) else None
+        found = (
+            second_map(trace, solve(trace, theory, time_limit=SECONDS).maps, theory)
+            if runner_up(trace)
+            else None
+        )
     except AbductionError:  # the trace lacks what the theory needs: `solve` will say so
         return []
     return [found.sentence] if found else []
@@ -92,5 +126,7 @@ def doubts(trace: Trace) -> list[str]:
 
 def true_dstates(trace: Trace) -> list[str] | None:
     """The true dstates, where every step tells one."""
-    found = [step.truth.get("dstate") if isinstance(step.truth, dict) else None for step in trace.steps]
+    found = [
+        step.truth.get("dstate") if isinstance(step.truth, dict) else None for step in trace.steps
+    ]
     return [str(name) for name in found] if all(name is not None for name in found) else None

@@ -22,18 +22,23 @@ UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
 
 def add_parser(verbs: Verbs) -> None:
     text = "Compare the minimal maps of a trace: what do all of them share, where do they differ, and which steps decide between them?"
-    parser = verbs.add_parser("compare", help="what do rival maps share, and where do they differ?", description=text)
-    parser.add_argument("maps", help="what solve --json printed, one saved map, or the folder of a run of map; - for standard input")
+    parser = verbs.add_parser(
+        "compare", help="what do rival maps share, and where do they differ?", description=text
+    )
     parser.add_argument(
-        "other", nargs="?", help="maps of the same trace to compare with: which maps are in both, and how do the first ones differ?"
+        "maps",
+        help="what solve --json printed, one saved map, or the folder of a run of map; - for standard input",
+    )
+    parser.add_argument(
+        "other",
+        nargs="?",
+        help="maps of the same trace to compare with: which maps are in both, and how do the first ones differ?",
     )
     diff = "instead, tell two maps apart in words, each by its number, from 1, or its id; with OTHER, the second one is of that file"
     parser.add_argument("--diff", nargs=2, metavar=("I", "J"), help=diff)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
-    parser.epilog = (
-        "Questions that decide are chosen greedily: none can be left out, but there may be fewer. docs/formats.md says what the JSON has."
-    )
+    parser.epilog = "Questions that decide are chosen greedily: none can be left out, but there may be fewer. docs/formats.md says what the JSON has."
 
 
 def run(options: argparse.Namespace) -> int:
@@ -41,13 +46,18 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.rivals.differences import difference
     from ssh_abduction.rivals.listing import Listing
 
-    maps, others = within(options.maps), within(options.other) if options.other is not None else None
+    maps, others = (
+        within(options.maps),
+        within(options.other) if options.other is not None else None,
+    )
     told: dict[str, Any] = {}  # what --json prints
     if maps != options.maps and others != options.other:
         told["runs"] = differences(options.maps, options.other)
         if not options.json:
             print("\n".join(_runs(told["runs"], options.maps, options.other)))
-        if not of_one_trace(options.maps, options.other):  # maps of different traces cannot be compared any further
+        if not of_one_trace(
+            options.maps, options.other
+        ):  # maps of different traces cannot be compared any further
             if options.json:
                 print(json_line(told))
             return 0
@@ -75,12 +85,19 @@ def differences(first: str, other: str) -> dict[str, tuple[Any, Any]]:
     """What two runs of `map` differ in: each setting and each figure by its name, as it is in the first run, and in the other one."""
     here, there = (_flat(read_json(Path(folder) / "run.json")) for folder in (first, other))
     names = {**here, **there}
-    return {name: (a, b) for name in names if (a := here.get(name)) != (b := there.get(name)) and not name.startswith(UNSTEADY)}
+    return {
+        name: (a, b)
+        for name in names
+        if (a := here.get(name)) != (b := there.get(name)) and not name.startswith(UNSTEADY)
+    }
 
 
 def _runs(differing: dict[str, tuple[Any, Any]], first: str, other: str) -> Iterator[str]:
     """A line for each setting and each figure in which two runs differ."""
-    yield from (f"{name}: {brief(a)} in {named(first)}, {brief(b)} in {named(other)}" for name, (a, b) in differing.items())
+    yield from (
+        f"{name}: {brief(a)} in {named(first)}, {brief(b)} in {named(other)}"
+        for name, (a, b) in differing.items()
+    )
     if not differing:
         yield "the two runs have the same settings, and found the same"
 
@@ -94,7 +111,11 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
     """The values of nested objects, by the names that lead to them."""
     if not isinstance(value, dict):
         return {name: value}
-    return {key: v for part in value for key, v in _flat(value[part], f"{name}.{part}".lstrip(".")).items()}
+    return {
+        key: v
+        for part in value
+        for key, v in _flat(value[part], f"{name}.{part}".lstrip(".")).items()
+    }
 
 
 def _lines(found: Comparison) -> Iterator[str]:

@@ -26,9 +26,13 @@ def run(options: argparse.Namespace) -> int:
     try:
         import shtab
     except ImportError:
-        raise AbductionError("completion: expected the package shtab, got none; pip install 'ssh-abduction[completion]'") from None
+        raise AbductionError(
+            "completion: expected the package shtab, got none; pip install 'ssh-abduction[completion]'"
+        ) from None
     if options.shell not in shtab.SUPPORTED_SHELLS:
-        raise AbductionError(f"completion: expected a shtab that knows {options.shell}, got {shtab.__version__}; pip install -U shtab")
+        raise AbductionError(
+            f"completion: expected a shtab that knows {options.shell}, got {shtab.__version__}; pip install -U shtab"
+        )
     from ssh_abduction.cli import parser
 
     top = parser()

@@ -19,23 +19,55 @@ if TYPE_CHECKING:
 UNKNOWN = "–"
 # Poses and relations of one log judge at least such a share of the pairs alike: else they are of different logs, or one of them is wrong.
 ALIKE = 0.9
-PAIRS = ("map", "places", "joined", "right", "precision", "recall", "dstates", "joined", "right", "precision", "recall")
-HEAD = ("map", "isomorphic", "dstates", "places", "paths", "accuracy", "same place", "edges", "links")
+PAIRS = (
+    "map",
+    "places",
+    "joined",
+    "right",
+    "precision",
+    "recall",
+    "dstates",
+    "joined",
+    "right",
+    "precision",
+    "recall",
+)
+HEAD = (
+    "map",
+    "isomorphic",
+    "dstates",
+    "places",
+    "paths",
+    "accuracy",
+    "same place",
+    "edges",
+    "links",
+)
 
 
 def add_parser(verbs: Verbs) -> None:
     text = "Compare maps with the truth that the steps of the trace tell: which map is the true one, and how right are the others?"
     parser = verbs.add_parser("evaluate", help="how right are these maps?", description=text)
-    parser.add_argument("maps", help="what solve --json printed for this trace, or one saved map; - for standard input")
+    parser.add_argument(
+        "maps",
+        help="what solve --json printed for this trace, or one saved map; - for standard input",
+    )
     parser.add_argument("trace", help="trace file (JSON Lines) with truth")
     parser.add_argument(
-        "--near", type=float, metavar="METRES", help="judge by poses, too, and take poses so near each other for one place (default: 2)"
+        "--near",
+        type=float,
+        metavar="METRES",
+        help="judge by poses, too, and take poses so near each other for one place (default: 2)",
     )
     parser.add_argument(
-        "--relations", metavar="FILE", help="judge by hand-checked relative poses, too: lines of time1 time2 x y z roll pitch yaw"
+        "--relations",
+        metavar="FILE",
+        help="judge by hand-checked relative poses, too: lines of time1 time2 x y z roll pitch yaw",
     )
     parser.add_argument(
-        "--truth", metavar="FILE", help="judge by the robot's true trajectory, in TUM format: lines of timestamp tx ty tz qx qy qz qw"
+        "--truth",
+        metavar="FILE",
+        help="judge by the robot's true trajectory, in TUM format: lines of timestamp tx ty tz qx qy qz qw",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
@@ -46,13 +78,22 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.evaluation import Relations, Trajectory, evaluate, evaluate_visits, tells_names, told_poses  # which load scipy
+    from ssh_abduction.evaluation import (
+        Relations,
+        Trajectory,
+        evaluate,
+        evaluate_visits,
+        tells_names,
+        told_poses,
+    )  # which load scipy
     from ssh_abduction.evaluation.visits import NEAR
 
     data = read_maps(options.maps)
     maps = maps_of(data, str(options.maps))
     if not maps:
-        raise MapError(f"{options.maps}: maps: expected one to evaluate, got none; see the status that solve printed")
+        raise MapError(
+            f"{options.maps}: maps: expected one to evaluate, got none; see the status that solve printed"
+        )
     trace = Trace.load(options.trace)
     if options.truth is not None:
         trace = Trajectory.load(options.truth).told_to(trace)
@@ -61,7 +102,11 @@ def run(options: argparse.Namespace) -> int:
     named_truth = tells_names(trace)
     found, judged = None, []
     try:
-        if options.near is not None or options.truth is not None or (not named_truth and any(told_poses(trace))):
+        if (
+            options.near is not None
+            or options.truth is not None
+            or (not named_truth and any(told_poses(trace)))
+        ):
             judged.append(evaluate_visits(maps, trace, near=near))
         if relations is not None:
             judged.append(evaluate_visits(maps, trace, near=near, relations=relations))
@@ -89,7 +134,15 @@ def run(options: argparse.Namespace) -> int:
         print(table(HEAD, [_row(i, one) for i, one in enumerate(found.maps, 1)]))
     for visits in judged:
         print(_told_of_visits(visits))
-        print(table(PAIRS, [[i, *_pairs(one.places), *_pairs(one.dstates)] for i, one in enumerate(visits.maps, 1)]))
+        print(
+            table(
+                PAIRS,
+                [
+                    [i, *_pairs(one.places), *_pairs(one.dstates)]
+                    for i, one in enumerate(visits.maps, 1)
+                ],
+            )
+        )
     return 0
 
 
@@ -100,23 +153,30 @@ def _nothing_judged(found: VisitsEvaluation) -> str:
         why += f"; of {counted(found.places.stayed, 'pairs')} within {found.near:g} m the robot was at no visit farther away in between"
     if found.places.unknown:
         why += f"; of {counted(found.places.unknown, 'pairs')} {found.judge} do not tell how far apart they are"
-    return (
-        f"judged by {found.judge}: expected pairs of visits to judge, got none: {why}; evaluate a longer drive, or with truth at more steps"
-    )
+    return f"judged by {found.judge}: expected pairs of visits to judge, got none: {why}; evaluate a longer drive, or with truth at more steps"
 
 
 def _told_of_visits(found: VisitsEvaluation) -> str:
     places, dstates = found.places, found.dstates
     left_out = [
-        counted(places.stayed, "pairs") + " within that, as the robot was at no visit farther away in between" if places.stayed else "",
-        counted(places.unknown, "pairs") + f", as {found.judge} do not tell how far apart they are" if places.unknown else "",
+        counted(places.stayed, "pairs")
+        + " within that, as the robot was at no visit farther away in between"
+        if places.stayed
+        else "",
+        counted(places.unknown, "pairs") + f", as {found.judge} do not tell how far apart they are"
+        if places.unknown
+        else "",
     ]
     return (
         f"judged by {found.judge}: of {counted(places.judged, 'pairs')} of different visits {places.returns} are returns to one place: within "
         f"{found.near:g} m, and the robot was farther away in between; of {counted(dstates.judged, 'pairs')} of their steps {dstates.returns} are returns "
         f"to one dstate: headings differ by at most {found.turned:g} degrees, too"
         + "".join(f"\nleft out: {text}" for text in left_out if text)
-        + (f"\nposes judge {found.by_both[1]} of {counted(found.by_both[0], 'pairs')} of visits alike" if found.by_both else "")
+        + (
+            f"\nposes judge {found.by_both[1]} of {counted(found.by_both[0], 'pairs')} of visits alike"
+            if found.by_both
+            else ""
+        )
     )
 
 
@@ -136,9 +196,17 @@ def _headline(found: Evaluation, may_be_more: bool) -> str:
 
 
 def _truth(found: Evaluation, steps: int) -> str:
-    told = ((found.true_dstates, "dstates"), (found.true_places, "places"), (found.true_paths, "paths"))
+    told = (
+        (found.true_dstates, "dstates"),
+        (found.true_places, "places"),
+        (found.true_paths, "paths"),
+    )
     counts = ", ".join(counted(number, things) for number, things in told if number is not None)
-    ambiguity = "" if found.ambiguity is None else f"; {100 * found.ambiguity:.0f} % of the pairs of dstates share a view"
+    ambiguity = (
+        ""
+        if found.ambiguity is None
+        else f"; {100 * found.ambiguity:.0f} % of the pairs of dstates share a view"
+    )
     return f"the truth, told at {found.steps} of {counted(steps, 'steps')}: {counts}{ambiguity}"
 
 
@@ -148,7 +216,11 @@ def _row(number: int, one: MapEvaluation) -> list[object]:
         _word(one.isomorphic, "yes", "no"),
         *(
             UNKNOWN if count is None else f"{count} {_word(right, 'right', 'wrong')}"
-            for count, right in ((one.dstates, one.dstates_right), (one.places, one.places_right), (one.paths, one.paths_right))
+            for count, right in (
+                (one.dstates, one.dstates_right),
+                (one.places, one.places_right),
+                (one.paths, one.paths_right),
+            )
         ),
         _share(one.accuracy),
         f"{_share(one.place_precision)} {_share(one.place_recall)}",

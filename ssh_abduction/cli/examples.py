@@ -14,14 +14,29 @@ from ssh_abduction.data.files import shipped, write_file
 def add_parser(verbs: Verbs) -> None:
     text = "Copy the examples that ship with the package into a folder: traces, programs, and a notebook. A file that is there already, and is another one, is left as it is."
     parser = verbs.add_parser("examples", help="copy the examples into a folder", description=text)
-    parser.add_argument("-o", "--output", type=output, default="examples", metavar="FOLDER", help="the folder (default: examples)")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=output,
+        default="examples",
+        metavar="FOLDER",
+        help="the folder (default: examples)",
+    )
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     folder = Path(options.output)
-    examples = {folder / path.name: path.read_bytes() for path in sorted(shipped("examples").iterdir()) if path.is_file()}
-    changed = [path for path, data in examples.items() if path.exists() and not (path.is_file() and path.read_bytes() == data)]
+    examples = {
+        folder / path.name: path.read_bytes()
+        for path in sorted(shipped("examples").iterdir())
+        if path.is_file()
+    }
+    changed = [
+        path
+        for path, data in examples.items()
+        if path.exists() and not (path.is_file() and path.read_bytes() == data)
+    ]
     if changed:
         raise AbductionError(
             f"{named(changed[0])}: expected no file, or the example of this name, got another one; nothing was copied: "
@@ -30,5 +45,7 @@ def run(options: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     for path, data in examples.items():
         write_file(path, data)
-    print(f"{counted(len(examples), 'examples')} in {named(folder)}: {', '.join(path.name for path in examples)}")
+    print(
+        f"{counted(len(examples), 'examples')} in {named(folder)}: {', '.join(path.name for path in examples)}"
+    )
     return 0

@@ -11,7 +11,13 @@ from ssh_abduction.cli.outcome import dump, on_ctrl_c
 from ssh_abduction.data.errors import AbductionError, MapError, named
 from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain.pairs import PairExplanation, PairQuestion, TraceExplanation, TraceQuestion, Verdict
+from ssh_abduction.explain.pairs import (
+    PairExplanation,
+    PairQuestion,
+    TraceExplanation,
+    TraceQuestion,
+    Verdict,
+)
 from ssh_abduction.solver import Stop, theory_in
 from ssh_abduction.theory.theory import Theory
 
@@ -23,31 +29,67 @@ def add_parser(verbs: Verbs) -> None:
         "Explain why two steps of a trace are different dstates in every map, or one, with the axioms that it takes; or else in which maps they are, and what maps of "
         "the other kind cost. Without steps, explain why the trace has no map, and which one observation, if it were wrong, would mend it."
     )
-    parser = verbs.add_parser("explain", help="why are two steps one dstate, or not? why is there no map?", description=text)
+    parser = verbs.add_parser(
+        "explain",
+        help="why are two steps one dstate, or not? why is there no map?",
+        description=text,
+    )
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument(
-        "steps", nargs="*", type=int, default=(), metavar="step", help="two steps, counted from 0; none, to hear why there is no map"
+        "steps",
+        nargs="*",
+        type=int,
+        default=(),
+        metavar="step",
+        help="two steps, counted from 0; none, to hear why there is no map",
     )
-    parser.add_argument("-n", "--maps", type=int, default=100, metavar="K", help="count at most K minimal maps; 0 for all (default: 100)")
+    parser.add_argument(
+        "-n",
+        "--maps",
+        type=int,
+        default=100,
+        metavar="K",
+        help="count at most K minimal maps; 0 for all (default: 100)",
+    )
     parser.add_argument("--json", action="store_true", help="print the explanation as JSON")
-    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with what is known by then")
-    parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
-    parser.add_argument("--theory-of", metavar="MAPS", help="explain by the theory that this file of maps was made with")
-    add_theory(parser, default="that of --theory-of; else topological, or causal with --level causal")
+    parser.add_argument(
+        "--time-limit",
+        type=float,
+        metavar="S",
+        help="stop after S seconds with what is known by then",
+    )
+    parser.add_argument(
+        "--memory-limit",
+        type=int,
+        metavar="MIB",
+        help="stop when the process has used so much memory",
+    )
+    parser.add_argument(
+        "--theory-of",
+        metavar="MAPS",
+        help="explain by the theory that this file of maps was made with",
+    )
+    add_theory(
+        parser, default="that of --theory-of; else topological, or causal with --level causal"
+    )
     parser.epilog = "Exit codes: 0 explained; 20 the trace has no map; 30 not found out in time; 1, 2, 130 and 143 as for the other verbs."
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     if len(options.steps) not in (0, 2):
-        raise AbductionError(f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are to be explained")
+        raise AbductionError(
+            f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are to be explained"
+        )
     trace = Trace.load(options.trace)
     theory = theory_of(options, _theory_in(options.theory_of) if options.theory_of else None)
     limits: dict[str, Any] = {"limit": options.time_limit, "memory": options.memory_limit}
     question: PairQuestion | TraceQuestion
     if options.steps:
         first, second = options.steps
-        question = PairQuestion(trace, first, second, theory, max_maps=options.maps or None, **limits)
+        question = PairQuestion(
+            trace, first, second, theory, max_maps=options.maps or None, **limits
+        )
     else:
         question = TraceQuestion(trace, theory, **limits)
     told = _as_json if options.json else _as_text
@@ -56,7 +98,10 @@ def run(options: argparse.Namespace) -> int:
         known = question.known(why)
         return told(known), _exit_code(known)
 
-    with on_ctrl_c(question.interrupt), Guard(question.interrupt, last_words, options.time_limit, options.memory_limit) as guard:
+    with (
+        on_ctrl_c(question.interrupt),
+        Guard(question.interrupt, last_words, options.time_limit, options.memory_limit) as guard,
+    ):
         answer = question.answer()
         guard.say(lambda: told(answer))
     return _exit_code(answer)
@@ -66,7 +111,9 @@ def _theory_in(file: str) -> Theory:
     """The theory that a file of maps was made with. Raises MapError."""
     data = read_maps(file, mend="name the maps that were made of it")
     if not isinstance(data, dict) or "theory" not in data:
-        raise MapError(f"{named(file)}: theory: expected the theory that the maps were made with, got none; name it with --theory")
+        raise MapError(
+            f"{named(file)}: theory: expected the theory that the maps were made with, got none; name it with --theory"
+        )
     return theory_in(data["theory"], named(file))
 
 

@@ -15,21 +15,42 @@ FORMATS = ("nav2", "tmap2", "graphml", "dot", "networkx-json")
 
 def add_parser(verbs: Verbs) -> None:
     text = "Write a map as a file of another program: a route graph of Nav2 (GeoJSON), a topological map of LCAS's topological_navigation (tmap2, YAML), GraphML, Graphviz DOT, or JSON of networkx."
-    parser = verbs.add_parser("export", help="write a map for Nav2, tmap2, GraphML, DOT or networkx", description=text)
-    parser.add_argument("maps", help="what solve --json printed, or one saved map; - for standard input")
+    parser = verbs.add_parser(
+        "export", help="write a map for Nav2, tmap2, GraphML, DOT or networkx", description=text
+    )
+    parser.add_argument(
+        "maps", help="what solve --json printed, or one saved map; - for standard input"
+    )
     parser.add_argument("--to", required=True, choices=FORMATS, help="the format")
-    parser.add_argument("--map", default="1", metavar="I", help="which map, by its number, from 1, or its id (default: the first)")
+    parser.add_argument(
+        "--map",
+        default="1",
+        metavar="I",
+        help="which map, by its number, from 1, or its id (default: the first)",
+    )
     parser.add_argument(
         "--level",
         choices=("places", "dstates"),
         help="what nodes are (default: places for nav2 and tmap2, where the map has any, else dstates)",
     )
-    parser.add_argument("--name", default="ssh-abduction", help="the name of the map (default: ssh-abduction)")
-    parser.add_argument("--frame", default="map", help="the coordinate frame of the positions (default: map)")
     parser.add_argument(
-        "--trace", metavar="TRACE", help="the trace that was mapped, which says how actions turn: for the layout of a map without poses"
+        "--name", default="ssh-abduction", help="the name of the map (default: ssh-abduction)"
     )
-    parser.add_argument("-o", "--output", default="-", metavar="FILE", help="the file to write (default: standard output)")
+    parser.add_argument(
+        "--frame", default="map", help="the coordinate frame of the positions (default: map)"
+    )
+    parser.add_argument(
+        "--trace",
+        metavar="TRACE",
+        help="the trace that was mapped, which says how actions turn: for the layout of a map without poses",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        default="-",
+        metavar="FILE",
+        help="the file to write (default: standard output)",
+    )
     parser.set_defaults(run=run)
     parser.epilog = "Positions are metres, seen from the first dstate, where the map has poses; else they are of a layout, and this is said. docs/formats.md says what each file has."
 
@@ -43,7 +64,14 @@ def run(options: argparse.Namespace) -> int:
     chosen = listing.maps[listing.number(options.map)]
     turns = None if options.trace is None else Trace.load(options.trace)
     try:
-        text = export_map(chosen, options.to, level=options.level, name=options.name, frame=options.frame, turns=turns)
+        text = export_map(
+            chosen,
+            options.to,
+            level=options.level,
+            name=options.name,
+            frame=options.frame,
+            turns=turns,
+        )
     except MapError as error:
         raise MapError(f"{listing.source}: {error}") from None
     if options.output == "-":

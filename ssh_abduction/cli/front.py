@@ -17,8 +17,15 @@ from ssh_abduction.theory.theory import Theory
 def run(options: argparse.Namespace) -> int:
     """Print the front. Exit code 0 if all of it is proven, 20 if it is proven that there is no map, and else 10, as for solve."""
     if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
-        raise AbductionError("--front: expected one trace, got several, or --jobs or --scheduler; ask for each trace by itself")
-    front = fault_front(Trace.load(options.traces[0]), theory_of(options, Theory.causal()), options.front, options.time_limit)
+        raise AbductionError(
+            "--front: expected one trace, got several, or --jobs or --scheduler; ask for each trace by itself"
+        )
+    front = fault_front(
+        Trace.load(options.traces[0]),
+        theory_of(options, Theory.causal()),
+        options.front,
+        options.time_limit,
+    )
     print(dump(_as_data(front)) if options.json else _as_text(front, options.front))
     return 10 if front.stopped else 0 if front.points else 20
 
@@ -33,7 +40,9 @@ def _as_text(front: Front, most: int) -> str:
     for point in front.points:
         faults = "; ".join(map(str, point.map.faults)) if point.map else "–"
         shown = str(point.dstates) if point.proven else f"at least {point.dstates}"
-        rows.append([point.faults, shown, "knee" if point.faults == front.knee else "", faults or "none"])
+        rows.append(
+            [point.faults, shown, "knee" if point.faults == front.knee else "", faults or "none"]
+        )
     lines = [table(["faults", "dstates", "", "of the map found"], rows)]
     if front.prices:
         lines.append(
@@ -51,7 +60,16 @@ def _as_text(front: Front, most: int) -> str:
 
 def _as_data(front: Front) -> dict[str, object]:
     points = [
-        {"faults": p.faults, "dstates": p.dstates, "proven": p.proven, "map": None if p.map is None else p.map.to_dict()}
+        {
+            "faults": p.faults,
+            "dstates": p.dstates,
+            "proven": p.proven,
+            "map": None if p.map is None else p.map.to_dict(),
+        }
         for p in front.points
     ]
-    return {"knee": front.knee, "prices": None if front.prices is None else list(front.prices), "front": points}
+    return {
+        "knee": front.knee,
+        "prices": None if front.prices is None else list(front.prices),
+        "front": points,
+    }

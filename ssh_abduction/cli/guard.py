@@ -20,7 +20,10 @@ from typing import Any, NoReturn, Self
 from ssh_abduction.data import program
 from ssh_abduction.solver import POLL, Stop, end_all, resident_memory
 
-LATE = 1.1, 0.8  # times the time limit, and seconds beyond that, after which a search is over, whatever it is at
+LATE = (
+    1.1,
+    0.8,
+)  # times the time limit, and seconds beyond that, after which a search is over, whatever it is at
 LARGE = 1.1, 100.0  # times the memory limit, and MiB beyond that
 DEAF = 1.5  # seconds that a search may take to end after Ctrl-C
 PIECE = 2**16  # characters that are printed at a time
@@ -50,17 +53,23 @@ class Guard:
         self._interrupt, self._last_words, self._given_up = interrupt, last_words, given_up
         self._limit, self._memory = limit, memory
         self._print_last = print_last or _print
-        self._speaking = threading.RLock()  # one thread prints at a time; once the last words are said, no other does
+        self._speaking = (
+            threading.RLock()
+        )  # one thread prints at a time; once the last words are said, no other does
         self._over = threading.Event()
         self._deaf_at: float | None = None  # when the search should have ended after Ctrl-C
         self._waited = 0.0  # seconds that whoever reads the output took, which do not count
-        self._writes_since: float | None = None  # when the piece of text that is being printed was begun
+        self._writes_since: float | None = (
+            None  # when the piece of text that is being printed was begun
+        )
         self._began = time.monotonic()
         self._hears: socket.socket | None = None
         self._before = -1
 
     def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():  # only the main thread hears of signals
+        if (
+            threading.current_thread() is threading.main_thread()
+        ):  # only the main thread hears of signals
             self._hears, self._told = socket.socketpair()
             for end in (self._hears, self._told):
                 end.setblocking(False)
@@ -69,7 +78,12 @@ class Guard:
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self._over.set()
         self._thread.join()  # for ever, if it is about to end the process
         if self._hears is not None:
@@ -106,8 +120,14 @@ class Guard:
         """Whether somebody asks for an end."""
         if self._hears is not None:
             with suppress(BlockingIOError):
-                heard = [number for number in self._hears.recv(64) if number in (signal.SIGINT, signal.SIGTERM)]
-                program.heard.extend(heard)  # as the handler of the main thread has perhaps not run, and will not
+                heard = [
+                    number
+                    for number in self._hears.recv(64)
+                    if number in (signal.SIGINT, signal.SIGTERM)
+                ]
+                program.heard.extend(
+                    heard
+                )  # as the handler of the main thread has perhaps not run, and will not
                 return bool(heard) or self._given_up()
         return self._given_up()
 
@@ -115,7 +135,10 @@ class Guard:
         now = time.monotonic()
         if self._deaf_at is not None and now > self._deaf_at:
             return "interrupted"
-        if self._limit is not None and now - self._began - self._waited > LATE[0] * self._limit + LATE[1]:
+        if (
+            self._limit is not None
+            and now - self._began - self._waited > LATE[0] * self._limit + LATE[1]
+        ):
             return "time limit"
         if self._memory is not None and resident_memory() > LARGE[0] * self._memory + LARGE[1]:
             return "memory limit"
@@ -124,7 +147,12 @@ class Guard:
     def _is_unread(self) -> bool:
         """Whether the program is to end, and prints what nobody reads."""
         since, now = self._writes_since, time.monotonic()
-        return self._deaf_at is not None and now > self._deaf_at and since is not None and now > since + DEAF
+        return (
+            self._deaf_at is not None
+            and now > self._deaf_at
+            and since is not None
+            and now > since + DEAF
+        )
 
     def _end(self, why: Stop) -> None:
         """Print the last words, and end the process with its helpers. What Python and clingo hold is left to the system."""

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 FORMATS = ("carmen", "g2o", "ros1", "ros2", "mcap")
 PLACES = ("junctions", "doors")
 # What the name of a file ends in that says how it is packed, and then what is in it.
-ENDINGS = ("gz", "bz2", "xz", "zst", "zstd", "lz4"), ("log", "clf", "carmen", "txt", "g2o", "graph", "toro", "bag", "mcap", "db3")
+ENDINGS = (
+    ("gz", "bz2", "xz", "zst", "zstd", "lz4"),
+    ("log", "clf", "carmen", "txt", "g2o", "graph", "toro", "bag", "mcap", "db3"),
+)
 # Those of perception.readers.echoes.
 MEANINGS = ("free", "unknown")
 
@@ -31,7 +34,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser = verbs.add_parser("import", help="make a trace of a robot's log", description=text)
     parser.add_argument(
-        "log", help="CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by gzip, bzip2, xz or zstd, too"
+        "log",
+        help="CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by gzip, bzip2, xz or zstd, too",
     )
     add_output(parser)
     add_reading(parser)
@@ -41,15 +45,23 @@ def add_parser(verbs: Verbs) -> None:
 def add_reading(parser: argparse.ArgumentParser) -> None:
     """Add the options that say how a log is read, and at which scale a building is looked at."""
     group = parser.add_argument_group("reading logs")
-    group.add_argument("--format", choices=FORMATS, help="format of the log (default: guessed from what is in it)")
+    group.add_argument(
+        "--format", choices=FORMATS, help="format of the log (default: guessed from what is in it)"
+    )
     group.add_argument(
         "--scan-topic",
         action="append",
         metavar="TOPIC",
         help="of a bag: the topic of the scans, where there are several; repeat it to read several lasers at once",
     )
-    group.add_argument("--odom-topic", metavar="TOPIC", help="of a bag: the topic of the odometry, where there are several")
-    laser = parser.add_argument_group("the laser", "what the log does not say of it, or says wrongly")
+    group.add_argument(
+        "--odom-topic",
+        metavar="TOPIC",
+        help="of a bag: the topic of the odometry, where there are several",
+    )
+    laser = parser.add_argument_group(
+        "the laser", "what the log does not say of it, or says wrongly"
+    )
     laser.add_argument(
         "--fov",
         type=partial(_told, "fov"),
@@ -76,15 +88,23 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         "beside them are long)",
     )
     scale = parser.add_argument_group(
-        "scale", "which ways out of a place count; the log itself suggests it by the passages that the robot drove through"
+        "scale",
+        "which ways out of a place count; the log itself suggests it by the passages that the robot drove through",
     )
-    scale.add_argument("--gateway", type=metres, metavar="M", help="the least width of a gateway, in metres")
+    scale.add_argument(
+        "--gateway", type=metres, metavar="M", help="the least width of a gateway, in metres"
+    )
     scale.add_argument(
         "--places",
         choices=PLACES,
         help="what the places are: where ways part or bend (junctions), or the doors that the robot drives through (doors) (default: doors where most of its way is wide and leads through doors often, and neither --gateway nor --radius is given; else junctions)",
     )
-    scale.add_argument("--radius", type=metres, metavar="M", help="how far a way out must lead from the middle of a place, in metres")
+    scale.add_argument(
+        "--radius",
+        type=metres,
+        metavar="M",
+        help="how far a way out must lead from the middle of a place, in metres",
+    )
 
 
 def metres(text: str) -> float:
@@ -107,7 +127,10 @@ def read(path: str, options: argparse.Namespace) -> RobotLog:
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
     """How a log is to be read, as arguments of `read_log`."""
-    return {name: getattr(options, name) for name in ("format", "scan_topic", "odom_topic", "fov", "mount", "no_return", "zero_is")}
+    return {
+        name: getattr(options, name)
+        for name in ("format", "scan_topic", "odom_topic", "fov", "mount", "no_return", "zero_is")
+    }
 
 
 def _told(field: str, text: str) -> Any:
@@ -134,14 +157,20 @@ def run(options: argparse.Namespace) -> int:
     if options.log == "-":
         raise AbductionError("-: expected the file of a log, got standard input; save it to a file")
     if options.output != "-" and not Path(options.output).absolute().parent.is_dir():
-        raise AbductionError(f"{named(options.output)}: cannot write the trace: its folder is not there; make it first")
+        raise AbductionError(
+            f"{named(options.output)}: cannot write the trace: its folder is not there; make it first"
+        )
     doors = doors_of(options)
     log = read(options.log, options)
     warn(log.warnings)
     done = import_log(log, options.gateway, options.radius, named_after(options.log), doors)
     warn(done.notes)
     scale = done.scale
-    places = "doors" if scale.doors else f"distinctive places at a radius of {scale.radius:g} m, gateways from {scale.gateway:g} m"
+    places = (
+        "doors"
+        if scale.doors
+        else f"distinctive places at a radius of {scale.radius:g} m, gateways from {scale.gateway:g} m"
+    )
     said = f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: {counted(len(done.visits), 'visits')} to {places}; {counted(len(done.trace), 'steps')}"
     write(done.trace, options.output, said)
     return 0

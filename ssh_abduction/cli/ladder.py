@@ -28,10 +28,17 @@ def add_parser(verbs: Verbs) -> None:
         "Solve a trace by its views alone, and then with one kind of evidence more on each rung: stars, pairs of steps that displacements tell apart, "
         "sets of two returns, planarity. Says how many minimal maps there are, how large they are, and which of them is the true one, where the trace has truth."
     )
-    parser = verbs.add_parser("ladder", help="what is each kind of evidence worth?", description=text)
+    parser = verbs.add_parser(
+        "ladder", help="what is each kind of evidence worth?", description=text
+    )
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument(
-        "-n", "--maps", type=int, default=100, metavar="N", help="list at most N maps on each rung, 0 for all (default 100)"
+        "-n",
+        "--maps",
+        type=int,
+        default=100,
+        metavar="N",
+        help="list at most N maps on each rung, 0 for all (default 100)",
     )
     parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="for each rung")
     parser.add_argument("--json", action="store_true", help="print a JSON object a rung")
@@ -53,8 +60,17 @@ def run(options: argparse.Namespace) -> int:
     def last_words(_: Stop) -> tuple[str, int]:
         return told(), interrupted_code()
 
-    with on_ctrl_c(under_way.interrupt), Guard(under_way.interrupt, last_words, None, None) as guard:
-        for rung in ladder(trace, theory, time_limit=options.time_limit, max_maps=options.maps or None, under_way=under_way):
+    with (
+        on_ctrl_c(under_way.interrupt),
+        Guard(under_way.interrupt, last_words, None, None) as guard,
+    ):
+        for rung in ladder(
+            trace,
+            theory,
+            time_limit=options.time_limit,
+            max_maps=options.maps or None,
+            under_way=under_way,
+        ):
             rungs.append(rung)
             if options.json:
                 guard.say(lambda: f"{json_line(rungs[-1].to_dict())}\n")
@@ -65,9 +81,13 @@ def run(options: argparse.Namespace) -> int:
 
 def _row(rung: Rung) -> list[object]:
     data, cost = rung.to_dict(), rung.solution.cost
-    counts: Iterator[object] = (getattr(cost, name) if cost else UNKNOWN for name in ("dstates", "places", "paths"))
+    counts: Iterator[object] = (
+        getattr(cost, name) if cost else UNKNOWN for name in ("dstates", "places", "paths")
+    )
     more = "" if rung.solution.complete else "+"
     listed = f"{data['count']}{more}" if data["status"] == "optimal" else f"{data['status']}"
-    truth = UNKNOWN if rung.evaluation is None else "none" if rung.rank is None else f"map {rung.rank}"
+    truth = (
+        UNKNOWN if rung.evaluation is None else "none" if rung.rank is None else f"map {rung.rank}"
+    )
     accuracy = UNKNOWN if data["accuracy"] is None else f"{data['accuracy']:.3f}"
     return [rung.name, listed, *counts, truth, accuracy, f"{data['seconds']:.2f}"]

@@ -18,7 +18,7 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import stretches
 
 if TYPE_CHECKING:
-    from ssh_abduction.online.localize import Localiser
+    from ssh_abduction.online.localiser import Localiser
 
 HEAD = ("step", "action", "seen", "", "dstate", "probability", "nowhere", "entropy", "normaliser")
 CHANCES = ("misread", "slipped", "unmapped", "reentered")
@@ -30,15 +30,32 @@ def add_parser(verbs: Verbs) -> None:
         "Where in a known map was the robot at each step of another trace? Markov localisation: a belief over dstates after each step, from a prior that knows nothing. "
         "A robot that is kidnapped is found again, and one that is nowhere that the map knows is said to be nowhere."
     )
-    parser = verbs.add_parser("localize", help="where in a known map is the robot?", description=text)
-    parser.add_argument("maps", help="what solve --json printed for the trace that was mapped, or one saved map")
-    parser.add_argument(
-        "other", help="trace of a robot in the mapped world, with the same names of views and actions; - for standard input"
+    parser = verbs.add_parser(
+        "localize", help="where in a known map is the robot?", description=text
     )
-    parser.add_argument("--map", type=int, metavar="I", help="take the I-th map, from 1 (default: the first)")
-    parser.add_argument("--trace", metavar="TRACE", help="the trace that was mapped: estimate probabilities from its steps")
-    parser.add_argument("--recogniser", metavar="FILE.skops", help="what train wrote for this map: read images instead of views")
-    chances = parser.add_argument_group("chances", "how likely it is at each step that what the map says does not hold, from 0 to 1")
+    parser.add_argument(
+        "maps", help="what solve --json printed for the trace that was mapped, or one saved map"
+    )
+    parser.add_argument(
+        "other",
+        help="trace of a robot in the mapped world, with the same names of views and actions; - for standard input",
+    )
+    parser.add_argument(
+        "--map", type=int, metavar="I", help="take the I-th map, from 1 (default: the first)"
+    )
+    parser.add_argument(
+        "--trace",
+        metavar="TRACE",
+        help="the trace that was mapped: estimate probabilities from its steps",
+    )
+    parser.add_argument(
+        "--recogniser",
+        metavar="FILE.skops",
+        help="what train wrote for this map: read images instead of views",
+    )
+    chances = parser.add_argument_group(
+        "chances", "how likely it is at each step that what the map says does not hold, from 0 to 1"
+    )
     said = {
         "misread": "what is seen is not of the dstate that the robot is at",
         "slipped": "the action leads elsewhere: it failed, or the robot was kidnapped",
@@ -47,8 +64,15 @@ def add_parser(verbs: Verbs) -> None:
     }
     for name in CHANCES:
         chances.add_argument(f"--{name}", type=float, metavar="P", help=said[name])
-    chances.add_argument("--zero-one", action="store_true", help="none of these: the map holds without exception")
-    parser.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the entropy of the belief, step by step")
+    chances.add_argument(
+        "--zero-one", action="store_true", help="none of these: the map holds without exception"
+    )
+    parser.add_argument(
+        "--plot",
+        type=picture_file,
+        metavar="PNG",
+        help="draw the entropy of the belief, step by step",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
 
@@ -59,8 +83,14 @@ def run(options: argparse.Namespace) -> int:
     trace = Trace.load(options.other)
     beliefs = [belief.to_dict() for belief in localiser.beliefs(trace)]
     if options.json:
-        head = {"map": options.map or 1, "dstates": len(localiser.ssh_map.dstates), "chances": asdict(localiser.chances)}
-        lines = ",\n".join(json_line({"step": step, **belief}) for step, belief in enumerate(beliefs))
+        head = {
+            "map": options.map or 1,
+            "dstates": len(localiser.ssh_map.dstates),
+            "chances": asdict(localiser.chances),
+        }
+        lines = ",\n".join(
+            json_line({"step": step, **belief}) for step, belief in enumerate(beliefs)
+        )
         print(f'{json_line(head)[:-1]}, "beliefs": [\n{lines}\n]}}')
     else:
         print(_headline(beliefs))
@@ -75,14 +105,19 @@ def run(options: argparse.Namespace) -> int:
 
 def _localiser(options: argparse.Namespace) -> Localiser:
     """The localiser that the options ask for. Raises AbductionError that names the file that is wrong."""
-    from ssh_abduction.online.localize import Chances, Localiser
+    from ssh_abduction.online.localiser import Chances, Localiser
 
     maps = maps_of(read_maps(options.maps), str(options.maps))
     if not maps:
-        raise MapError(f"{named(options.maps)}: maps: expected one to localise in, got none; see the status that solve printed")
+        raise MapError(
+            f"{named(options.maps)}: maps: expected one to localise in, got none; see the status that solve printed"
+        )
     check_number(options.map, maps, options.maps)
     if len(maps) > 1 and options.map is None:
-        warnings.warn(f"{named(options.maps)}: the first of {len(maps)} maps is taken; choose one with --map", stacklevel=1)
+        warnings.warn(
+            f"{named(options.maps)}: the first of {len(maps)} maps is taken; choose one with --map",
+            stacklevel=1,
+        )
     given = {name: getattr(options, name) for name in CHANCES if getattr(options, name) is not None}
     chances = replace(Chances.none() if options.zero_one else Chances(), **given)
     recogniser = None

@@ -21,20 +21,45 @@ def add_parser(verbs: Verbs) -> None:
         help="CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by gzip, bzip2, xz or zstd, too",
     )
     parser.add_argument(
-        "-o", "--output", type=output, required=True, metavar="FOLDER", help="folder to write; of several logs, the folder of their folders"
+        "-o",
+        "--output",
+        type=output,
+        required=True,
+        metavar="FOLDER",
+        help="folder to write; of several logs, the folder of their folders",
     )
-    parser.add_argument("-n", "--maps", type=int, default=300, metavar="K", help="list at most K minimal maps, 0 for all (default: 300)")
+    parser.add_argument(
+        "-n",
+        "--maps",
+        type=int,
+        default=300,
+        metavar="K",
+        help="list at most K minimal maps, 0 for all (default: 300)",
+    )
     parser.add_argument(
         "--time-limit",
         type=float,
         metavar="S",
         help="seconds for the minimal maps (default: what is left of a twentieth of the time that the robot drove, and 5 at least)",
     )
-    parser.add_argument("--no-ladder", action="store_true", help="do not work out what each kind of evidence is worth")
+    parser.add_argument(
+        "--no-ladder",
+        action="store_true",
+        help="do not work out what each kind of evidence is worth",
+    )
     parser.add_argument("--again", action="store_true", help="do again what is done already")
     many = parser.add_argument_group("many logs")
-    many.add_argument("--jobs", type=int, metavar="N", help="map N logs at a time, each in a process; -1 for one a core (default: 1)")
-    many.add_argument("--scheduler", metavar="ADDRESS", help="map on the workers of the Dask scheduler at this address, tcp://host:port")
+    many.add_argument(
+        "--jobs",
+        type=int,
+        metavar="N",
+        help="map N logs at a time, each in a process; -1 for one a core (default: 1)",
+    )
+    many.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="map on the workers of the Dask scheduler at this address, tcp://host:port",
+    )
     add_reading(parser)
     add_theory(
         parser,

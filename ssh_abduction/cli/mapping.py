@@ -142,16 +142,24 @@ class MapQuestion:
                 mapping.interrupt()
 
         def end() -> None:
-            if not begun or begun[0][1].search is None or begun[0][1].interrupted:  # nothing is known yet, or this is Ctrl-C once more
+            if (
+                not begun or begun[0][1].search is None or begun[0][1].interrupted
+            ):  # nothing is known yet, or this is Ctrl-C once more
                 raise KeyboardInterrupt
             interrupt()
 
         def last_words(_: Stop) -> tuple[MapAnswer, int]:
-            known = [self._told(number, path, log, mapping.known(), content) for log, mapping in begun if mapping.search is not None]
+            known = [
+                self._told(number, path, log, mapping.known(), content)
+                for log, mapping in begun
+                if mapping.search is not None
+            ]
             return known[0] if known else self._given_up(number, path), interrupted_code()
 
         guard = Guard(interrupt, last_words, None, None, given_up=given_up, print_last=answer_last)
-        with contextlib.nullcontext() if workers.serves() else on_ctrl_c(end):  # a worker is told what it is to do
+        with (
+            contextlib.nullcontext() if workers.serves() else on_ctrl_c(end)
+        ):  # a worker is told what it is to do
             with guard:
                 from perception.readers.logs import read_log
                 from ssh_abduction.robot_logs.maps import LogMapping, map_log
@@ -173,7 +181,9 @@ class MapQuestion:
                 )
             return self._told(number, path, log, done, content)
 
-    def _told(self, number: int, path: str, log: RobotLog, done: LogMap, content: str | None) -> MapAnswer:
+    def _told(
+        self, number: int, path: str, log: RobotLog, done: LogMap, content: str | None
+    ) -> MapAnswer:
         """The answer for a log that was mapped."""
         files = done.files()
         run = json.loads(files["run.json"])
@@ -189,7 +199,13 @@ class MapQuestion:
         total = sum(done.seconds.values())
         line = f"{named(path)}: {found}; {how}; {counted(len(done.imported.visits), 'visits')} in {counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m; {total:.1f} s"
         code = interrupted_code() if done.interrupted else exit_code(solution)
-        return MapAnswer(number, line, code, (*log.warnings, *done.notes, *solution.warnings), tuple(files.items()))
+        return MapAnswer(
+            number,
+            line,
+            code,
+            (*log.warnings, *done.notes, *solution.warnings),
+            tuple(files.items()),
+        )
 
     def _given_up(self, number: int, path: str) -> MapAnswer:
         """The answer for a log of which nothing is known when all is to stop."""
@@ -215,16 +231,24 @@ class MapQuestion:
 
     def failed(self, number: int, path: str, error: Exception) -> MapAnswer:
         message = batch.in_a_line(error)
-        return MapAnswer(number, message if message.startswith(named(path)) else f"{named(path)}: error: {message}", EXIT_ERROR)
+        return MapAnswer(
+            number,
+            message if message.startswith(named(path)) else f"{named(path)}: error: {message}",
+            EXIT_ERROR,
+        )
 
 
 def run(options: argparse.Namespace) -> int:
     if options.jobs == 0:
-        raise AbductionError("--jobs: expected how many logs to map at a time, or -1 for one a core, got 0; leave it out for 1")
+        raise AbductionError(
+            "--jobs: expected how many logs to map at a time, or -1 for one a core, got 0; leave it out for 1"
+        )
     if "-" in options.logs:
         raise AbductionError("-: expected the files of logs, got standard input; save it to a file")
     if options.maps < 0:
-        raise AbductionError(f"--maps: expected how many minimal maps to list, 0 for all, got {options.maps}")
+        raise AbductionError(
+            f"--maps: expected how many minimal maps to list, 0 for all, got {options.maps}"
+        )
     check_limit("--time-limit", "seconds", options.time_limit)
     _check_folder(Path(options.output))
     question = MapQuestion(
@@ -259,13 +283,20 @@ def run(options: argparse.Namespace) -> int:
     if left and options.scheduler is None:
         codes += _kept(batch.here(question, left, options.jobs or 1, stop), left, folders)
     elif left:
-        codes += _kept(batch.on_cluster(question, left, options.scheduler, options.jobs, stop), left, folders)
+        codes += _kept(
+            batch.on_cluster(question, left, options.scheduler, options.jobs, stop), left, folders
+        )
     if stop.is_set():
         missing = asked - sum(code <= SIGNALLED for code in codes)
-        print(f"ssh-abduction: interrupted: {missing} of {asked} logs not finished", file=sys.stderr)
+        print(
+            f"ssh-abduction: interrupted: {missing} of {asked} logs not finished", file=sys.stderr
+        )
         return interrupted_code()
     if errors := codes.count(EXIT_ERROR):
-        print(f"ssh-abduction: errors in {errors} of {len(codes)} logs, on their lines", file=sys.stderr)
+        print(
+            f"ssh-abduction: errors in {errors} of {len(codes)} logs, on their lines",
+            file=sys.stderr,
+        )
         return EXIT_ERROR
     return max(codes, default=0)
 
@@ -292,7 +323,9 @@ def _alone(question: MapQuestion, left: list[str], folders: dict[str, Path]) -> 
     return max(codes)
 
 
-def _kept(answers: Iterator[MapAnswer], paths: list[str], folders: dict[str, Path]) -> Iterator[int]:
+def _kept(
+    answers: Iterator[MapAnswer], paths: list[str], folders: dict[str, Path]
+) -> Iterator[int]:
     """Write the files of each answer as it comes, and print its line. Yields the exit codes."""
     for answer in answers:
         path, code = paths[answer.number], answer.code
@@ -336,7 +369,9 @@ def _check_folder(folder: Path) -> None:
     """Whether a folder can be made and written, before hours of work. Raises AbductionError."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not there.is_dir():
-        raise AbductionError(f"{named(str(folder))}: expected a folder to write, got a file: {named(str(there))}; name another one")
+        raise AbductionError(
+            f"{named(str(folder))}: expected a folder to write, got a file: {named(str(there))}; name another one"
+        )
     if not os.access(there, os.W_OK):
         raise AbductionError(
             f"{named(str(folder))}: expected a folder that can be written, got no permission in {named(str(there))}; name another one"
@@ -353,7 +388,11 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
     contents = {path: _content(path) for path in dict.fromkeys(logs)}
     runs = _runs_in(folder)
     owners = {_key(place) for places in runs.values() for place in places}
-    new = {(_key(folder / named_after(path)), content) for path, content in contents.items() if content and content not in runs}
+    new = {
+        (_key(folder / named_after(path)), content)
+        for path, content in contents.items()
+        if content and content not in runs
+    }
     named_so = Counter(key for key, _ in new)
     found: dict[str, Path] = {}
     same: dict[str, str] = {}
@@ -366,11 +405,23 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
         else:
             digits = content or hashlib.sha256(os.fsencode(os.path.abspath(path))).hexdigest()
             longer = folder / f"{_cut(plain.name)}-{digits[:DIGITS]}"
-            choices = [*([folder] if wished == folder else []), *([plain] if content and named_so[_key(plain)] == 1 else []), longer]
+            choices = [
+                *([folder] if wished == folder else []),
+                *([plain] if content and named_so[_key(plain)] == 1 else []),
+                longer,
+            ]
             place = next((one for one in choices if _key(one) not in owners), folder / digits)
             if place != wished and content:
-                why = "has the map of another log" if _key(wished) in owners else "is the name of several logs"
-                warn([f"{named(path)}: its folder is {named(str(place))}, as {named(str(wished))} {why}"])
+                why = (
+                    "has the map of another log"
+                    if _key(wished) in owners
+                    else "is the name of several logs"
+                )
+                warn(
+                    [
+                        f"{named(path)}: its folder is {named(str(place))}, as {named(str(wished))} {why}"
+                    ]
+                )
         other = next((one for one, taken in found.items() if _key(taken) == _key(place)), None)
         if other is None:
             found[path] = place
@@ -412,7 +463,11 @@ def _key(folder: Path) -> str:
 
 def _cut(name: str) -> str:
     """A name that is short enough for a part of a digest behind it."""
-    return os.fsdecode(os.fsencode(name)[: LONGEST - DIGITS - 1]) if len(os.fsencode(name)) > LONGEST - DIGITS - 1 else name
+    return (
+        os.fsdecode(os.fsencode(name)[: LONGEST - DIGITS - 1])
+        if len(os.fsencode(name)) > LONGEST - DIGITS - 1
+        else name
+    )
 
 
 def _theory(options: argparse.Namespace) -> tuple[Theory | None, dict[str, Any]]:
@@ -426,7 +481,12 @@ def is_done(folder: Path, path: str, question: MapQuestion) -> bool:
     """Whether a folder holds the whole run of this log with these settings."""
     run = _run_in(folder)
     settings, content = json.loads(json.dumps(question.settings)), run.get("digest")
-    return bool(run.get("settings") == settings and not run.get("interrupted") and content is not None and content == _content(path))
+    return bool(
+        run.get("settings") == settings
+        and not run.get("interrupted")
+        and content is not None
+        and content == _content(path)
+    )
 
 
 def digest(path: str) -> str | None:

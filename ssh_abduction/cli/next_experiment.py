@@ -34,11 +34,23 @@ def add_parser(verbs: Verbs) -> None:
         "What to do next, to find out which of these maps is true: from where the robot is now, the fewest actions after which they predict something different; of many maps a plan. "
         "Where the links that all maps know do not tell them apart, the untried action that tells most, and the way to it."
     )
-    parser = verbs.add_parser("next", help="what should the robot do to tell these maps apart?", description=text)
+    parser = verbs.add_parser(
+        "next", help="what should the robot do to tell these maps apart?", description=text
+    )
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
-    parser.add_argument("maps", help="what solve --json printed for this trace, or one saved map; - for standard input")
-    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with the plan so far")
-    parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
+    parser.add_argument(
+        "maps",
+        help="what solve --json printed for this trace, or one saved map; - for standard input",
+    )
+    parser.add_argument(
+        "--time-limit", type=float, metavar="S", help="stop after S seconds with the plan so far"
+    )
+    parser.add_argument(
+        "--memory-limit",
+        type=int,
+        metavar="MIB",
+        help="stop when the process has used so much memory",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_theory(parser, default="the theory of the maps, or how the maps read stars")
     parser.set_defaults(run=run)
@@ -57,7 +69,9 @@ def run(options: argparse.Namespace) -> int:
     data = read_json(options.maps)
     maps = maps_of(data, str(options.maps))
     if not maps:
-        raise MapError(f"{named(options.maps)}: maps: expected one to seek an experiment for, got none; see the status that solve printed")
+        raise MapError(
+            f"{named(options.maps)}: maps: expected one to seek an experiment for, got none; see the status that solve printed"
+        )
     found = data.get("theory") if isinstance(data, dict) else None
     theory: Theory | None = theory_of(options, None if found is None else Theory.from_dict(found))
     if found is None and options.theory is None and theory == Theory.topological():
@@ -83,7 +97,13 @@ def run(options: argparse.Namespace) -> int:
         warn([experiment.warning])
     if experiment.stopped == "interrupted":
         return interrupted_code()
-    return 0 if not experiment.stopped else EXIT_CUT_SHORT if experiment.plan.branches else EXIT_NOTHING
+    return (
+        0
+        if not experiment.stopped
+        else EXIT_CUT_SHORT
+        if experiment.plan.branches
+        else EXIT_NOTHING
+    )
 
 
 def _lines(experiment: Experiment) -> Iterator[str]:
@@ -93,8 +113,19 @@ def _lines(experiment: Experiment) -> Iterator[str]:
     if plan.branches:
         shown = experiment.predictions[:SHOWN_COLUMNS]
         more = len(experiment.predictions) - len(shown)
-        rows = [[action, *(said.seen[i] for said in shown)] for i, action in enumerate(plan.actions)]
-        yield table(["action", *(f"{_told_rivals(said.rivals)} predict{'s' * (len(said.rivals) == 1)}" for said in shown)], rows)
+        rows = [
+            [action, *(said.seen[i] for said in shown)] for i, action in enumerate(plan.actions)
+        ]
+        yield table(
+            [
+                "action",
+                *(
+                    f"{_told_rivals(said.rivals)} predict{'s' * (len(said.rivals) == 1)}"
+                    for said in shown
+                ),
+            ],
+            rows,
+        )
         if more:
             yield f"  and {more} more predictions (--json has all)"
         lines = list(_tree(plan, "  "))
@@ -129,7 +160,10 @@ def _untried(plan: Plan) -> str:
 def _expected(untried: Untried) -> Iterator[str]:
     """What rivals say of an untried action."""
     shown = untried.expects[:SHOWN_LINES]
-    yield table(["maps", "leads to", "seen there", "which is"], [[_told_rivals(said.rivals), *_says(said.says)] for said in shown])
+    yield table(
+        ["maps", "leads to", "seen there", "which is"],
+        [[_told_rivals(said.rivals), *_says(said.says)] for said in shown],
+    )
     if len(untried.expects) > len(shown):
         yield f"  and {len(untried.expects) - len(shown)} more (--json has all)"
 

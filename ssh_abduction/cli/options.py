@@ -14,12 +14,22 @@ from typing import Any
 from ssh_abduction.data.errors import AbductionError, MapError, named
 from ssh_abduction.data.maps import read_json
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.theory.theory import ASSERTIONS, CHOICES, COUNTS, EXCUSED, PRESETS, SETTLED, Theory
+from ssh_abduction.theory.theory import (
+    ASSERTIONS,
+    CHOICES,
+    COUNTS,
+    EXCUSED,
+    PRESETS,
+    SETTLED,
+    Theory,
+)
 
 Verbs = Any  # argparse's type for what add_subparsers returns is private
 
 
-def add_theory(parser: argparse.ArgumentParser, default: str = "topological, or causal with --level causal") -> None:
+def add_theory(
+    parser: argparse.ArgumentParser, default: str = "topological, or causal with --level causal"
+) -> None:
     """Add --theory PRESET, and a flag for each field of Theory to lay over it."""
     group = parser.add_argument_group("theory", "a preset, and choices laid over it")
     group.add_argument("--theory", choices=PRESETS, help=f"preset (default: {default})")
@@ -28,23 +38,50 @@ def add_theory(parser: argparse.ArgumentParser, default: str = "topological, or 
     said = dict(re.findall(r"^ +(\w+)  +(.+)$", Theory.__doc__ or "", re.MULTILINE))
     for field in fields(Theory):
         if isinstance(field.default, bool) and field.name not in SETTLED:
-            group.add_argument(f"--{field.name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=said.get(field.name))
+            group.add_argument(
+                f"--{field.name.replace('_', '-')}",
+                action=argparse.BooleanOptionalAction,
+                help=said.get(field.name),
+            )
     group.add_argument("--reject", type=float, metavar="P", help=said.get("reject"))
     group.add_argument("--joint", type=int, metavar="N", help=said.get("joint"))
     for name in EXCUSED:
         group.add_argument(f"--{name}", type=float, metavar="DSTATES", help=said.get(name))
-    group.add_argument("--prefer", metavar="COUNTS", help=f"what to minimise, first to last, of {', '.join(COUNTS)}; commas between")
+    group.add_argument(
+        "--prefer",
+        metavar="COUNTS",
+        help=f"what to minimise, first to last, of {', '.join(COUNTS)}; commas between",
+    )
     group.add_argument("--without", metavar="AXIOMS", help="leave these axioms out; commas between")
     group.add_argument(
-        "--rules", action="append", metavar="FILE", help="rules of your own, over the predicates of the encodings; may be given again"
+        "--rules",
+        action="append",
+        metavar="FILE",
+        help="rules of your own, over the predicates of the encodings; may be given again",
     )
-    for name, text in (("same", "are one dstate"), ("different", "are different dstates"), ("elsewhere", "are at different places")):
-        group.add_argument(f"--{name}", action="append", metavar="I,J", help=f"steps I and J {text}; may be given again")
+    for name, text in (
+        ("same", "are one dstate"),
+        ("different", "are different dstates"),
+        ("elsewhere", "are at different places"),
+    ):
+        group.add_argument(
+            f"--{name}",
+            action="append",
+            metavar="I,J",
+            help=f"steps I and J {text}; may be given again",
+        )
 
 
 def add_output(parser: argparse.ArgumentParser) -> None:
     """Add -o TRACE."""
-    parser.add_argument("-o", "--output", type=output, required=True, metavar="TRACE", help="trace file to write, or - for standard output")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=output,
+        required=True,
+        metavar="TRACE",
+        help="trace file to write, or - for standard output",
+    )
 
 
 def write(trace: Trace, target: str, said: str) -> None:
@@ -60,7 +97,9 @@ def write(trace: Trace, target: str, said: str) -> None:
 def output(text: str) -> str:
     """A file or folder to write."""
     if not text or "\0" in text:
-        raise argparse.ArgumentTypeError(f"expected the name of a file or folder, got {text!r}; name one")
+        raise argparse.ArgumentTypeError(
+            f"expected the name of a file or folder, got {text!r}; name one"
+        )
     return text
 
 
@@ -74,7 +113,9 @@ def seed(text: str) -> int:
 def picture_file(text: str) -> str:
     """A file that a figure can be drawn into."""
     if Path(text).suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise argparse.ArgumentTypeError(f"expected a name that ends in .png, .pdf or .svg, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected a name that ends in .png, .pdf or .svg, got {text!r}"
+        )
     return text
 
 
@@ -90,7 +131,11 @@ def check_picture(file: str | None) -> None:
 def check_number(number: int | None, maps: Sequence[object], where: str) -> None:
     """Whether there is such a map, counted from 1. Raises MapError."""
     if number is not None and not 1 <= number <= len(maps):
-        raise MapError(f"{where}: --map: expected 1 to {len(maps)}, got {number}" if maps else f"{where}: --map: expected a map, got none")
+        raise MapError(
+            f"{where}: --map: expected 1 to {len(maps)}, got {number}"
+            if maps
+            else f"{where}: --map: expected a map, got none"
+        )
 
 
 def read_maps(file: str, mend: str = "name the maps first, and then the trace") -> Any:
@@ -124,7 +169,11 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
 
 def choices_of(options: argparse.Namespace) -> dict[str, Any]:
     """What the options say of single fields of a theory, by name, as it was given."""
-    chosen = {f.name: getattr(options, f.name) for f in fields(Theory) if getattr(options, f.name, None) is not None}
+    chosen = {
+        f.name: getattr(options, f.name)
+        for f in fields(Theory)
+        if getattr(options, f.name, None) is not None
+    }
     if "prefer" in chosen and not chosen["prefer"]:
         chosen["prefer"] = ()
     return chosen
@@ -138,7 +187,9 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
     default = Theory.causal() if theory.level == "causal" else Theory.topological()
     flags = ["--theory", "causal"] if theory.level == "causal" else []
     if trace is not None:
-        with suppress(AbductionError):  # the theory was made for a trace that has what the default asks for; this one may be another
+        with suppress(
+            AbductionError
+        ):  # the theory was made for a trace that has what the default asks for; this one may be another
             default = default.resolve(trace)
     for field in fields(Theory):
         value, flag = getattr(theory, field.name), f"--{field.name.replace('_', '-')}"

@@ -29,7 +29,11 @@ EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, 
 
 def exit_code(solution: Solution) -> int:
     """What the shell is told of a solution."""
-    return program.interrupted_code() if solution.stopped == "interrupted" else EXIT_CODES[solution.status]
+    return (
+        program.interrupted_code()
+        if solution.stopped == "interrupted"
+        else EXIT_CODES[solution.status]
+    )
 
 
 def explained(search: Search) -> Explanation | None:
@@ -63,7 +67,13 @@ def all_given(solution: Solution) -> list[Given]:
     return list(zip_longest(solution.maps, solution.costs if solution.within else ()))
 
 
-def ending(search: Search, solution: Solution, explanation: Explanation | None, maps: int, backbone: Backbone | None) -> dict[str, Any]:
+def ending(
+    search: Search,
+    solution: Solution,
+    explanation: Explanation | None,
+    maps: int,
+    backbone: Backbone | None,
+) -> dict[str, Any]:
     """What the JSON of a solution says after its maps, of which there were so many: with all warnings, and why there is no map.
 
     backbone  what the minimal maps share, as far as it is known
@@ -71,7 +81,11 @@ def ending(search: Search, solution: Solution, explanation: Explanation | None, 
     end = result.ending(solution, maps, backbone)
     found = warnings_of(search, solution)
     end.pop("warnings", None)
-    return end | ({"warnings": found} if found else {}) | ({"explanation": explanation.to_dict()} if explanation else {})
+    return (
+        end
+        | ({"warnings": found} if found else {})
+        | ({"explanation": explanation.to_dict()} if explanation else {})
+    )
 
 
 def warnings_of(search: Search, solution: Solution) -> list[str]:
@@ -124,7 +138,10 @@ def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
         if action:
             action()
 
-    before = {number: signal.signal(number, hear if action else signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, hear if action else signal.SIG_IGN)
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     told = signal.set_wakeup_fd(-1)
     try:
         yield

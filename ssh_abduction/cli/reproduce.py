@@ -17,13 +17,30 @@ MOST_SEEDS = 10_000  # a seed takes seconds: more are surely a slip of the hand,
 
 def add_parser(verbs: Verbs) -> None:
     text = "Reproduce an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn. Writes figures, data and a page into a folder."
-    parser = verbs.add_parser("reproduce", help="the paper's experiments, end to end", description=text)
+    parser = verbs.add_parser(
+        "reproduce", help="the paper's experiments, end to end", description=text
+    )
     parser.add_argument("experiment", choices=("notched-rectangle", "taylor-hall"))
     parser.add_argument("--seeds", default="0-19", help="seeds, as 0-19 or 1,5,7 (default: 0-19)")
-    parser.add_argument("--json", action="store_true", help="print each claim, the paper's figure and ours by seed, as JSON")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print each claim, the paper's figure and ours by seed, as JSON",
+    )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
-    parser.add_argument("--outcomes", action=argparse.BooleanOptionalAction, default=True, help="map outcomes over notch and spread")
-    parser.add_argument("-o", "--output", type=output, metavar="FOLDER", help="folder to write (default: out/EXPERIMENT)")
+    parser.add_argument(
+        "--outcomes",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="map outcomes over notch and spread",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=output,
+        metavar="FOLDER",
+        help="folder to write (default: out/EXPERIMENT)",
+    )
     parser.set_defaults(run=run)
 
 
@@ -35,11 +52,22 @@ def run(options: argparse.Namespace) -> int:
 
     seeds = _seeds(options.seeds)
     if options.jobs == 0:
-        raise AbductionError("--jobs: expected how many processes, or -1 for one a core, got 0; leave it out for 2")
+        raise AbductionError(
+            "--jobs: expected how many processes, or -1 for one a core, got 0; leave it out for 2"
+        )
     folder = Path(options.output or f"out/{options.experiment}")
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:
-        task = progress.add_task(options.experiment, total=steps(options.experiment, seeds, options.outcomes))
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(
+        *columns, console=Console(stderr=True), disable=not sys.stderr.isatty()
+    ) as progress:
+        task = progress.add_task(
+            options.experiment, total=steps(options.experiment, seeds, options.outcomes)
+        )
 
         def show(rows: list[dict[str, Any]]) -> None:
             progress.stop()  # so that the bar is not drawn into the table
@@ -52,7 +80,9 @@ def run(options: argparse.Namespace) -> int:
             folder,
             options.jobs,
             options.outcomes,
-            on_done=lambda what: progress.update(task, advance=1, description=f"{options.experiment}: {what}"),
+            on_done=lambda what: progress.update(
+                task, advance=1, description=f"{options.experiment}: {what}"
+            ),
             on_table=show,
         )
     if not options.json:
@@ -64,7 +94,12 @@ def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
     from ssh_abduction.evaluation.paper.report import claimed, spread_of
 
     if options.json:
-        print(json.dumps({"experiment": options.experiment, "claims": rows}, ensure_ascii=False, indent=1), flush=True)
+        print(
+            json.dumps(
+                {"experiment": options.experiment, "claims": rows}, ensure_ascii=False, indent=1
+            ),
+            flush=True,
+        )
         return
     cells = [[claimed(r), r["paper"], spread_of(r), f"{r['holds']} of {r['seeds']}"] for r in rows]
     print(table(["claim", "paper", "here", "holds"], cells), flush=True)

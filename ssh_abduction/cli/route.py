@@ -13,15 +13,37 @@ from ssh_abduction.data.files import json_line
 def add_parser(verbs: Verbs) -> None:
     text = "The shortest route through a map: the actions from one dstate or place to another, and the views to expect on the way."
     parser = verbs.add_parser("route", help="which actions lead there?", description=text)
-    parser.add_argument("maps", help="what solve --json printed, or one saved map; - for standard input")
     parser.add_argument(
-        "--from", dest="start", metavar="A", help="a dstate by its number, or a place as p3 (default: where the robot was at its last step)"
+        "maps", help="what solve --json printed, or one saved map; - for standard input"
     )
-    parser.add_argument("--to", dest="goal", metavar="B", required=True, help="a dstate by its number, or a place as p3: any dstate there")
-    parser.add_argument("--avoid", nargs="+", action="extend", metavar="X", help="dstates, and places as p3, that the route may not touch")
+    parser.add_argument(
+        "--from",
+        dest="start",
+        metavar="A",
+        help="a dstate by its number, or a place as p3 (default: where the robot was at its last step)",
+    )
+    parser.add_argument(
+        "--to",
+        dest="goal",
+        metavar="B",
+        required=True,
+        help="a dstate by its number, or a place as p3: any dstate there",
+    )
+    parser.add_argument(
+        "--avoid",
+        nargs="+",
+        action="extend",
+        metavar="X",
+        help="dstates, and places as p3, that the route may not touch",
+    )
     by = "what the route has the fewest of: actions or metres, through links that were driven before, or places, along the paths of the map, driven that way or not (default: actions)"
     parser.add_argument("--by", choices=("actions", "places", "metres"), default="actions", help=by)
-    parser.add_argument("--map", default="1", metavar="I", help="which map, by its number, from 1, or its id (default: the first)")
+    parser.add_argument(
+        "--map",
+        default="1",
+        metavar="I",
+        help="which map, by its number, from 1, or its id (default: the first)",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     parser.epilog = "ssh-abduction show lists the dstates and places of a map. docs/formats.md says what the JSON has."
@@ -33,7 +55,14 @@ def run(options: argparse.Namespace) -> int:
 
     listing = Listing.load(options.maps)
     try:
-        found = route(listing, options.start, options.goal, by=options.by, avoid=_names(options.avoid), map=options.map)
+        found = route(
+            listing,
+            options.start,
+            options.goal,
+            by=options.by,
+            avoid=_names(options.avoid),
+            map=options.map,
+        )
     except MapError as error:
         if str(error).startswith(f"{listing.source}:"):
             raise

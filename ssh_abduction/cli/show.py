@@ -12,11 +12,20 @@ from ssh_abduction.data.maps import maps_of, read_json, write_map
 
 def add_parser(verbs: Verbs) -> None:
     text = "Show maps: dstates, places, paths, links."
-    parser = verbs.add_parser("show", help="show maps as text, DOT, GraphML or SVG", description=text)
+    parser = verbs.add_parser(
+        "show", help="show maps as text, DOT, GraphML or SVG", description=text
+    )
     parser.add_argument("maps", help="what solve --json printed, or one saved map")
-    parser.add_argument("--map", type=int, metavar="I", help="only the I-th map, from 1 (default: all as text, the first otherwise)")
+    parser.add_argument(
+        "--map",
+        type=int,
+        metavar="I",
+        help="only the I-th map, from 1 (default: all as text, the first otherwise)",
+    )
     form = parser.add_mutually_exclusive_group()
-    form.add_argument("--dot", action="store_true", help="Graphviz DOT: a node a dstate, a cluster a place")
+    form.add_argument(
+        "--dot", action="store_true", help="Graphviz DOT: a node a dstate, a cluster a place"
+    )
     form.add_argument("--graphml", action="store_true", help="GraphML: a node a dstate")
     form.add_argument(
         "--svg",
@@ -34,7 +43,9 @@ def run(options: argparse.Namespace) -> int:
     check_number(options.map, maps, options.maps)
     if not maps:
         if options.dot or options.graphml or options.svg:
-            raise MapError(f"{options.maps}: maps: expected one to draw, got none; see the status that solve printed")
+            raise MapError(
+                f"{options.maps}: maps: expected one to draw, got none; see the status that solve printed"
+            )
         print("no map")
         return 0
     chosen = maps[(options.map or 1) - 1]

@@ -18,7 +18,17 @@ if TYPE_CHECKING:
     from ssh_abduction.data.trace import Trace
 
 ENDINGS = (".log", ".clf", ".bag", ".mcap")
-SHIPPED = ("notched-rectangle", "taylor-hall", "triangle", "three-ways", "five-ways", "six-ways", "curved", "cluttered", "doors")
+SHIPPED = (
+    "notched-rectangle",
+    "taylor-hall",
+    "triangle",
+    "three-ways",
+    "five-ways",
+    "six-ways",
+    "curved",
+    "cluttered",
+    "doors",
+)
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -27,47 +37,94 @@ def add_parser(verbs: Verbs) -> None:
         "Or, with --as, log scans and odometry all along, as real robots do, and write the truth about places beside the log."
     )
     parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
-    parser.add_argument("world", help=f"{', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or a floor plan (.xml)")
+    parser.add_argument(
+        "world",
+        help=f"{', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or a floor plan (.xml)",
+    )
     parser.add_argument(
         "--as",
         dest="log",
         choices=("carmen", "bag"),
         help="write a robot's log: lines of CARMEN, or a bag of ROS (.bag, .mcap, or a folder)",
     )
-    parser.add_argument("--tours", type=int, default=1, metavar="N", help="how often the route is driven (default: 1)")
+    parser.add_argument(
+        "--tours",
+        type=int,
+        default=1,
+        metavar="N",
+        help="how often the route is driven (default: 1)",
+    )
     parser.add_argument("--seed", type=seed, default=0, help="seed of all noise (default: 0)")
-    parser.add_argument("--no-stars", action="store_true", help="do not log the openings that the robot sees at each place")
+    parser.add_argument(
+        "--no-stars",
+        action="store_true",
+        help="do not log the openings that the robot sees at each place",
+    )
     parser.add_argument(
         "--every",
         type=float,
         metavar="M",
         help="log an image each so many metres, rather than at dstates; with --as a scan (default: 0.25)",
     )
-    parser.add_argument("--start", metavar="X,Y,DEGREES", help="another start than the world's; write --start=-1,2,90")
-    parser.add_argument("--route", metavar="ACTIONS", help="another route than the world's; travel, right, left, around with commas")
-    parser.add_argument("--reach", type=float, metavar="M", help="metres from a wall at which the robot follows it")
-    errors = parser.add_argument_group("odometry", "how wrong the displacements are that the robot logs")
+    parser.add_argument(
+        "--start",
+        metavar="X,Y,DEGREES",
+        help="another start than the world's; write --start=-1,2,90",
+    )
+    parser.add_argument(
+        "--route",
+        metavar="ACTIONS",
+        help="another route than the world's; travel, right, left, around with commas",
+    )
+    parser.add_argument(
+        "--reach", type=float, metavar="M", help="metres from a wall at which the robot follows it"
+    )
+    errors = parser.add_argument_group(
+        "odometry", "how wrong the displacements are that the robot logs"
+    )
     errors.add_argument(
         "--odometry-noise",
         type=float,
         metavar="SHARE",
         help="standard deviation, as a share of each motion (default: 0.02); with --as metres after one metre, the rest in proportion (default: 0.05)",
     )
-    errors.add_argument("--scale-error", type=float, default=0.0, metavar="SHARE", help="all ways are reported longer by this (default: 0)")
-    errors.add_argument("--bend-error", type=float, default=0.0, metavar="DEGREES", help="drift of the heading in each metre (default: 0)")
+    errors.add_argument(
+        "--scale-error",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="all ways are reported longer by this (default: 0)",
+    )
+    errors.add_argument(
+        "--bend-error",
+        type=float,
+        default=0.0,
+        metavar="DEGREES",
+        help="drift of the heading in each metre (default: 0)",
+    )
     camera = parser.add_argument_group(
-        "panoramas", "what a camera sees that looks all around, for --images panoramas; they go to a file .npz beside the trace"
+        "panoramas",
+        "what a camera sees that looks all around, for --images panoramas; they go to a file .npz beside the trace",
     )
     camera.add_argument(
-        "--images", choices=("ranges", "panoramas"), default="ranges", help="log ranges of the laser, or panoramas (default: ranges)"
+        "--images",
+        choices=("ranges", "panoramas"),
+        default="ranges",
+        help="log ranges of the laser, or panoramas (default: ranges)",
     )
     camera.add_argument(
         "--textures",
         choices=("unique", "repeated"),
         help="whether each wall has its own texture, or parallel ones the same (default: unique)",
     )
-    camera.add_argument("--paint-seed", type=seed, metavar="SEED", help="seed of the textures (default: 0)")
-    camera.add_argument("--hours", metavar="FROM,TO", help="hours of the day at which the drive begins and ends (default: 12,12)")
+    camera.add_argument(
+        "--paint-seed", type=seed, metavar="SEED", help="seed of the textures (default: 0)"
+    )
+    camera.add_argument(
+        "--hours",
+        metavar="FROM,TO",
+        help="hours of the day at which the drive begins and ends (default: 12,12)",
+    )
     add_output(parser)
     parser.set_defaults(run=run)
 
@@ -89,7 +146,15 @@ def run(options: argparse.Namespace) -> int:
     body = Body(odometry=noise, scale=options.scale_error, bend=math.radians(options.bend_error))
     world = World.named(options.world).with_choices(options.start, options.route, options.reach)
     camera = _camera(options)
-    trace = simulate(world, options.tours, options.seed, body=body, stars=not options.no_stars, every=options.every, camera=camera)
+    trace = simulate(
+        world,
+        options.tours,
+        options.seed,
+        body=body,
+        stars=not options.no_stars,
+        every=options.every,
+        camera=camera,
+    )
     if camera and options.output != "-":
         trace = _with_table(trace, options.output)
     write(trace, options.output, f"{counted(len(trace), 'images')} of {printable(world.name)}")
@@ -116,7 +181,9 @@ def _drive(options: argparse.Namespace) -> Drive:
         ("-o -", options.output == "-"),
     ):
         if given:
-            raise AbductionError(f"{name}: expected none beside --as, as a robot's log is a file of scans; leave it out")
+            raise AbductionError(
+                f"{name}: expected none beside --as, as a robot's log is a file of scans; leave it out"
+            )
     odometer = Odometer(scale=options.scale_error, bend=math.radians(options.bend_error))
     if options.odometry_noise is not None:
         odometer = odometer.as_noisy_as(options.odometry_noise)
@@ -126,8 +193,12 @@ def _drive(options: argparse.Namespace) -> Drive:
         return record(world, options.tours, options.seed, odometer=odometer, every=every)
     for name in ("start", "route", "reach"):
         if getattr(options, name) is not None:
-            raise AbductionError(f"--{name}: expected none beside a floor plan, whose rounds are drawn by --seed; leave it out")
-    return record_plan(Plan.load(options.world), options.tours, options.seed, odometer=odometer, every=every)
+            raise AbductionError(
+                f"--{name}: expected none beside a floor plan, whose rounds are drawn by --seed; leave it out"
+            )
+    return record_plan(
+        Plan.load(options.world), options.tours, options.seed, odometer=odometer, every=every
+    )
 
 
 def _write_log(options: argparse.Namespace, drive: Drive) -> int:
@@ -140,16 +211,23 @@ def _write_log(options: argparse.Namespace, drive: Drive) -> int:
 
     target = Path(options.output)
     if options.log == "carmen":
-        noise = {f"simulator_odometry_{name}": value for name, value in drive.odometer.parameters().items()}
+        noise = {
+            f"simulator_odometry_{name}": value
+            for name, value in drive.odometer.parameters().items()
+        }
         write_carmen(target, scans_of(drive), noise)
     else:
         write_bag(target, scans_of(drive), drive.odometer.covariances(drive.odometry))
     name = target.name.removesuffix(".gz")
-    truth = target.with_name(f"{name if Path(name).suffix not in ENDINGS else Path(name).stem}.truth.json")
+    truth = target.with_name(
+        f"{name if Path(name).suffix not in ENDINGS else Path(name).stem}.truth.json"
+    )
     try:
         write_file(truth, json.dumps(drive.truth).encode() + b"\n")
     except OSError as error:
-        raise AbductionError(f"{named(truth)}: cannot write the truth: {error.strerror or error}; check the folder") from None
+        raise AbductionError(
+            f"{named(truth)}: cannot write the truth: {error.strerror or error}; check the folder"
+        ) from None
     print(
         f"{counted(len(drive), 'scans')} along {drive.metres:.0f} m of {printable(drive.name)} in {named(target)}, and the truth in {named(truth)}"
     )
@@ -162,7 +240,13 @@ def scans_of(drive: Drive) -> Iterator[Scan]:
     from simulator.laser import BEAMS, BEARINGS
 
     laser = Laser(float(BEARINGS[0]), float(BEARINGS[1] - BEARINGS[0]), BEAMS, drive.laser.reach)
-    rows = zip(drive.ranges, drive.odometry.tolist(), drive.poses.tolist(), drive.times.tolist(), strict=True)
+    rows = zip(
+        drive.ranges,
+        drive.odometry.tolist(),
+        drive.poses.tolist(),
+        drive.times.tolist(),
+        strict=True,
+    )
     for line, (ranges, odometry, pose, time) in enumerate(rows, 1):
         yield Scan(ranges, laser, tuple(odometry), tuple(pose), time, line)
 
@@ -184,7 +268,9 @@ def _camera(options: argparse.Namespace) -> Camera | None:
     try:
         begin, end = (float(hour) for hour in options.hours.split(","))
     except ValueError:
-        raise AbductionError(f"--hours: expected two hours with a comma between them, as 7,19, got {options.hours!r}; write two") from None
+        raise AbductionError(
+            f"--hours: expected two hours with a comma between them, as 7,19, got {options.hours!r}; write two"
+        ) from None
     return Camera(paint=paint, hours=(begin, end))
 
 
@@ -204,6 +290,8 @@ def _with_table(trace: Trace, target: str) -> Trace:
     try:
         write_file(path, packed.getvalue())
     except (OSError, ValueError) as error:
-        raise AbductionError(f"{named(path)}: cannot write the images: {error}; check the folder") from None
+        raise AbductionError(
+            f"{named(path)}: cannot write the images: {error}; check the folder"
+        ) from None
     steps = tuple(replace(step, image=i) for i, step in enumerate(trace.steps))
     return replace(trace, steps=steps, images=path.name)

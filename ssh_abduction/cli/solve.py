@@ -43,21 +43,50 @@ HELD_DSTATES = 500_000
 
 def add_parser(verbs: Verbs) -> None:
     text = "Find the minimal maps of a trace, or of many: then the result of each is one line."
-    parser = verbs.add_parser("solve", help="find the minimal maps of a trace, or of many", description=text)
-    parser.add_argument("traces", nargs="+", metavar="trace", help="trace file (JSON Lines), or - for standard input")
-    parser.add_argument("-n", "--maps", type=int, default=100, metavar="K", help="stop after K maps; 0 for all (default: 100)")
+    parser = verbs.add_parser(
+        "solve", help="find the minimal maps of a trace, or of many", description=text
+    )
+    parser.add_argument(
+        "traces",
+        nargs="+",
+        metavar="trace",
+        help="trace file (JSON Lines), or - for standard input",
+    )
+    parser.add_argument(
+        "-n",
+        "--maps",
+        type=int,
+        default=100,
+        metavar="K",
+        help="stop after K maps; 0 for all (default: 100)",
+    )
     more = "list maps with up to K dstates more than the least, too: for each number of dstates the best (default: 0)"
     parser.add_argument("--within", type=int, default=0, metavar="K", help=more)
     parser.add_argument(
-        "--json", action="store_true", help="print the solution as JSON, map by map as they are found; of many traces, a line each"
+        "--json",
+        action="store_true",
+        help="print the solution as JSON, map by map as they are found; of many traces, a line each",
     )
     front = "instead, the fewest dstates for 0, 1, … K faults, and the knee, by the causal theory (--misread, --slipped: only these kinds)"
     parser.add_argument("--front", type=int, metavar="K", help=front)
-    parser.add_argument("--time-limit", type=float, metavar="S", help="stop after S seconds with the best answer so far")
     parser.add_argument(
-        "--without-speedups", default="", metavar="NAMES", help=f"leave these out, of {', '.join(SPEEDUPS)}; commas between"
+        "--time-limit",
+        type=float,
+        metavar="S",
+        help="stop after S seconds with the best answer so far",
     )
-    parser.add_argument("--memory-limit", type=int, metavar="MIB", help="stop when the process has used so much memory")
+    parser.add_argument(
+        "--without-speedups",
+        default="",
+        metavar="NAMES",
+        help=f"leave these out, of {', '.join(SPEEDUPS)}; commas between",
+    )
+    parser.add_argument(
+        "--memory-limit",
+        type=int,
+        metavar="MIB",
+        help="stop when the process has used so much memory",
+    )
     many = parser.add_argument_group(
         "many traces",
         "With several traces, or one of these, each result is a line, in the order of the traces. What goes wrong with a trace is on its line, "
@@ -66,7 +95,11 @@ def add_parser(verbs: Verbs) -> None:
     )
     jobs = "solve N traces at a time, each in a process; -1 for one a core (default: 1; with --scheduler, as many as its workers can)"
     many.add_argument("--jobs", type=int, metavar="N", help=jobs)
-    many.add_argument("--scheduler", metavar="ADDRESS", help="solve on the workers of the Dask scheduler at this address, tcp://host:port")
+    many.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="solve on the workers of the Dask scheduler at this address, tcp://host:port",
+    )
     add_theory(parser)
     parser.set_defaults(run=run)
 
@@ -96,9 +129,13 @@ def run(options: argparse.Namespace) -> int:
                 speedups=Speedups.without(options.without_speedups),
                 on_progress=on_progress,
             )
-            until_printed.enter_context(on_ctrl_c(search.interrupt))  # half of what is printed would be worth nothing
+            until_printed.enter_context(
+                on_ctrl_c(search.interrupt)
+            )  # half of what is printed would be worth nothing
             printed = (_Json if options.json else _Text)(search)
-            guard = Guard(search.interrupt, printed.last_words, options.time_limit, options.memory_limit)
+            guard = Guard(
+                search.interrupt, printed.last_words, options.time_limit, options.memory_limit
+            )
             until_printed.enter_context(guard)
             explanation = printed.searched(guard.say)
         solution = search.solution(tuple(printed.kept))
@@ -133,9 +170,13 @@ class _Text:
     def last_words(self, why: Stop) -> tuple[str, int]:
         """What is known, where the search cannot be ended in time, and the exit code."""
         solution = self._search.snapshot(why)
-        kept = tuple(self.kept) if solution.status is Status.OPTIMAL and self.kept else solution.maps
+        kept = (
+            tuple(self.kept) if solution.status is Status.OPTIMAL and self.kept else solution.maps
+        )
         warn(warnings_of(self._search, solution))
-        return _text(_lines(self._search, replace(solution, maps=kept), None, None)), exit_code(solution)
+        return _text(_lines(self._search, replace(solution, maps=kept), None, None)), exit_code(
+            solution
+        )
 
 
 class _Json:
@@ -172,8 +213,14 @@ class _Json:
         maps = "".join(map(self._line, all_given(solution)))
         return maps + self._end(solution, explanation, self._search.backbone)
 
-    def _end(self, solution: Solution, explanation: Explanation | None, backbone: Backbone | None) -> str:
-        return "\n]," + dump(ending(self._search, solution, explanation, self._maps, backbone))[1:] + "\n"
+    def _end(
+        self, solution: Solution, explanation: Explanation | None, backbone: Backbone | None
+    ) -> str:
+        return (
+            "\n],"
+            + dump(ending(self._search, solution, explanation, self._maps, backbone))[1:]
+            + "\n"
+        )
 
     def last_words(self, why: Stop) -> tuple[str, int]:
         """What is missing, with what is known, where the search cannot be ended in time, and the exit code."""
@@ -203,7 +250,9 @@ def _text(lines: Iterator[str]) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _lines(search: Search, solution: Solution, explanation: Explanation | None, backbone: Backbone | None) -> Iterator[str]:
+def _lines(
+    search: Search, solution: Solution, explanation: Explanation | None, backbone: Backbone | None
+) -> Iterator[str]:
     yield headline(solution, search.count, explanation)
     yield from by_displacements(solution)
     if solution.status is Status.UNSATISFIABLE:
@@ -225,7 +274,11 @@ def _lines(search: Search, solution: Solution, explanation: Explanation | None, 
         from ssh_abduction.rivals.comparison import compare
         from ssh_abduction.rivals.listing import Listing
 
-        some = "" if search.count == len(solution.maps) else f" (of the first {len(solution.maps)} found)"
+        some = (
+            ""
+            if search.count == len(solution.maps)
+            else f" (of the first {len(solution.maps)} found)"
+        )
         yield f"\nwhat tells the maps apart{some}"
         yield from compared(compare(Listing(solution.maps)))
 
@@ -233,7 +286,11 @@ def _lines(search: Search, solution: Solution, explanation: Explanation | None, 
 @contextlib.contextmanager
 def _progress(prints_meanwhile: bool) -> Iterator[Any]:
     """A line on stderr, while solving, if stderr is a terminal, unless it would come between the lines that are printed meanwhile, or of the log."""
-    if not sys.stderr.isatty() or (prints_meanwhile and sys.stdout.isatty()) or PROGRESS.isEnabledFor(logging.INFO):
+    if (
+        not sys.stderr.isatty()
+        or (prints_meanwhile and sys.stdout.isatty())
+        or PROGRESS.isEnabledFor(logging.INFO)
+    ):
         yield None
         return
     from rich.console import Console
@@ -242,7 +299,13 @@ def _progress(prints_meanwhile: bool) -> Iterator[Any]:
 
     status = Spinner("dots", "solving")
     # Unless told otherwise, rich takes over what is printed to stdout, too: it would go to stderr, fitted to the terminal's width.
-    with Live(status, console=Console(stderr=True), transient=True, redirect_stdout=False, redirect_stderr=False):
+    with Live(
+        status,
+        console=Console(stderr=True),
+        transient=True,
+        redirect_stdout=False,
+        redirect_stderr=False,
+    ):
 
         def show(p: Progress) -> None:
             status.update(text=p.sentence)

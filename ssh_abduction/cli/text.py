@@ -43,14 +43,20 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
     why = f" ({solution.stopped})" if solution.stopped else ""
     seconds = f"{solution.seconds.total:.2f} s, {solution.prefix} of {solution.steps} steps given to clingo"
     bound = ", ".join(
-        f"at least {counted(v, k)}" if k != "cost" else f"a cost of at least {v:g} dstates" for k, v in solution.bound.to_dict().items()
+        f"at least {counted(v, k)}" if k != "cost" else f"a cost of at least {v:g} dstates"
+        for k, v in solution.bound.to_dict().items()
     )
     if solution.cost is None:
         return f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any has {bound or 'no proven bound'}; {seconds}"
-    counts = ", ".join(counted(v, k) if k != "faults" else f"faults that cost {v:g} dstates" for k, v in solution.cost.to_dict().items())
+    counts = ", ".join(
+        counted(v, k) if k != "faults" else f"faults that cost {v:g} dstates"
+        for k, v in solution.cost.to_dict().items()
+    )
     if solution.status is Status.FEASIBLE:
         return f"feasible{why}: {counts}, not proven minimal; any map has {bound or 'no proven bound'}; {seconds}"
-    found = counted(solution.levels[0].count if solution.levels else count, "minimal maps") + _levels_above(solution)
+    found = counted(
+        solution.levels[0].count if solution.levels else count, "minimal maps"
+    ) + _levels_above(solution)
     beyond = f" that cost up to {solution.within} more" if solution.minimal_listed else ""
     return f"optimal: {counts}; {found}{'' if solution.complete else f', and there may be more{beyond}{why}'}; {seconds}"
 
@@ -58,7 +64,8 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
 def _levels_above(solution: Solution) -> str:
     """How many maps cost more than the least, and what they cost."""
     return "".join(
-        f"; {level.count} with {', '.join(counted(v, k) for k, v in level.cost.to_dict().items())}" for level in solution.levels[1:]
+        f"; {level.count} with {', '.join(counted(v, k) for k, v in level.cost.to_dict().items())}"
+        for level in solution.levels[1:]
     )
 
 
@@ -85,14 +92,20 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Columns aligned under a head. What would break the table, or steer the terminal, is escaped."""
     cells = [[*head], *([printable(str(cell)) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    return "\n".join("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells)
+    return "\n".join(
+        "  "
+        + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in cells
+    )
 
 
 def describe(ssh_map: SSHMap) -> str:
     """A map: its paths with their places in order, and its dstates with where they are and where actions lead."""
     parts = []
     if ssh_map.faults:
-        parts.append(f"  {counted(len(ssh_map.dstates), 'dstates')}, and {'; '.join(printable(str(fault)) for fault in ssh_map.faults)}")
+        parts.append(
+            f"  {counted(len(ssh_map.dstates), 'dstates')}, and {'; '.join(printable(str(fault)) for fault in ssh_map.faults)}"
+        )
     if ssh_map.paths:
         parts += [f"  path {p.id}: places {' – '.join(map(str, p.order))}" for p in ssh_map.paths]
     if ssh_map.excused:
@@ -101,7 +114,13 @@ def describe(ssh_map: SSHMap) -> str:
     for source, action, target in ssh_map.links:
         leads.setdefault(source, []).append(f"{action} → {target}")
     rows = [
-        [s.id, s.shown, "" if s.place is None else s.place, course(s.path, s.direction), ", ".join(leads.get(s.id, []))]
+        [
+            s.id,
+            s.shown,
+            "" if s.place is None else s.place,
+            course(s.path, s.direction),
+            ", ".join(leads.get(s.id, [])),
+        ]
         for s in ssh_map.dstates
     ]
     if any(s.place is not None for s in ssh_map.dstates):
@@ -116,11 +135,28 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
     steps: dict[int, list[int]] = {}
     for t, number in enumerate(backbone.dstates.always):
         steps.setdefault(number, []).append(t)
-    rows = [[next((view for t in some if (view := trace.steps[t].view) is not None), "?"), stretches(some)] for some in steps.values()]
-    parts = [
-        table(["view", "steps at one dstate in all minimal maps" if backbone.proven else "steps at one dstate in all maps found"], rows)
+    rows = [
+        [
+            next((view for t in some if (view := trace.steps[t].view) is not None), "?"),
+            stretches(some),
+        ]
+        for some in steps.values()
     ]
-    for sort, pairs in (("one dstate", backbone.dstates.sometimes), ("at one place", backbone.places.sometimes if backbone.places else ())):
+    parts = [
+        table(
+            [
+                "view",
+                "steps at one dstate in all minimal maps"
+                if backbone.proven
+                else "steps at one dstate in all maps found",
+            ],
+            rows,
+        )
+    ]
+    for sort, pairs in (
+        ("one dstate", backbone.dstates.sometimes),
+        ("at one place", backbone.places.sometimes if backbone.places else ()),
+    ):
         if pairs:
             more = f", and {len(pairs) - SHOWN_PAIRS} more" if len(pairs) > SHOWN_PAIRS else ""
             told = ", ".join(f"{i} and {j}" for i, j in pairs[:SHOWN_PAIRS])
@@ -137,33 +173,60 @@ def compared(found: Comparison) -> Iterator[str]:
         yield f"  {counted(len(choice.options), 'ways')}: {depending(choice.differing)}"
         asked = sorted(choice.questions, key=number.__getitem__)
         for question in asked[:SHOWN_QUESTIONS]:
-            yes = [i for option in choice.options if option.answers[choice.questions.index(question)] for i in option.maps]
+            yes = [
+                i
+                for option in choice.options
+                if option.answers[choice.questions.index(question)]
+                for i in option.maps
+            ]
             yield f"    {number[question]}. {question}: in {_numbered(sorted(yes), len(found.ids))}"
         if len(asked) > SHOWN_QUESTIONS:
             yield f"    and {counted(len(asked) - SHOWN_QUESTIONS, 'more questions')}; --json has them"
         if 1 < len(asked) <= SHOWN_QUESTIONS and len(choice.options) <= SHOWN_OPTIONS:
             order = [choice.questions.index(question) for question in asked]
-            rows = [[*("yes" if option.answers[k] else "no" for k in order), stretches(option.maps)] for option in choice.options]
-            yield "\n".join(f"    {line}" for line in table([*(f"{number[q]}." for q in asked), "maps"], rows).splitlines())
+            rows = [
+                [*("yes" if option.answers[k] else "no" for k in order), stretches(option.maps)]
+                for option in choice.options
+            ]
+            yield "\n".join(
+                f"    {line}"
+                for line in table([*(f"{number[q]}." for q in asked), "maps"], rows).splitlines()
+            )
     if found.together:
         yield f"  several of these together: {depending(found.together)}"
     if not found.deciding:
         return
     causes = sum(question.sort in ("faults", "dstates") for question in found.deciding)
-    told = "question 1 tells" if len(found.deciding) == 1 else f"questions 1 to {len(found.deciding)}, in this order, tell"
-    some = f", and 1 to {causes} the {found.variants['dstates']} labelings" if 0 < causes < len(found.deciding) else ""
+    told = (
+        "question 1 tells"
+        if len(found.deciding) == 1
+        else f"questions 1 to {len(found.deciding)}, in this order, tell"
+    )
+    some = (
+        f", and 1 to {causes} the {found.variants['dstates']} labelings"
+        if 0 < causes < len(found.deciding)
+        else ""
+    )
     maps = "both maps" if len(found.ids) == 2 else f"all {counted(len(found.ids), 'maps')}"
     yield f"  which steps decide: {told} {maps} apart{some}"
 
 
 def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
     """The dstates of steps 48 and 51; the paths of step 66."""
-    shown = {sort: steps for sort, steps in differing.items() if sort != "courses" or not set(steps) <= set(differing.get("paths", ()))}
-    return "; ".join(f"the {NOUNS[sort][len(steps) > 1]} of {told_steps(steps)}" for sort, steps in shown.items())
+    shown = {
+        sort: steps
+        for sort, steps in differing.items()
+        if sort != "courses" or not set(steps) <= set(differing.get("paths", ()))
+    }
+    return "; ".join(
+        f"the {NOUNS[sort][len(steps) > 1]} of {told_steps(steps)}" for sort, steps in shown.items()
+    )
 
 
 def _numbered(numbers: Sequence[int], count: int) -> str:
-    return f"{'map' if len(numbers) == 1 else 'maps'} {stretches(numbers)} ({len(numbers)} of {count})"
+    return (
+        f"{'map' if len(numbers) == 1 else 'maps'} {stretches(numbers)} ({len(numbers)} of {count})"
+    )
 
 
 def told_steps(steps: Sequence[int]) -> str:

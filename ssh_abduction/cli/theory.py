@@ -17,11 +17,18 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    print("presets: on, or stars (on where the trace has stars that fit right angles), or gateways (on where it has other stars), or –")
+    print(
+        "presets: on, or stars (on where the trace has stars that fit right angles), or gateways (on where it has other stars), or –"
+    )
     for level in encodings.levels():
         print(f"\n{level}")
         rows = [
-            [axiom.name, *(_state(axiom.name, preset) for preset in PRESETS), axiom.sentence, f"[{axiom.source}]"]
+            [
+                axiom.name,
+                *(_state(axiom.name, preset) for preset in PRESETS),
+                axiom.sentence,
+                f"[{axiom.source}]",
+            ]
             for axiom in encodings.axioms()
             if axiom.level == level
         ]
@@ -35,4 +42,6 @@ def _state(name: str, preset: str) -> str:
     if name in theory.axioms:
         return "on"
     settled = {"stars": "frame", "gateways": "gateways"} if theory.star == "auto" else {}
-    return next((said for said, star in settled.items() if name in theory.replace(star=star).axioms), "–")
+    return next(
+        (said for said, star in settled.items() if name in theory.replace(star=star).axioms), "–"
+    )

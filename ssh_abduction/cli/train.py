@@ -17,30 +17,60 @@ from ssh_abduction.data.trace import Trace
 def add_parser(verbs: Verbs) -> None:
     text = "Train a nearest-neighbour recogniser on the labels that a map gives to the images of a trace."
     train = verbs.add_parser("train", help="train a recogniser on a map's labels", description=text)
-    train.add_argument("-o", "--output", type=output, required=True, metavar="FILE.skops", help="file to write")
+    train.add_argument(
+        "-o", "--output", type=output, required=True, metavar="FILE.skops", help="file to write"
+    )
     train.set_defaults(run=run_train)
     text = "Recognition rate by 10-fold cross-validation, against the number of images, on the labels that a map gives."
-    curve = verbs.add_parser("learning-curve", help="how well a recogniser does with few and many images", description=text)
-    curve.add_argument("--folds", type=int, default=10, help="parts of the cross-validation (default: 10)")
+    curve = verbs.add_parser(
+        "learning-curve",
+        help="how well a recogniser does with few and many images",
+        description=text,
+    )
+    curve.add_argument(
+        "--folds", type=int, default=10, help="parts of the cross-validation (default: 10)"
+    )
     curve.add_argument("--seed", type=seed, default=0, help="seed of the folds (default: 0)")
     curve.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the learning curve")
     curve.add_argument("--json", action="store_true", help="print JSON")
     curve.set_defaults(run=run_learning_curve)
     text = "Say by which beams two dstates differ that look alike: by default, each pair of dstates that share a view."
-    apart = verbs.add_parser("tell-apart", help="which beams tell dstates apart that share a view", description=text)
-    apart.add_argument("--dstates", type=pair, metavar="I,J", help="two dstates of the map (default: each pair that shares a view)")
-    apart.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the beams over the scans")
-    apart.add_argument("--json", action="store_true", help="print the share of each beam, by method, as JSON")
+    apart = verbs.add_parser(
+        "tell-apart", help="which beams tell dstates apart that share a view", description=text
+    )
+    apart.add_argument(
+        "--dstates",
+        type=pair,
+        metavar="I,J",
+        help="two dstates of the map (default: each pair that shares a view)",
+    )
+    apart.add_argument(
+        "--plot", type=picture_file, metavar="PNG", help="draw the beams over the scans"
+    )
+    apart.add_argument(
+        "--json", action="store_true", help="print the share of each beam, by method, as JSON"
+    )
     apart.set_defaults(run=run_tell_apart)
     for parser in (train, curve, apart):
         parser.add_argument("trace", help="trace file with images")
-        parser.add_argument("maps", help="what solve --json printed for this trace, or one saved map")
-        parser.add_argument("--map", type=int, metavar="I", help="take the I-th map, from 1 (default: the labels all maps agree on)")
+        parser.add_argument(
+            "maps", help="what solve --json printed for this trace, or one saved map"
+        )
+        parser.add_argument(
+            "--map",
+            type=int,
+            metavar="I",
+            help="take the I-th map, from 1 (default: the labels all maps agree on)",
+        )
     text = "Say of each image of a trace at which dstate it was taken, or that it was taken nowhere that the recogniser knows."
-    recognise = verbs.add_parser("recognise", help="recognise dstates from images", description=text)
+    recognise = verbs.add_parser(
+        "recognise", help="recognise dstates from images", description=text
+    )
     recognise.add_argument("recogniser", help="what train wrote")
     recognise.add_argument("trace", help="trace file with images")
-    recognise.add_argument("--json", action="store_true", help="print the labels as a JSON list, null for nowhere")
+    recognise.add_argument(
+        "--json", action="store_true", help="print the labels as a JSON list, null for nowhere"
+    )
     recognise.set_defaults(run=run_recognise)
 
 
@@ -48,7 +78,9 @@ def pair(text: str) -> tuple[int, int]:
     """Two numbers with a comma between them."""
     first, comma, second = text.partition(",")
     if not (comma and first.strip().isdecimal() and second.strip().isdecimal()):
-        raise argparse.ArgumentTypeError(f"expected two dstates with a comma between them, as 0,4, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected two dstates with a comma between them, as 0,4, got {text!r}"
+        )
     return int(first), int(second)
 
 
@@ -89,7 +121,9 @@ def run_train(options: argparse.Namespace) -> int:
 
     images, labels, recogniser = _labelled(options)
     save(recogniser.fit(images, labels), options.output)
-    print(f"{counted(len(set(labels.tolist())), 'dstates')} learnt from {counted(len(images), 'images')} in {named(options.output)}")
+    print(
+        f"{counted(len(set(labels.tolist())), 'dstates')} learnt from {counted(len(images), 'images')} in {named(options.output)}"
+    )
     return 0
 
 
@@ -99,14 +133,25 @@ def run_learning_curve(options: argparse.Namespace) -> int:
     check_picture(options.plot)
     images, labels, recogniser = _labelled(options)
     sizes = sorted({len(images) * tenth // 10 for tenth in range(1, 11)} - {0})
-    curve = learning_curve(images, labels, sizes, folds=options.folds, random_state=options.seed, estimator=recogniser)
+    curve = learning_curve(
+        images, labels, sizes, folds=options.folds, random_state=options.seed, estimator=recogniser
+    )
     if options.json:
         print(
-            json.dumps({"sizes": curve.sizes, "mean": curve.mean, "lowest": curve.lowest, "highest": curve.highest, "folds": curve.folds})
+            json.dumps(
+                {
+                    "sizes": curve.sizes,
+                    "mean": curve.mean,
+                    "lowest": curve.lowest,
+                    "highest": curve.highest,
+                    "folds": curve.folds,
+                }
+            )
         )
     else:
         rows = [
-            [s, f"{m:.3f}", f"{a:.3f}", f"{b:.3f}"] for s, m, a, b in zip(curve.sizes, curve.mean, curve.lowest, curve.highest, strict=True)
+            [s, f"{m:.3f}", f"{a:.3f}", f"{b:.3f}"]
+            for s, m, a, b in zip(curve.sizes, curve.mean, curve.lowest, curve.highest, strict=True)
         ]
         print(table(["images", "recognised", "worst fold", "best fold"], rows))
     if options.plot:
@@ -133,7 +178,15 @@ def run_recognise(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(labels))
     else:
-        print(table(["step", "dstate"], [(step, "nowhere" if label is None else label) for step, label in enumerate(labels)]))
+        print(
+            table(
+                ["step", "dstate"],
+                [
+                    (step, "nowhere" if label is None else label)
+                    for step, label in enumerate(labels)
+                ],
+            )
+        )
     return 0
 
 
@@ -144,21 +197,48 @@ def run_tell_apart(options: argparse.Namespace) -> int:
     check_picture(options.plot)
     ranges, labels, ssh_map, features = _mapped(options)
     if not isinstance(features, ReciprocalTransformer):
-        raise MapError(f"{options.trace}: expected a trace with ranges, as beams are told of, got panoramas; take a trace of a laser")
+        raise MapError(
+            f"{options.trace}: expected a trace with ranges, as beams are told of, got panoramas; take a trace of a laser"
+        )
     images = ReciprocalTransformer().fit_transform(ranges)
     views = {s.id: s.view for s in ssh_map.dstates if s.view is not None}
     alike = [(a, b) for a in views for b in views if a < b and views[a] == views[b]]
     seen = {label for label in set(labels.tolist()) if (labels == label).sum() > 1}
     pairs = [options.dstates] if options.dstates else [p for p in alike if seen.issuperset(p)]
     if not pairs:
-        raise MapError(f"{options.maps}: expected dstates that share a view, with two images each, got none; name two with --dstates I,J")
+        raise MapError(
+            f"{options.maps}: expected dstates that share a view, with two images each, got none; name two with --dstates I,J"
+        )
     found = {p: telling_features(images, labels, *p) for p in pairs}
     if options.json:
-        told = [{"dstates": p, "recognised": f.recognised, **{k: v.tolist() for k, v in f.methods.items()}} for p, f in found.items()]
+        told = [
+            {
+                "dstates": p,
+                "recognised": f.recognised,
+                **{k: v.tolist() for k, v in f.methods.items()},
+            }
+            for p, f in found.items()
+        ]
         print(json.dumps(told))
     else:
-        rows = [[f"{a}, {b}", f"{f.recognised:.3f}", *(strongest(shares) for shares in f.methods.values())] for (a, b), f in found.items()]
-        print(table(["dstates", "told apart", *(f"beams by {method}" for method in next(iter(found.values())).methods)], rows))
+        rows = [
+            [
+                f"{a}, {b}",
+                f"{f.recognised:.3f}",
+                *(strongest(shares) for shares in f.methods.values()),
+            ]
+            for (a, b), f in found.items()
+        ]
+        print(
+            table(
+                [
+                    "dstates",
+                    "told apart",
+                    *(f"beams by {method}" for method in next(iter(found.values())).methods),
+                ],
+                rows,
+            )
+        )
     if options.plot:
         sys.stdout.flush()  # a picture that fails loses nothing of this
         from ssh_abduction.evaluation.paper.figures import draw_telling

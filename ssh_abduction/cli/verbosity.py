@@ -21,7 +21,13 @@ def add_verbosity(parser: argparse.ArgumentParser) -> None:
     """Add -q and -v to a parser, before or behind the verb."""
     told = parser.add_argument_group("messages").add_mutually_exclusive_group()
     none = argparse.SUPPRESS  # else the verb's own would replace what stands before the verb
-    told.add_argument("-q", "--quiet", action="store_true", default=none, help="no warnings and no progress on stderr, only errors")
+    told.add_argument(
+        "-q",
+        "--quiet",
+        action="store_true",
+        default=none,
+        help="no warnings and no progress on stderr, only errors",
+    )
     told.add_argument(
         "-v",
         "--verbose",
@@ -39,7 +45,10 @@ def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
     """
     verbose = getattr(options, "verbose", 0)
     if getattr(options, "quiet", False):
-        with open(os.devnull, "w", encoding="utf-8") as nowhere, contextlib.redirect_stderr(nowhere):
+        with (
+            open(os.devnull, "w", encoding="utf-8") as nowhere,
+            contextlib.redirect_stderr(nowhere),
+        ):
             yield
     elif verbose:
         with _handled(logging.getLogger(PACKAGE), _Told(), LEVELS[min(verbose, 2)]):
@@ -97,5 +106,7 @@ class _NowAndThen(logging.Handler):
 
 
 def _say(text: str) -> None:
-    with contextlib.suppress(OSError, ValueError):  # whoever reads the log may leave: the command goes on
+    with contextlib.suppress(
+        OSError, ValueError
+    ):  # whoever reads the log may leave: the command goes on
         print(f"ssh-abduction: {printable(text)}", file=sys.stderr, flush=True)

@@ -17,28 +17,54 @@ if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
 
-ASSUMING = 3.0  # For so many seconds it is sought what assumptions cost that the page may be asked about.
+ASSUMING = (
+    3.0  # For so many seconds it is sought what assumptions cost that the page may be asked about.
+)
 
 
 def add_parser(verbs: Verbs) -> None:
     text = "Show maps in the browser, on one page: what all share, where they differ, each map, two side by side, and what happened at each step."
     parser = verbs.add_parser("view", help="see rival maps in the browser", description=text)
-    parser.add_argument("maps", help="what solve --json printed, or one saved map; - for standard input")
-    parser.add_argument("trace", nargs="?", help="the trace that was mapped: for its actions and laser images, and for --serve")
-    parser.add_argument("-o", "--output", metavar="FILE", help="write the page to this file, and do not open it")
+    parser.add_argument(
+        "maps", help="what solve --json printed, or one saved map; - for standard input"
+    )
+    parser.add_argument(
+        "trace",
+        nargs="?",
+        help="the trace that was mapped: for its actions and laser images, and for --serve",
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", help="write the page to this file, and do not open it"
+    )
     localised = (
         "also replay this run of a robot, with the belief where it may be at each step, in each rival. It may be TRACE itself. It is localised by its views, or as "
         "--belief says"
     )
     parser.add_argument("--localize", metavar="RUN", help=localised)
-    parser.add_argument("--belief", metavar="FILE", help="what localize --json printed of the run of --localize, or of TRACE")
-    serve = (
-        "serve the page on this computer alone, so that it can explain, and solve again under what is assumed; needs TRACE. Ctrl-C ends it"
+    parser.add_argument(
+        "--belief",
+        metavar="FILE",
+        help="what localize --json printed of the run of --localize, or of TRACE",
     )
+    serve = "serve the page on this computer alone, so that it can explain, and solve again under what is assumed; needs TRACE. Ctrl-C ends it"
     parser.add_argument("--serve", action="store_true", help=serve)
-    parser.add_argument("--port", type=int, default=0, metavar="N", help="with --serve, the port (default: any that is free)")
-    parser.add_argument("--time-limit", type=float, default=30.0, metavar="S", help="with --serve, seconds for an answer (default: 30)")
-    parser.add_argument("--no-open", action="store_true", help="print where the page is, and do not open it")
+    parser.add_argument(
+        "--port",
+        type=int,
+        default=0,
+        metavar="N",
+        help="with --serve, the port (default: any that is free)",
+    )
+    parser.add_argument(
+        "--time-limit",
+        type=float,
+        default=30.0,
+        metavar="S",
+        help="with --serve, seconds for an answer (default: 30)",
+    )
+    parser.add_argument(
+        "--no-open", action="store_true", help="print where the page is, and do not open it"
+    )
     parser.set_defaults(run=run)
     parser.epilog = "The page is one file that loads nothing from elsewhere. Without --serve it says which commands answer its questions."
 
@@ -52,19 +78,31 @@ def run(options: argparse.Namespace) -> int:
     from ssh_abduction.theory.theory import Theory
 
     if options.serve and options.trace is None:
-        raise AbductionError("--serve: expected the trace that was mapped, got none; give it after the maps")
+        raise AbductionError(
+            "--serve: expected the trace that was mapped, got none; give it after the maps"
+        )
     if options.serve and options.output:
-        raise AbductionError("--output: expected none with --serve, which writes no file; leave out one of the two")
+        raise AbductionError(
+            "--output: expected none with --serve, which writes no file; leave out one of the two"
+        )
     if not 0 <= options.port <= 65535:
         raise AbductionError(f"--port: expected 0 to 65535, got {options.port}; name a free port")
     data = read_json(options.maps)
     source = "standard input" if options.maps == "-" else options.maps
     listing = Listing.from_dict(data, source)
     trace = Trace.load(options.trace) if options.trace is not None else None
-    theory = Theory.from_dict(data["theory"]) if isinstance(data, dict) and "theory" in data else None
-    flags = "" if theory is None else "".join(f" {shlex.quote(flag)}" for flag in flags_of(theory, trace))
+    theory = (
+        Theory.from_dict(data["theory"]) if isinstance(data, dict) and "theory" in data else None
+    )
+    flags = (
+        ""
+        if theory is None
+        else "".join(f" {shlex.quote(flag)}" for flag in flags_of(theory, trace))
+    )
     called = Called(
-        "maps.json" if options.maps == "-" else shlex.quote(options.maps), shlex.quote(options.trace) if options.trace else "TRACE", flags
+        "maps.json" if options.maps == "-" else shlex.quote(options.maps),
+        shlex.quote(options.trace) if options.trace else "TRACE",
+        flags,
     )
     localised = _run(options, trace, data)
     if options.serve:
@@ -88,11 +126,18 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
 
     try:
         known = assumptions(listing, trace, theory, ASSUMING)
-    except AbductionError:  # the file was made with a theory that does not suit this trace: then nobody can say
+    except (
+        AbductionError
+    ):  # the file was made with a theory that does not suit this trace: then nobody can say
         known = {}
-    texts = list(dict.fromkeys(text for told in known.values() for text in (told["same"], told["different"])))
+    texts = list(
+        dict.fromkeys(text for told in known.values() for text in (told["same"], told["different"]))
+    )
     number = {text: k for k, text in enumerate(texts)}
-    pairs = {f"{i},{j}": [number[told["same"]], number[told["different"]]] for (i, j), told in known.items()}
+    pairs = {
+        f"{i},{j}": [number[told["same"]], number[told["different"]]]
+        for (i, j), told in known.items()
+    }
     return {"texts": texts, "pairs": pairs}
 
 
@@ -109,7 +154,7 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
             "--belief: expected the run that it is of, got none; name it with --localize, or give the trace that was mapped"
         )
     if options.belief is None:
-        from ssh_abduction.online.localize import Localiser
+        from ssh_abduction.online.localiser import Localiser
 
         return Run(followed, lambda ssh_map: Localiser(ssh_map).beliefs(followed))
     return _with_beliefs(followed, options.belief, data)
@@ -123,10 +168,14 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     told = read_json(file)
     beliefs = told.get("beliefs") if isinstance(told, dict) else None
     if not isinstance(beliefs, list) or not all(isinstance(belief, dict) for belief in beliefs):
-        raise MapError(f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write them with localize --json")
+        raise MapError(
+            f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write them with localize --json"
+        )
     maps, number = maps_of(data, "maps"), told.get("map", 1)
     if not is_whole(number) or not 1 <= number <= len(maps):
-        raise MapError(f"{named(file)}: map: expected 1 to {len(maps)}, got {brief(number)}; localise in these maps")
+        raise MapError(
+            f"{named(file)}: map: expected 1 to {len(maps)}, got {brief(number)}; localise in these maps"
+        )
     if told.get("dstates", count := len(maps[number - 1].dstates)) != count:
         raise MapError(
             f"{named(file)}: dstates: expected {count}, as map {number} has, got {brief(told['dstates'])}; localise in these maps, and not in others"
@@ -139,14 +188,24 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     visited = dict.fromkeys([*chosen.labels, *range(len(chosen.dstates))])
     new = {s: i for i, s in enumerate(visited)}  # the page numbers dstates by first visit
     try:
-        renumbered = [{**belief, "probabilities": [[new[s], p] for s, p in belief["probabilities"]]} for belief in beliefs]
+        renumbered = [
+            {**belief, "probabilities": [[new[s], p] for s, p in belief["probabilities"]]}
+            for belief in beliefs
+        ]
     except (KeyError, TypeError, ValueError):
-        raise MapError(f"{named(file)}: probabilities: expected pairs [dstate, probability], got something else; localise again") from None
+        raise MapError(
+            f"{named(file)}: probabilities: expected pairs [dstate, probability], got something else; localise again"
+        ) from None
     return Run(followed, lambda ssh_map: renumbered if ssh_map.labels == labels else None)
 
 
 def _serve(
-    options: argparse.Namespace, listing: Listing, trace: Trace, theory: Theory | None, localised: Run | None, called: Called
+    options: argparse.Namespace,
+    listing: Listing,
+    trace: Trace,
+    theory: Theory | None,
+    localised: Run | None,
+    called: Called,
 ) -> int:
     import signal
 
@@ -155,9 +214,19 @@ def _serve(
     from ssh_abduction.solver import end_all
 
     try:
-        server = PageServer(listing, trace, theory, run=localised, called=called, port=options.port, time_limit=options.time_limit)
+        server = PageServer(
+            listing,
+            trace,
+            theory,
+            run=localised,
+            called=called,
+            port=options.port,
+            time_limit=options.time_limit,
+        )
     except OSError as error:
-        raise AbductionError(f"--port: expected a free port, got {options.port}: {error.strerror}; name another one") from None
+        raise AbductionError(
+            f"--port: expected a free port, got {options.port}: {error.strerror}; name another one"
+        ) from None
     with server:
         print(server.url, flush=True)
         if not options.no_open:

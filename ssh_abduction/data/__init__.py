@@ -8,7 +8,15 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.data.errors import AbductionError, LocaliserError, MapError, RangeError, SolverError, TheoryError, TraceError
+    from ssh_abduction.data.errors import (
+        AbductionError,
+        LocaliserError,
+        MapError,
+        RangeError,
+        SolverError,
+        TheoryError,
+        TraceError,
+    )
     from ssh_abduction.data.maps import DState, Fault, Fit, MapPath, Pose, SSHMap
     from ssh_abduction.data.odometry import Odometry
     from ssh_abduction.data.star import Star

@@ -28,7 +28,10 @@ def paragraph(sentence: str) -> str:
 def table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "rows") -> str:
     """A table. Of more than ROWS rows the first ones are shown, and how many `more` there are."""
     listed = list(rows)
-    body = "".join(f"<tr>{''.join(f'<td>{text(_cut(str(cell)))}</td>' for cell in row)}</tr>" for row in listed[:ROWS])
+    body = "".join(
+        f"<tr>{''.join(f'<td>{text(_cut(str(cell)))}</td>' for cell in row)}</tr>"
+        for row in listed[:ROWS]
+    )
     left = paragraph(f"and {len(listed) - ROWS} more {more}") if len(listed) > ROWS else ""
     return f"<table><thead><tr>{''.join(f'<th>{text(name)}</th>' for name in head)}</tr></thead><tbody>{body}</tbody></table>{left}"
 

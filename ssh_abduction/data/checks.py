@@ -75,13 +75,22 @@ def a_whole_number(
 def a_count_of_maps(value: object, error: Kind) -> int | None:
     """How many maps to list at most, 1 or more; None lists all."""
     mend = "None lists all (--maps 0)"
-    return None if value is None else a_whole_number("max_maps (--maps)", value, error, 1, mend=mend)
+    return (
+        None if value is None else a_whole_number("max_maps (--maps)", value, error, 1, mend=mend)
+    )
 
 
-def numbers(name: str, value: object, error: Kind, length: int, what: str, mend: str = "change it") -> tuple[float, ...]:
+def numbers(
+    name: str, value: object, error: Kind, length: int, what: str, mend: str = "change it"
+) -> tuple[float, ...]:
     """So many finite numbers, from a list, a tuple or an array."""
     listed = value.tolist() if hasattr(value, "tolist") else value
-    if isinstance(listed, Sequence) and not isinstance(listed, str | bytes) and len(listed) == length and all(map(is_finite, listed)):
+    if (
+        isinstance(listed, Sequence)
+        and not isinstance(listed, str | bytes)
+        and len(listed) == length
+        and all(map(is_finite, listed))
+    ):
         return tuple(float(number) for number in listed)
     raise error(f"{name}: expected {what}, got {brief(value)}; {mend}")
 
@@ -100,7 +109,14 @@ def a_text(name: str, value: object, error: Kind, *, mend: str = "give a text") 
     raise error(f"{name}: expected a text, got {brief(value)}; {mend}")
 
 
-def one_of(name: str, value: object, choices: Iterable[str], error: Kind, *, mend: str = "take one of these") -> str:
+def one_of(
+    name: str,
+    value: object,
+    choices: Iterable[str],
+    error: Kind,
+    *,
+    mend: str = "take one of these",
+) -> str:
     """One of several texts."""
     known = list(choices)
     if isinstance(value, str) and value in known:
@@ -117,12 +133,19 @@ def an_instance(name: str, value: object, kind: type[T], error: Kind, *, mend: s
     raise error(f"{name}: expected {article} {kind.__name__}, got {brief(value)}; {mend}")
 
 
-def all_instances(name: str, values: object, kind: type[T], error: Kind, *, mend: str) -> tuple[T, ...]:
+def all_instances(
+    name: str, values: object, kind: type[T], error: Kind, *, mend: str
+) -> tuple[T, ...]:
     """Values of a class, from anything that can be iterated over. Messages name the first one that is wrong."""
-    return tuple(an_instance(f"{name}[{i}]", value, kind, error, mend=mend) for i, value in enumerate(a_list(name, values, error)))
+    return tuple(
+        an_instance(f"{name}[{i}]", value, kind, error, mend=mend)
+        for i, value in enumerate(a_list(name, values, error))
+    )
 
 
-def a_list(name: str, value: object, error: Kind, *, what: str = "a list", mend: str = "give a list") -> list[Any]:
+def a_list(
+    name: str, value: object, error: Kind, *, what: str = "a list", mend: str = "give a list"
+) -> list[Any]:
     """The members of a list, a tuple, an array, a generator or the like. A text, bytes and an object are no lists."""
     if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
         return list(value)
@@ -148,7 +171,9 @@ def a_path(name: str, value: object, error: Kind) -> str:
     path = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if isinstance(path, str):
         return path
-    raise error(f"{name}: expected the path of a file, as a text or a pathlib.Path, got {brief(value)}; name a file")
+    raise error(
+        f"{name}: expected the path of a file, as a text or a pathlib.Path, got {brief(value)}; name a file"
+    )
 
 
 def _between(low: float, high: float, above: float = -math.inf) -> str:
@@ -158,7 +183,15 @@ def _between(low: float, high: float, above: float = -math.inf) -> str:
         return f"{number:,.0f}" if number == round(number) else f"{number:g}"
 
     if math.isfinite(above):
-        return f" above {told(above)}" + (f" and at most {told(high)}" if math.isfinite(high) else "")
+        return f" above {told(above)}" + (
+            f" and at most {told(high)}" if math.isfinite(high) else ""
+        )
     if math.isfinite(low) and math.isfinite(high):
         return f" from {told(low)} to {told(high)}"
-    return f", {told(low)} or more" if math.isfinite(low) else f", {told(high)} or less" if math.isfinite(high) else ""
+    return (
+        f", {told(low)} or more"
+        if math.isfinite(low)
+        else f", {told(high)} or less"
+        if math.isfinite(high)
+        else ""
+    )

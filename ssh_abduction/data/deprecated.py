@@ -27,9 +27,13 @@ def renamed_parameters(*old: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
             for name in old:
                 if name in kwargs:
                     now = RENAMED[name]
-                    warnings.warn(f"{name} is deprecated; use {now}", DeprecationWarning, stacklevel=2)
+                    warnings.warn(
+                        f"{name} is deprecated; use {now}", DeprecationWarning, stacklevel=2
+                    )
                     value = kwargs.pop(name)
-                    kwargs[now] = None if name == "maps" and value == 0 and value is not False else value
+                    kwargs[now] = (
+                        None if name == "maps" and value == 0 and value is not False else value
+                    )
             return function(*args, **kwargs)
 
         return call

@@ -60,7 +60,11 @@ def brief(value: object, width: int = 60) -> str:
 
 def printable(text: str) -> str:
     """A text on one line, in which characters that would steer a terminal, or that nobody sees, are escaped."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return (
+        text
+        if text.isprintable()
+        else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    )
 
 
 def xml_text(text: str) -> str:
@@ -77,7 +81,11 @@ def checked_index(index: object, count: int, what: str) -> int:
         raise TypeError(f"{what}: expected a whole number or a slice, got {brief(index)}")
     found = int(index)
     if not -count <= found < count:
-        there = f"0 to {count - 1}, or {-count} to -1 from the end" if count else "none, as there are none"
+        there = (
+            f"0 to {count - 1}, or {-count} to -1 from the end"
+            if count
+            else "none, as there are none"
+        )
         raise RangeError(f"{what}: expected {there}, got {brief(found)}")
     return found % count
 
@@ -85,7 +93,9 @@ def checked_index(index: object, count: int, what: str) -> int:
 def is_finite(value: object) -> TypeGuard[float]:
     """Whether a value is a number (numpy's, too; true and false are none) that a floating-point number can hold."""
     try:
-        return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+        return (
+            isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+        )
     except OverflowError:  # a whole number of more than 308 digits
         return False
 

@@ -20,11 +20,14 @@ DEEPEST = 100
 LONGEST_NUMBER = 100
 # How a line begins in which CARMEN, g2o or TORO log what a robot saw and did.
 LINE_OF_A_LOG = re.compile(
-    rb"^(FLASER|RLASER|ROBOTLASER\d|RAWLASER\d|ODOM|PARAM|SYNC|TRUEPOS|NEFF|VERTEX2|VERTEX_SE2|EDGE2|EDGE_SE2)\s", re.MULTILINE
+    rb"^(FLASER|RLASER|ROBOTLASER\d|RAWLASER\d|ODOM|PARAM|SYNC|TRUEPOS|NEFF|VERTEX2|VERTEX_SE2|EDGE2|EDGE_SE2)\s",
+    re.MULTILINE,
 )
 _LONG_NUMBER = re.compile(rf"\d{{{LONGEST_NUMBER + 1}}}")
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
-_UNSEEN = re.compile("[\x7f-\x9f\u2028\u2029]")  # control characters that JSON need not escape, and that terminals obey
+_UNSEEN = re.compile(
+    "[\x7f-\x9f\u2028\u2029]"
+)  # control characters that JSON need not escape, and that terminals obey
 
 
 class NotFinite(ValueError):  # noqa: N818 - part of an error message, which the caller completes
@@ -64,13 +67,18 @@ def parse_json(text: str) -> Any:
         try:
             json.dumps(value, ensure_ascii=False).encode("utf-8")
         except UnicodeEncodeError as error:
-            raise HalfCharacter(f"half a character, \\u{ord(error.object[error.start]):04x}; mend it") from None
+            raise HalfCharacter(
+                f"half a character, \\u{ord(error.object[error.start]):04x}; mend it"
+            ) from None
     return value
 
 
 def json_line(value: Any) -> str:
     """A value as JSON on one line. Characters that would steer a terminal are escaped. Raises TypeError or ValueError."""
-    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", json.dumps(value, ensure_ascii=False, allow_nan=False))
+    return _UNSEEN.sub(
+        lambda found: f"\\u{ord(found[0]):04x}",
+        json.dumps(value, ensure_ascii=False, allow_nan=False),
+    )
 
 
 @cache
@@ -109,7 +117,9 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> None:
         except OSError as error:
             raise OSError(error.errno, error.strerror, os.fspath(path)) from None
         return
-    draft = target.with_name(f".{os.getpid()}-{threading.get_ident():x}.part")  # short, as the target's name may be as long as names can be
+    draft = target.with_name(
+        f".{os.getpid()}-{threading.get_ident():x}.part"
+    )  # short, as the target's name may be as long as names can be
     try:
         draft.write_bytes(data)
         if mode is not None:
@@ -141,7 +151,11 @@ def _is_deep(value: Any) -> bool:
     """Whether more than DEEPEST objects and lists are within each other."""
     level = [value]
     for _ in range(DEEPEST + 1):
-        inside = (item.values() if isinstance(item, dict) else item for item in level if isinstance(item, dict | list))
+        inside = (
+            item.values() if isinstance(item, dict) else item
+            for item in level
+            if isinstance(item, dict | list)
+        )
         level = [item for items in inside for item in items if isinstance(item, dict | list)]
         if not level:
             return False
@@ -150,9 +164,17 @@ def _is_deep(value: Any) -> bool:
 
 def _where_nan(value: Any, path: str = "") -> str:
     """The field in which a value that is no number stands."""
-    inside: Iterable[tuple[Any, Any]] = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    inside: Iterable[tuple[Any, Any]] = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     for key, item in inside:
-        here = f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}" if path else str(key)
+        here = (
+            f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}" if path else str(key)
+        )
         if isinstance(item, float) and math.isnan(item):
             return here
         if isinstance(item, dict | list) and (deeper := _where_nan(item, here)):

@@ -21,7 +21,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ssh_abduction.data import cards
 from ssh_abduction.data.checks import a_path, a_text, all_instances, an_instance
-from ssh_abduction.data.errors import MapError, brief, is_finite, is_whole, is_writable, named, printable, xml_text
+from ssh_abduction.data.errors import (
+    MapError,
+    brief,
+    is_finite,
+    is_whole,
+    is_writable,
+    named,
+    printable,
+    xml_text,
+)
 from ssh_abduction.data.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.data.words import counted
@@ -99,7 +108,9 @@ class Fit:
     poses: tuple[Pose, ...] = field(default=(), repr=False)
 
     def to_dict(self) -> dict[str, float]:
-        return {name: round(getattr(self, name), 6) for name in ("chi2", "dof", "p", "scale", "bend")}
+        return {
+            name: round(getattr(self, name), 6) for name in ("chi2", "dof", "p", "scale", "bend")
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,14 +176,20 @@ class SSHMap:
 
     def __repr__(self) -> str:
         parts = [counted(len(self.dstates), "dstates")]
-        parts += [counted(len(self.places), "places"), counted(len(self.paths), "paths")] if self.places else []
+        parts += (
+            [counted(len(self.places), "places"), counted(len(self.paths), "paths")]
+            if self.places
+            else []
+        )
         parts += [counted(len(self.faults), "faults")] if self.faults else []
         return f"<SSHMap: {', '.join(parts)}; {counted(len(self.labels), 'steps')}>"
 
     @property
     def id(self) -> str:
         """The map in twelve hexadecimal digits, the same in each run and whatever its dstates, places and paths are numbered like: a digest of what equality compares."""
-        return hashlib.sha256(json.dumps(self._compared(), separators=(",", ":")).encode()).hexdigest()[:ID_LENGTH]
+        return hashlib.sha256(
+            json.dumps(self._compared(), separators=(",", ":")).encode()
+        ).hexdigest()[:ID_LENGTH]
 
     def _compared(self) -> list[Any]:
         """What equality compares, as plain data."""
@@ -186,22 +203,31 @@ class SSHMap:
         from ssh_abduction.output.picture import svg
 
         parts = [
-            cards.picture(svg(self)) if len(self.dstates) <= DRAWN else cards.paragraph(f"not drawn, as it has more than {DRAWN} dstates")
+            cards.picture(svg(self))
+            if len(self.dstates) <= DRAWN
+            else cards.paragraph(f"not drawn, as it has more than {DRAWN} dstates")
         ]
         if self.faults:
             parts.append(cards.paragraph("; ".join(map(str, self.faults))))
         if self.fit:
-            parts.append(cards.paragraph(f"chi-square {self.fit.chi2:.1f} for {self.fit.dof} degrees of freedom (p = {self.fit.p:.2g})"))
+            parts.append(
+                cards.paragraph(
+                    f"chi-square {self.fit.chi2:.1f} for {self.fit.dof} degrees of freedom (p = {self.fit.p:.2g})"
+                )
+            )
         leads: dict[int, list[str]] = {}
         for source, action, target in self.links:
             leads.setdefault(source, []).append(f"{action} → {target}")
         topological = bool(self.places)
         head = ("dstate", "view", *(("place", "path") if topological else ()), "links")
         rows = [
-            (s.id, s.shown, *(_where(s) if topological else ()), ", ".join(leads.get(s.id, ()))) for s in self.dstates[: cards.ROWS + 1]
+            (s.id, s.shown, *(_where(s) if topological else ()), ", ".join(leads.get(s.id, ())))
+            for s in self.dstates[: cards.ROWS + 1]
         ]
         table = cards.table(head, [*rows, *(() for _ in self.dstates[len(rows) :])], "dstates")
-        return cards.card(repr(self)[1:-1], *parts, cards.folded(counted(len(self.dstates), "dstates"), table))
+        return cards.card(
+            repr(self)[1:-1], *parts, cards.folded(counted(len(self.dstates), "dstates"), table)
+        )
 
     def without_headings(self) -> SSHMap:
         """The same map for a theory in which places have no frames."""
@@ -209,7 +235,9 @@ class SSHMap:
 
     def renumbered(self) -> SSHMap:
         """The same map with dstates, places and paths numbered by first visit, so that maps which are the same up to renaming become equal."""
-        visited = [self.dstates[s] for s in dict.fromkeys([*self.labels, *range(len(self.dstates))])]
+        visited = [
+            self.dstates[s] for s in dict.fromkeys([*self.labels, *range(len(self.dstates))])
+        ]
         number = {s.id: i for i, s in enumerate(visited)}
         place = _numbered([*(s.place for s in visited), *self.places])
         path = _numbered([*(s.path for s in visited), *(p.id for p in self.paths)])
@@ -233,11 +261,20 @@ class SSHMap:
             links=tuple(sorted({(number[s], action, number[x]) for s, action, x in self.links})),
             places=tuple(sorted(place.values())),
             paths=tuple(
-                MapPath(path[p.id], tuple(place[q] for q in (p.order if faced.get(p.id, 1) != -1 else p.order[::-1])))
+                MapPath(
+                    path[p.id],
+                    tuple(
+                        place[q] for q in (p.order if faced.get(p.id, 1) != -1 else p.order[::-1])
+                    ),
+                )
                 for p in sorted(self.paths, key=lambda p: path[p.id])
             ),
             excused=tuple((path.get(h, h), path.get(g, g)) for h, g in self.excused),
-            fit=self.fit and replace(self.fit, poses=tuple(self.fit.poses[s.id] for s in visited) if self.fit.poses else ()),
+            fit=self.fit
+            and replace(
+                self.fit,
+                poses=tuple(self.fit.poses[s.id] for s in visited) if self.fit.poses else (),
+            ),
             faults=self.faults,
         )
 
@@ -264,10 +301,14 @@ class SSHMap:
         if self.excused:
             data["excused"] = [list(pair) for pair in self.excused]
         if self.faults:
-            data["faults"] = [{k: v for k, v in asdict(fault).items() if v is not None} for fault in self.faults]
+            data["faults"] = [
+                {k: v for k, v in asdict(fault).items() if v is not None} for fault in self.faults
+            ]
         if self.fit:
             data["fit"] = self.fit.to_dict()
-            data["poses"] = [[round(x, 4) for x in (pose.x, pose.y, pose.heading)] for pose in self.fit.poses]
+            data["poses"] = [
+                [round(x, 4) for x in (pose.x, pose.y, pose.heading)] for pose in self.fit.poses
+            ]
             data["spreads"] = [[round(x, 4) for x in pose.spread] for pose in self.fit.poses]
         return data
 
@@ -276,21 +317,37 @@ class SSHMap:
         """The map that `to_dict` wrote. Raises MapError with the field that is wrong."""
         read = FieldReader(where)
         record = read.mapping(data, "")
-        dstates = tuple(read.dstate(s, f"dstates[{i}]") for i, s in enumerate(read.list(record, "dstates")))
+        dstates = tuple(
+            read.dstate(s, f"dstates[{i}]") for i, s in enumerate(read.list(record, "dstates"))
+        )
         ids = {s.id for s in dstates}
-        places = tuple(read.integer(p, f"places[{i}]") for i, p in enumerate(read.list(record, "places", optional=True)))
-        paths = tuple(read.path(p, f"paths[{i}]") for i, p in enumerate(read.list(record, "paths", optional=True)))
+        places = tuple(
+            read.integer(p, f"places[{i}]")
+            for i, p in enumerate(read.list(record, "places", optional=True))
+        )
+        paths = tuple(
+            read.path(p, f"paths[{i}]")
+            for i, p in enumerate(read.list(record, "paths", optional=True))
+        )
         if [s.id for s in dstates] != list(range(len(dstates))):
             raise MapError(
                 f"{where}: dstates: expected the ids 0, 1, 2, … in this order, got {brief([s.id for s in dstates])}; renumber them"
             )
         for name, known, used in (
-            ("places", set(places), {s.place for s in dstates} | {q for p in paths for q in p.order}),
+            (
+                "places",
+                set(places),
+                {s.place for s in dstates} | {q for p in paths for q in p.order},
+            ),
             ("paths", {p.id for p in paths}, {s.path for s in dstates}),
         ):
             if missing := used - known - {None}:
-                raise MapError(f"{where}: {name}: expected every id that is used, got none for {brief(sorted(missing, key=str))}; add it")
-        labels = tuple(read.integer(x, f"labels[{i}]") for i, x in enumerate(read.list(record, "labels")))
+                raise MapError(
+                    f"{where}: {name}: expected every id that is used, got none for {brief(sorted(missing, key=str))}; add it"
+                )
+        labels = tuple(
+            read.integer(x, f"labels[{i}]") for i, x in enumerate(read.list(record, "labels"))
+        )
         if not labels:
             raise read.wrong("labels", "the dstate of each step", [])
         for name, numbers in (("places", places), ("paths", tuple(p.id for p in paths))):
@@ -298,11 +355,23 @@ class SSHMap:
                 raise read.wrong(name, "each id once", list(numbers))
         for i, label in enumerate(labels):
             if label not in ids:
-                raise MapError(f"{where}: labels[{i}]: expected the id of a dstate, got {label}; there are {len(dstates)} dstates")
-        links = tuple(read.link(x, ids, f"links[{i}]") for i, x in enumerate(read.list(record, "links")))
-        excused = tuple(read.pair(x, f"excused[{i}]") for i, x in enumerate(read.list(record, "excused", optional=True)))
-        faults = tuple(read.fault(x, len(labels), f"faults[{i}]") for i, x in enumerate(read.list(record, "faults", optional=True)))
-        return cls(labels, dstates, links, places, paths, excused, read.fit(record, len(dstates)), faults)
+                raise MapError(
+                    f"{where}: labels[{i}]: expected the id of a dstate, got {label}; there are {len(dstates)} dstates"
+                )
+        links = tuple(
+            read.link(x, ids, f"links[{i}]") for i, x in enumerate(read.list(record, "links"))
+        )
+        excused = tuple(
+            read.pair(x, f"excused[{i}]")
+            for i, x in enumerate(read.list(record, "excused", optional=True))
+        )
+        faults = tuple(
+            read.fault(x, len(labels), f"faults[{i}]")
+            for i, x in enumerate(read.list(record, "faults", optional=True))
+        )
+        return cls(
+            labels, dstates, links, places, paths, excused, read.fit(record, len(dstates)), faults
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the map as JSON. Raises MapError."""
@@ -320,7 +389,9 @@ class SSHMap:
     def place_of(self, step: int) -> int | None:
         """The place that the robot was at in a step; None where the map has no places. Raises MapError where the trace has no such step."""
         if not is_whole(step) or not 0 <= step < len(self.labels):
-            raise MapError(f"step: expected 0 to {len(self.labels) - 1}, got {brief(step)}; name a step of the trace that was mapped")
+            raise MapError(
+                f"step: expected 0 to {len(self.labels) - 1}, got {brief(step)}; name a step of the trace that was mapped"
+            )
         return self.dstates[self.labels[step]].place
 
     def to_svg(self, turns: Trace | Turns | None = None) -> str:
@@ -350,7 +421,9 @@ class SSHMap:
         try:
             import pandas as pd
         except ImportError:
-            raise MapError("to_pandas: expected pandas, got none; install it with pip install pandas") from None
+            raise MapError(
+                "to_pandas: expected pandas, got none; install it with pip install pandas"
+            ) from None
         rows = []
         for s in (self.dstates[label] for label in self.labels):
             row: dict[str, Any] = {
@@ -370,7 +443,9 @@ class SSHMap:
         return table.astype(dict.fromkeys(whole, "Int64"))  # which knows missing numbers
 
     def to_networkx(
-        self, level: Literal["causal", "topological", "places"] = "causal", turns: Trace | Turns | None = None
+        self,
+        level: Literal["causal", "topological", "places"] = "causal",
+        turns: Trace | Turns | None = None,
     ) -> nx.Graph[Any]:
         """The map as a graph of networkx.
 
@@ -388,11 +463,19 @@ class SSHMap:
 
             degrees_of(turns)
         if not isinstance(level, str):
-            raise MapError(f'level: expected "causal", "topological" or "places", got {brief(level)}')
+            raise MapError(
+                f'level: expected "causal", "topological" or "places", got {brief(level)}'
+            )
         if level == "causal":
             causal: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
             for s in self.dstates:
-                facts = {"view": s.view, "place": s.place, "path": s.path, "direction": s.direction, "heading": s.heading}
+                facts = {
+                    "view": s.view,
+                    "place": s.place,
+                    "path": s.path,
+                    "direction": s.direction,
+                    "heading": s.heading,
+                }
                 causal.add_node(s.id, **{k: v for k, v in facts.items() if v is not None})
             for source, action, target in self.links:
                 causal.add_edge(source, target, key=action, action=action)
@@ -400,7 +483,9 @@ class SSHMap:
         if level == "places":
             return self._graph_of_places(turns)
         if level != "topological":
-            raise MapError(f'level: expected "causal", "topological" or "places", got {brief(level)}')
+            raise MapError(
+                f'level: expected "causal", "topological" or "places", got {brief(level)}'
+            )
         bipartite: nx.Graph[Any] = nx.Graph()
         bipartite.add_nodes_from((("place", p) for p in self.places), bipartite=0)
         bipartite.add_nodes_from((("path", p.id) for p in self.paths), bipartite=1)
@@ -417,12 +502,26 @@ class SSHMap:
         found = layout(self, turns)
         graph: nx.MultiGraph[Any] = nx.MultiGraph(metric=found.metric)
         for place in self.places:
-            graph.add_node(place, pos=found.places[place], dstates=tuple(s.id for s in self.dstates if s.place == place))
+            graph.add_node(
+                place,
+                pos=found.places[place],
+                dstates=tuple(s.id for s in self.dstates if s.place == place),
+            )
         for path in self.paths:
             streets = travelled(self, path)
             for index, (p, q) in enumerate(pairwise(path.order)):
-                metres = {"metres": math.dist(found.places[p], found.places[q])} if found.metric else {}
-                graph.add_edge(p, q, key=path.id, path=path.id, order=index, travelled=(min(p, q), max(p, q)) in streets, **metres)
+                metres = (
+                    {"metres": math.dist(found.places[p], found.places[q])} if found.metric else {}
+                )
+                graph.add_edge(
+                    p,
+                    q,
+                    key=path.id,
+                    path=path.id,
+                    order=index,
+                    travelled=(min(p, q), max(p, q)) in streets,
+                    **metres,
+                )
         return graph
 
     def to_graphml(self) -> str:
@@ -432,10 +531,16 @@ class SSHMap:
         causal = self.to_networkx()
         graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
         for s, data in causal.nodes(data=True):
-            graph.add_node(s, **{**data, **({"view": xml_text(str(data["view"]))} if "view" in data else {})})
+            graph.add_node(
+                s, **{**data, **({"view": xml_text(str(data["view"]))} if "view" in data else {})}
+            )
         for source, target, action in causal.edges(data="action"):
             name = xml_text(action)
-            key = name if not graph.has_edge(source, target, name) else f"{name} ({graph.number_of_edges(source, target)})"
+            key = (
+                name
+                if not graph.has_edge(source, target, name)
+                else f"{name} ({graph.number_of_edges(source, target)})"
+            )
             graph.add_edge(source, target, key=key, action=name)
         return "\n".join(nx.generate_graphml(graph))
 
@@ -443,8 +548,14 @@ class SSHMap:
         """The causal graph as Graphviz DOT text, with a cluster for each place."""
 
         def quoted(text: object) -> str:
-            lines = (printable(line) for line in str(text).split("\n"))  # a terminal would obey some characters
-            return '"' + "\\n".join(line.replace("\\", "\\\\").replace('"', '\\"') for line in lines) + '"'
+            lines = (
+                printable(line) for line in str(text).split("\n")
+            )  # a terminal would obey some characters
+            return (
+                '"'
+                + "\\n".join(line.replace("\\", "\\\\").replace('"', '\\"') for line in lines)
+                + '"'
+            )
 
         def node(s: DState) -> str:
             course = "" if s.path is None else f"\npath {s.path}{'+' if s.direction == 1 else '-'}"
@@ -455,27 +566,39 @@ class SSHMap:
         for p in self.places:
             inside = " ".join(node(s) for s in self.dstates if s.place == p)
             lines.append(f"  subgraph cluster_{p} {{ label={quoted(f'place {p}')}; {inside} }}")
-        lines += [f"  {source} -> {target} [label={quoted(action)}];" for source, action, target in self.links]
+        lines += [
+            f"  {source} -> {target} [label={quoted(action)}];"
+            for source, action, target in self.links
+        ]
         return "\n".join([*lines, "}"])
 
 
 def checked_map(value: object, name: str = "map") -> SSHMap:
     """The map that a caller gives. Raises MapError."""
-    return an_instance(name, value, SSHMap, MapError, mend="take one of solution.maps, or SSHMap.load")
+    return an_instance(
+        name, value, SSHMap, MapError, mend="take one of solution.maps, or SSHMap.load"
+    )
 
 
 def checked_maps(values: object) -> tuple[SSHMap, ...]:
     """The maps that a caller gives. Raises MapError."""
-    return all_instances("maps", values, SSHMap, MapError, mend="take the maps of a solution, or SSHMap.load")
+    return all_instances(
+        "maps", values, SSHMap, MapError, mend="take the maps of a solution, or SSHMap.load"
+    )
 
 
 def _where(dstate: DState) -> tuple[object, object]:
     """The place and the course of a dstate, as a table shows them."""
     place = "" if dstate.place is None else dstate.place
-    return place, "" if dstate.path is None else f"{dstate.path}{'+' if dstate.direction == 1 else '-'}"
+    return (
+        place,
+        "" if dstate.path is None else f"{dstate.path}{'+' if dstate.direction == 1 else '-'}",
+    )
 
 
-def write_map(path: str | os.PathLike[str], text: str, what: str = "map", option: str = "output") -> None:
+def write_map(
+    path: str | os.PathLike[str], text: str, what: str = "map", option: str = "output"
+) -> None:
     """Write a map, or what is made of it, into a file. Raises MapError.
 
     what    is written, as messages call it
@@ -485,7 +608,9 @@ def write_map(path: str | os.PathLike[str], text: str, what: str = "map", option
     try:
         write_file(path, f"{text}\n".encode())
     except OSError as error:
-        raise MapError(f"{named(path)}: cannot write the {what}: {error.strerror or error}; check the folder") from None
+        raise MapError(
+            f"{named(path)}: cannot write the {what}: {error.strerror or error}; check the folder"
+        ) from None
     except ValueError as error:
         raise MapError(f"{option}: cannot write the {what}: {error}; name a file") from None
 
@@ -502,22 +627,34 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     try:
         text = sys.stdin.buffer.read(LARGEST + 1) if path == "-" else _read_at_most(path, LARGEST)
         if len(text) > LARGEST:
-            raise MapError(f"{source}: expected at most {LARGEST // 2**20} MiB, got more; list fewer (solve --maps)")
+            raise MapError(
+                f"{source}: expected at most {LARGEST // 2**20} MiB, got more; list fewer (solve --maps)"
+            )
         if not text.strip():
-            raise MapError(f"{source}: expected JSON, got an empty file; write it with solve --json")
+            raise MapError(
+                f"{source}: expected JSON, got an empty file; write it with solve --json"
+            )
         return parse_json(text.decode("utf-8"))
     except MapError:
         raise
     except OSError as error:
-        raise MapError(f"{source}: expected a readable file of maps: {error.strerror or error}; check the path") from None
+        raise MapError(
+            f"{source}: expected a readable file of maps: {error.strerror or error}; check the path"
+        ) from None
     except MemoryError:
-        raise MapError(f"{source}: expected a file of maps that fits into memory, got a larger one; list fewer (solve --maps)") from None
+        raise MapError(
+            f"{source}: expected a file of maps that fits into memory, got a larger one; list fewer (solve --maps)"
+        ) from None
     except json.JSONDecodeError as error:
         if text.startswith(b'{"format": "ssh-trace"'):
-            raise MapError(f"{source}: expected maps, got a trace; name the two files in the other order, or solve it first") from None
+            raise MapError(
+                f"{source}: expected maps, got a trace; name the two files in the other order, or solve it first"
+            ) from None
         if error.msg == "Extra data":
             mend = "solve prints a line for each of several traces: take one of them"
-            raise MapError(f"{source}:{error.lineno}: expected one JSON value, got more after it; {mend}") from None
+            raise MapError(
+                f"{source}:{error.lineno}: expected one JSON value, got more after it; {mend}"
+            ) from None
         raise MapError(
             f"{source}:{error.lineno}: expected JSON, got broken JSON at column {error.colno} ({error.msg}); write it with solve --json"
         ) from None
@@ -528,9 +665,13 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     except HalfCharacter as error:
         raise MapError(f"{source}: expected text, got {error}") from None
     except (UnicodeDecodeError, AttributeError):  # other text, a closed stream
-        raise MapError(f"{source}: expected JSON in UTF-8, got something else; write it with solve --json") from None
+        raise MapError(
+            f"{source}: expected JSON in UTF-8, got something else; write it with solve --json"
+        ) from None
     except ValueError as error:
-        raise MapError(f"{source}: expected JSON, got {error}; write it with solve --json") from None
+        raise MapError(
+            f"{source}: expected JSON, got {error}; write it with solve --json"
+        ) from None
 
 
 def _read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
@@ -543,7 +684,9 @@ def maps_of(data: Any, where: str) -> list[SSHMap]:
     if isinstance(data, Mapping) and "maps" in data:
         check_format(data, SOLUTION_FORMAT, where)
         if not isinstance(data["maps"], list):
-            raise MapError(f"{where}: maps: expected a list, got {brief(data['maps'])}; write it with solve --json")
+            raise MapError(
+                f"{where}: maps: expected a list, got {brief(data['maps'])}; write it with solve --json"
+            )
         return [SSHMap.from_dict(m, f"{where}: maps[{i}]") for i, m in enumerate(data["maps"])]
     if isinstance(data, Mapping):
         check_format(data, MAP_FORMAT, where)
@@ -553,7 +696,9 @@ def maps_of(data: Any, where: str) -> list[SSHMap]:
 def check_format(data: Mapping[str, Any], expected: str, where: str) -> None:
     """Whether JSON is of the format and the version that this program writes; files of before these were written say neither. Raises MapError."""
     if "format" in data and data["format"] != expected:
-        raise MapError(f'{where}: format: expected "{expected}", got {brief(data["format"])}; write it with solve --json')
+        raise MapError(
+            f'{where}: format: expected "{expected}", got {brief(data["format"])}; write it with solve --json'
+        )
     version = data.get("version", VERSION)
     if version != VERSION or isinstance(version, bool):
         raise MapError(
@@ -588,7 +733,9 @@ class FieldReader:
         self.where = a_text("where", where, MapError)
 
     def wrong(self, name: str, expected: str, value: Any) -> MapError:
-        return MapError(f"{self.where}: {name or 'map'}: expected {expected}, got {brief(value)}; write it with solve --json")
+        return MapError(
+            f"{self.where}: {name or 'map'}: expected {expected}, got {brief(value)}; write it with solve --json"
+        )
 
     def mapping(self, value: Any, name: str) -> Mapping[str, Any]:
         if not isinstance(value, Mapping):
@@ -618,11 +765,15 @@ class FieldReader:
             or not isinstance(view, str | int | None)
             or (isinstance(view, str) and not is_writable(view))
         ):
-            raise self.wrong(f"{name}.view", "a text or an integer, or null where it is unknown", view)
+            raise self.wrong(
+                f"{name}.view", "a text or an integer, or null where it is unknown", view
+            )
         direction = self.optional(record.get("direction"), f"{name}.direction")
         path = self.optional(record.get("path"), f"{name}.path")
         if direction not in (None, 1, -1) or (direction is None) != (path is None):
-            raise self.wrong(f"{name}.direction", "1 or -1 where there is a path, null elsewhere", direction)
+            raise self.wrong(
+                f"{name}.direction", "1 or -1 where there is a path, null elsewhere", direction
+            )
         heading = self.optional(record.get("heading"), f"{name}.heading")
         if heading is not None and not 0 <= heading < 360:
             raise self.wrong(f"{name}.heading", "a slot, 0 to 3, or degrees, 0 to 359", heading)
@@ -637,13 +788,20 @@ class FieldReader:
 
     def path(self, value: Any, name: str) -> MapPath:
         record = self.mapping(value, name)
-        order = tuple(self.integer(p, f"{name}.order[{i}]") for i, p in enumerate(self.list(record, "order")))
+        order = tuple(
+            self.integer(p, f"{name}.order[{i}]") for i, p in enumerate(self.list(record, "order"))
+        )
         if len(set(order)) < len(order):
             raise self.wrong(f"{name}.order", "each place once", list(order))
         return MapPath(self.integer(record.get("id"), f"{name}.id"), order)
 
     def link(self, value: Any, ids: set[int], name: str) -> tuple[int, str, int]:
-        good = isinstance(value, list) and len(value) == 3 and type(value[0]) is type(value[2]) is int and isinstance(value[1], str)
+        good = (
+            isinstance(value, list)
+            and len(value) == 3
+            and type(value[0]) is type(value[2]) is int
+            and isinstance(value[1], str)
+        )
         if not good or not is_writable(value[1]) or not {value[0], value[2]} <= ids:
             raise self.wrong(name, "[dstate, action name, dstate]", value)
         return value[0], value[1], value[2]
@@ -657,21 +815,43 @@ class FieldReader:
             raise self.wrong(f"{name}.step", f"a step from 0 to {steps - 1}", step)
         for part in ("seen", "expected"):
             view = record.get(part)
-            if isinstance(view, bool) or not isinstance(view, str | int | None) or (isinstance(view, str) and not is_writable(view)):
+            if (
+                isinstance(view, bool)
+                or not isinstance(view, str | int | None)
+                or (isinstance(view, str) and not is_writable(view))
+            ):
                 raise self.wrong(f"{name}.{part}", "a text or an integer", view)
-        return Fault(step, record["kind"], record.get("seen"), record.get("expected"), self.number(record.get("cost", 0), f"{name}.cost"))
+        return Fault(
+            step,
+            record["kind"],
+            record.get("seen"),
+            record.get("expected"),
+            self.number(record.get("cost", 0), f"{name}.cost"),
+        )
 
     def fit(self, record: Mapping[str, Any], dstates: int) -> Fit | None:
         if record.get("fit") is None:
             return None
         found = self.mapping(record["fit"], "fit")
-        chi2, dof, p, scale, bend = (self.number(found.get(name, 0), f"fit.{name}") for name in ("chi2", "dof", "p", "scale", "bend"))
-        rows = [self.numbers(row, f"poses[{i}]") for i, row in enumerate(self.list(record, "poses", optional=True))]
-        spreads = [self.numbers(row, f"spreads[{i}]") for i, row in enumerate(self.list(record, "spreads", optional=True))]
+        chi2, dof, p, scale, bend = (
+            self.number(found.get(name, 0), f"fit.{name}")
+            for name in ("chi2", "dof", "p", "scale", "bend")
+        )
+        rows = [
+            self.numbers(row, f"poses[{i}]")
+            for i, row in enumerate(self.list(record, "poses", optional=True))
+        ]
+        spreads = [
+            self.numbers(row, f"spreads[{i}]")
+            for i, row in enumerate(self.list(record, "spreads", optional=True))
+        ]
         for name, listed in (("poses", rows), ("spreads", spreads)):
             if listed and len(listed) != dstates:
                 raise self.wrong(name, f"{dstates}, one a dstate", len(listed))
-        poses = tuple(Pose(*row, spread) for row, spread in zip(rows, spreads or [(0.0, 0.0, 0.0)] * len(rows), strict=True))
+        poses = tuple(
+            Pose(*row, spread)
+            for row, spread in zip(rows, spreads or [(0.0, 0.0, 0.0)] * len(rows), strict=True)
+        )
         return Fit(chi2, int(dof), p, scale, bend, poses)
 
     def number(self, value: Any, name: str) -> float:

@@ -73,7 +73,9 @@ class Odometry:
         if isinstance(value, Odometry):
             return value
         if not isinstance(value, Mapping):
-            raise TraceError(f'odometry: expected an object, got {brief(value)}; write {{"along": 0.05, "heading": 0.005}}')
+            raise TraceError(
+                f'odometry: expected an object, got {brief(value)}; write {{"along": 0.05, "heading": 0.005}}'
+            )
         known = {name: value[name] for name in NUMBERS if value.get(name) is not None}
         return cls(**known, extra={name: v for name, v in value.items() if name not in NUMBERS})
 
@@ -83,13 +85,22 @@ class Odometry:
     def covariance(self, displacement: Displacement) -> Covariance:
         """The covariance of a displacement, (3, 3), in metres and radians and in the frame of the robot before it moved."""
         dx, dy, turned = checked_displacement(displacement, "displacement")
-        along, across, offset = (self.along * dx) ** 2, (self.across * dx) ** 2, self.position**2 + ROUNDED**2
+        along, across, offset = (
+            (self.along * dx) ** 2,
+            (self.across * dx) ** 2,
+            self.position**2 + ROUNDED**2,
+        )
         along, across = along + (self.along * dy) ** 2, across + (self.across * dy) ** 2
         way = math.hypot(dx, dy)
         cos, sin = (dx / way, dy / way) if way else (1.0, 0.0)
         mixed = (along - across) * cos * sin
-        xx, yy = along * cos**2 + across * sin**2 + offset, along * sin**2 + across * cos**2 + offset
-        heading = (self.heading * way) ** 2 + (self.turning * turned) ** 2 + self.angle**2 + ROUNDED**2
+        xx, yy = (
+            along * cos**2 + across * sin**2 + offset,
+            along * sin**2 + across * cos**2 + offset,
+        )
+        heading = (
+            (self.heading * way) ** 2 + (self.turning * turned) ** 2 + self.angle**2 + ROUNDED**2
+        )
         return (xx, mixed, 0.0), (mixed, yy, 0.0), (0.0, 0.0, heading)
 
 
@@ -101,13 +112,19 @@ def checked_displacement(value: Any, where: str) -> Displacement:
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 3:
-        raise TraceError(f"{where}: expected [dx, dy, dtheta], got {brief(value)}; give metres, metres, radians")
+        raise TraceError(
+            f"{where}: expected [dx, dy, dtheta], got {brief(value)}; give metres, metres, radians"
+        )
     for i, x in enumerate(value):
         if not is_finite(x):
-            raise TraceError(f"{where}[{i}]: expected a finite number, got {brief(x)}; replace it, or leave the field out")
+            raise TraceError(
+                f"{where}[{i}]: expected a finite number, got {brief(x)}; replace it, or leave the field out"
+            )
     dx, dy, turned = map(float, value)
     if max(abs(dx), abs(dy)) > FARTHEST:
-        raise TraceError(f"{where}: expected metres, at most {FARTHEST:,.0f} in a step, got {brief(list(value))}; convert it to metres")
+        raise TraceError(
+            f"{where}: expected metres, at most {FARTHEST:,.0f} in a step, got {brief(list(value))}; convert it to metres"
+        )
     if abs(turned) > MOST_TURNED:
         raise TraceError(
             f"{where}[2]: expected radians, from {-MOST_TURNED:.1f} to {MOST_TURNED:.1f}, got {brief(value[2])}; convert it from degrees"
@@ -119,17 +136,29 @@ def checked_covariance(value: Any, where: str) -> Covariance:
     """A covariance that a user gives: symmetric and positive definite. Raises TraceError."""
     if hasattr(value, "tolist"):
         value = value.tolist()
-    rows = value if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 3 else ()
-    if not rows or not all(isinstance(row, Sequence) and not isinstance(row, str) and len(row) == 3 for row in rows):
-        raise TraceError(f"{where}: expected three rows of three numbers, got {brief(value)}; give the covariance of [dx, dy, dtheta]")
+    rows = (
+        value
+        if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 3
+        else ()
+    )
+    if not rows or not all(
+        isinstance(row, Sequence) and not isinstance(row, str) and len(row) == 3 for row in rows
+    ):
+        raise TraceError(
+            f"{where}: expected three rows of three numbers, got {brief(value)}; give the covariance of [dx, dy, dtheta]"
+        )
     for i, row in enumerate(rows):
         for j, x in enumerate(row):
             if not is_finite(x):
-                raise TraceError(f"{where}[{i}][{j}]: expected a finite number, got {brief(x)}; replace it, or leave the field out")
+                raise TraceError(
+                    f"{where}[{i}][{j}]: expected a finite number, got {brief(x)}; replace it, or leave the field out"
+                )
     (a, b, c), (d, e, f), (g, h, k) = (tuple(map(float, row)) for row in rows)
     largest = max(abs(x) for x in (a, b, c, d, e, f, g, h, k))
     if max(abs(b - d), abs(c - g), abs(f - h)) > SYMMETRIC * largest:
-        raise TraceError(f"{where}: expected a symmetric matrix, got {brief(value)}; mend the entries that differ")
+        raise TraceError(
+            f"{where}: expected a symmetric matrix, got {brief(value)}; mend the entries that differ"
+        )
     minors = a, a * e - b * b, a * (e * k - f * f) - b * (b * k - f * c) + c * (b * f - e * c)
     if not all(minor > 0 for minor in minors) or not all(map(math.isfinite, minors)):
         raise TraceError(
@@ -143,7 +172,11 @@ def moved(pose: Pose, displacement: Displacement) -> Pose:
     x, y, heading = pose
     dx, dy, turned = displacement
     cos, sin = math.cos(heading), math.sin(heading)
-    return x + cos * dx - sin * dy, y + sin * dx + cos * dy, math.remainder(heading + turned, math.tau)
+    return (
+        x + cos * dx - sin * dy,
+        y + sin * dx + cos * dy,
+        math.remainder(heading + turned, math.tau),
+    )
 
 
 def between(start: Pose, end: Pose) -> Displacement:
@@ -161,7 +194,9 @@ def in_words(displacement: Displacement) -> str:
     """
     x, y, angle = displacement
     said = [
-        f"{abs(value):.1f} m {ways[value < 0]}" for value, ways in ((x, ("ahead", "back")), (y, ("left", "right"))) if round(abs(value), 1)
+        f"{abs(value):.1f} m {ways[value < 0]}"
+        for value, ways in ((x, ("ahead", "back")), (y, ("left", "right")))
+        if round(abs(value), 1)
     ]
     if degrees := round(abs(math.degrees(angle))):
         said.append(f"turned {degrees} degrees {'left' if angle > 0 else 'right'}")

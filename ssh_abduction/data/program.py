@@ -15,7 +15,9 @@ raised: list[int] = []  # those of them that became a KeyboardInterrupt
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
 # What a new process runs first, as `python -P -c`. The option -P keeps the current folder off the path; the path of the process that began it comes next.
-_START = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from {} import serve; serve()"
+_START = (
+    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from {} import serve; serve()"
+)
 
 
 def interrupted_code() -> int:

@@ -100,8 +100,19 @@ class Star:
         """The star that a trace writes as four 0/1/null (ahead, right, back, left), or as bearings and gateways."""
         if is_four(entries):
             quarters = ((90.0 * k, entry) for k, entry in enumerate(entries))
-            return cls(tuple(Gateway(bearing, open=True if entry else None) for bearing, entry in quarters if entry != 0))
-        return cls(tuple(entry if isinstance(entry, Gateway) else Gateway(float(entry or 0)) for entry in entries))
+            return cls(
+                tuple(
+                    Gateway(bearing, open=True if entry else None)
+                    for bearing, entry in quarters
+                    if entry != 0
+                )
+            )
+        return cls(
+            tuple(
+                entry if isinstance(entry, Gateway) else Gateway(float(entry or 0))
+                for entry in entries
+            )
+        )
 
     @property
     def openings(self) -> Openings | None:
@@ -113,7 +124,11 @@ class Star:
             slot = near_quarter(gateway.bearing)
             if slot is None or not gateway.open or found.setdefault(slot, k) != k:
                 return None
-        if any(g.opposite is not None and found.get((slot + 2) % 4) != g.opposite for slot, k in found.items() if (g := self.gateways[k])):
+        if any(
+            g.opposite is not None and found.get((slot + 2) % 4) != g.opposite
+            for slot, k in found.items()
+            if (g := self.gateways[k])
+        ):
             return None
         return 0 in found, 1 in found, 2 in found, 3 in found
 
@@ -121,8 +136,17 @@ class Star:
     def frames(self) -> tuple[Frame, ...]:
         """All that the place may look like from here: each gateway that was not observed is there, or is not."""
         unknown = [k for k, gateway in enumerate(self.gateways) if not gateway.open]
-        left_out = (set(some) for count in range(len(unknown), -1, -1) for some in combinations(unknown, count))
-        return tuple(dict.fromkeys(self._frame([k for k in range(len(self.gateways)) if k not in some]) for some in left_out))
+        left_out = (
+            set(some)
+            for count in range(len(unknown), -1, -1)
+            for some in combinations(unknown, count)
+        )
+        return tuple(
+            dict.fromkeys(
+                self._frame([k for k in range(len(self.gateways)) if k not in some])
+                for some in left_out
+            )
+        )
 
     @property
     def too_near(self) -> tuple[float, float] | None:
@@ -135,7 +159,9 @@ class Star:
 
     def _frame(self, kept: list[int]) -> Frame:
         """The frame of these gateways."""
-        clockwise = sorted(kept, key=lambda k: (self.gateways[k].bearing + self.gateways[k].spread) % 360)
+        clockwise = sorted(
+            kept, key=lambda k: (self.gateways[k].bearing + self.gateways[k].spread) % 360
+        )
         slot = {k: i for i, k in enumerate(clockwise)}
         gateways = [self.gateways[k] for k in clockwise]
         return Frame(
@@ -149,7 +175,9 @@ class Star:
 
 def is_four(entries: Sequence[Entry]) -> bool:
     """Whether a star is written as four 0/1/null, which are openings and not bearings: as bearings at least two of them would be equal."""
-    return len(entries) == 4 and all(x is None or (not isinstance(x, Gateway) and x in (0, 1)) for x in entries)
+    return len(entries) == 4 and all(
+        x is None or (not isinstance(x, Gateway) and x in (0, 1)) for x in entries
+    )
 
 
 def near_quarter(bearing: float) -> int | None:
@@ -163,20 +191,30 @@ def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
     if not isinstance(value, list | tuple):
-        raise TraceError(f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]")
+        raise TraceError(
+            f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]"
+        )
     given = [int(x) if isinstance(x, bool) else x for x in value]
-    four = len(given) == 4 and all(x is None or x in (0, 1) for x in given if not isinstance(x, Mapping | Gateway))
+    four = len(given) == 4 and all(
+        x is None or x in (0, 1) for x in given if not isinstance(x, Mapping | Gateway)
+    )
     star = tuple(_entry(x, len(given), four, f"{where}[{i}]") for i, x in enumerate(given))
-    if not is_four(star) and len({(e.bearing if isinstance(e, Gateway) else float(e or 0)) % 360 for e in star if _is_seen(e)}) < sum(
-        map(_is_seen, star)
-    ):
+    if not is_four(star) and len(
+        {
+            (e.bearing if isinstance(e, Gateway) else float(e or 0)) % 360
+            for e in star
+            if _is_seen(e)
+        }
+    ) < sum(map(_is_seen, star)):
         raise TraceError(
             f"{where}: expected four 0/1 (openings ahead, right, back, left) or different bearings in degrees, got {brief(list(value))}; mend it"
         )
     for i, entry in enumerate(star):
         _check_opposite(i, entry, star, f"{where}[{i}]")
     if sum(not _is_seen(entry) for entry in star) > MOST_UNKNOWN:
-        raise TraceError(f"{where}: expected at most {MOST_UNKNOWN} gateways that were not observed, got more; leave some out")
+        raise TraceError(
+            f"{where}: expected at most {MOST_UNKNOWN} gateways that were not observed, got more; leave some out"
+        )
     return star
 
 
@@ -186,32 +224,54 @@ def _is_seen(entry: Entry) -> bool:
 
 def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
     if isinstance(value, Gateway):
-        value = {"bearing": value.bearing, "spread": value.spread, "opposite": value.opposite, "open": value.open}
+        value = {
+            "bearing": value.bearing,
+            "spread": value.spread,
+            "opposite": value.opposite,
+            "open": value.open,
+        }
     if isinstance(value, Mapping):
         return _gateway(value, count, where)
     if value is None and four:
         return None
     if not is_finite(value):
-        raise TraceError(f"{where}: expected a finite number, got {brief(value)}; replace it, or leave the field out")
-    return value if type(value) in (int, float) else int(value) if is_whole(value) else float(value)  # numpy's numbers are no JSON
+        raise TraceError(
+            f"{where}: expected a finite number, got {brief(value)}; replace it, or leave the field out"
+        )
+    return (
+        value if type(value) in (int, float) else int(value) if is_whole(value) else float(value)
+    )  # numpy's numbers are no JSON
 
 
 def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
     if unknown := [name for name in value if name not in _FIELDS]:
-        raise TraceError(f"{where}: expected fields out of {', '.join(_FIELDS)}, got {brief(unknown[0])}; leave it out")
+        raise TraceError(
+            f"{where}: expected fields out of {', '.join(_FIELDS)}, got {brief(unknown[0])}; leave it out"
+        )
     bearing, spread, opposite, is_open = (
-        value.get(name, default) for name, default in zip(_FIELDS, (None, SPREAD, None, True), strict=True)
+        value.get(name, default)
+        for name, default in zip(_FIELDS, (None, SPREAD, None, True), strict=True)
     )
     if not is_finite(bearing):
-        raise TraceError(f"{where}.bearing: expected a number of degrees, got {brief(bearing)}; say in which direction the gateway is")
+        raise TraceError(
+            f"{where}.bearing: expected a number of degrees, got {brief(bearing)}; say in which direction the gateway is"
+        )
     if is_open is not None and is_open is not True:
-        raise TraceError(f"{where}.open: expected true, or null where it was not observed, got {brief(is_open)}; leave out what is closed")
+        raise TraceError(
+            f"{where}.open: expected true, or null where it was not observed, got {brief(is_open)}; leave out what is closed"
+        )
     widest = WIDEST if is_open is None else WIDEST / 2
     if not is_finite(spread) or not 0 <= spread <= widest:
-        raise TraceError(f"{where}.spread: expected 0 to {widest:g} degrees, got {brief(spread)}; say how far the bearing may be off")
+        raise TraceError(
+            f"{where}.spread: expected 0 to {widest:g} degrees, got {brief(spread)}; say how far the bearing may be off"
+        )
     if opposite is not None and not (is_whole(opposite) and 0 <= opposite < count):
-        raise TraceError(f"{where}.opposite: expected the index of a gateway, 0 to {count - 1}, got {brief(opposite)}; count from 0")
-    return Gateway(float(bearing), float(spread), None if opposite is None else int(opposite), is_open)
+        raise TraceError(
+            f"{where}.opposite: expected the index of a gateway, 0 to {count - 1}, got {brief(opposite)}; count from 0"
+        )
+    return Gateway(
+        float(bearing), float(spread), None if opposite is None else int(opposite), is_open
+    )
 
 
 def _check_opposite(i: int, entry: Entry, star: Sequence[Entry], where: str) -> None:

@@ -22,10 +22,41 @@ from typing import Any, BinaryIO, Literal, TypeAlias, overload
 
 from ssh_abduction.data import cards
 from ssh_abduction.data.checks import a_list, a_path, a_text, a_whole_number, an_instance, an_object
-from ssh_abduction.data.errors import RangeError, TraceError, brief, checked_index, is_finite, is_whole, is_writable, named
-from ssh_abduction.data.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, json_line, parse_json, write_file
-from ssh_abduction.data.odometry import Covariance, Displacement, Odometry, checked_covariance, checked_displacement
-from ssh_abduction.data.star import SPREAD, Entry, Gateway, Openings, Star, is_four, near_quarter, parse_star
+from ssh_abduction.data.errors import (
+    RangeError,
+    TraceError,
+    brief,
+    checked_index,
+    is_finite,
+    is_whole,
+    is_writable,
+    named,
+)
+from ssh_abduction.data.files import (
+    LINE_OF_A_LOG,
+    HalfCharacter,
+    NotFinite,
+    json_line,
+    parse_json,
+    write_file,
+)
+from ssh_abduction.data.odometry import (
+    Covariance,
+    Displacement,
+    Odometry,
+    checked_covariance,
+    checked_displacement,
+)
+from ssh_abduction.data.star import (
+    SPREAD,
+    Entry,
+    Gateway,
+    Openings,
+    Star,
+    is_four,
+    near_quarter,
+    parse_star,
+)
 from ssh_abduction.data.words import counted, that_differ
 
 View: TypeAlias = str | int
@@ -47,7 +78,16 @@ _LOGS = {
     b"\x89MCAP0": "MCAP",
     b"# message formats defined": "a log of CARMEN",
 }
-_STEP_FIELDS = ("view", "image", "action", "star", "displacement", "covariance", "truth", "confidence")
+_STEP_FIELDS = (
+    "view",
+    "image",
+    "action",
+    "star",
+    "displacement",
+    "covariance",
+    "truth",
+    "confidence",
+)
 _ACTION_FIELDS = ("name", "kind", "turn", "gateway", "bearing")
 _QUARTERS = (None, "right", "around", "left")
 _USUAL = Odometry()  # what odometry is worth where the trace does not say
@@ -75,18 +115,28 @@ class Action:
         if not isinstance(name, str) or not name or "\0" in name or not is_writable(name):
             raise TraceError(f"action.name: expected a text, got {brief(name)}; name the action")
         if not isinstance(kind, str | None) or kind not in (None, *_KINDS):
-            raise TraceError(f'action.kind: expected "travel" or "turn", got {brief(kind)}; leave it out for other actions')
+            raise TraceError(
+                f'action.kind: expected "travel" or "turn", got {brief(kind)}; leave it out for other actions'
+            )
         if not isinstance(turn, str | None) or turn not in (None, *_TURNS):
-            raise TraceError(f'action.turn: expected "right", "left" or "around", got {brief(turn)}; choose the nearest')
+            raise TraceError(
+                f'action.turn: expected "right", "left" or "around", got {brief(turn)}; choose the nearest'
+            )
         if turn is not None and kind != "turn":
-            raise TraceError(f'action.kind: expected "turn", as the action has a turn, got {brief(kind)}; set the kind or drop the turn')
+            raise TraceError(
+                f'action.kind: expected "turn", as the action has a turn, got {brief(kind)}; set the kind or drop the turn'
+            )
         an_object("action.extra", self.extra, TraceError)
         if self.bearing is not None:
             turn = self._turn_of_bearing()
             object.__setattr__(self, "turn", turn)
         if kind == "turn" and turn is None:
-            raise TraceError('action.turn: expected "right", "left" or "around" for a turn, got none; say which way it goes')
-        if self.gateway is not None and (not is_whole(self.gateway) or self.gateway < 1 or turn not in ("right", "left")):
+            raise TraceError(
+                'action.turn: expected "right", "left" or "around" for a turn, got none; say which way it goes'
+            )
+        if self.gateway is not None and (
+            not is_whole(self.gateway) or self.gateway < 1 or turn not in ("right", "left")
+        ):
             raise TraceError(
                 f"action.gateway: expected 1 or more, for a turn right or left, got {brief(self.gateway)}; count the gateways to that side"
             )
@@ -94,10 +144,14 @@ class Action:
     def _turn_of_bearing(self) -> TurnDirection:
         """Which way a turn by the bearing goes. Raises TraceError."""
         if self.kind != "turn" or not is_finite(self.bearing):
-            raise TraceError(f"action.bearing: expected degrees clockwise, for a turn, got {brief(self.bearing)}; leave it out elsewhere")
+            raise TraceError(
+                f"action.bearing: expected degrees clockwise, for a turn, got {brief(self.bearing)}; leave it out elsewhere"
+            )
         assert self.bearing is not None
         degrees = self.bearing % 360
-        turn: TurnDirection = "around" if abs(degrees - 180) <= SPREAD else "right" if degrees < 180 else "left"
+        turn: TurnDirection = (
+            "around" if abs(degrees - 180) <= SPREAD else "right" if degrees < 180 else "left"
+        )
         if min(degrees, 360 - degrees) <= SPREAD or self.turn not in (None, turn):
             went = "no turn" if min(degrees, 360 - degrees) <= SPREAD else turn
             raise TraceError(
@@ -108,7 +162,9 @@ class Action:
     @staticmethod
     def that_slipped(step: int) -> Action:
         """What stands for the action of a step that did not do what its name says: nothing is known of it, and it is like no other action."""
-        return Action(f"slipped at step {a_whole_number('step', step, TraceError)}", extra={"slipped": True})
+        return Action(
+            f"slipped at step {a_whole_number('step', step, TraceError)}", extra={"slipped": True}
+        )
 
     @property
     def slipped(self) -> bool:
@@ -118,7 +174,9 @@ class Action:
     @property
     def in_quarters(self) -> bool:
         """Whether all that is said of a turn is that it goes right, left or around, by quarters."""
-        quarter = self.bearing is None or ((slot := near_quarter(self.bearing)) is not None and _QUARTERS[slot] == self.turn)
+        quarter = self.bearing is None or (
+            (slot := near_quarter(self.bearing)) is not None and _QUARTERS[slot] == self.turn
+        )
         return quarter and self.gateway is None
 
     @staticmethod
@@ -131,7 +189,13 @@ class Action:
     def to_json(self) -> Any:
         if self == STANDARD_ACTIONS.get(self.name, Action(self.name)) and not self.extra:
             return self.name
-        known = {"name": self.name, "kind": self.kind, "turn": self.turn, "gateway": self.gateway, "bearing": self.bearing}
+        known = {
+            "name": self.name,
+            "kind": self.kind,
+            "turn": self.turn,
+            "gateway": self.gateway,
+            "bearing": self.bearing,
+        }
         return {**{k: v for k, v in known.items() if v is not None}, **self.extra}
 
 
@@ -171,7 +235,9 @@ class Step:
         if self.view is not None:
             object.__setattr__(self, "view", _view(self.view, "view"))
         if self.action is not None:
-            an_instance("action", self.action, Action, TraceError, mend='make one with Action.of("travel")')
+            an_instance(
+                "action", self.action, Action, TraceError, mend='make one with Action.of("travel")'
+            )
         an_object("extra", self.extra, TraceError)
         if self.image is not None:
             object.__setattr__(self, "image", _frozen_image(self.image))
@@ -180,11 +246,17 @@ class Step:
         if self.star is not None:
             object.__setattr__(self, "star", parse_star(self.star, "star"))
         if self.displacement is not None:
-            object.__setattr__(self, "displacement", checked_displacement(self.displacement, "displacement"))
+            object.__setattr__(
+                self, "displacement", checked_displacement(self.displacement, "displacement")
+            )
         if self.covariance is not None:
             if self.displacement is None:
-                raise TraceError("covariance: expected a displacement that it belongs to, got none; add it, or leave the covariance out")
-            object.__setattr__(self, "covariance", checked_covariance(self.covariance, "covariance"))
+                raise TraceError(
+                    "covariance: expected a displacement that it belongs to, got none; add it, or leave the covariance out"
+                )
+            object.__setattr__(
+                self, "covariance", checked_covariance(self.covariance, "covariance")
+            )
 
     def __repr__(self) -> str:
         told = that_differ(self)
@@ -205,7 +277,10 @@ class Step:
     ) -> Step:
         """A step from a view, or None where it is unknown, and perhaps a star and a displacement. Raises TraceError that says where."""
         a_text("where", where, TraceError)
-        seen, openings = _view_or_unknown(view, f"{where}: view"), None if star is None else parse_star(star, f"{where}: star")
+        seen, openings = (
+            _view_or_unknown(view, f"{where}: view"),
+            None if star is None else parse_star(star, f"{where}: star"),
+        )
         try:
             return Step(seen, action, openings, displacement, covariance)  # type: ignore[arg-type]
         except TraceError as error:
@@ -239,7 +314,9 @@ class Step:
             "action": self.action.to_json() if self.action else None,
             "star": _star_to_json(self.star) if self.star is not None else None,
             "displacement": list(self.displacement) if self.displacement is not None else None,
-            "covariance": [list(row) for row in self.covariance] if self.covariance is not None else None,
+            "covariance": [list(row) for row in self.covariance]
+            if self.covariance is not None
+            else None,
             "truth": self.truth,
             "confidence": self.confidence,
         }
@@ -262,15 +339,27 @@ class Trace:
     source: str | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.steps, tuple) or not all(isinstance(step, Step) for step in self.steps):
-            raise TraceError(f"steps: expected a tuple of Step, got {brief(self.steps)}; take Trace.from_steps for views and actions")
+        if not isinstance(self.steps, tuple) or not all(
+            isinstance(step, Step) for step in self.steps
+        ):
+            raise TraceError(
+                f"steps: expected a tuple of Step, got {brief(self.steps)}; take Trace.from_steps for views and actions"
+            )
         if not self.steps:
-            raise TraceError(f"{named(self.source or 'trace')}: expected at least one step, got none; add what the robot saw first")
+            raise TraceError(
+                f"{named(self.source or 'trace')}: expected at least one step, got none; add what the robot saw first"
+            )
         for name in ("name", "images", "source"):
             if getattr(self, name) is not None:
                 a_text(name, getattr(self, name), TraceError, mend="give a text, or leave it out")
         if self.odometry is not None:
-            an_instance("odometry", self.odometry, Odometry, TraceError, mend="make one with Odometry.of, or leave it out")
+            an_instance(
+                "odometry",
+                self.odometry,
+                Odometry,
+                TraceError,
+                mend="make one with Odometry.of, or leave it out",
+            )
         an_object("extra", self.extra, TraceError)
         last = len(self.steps) - 1
         types: dict[str, tuple[int, Action]] = {}
@@ -278,7 +367,9 @@ class Trace:
             action = step.action
             if action is None:
                 if i < last:
-                    raise TraceError(f"{self.at(i)}: action: expected one, as another step follows; name the action that led to it")
+                    raise TraceError(
+                        f"{self.at(i)}: action: expected one, as another step follows; name the action that led to it"
+                    )
                 continue
             if i == last:
                 raise TraceError(
@@ -326,14 +417,26 @@ class Trace:
             return self.prefix(stop)
         here = self.prefix(stop).steps[start:]
         # What an error message says of a step is its line in the file, which would be another one.
-        return replace(self, steps=(replace(here[0], displacement=None, covariance=None), *here[1:]), source=None)
+        return replace(
+            self,
+            steps=(replace(here[0], displacement=None, covariance=None), *here[1:]),
+            source=None,
+        )
 
     def __repr__(self) -> str:
         name = f" {brief(self.name, 40)}" if self.name else ""
         actions = len({action.name for action in self.actions})
         views = {view for view in self.views if view is not None}
-        parts = [counted(len(self), "steps"), *([counted(len(views), "views")] if views else []), counted(actions, "actions")]
-        there = {"images": any(step.image is not None for step in self), "stars": self.has_stars, "displacements": self.has_displacements}
+        parts = [
+            counted(len(self), "steps"),
+            *([counted(len(views), "views")] if views else []),
+            counted(actions, "actions"),
+        ]
+        there = {
+            "images": any(step.image is not None for step in self),
+            "stars": self.has_stars,
+            "displacements": self.has_displacements,
+        }
         return f"<Trace{name}: {', '.join(parts)}{''.join(f'; {what}' for what, is_there in there.items() if is_there)}>"
 
     def _repr_html_(self) -> str:
@@ -341,15 +444,36 @@ class Trace:
         columns: dict[str, Callable[[Step], object]] = {
             "view": lambda step: "" if step.view is None else step.view,
             "image": lambda step: (
-                f"{counted(len(step.image), 'numbers')}" if isinstance(step.image, tuple) else "" if step.image is None else step.image
+                f"{counted(len(step.image), 'numbers')}"
+                if isinstance(step.image, tuple)
+                else ""
+                if step.image is None
+                else step.image
             ),
-            "star": lambda step: "" if step.star is None else ", ".join(map(str, _star_to_json(step.star))),
-            "displacement": lambda step: "" if step.displacement is None else ", ".join(f"{x:.2f}" for x in step.displacement),
+            "star": lambda step: (
+                "" if step.star is None else ", ".join(map(str, _star_to_json(step.star)))
+            ),
+            "displacement": lambda step: (
+                ""
+                if step.displacement is None
+                else ", ".join(f"{x:.2f}" for x in step.displacement)
+            ),
             "action": lambda step: step.action.name if step.action else "",
         }
-        shown = {name: cell for name, cell in columns.items() if any(cell(step) != "" for step in self.steps[:SHOWN])}
-        rows = [(t, *(cell(step) for cell in shown.values())) for t, step in enumerate(self.steps[:SHOWN])]
-        left = cards.paragraph(f"and {counted(len(self) - SHOWN, 'more steps')}") if len(self) > SHOWN else ""
+        shown = {
+            name: cell
+            for name, cell in columns.items()
+            if any(cell(step) != "" for step in self.steps[:SHOWN])
+        }
+        rows = [
+            (t, *(cell(step) for cell in shown.values()))
+            for t, step in enumerate(self.steps[:SHOWN])
+        ]
+        left = (
+            cards.paragraph(f"and {counted(len(self) - SHOWN, 'more steps')}")
+            if len(self) > SHOWN
+            else ""
+        )
         return cards.card(repr(self)[1:-1], cards.table(("step", *shown), rows), left)
 
     @property
@@ -369,7 +493,9 @@ class Trace:
     def in_quarters(self) -> bool:
         """Whether all stars and turns fit right angles: then a star is four openings."""
         stars = {tuple(step.star) for step in self.steps if step.star is not None}
-        return all(Star.of(star).openings is not None for star in stars) and all(action.in_quarters for action in set(self.actions))
+        return all(Star.of(star).openings is not None for star in stars) and all(
+            action.in_quarters for action in set(self.actions)
+        )
 
     @property
     def has_displacements(self) -> bool:
@@ -408,7 +534,9 @@ class Trace:
         odometry       how far displacements without a covariance may be off
         """
         if isinstance(actions, str):
-            raise TraceError(f"actions: expected a list, got {brief(actions)}; give the name of one action after another, as in ['travel']")
+            raise TraceError(
+                f"actions: expected a list, got {brief(actions)}; give the name of one action after another, as in ['travel']"
+            )
         seen, done = _listed(views, "views"), [Action.of(a) for a in _listed(actions, "actions")]
         if len(seen) != len(done) + 1:
             raise TraceError(
@@ -421,7 +549,8 @@ class Trace:
                 f"trace: expected a star a view, got {len(openings)} stars and {len(seen)} views; give None where none was seen"
             )
         moved, noise = (
-            _of_actions(values, what, len(done)) for values, what in ((displacements, "displacements"), (covariances, "covariances"))
+            _of_actions(values, what, len(done))
+            for values, what in ((displacements, "displacements"), (covariances, "covariances"))
         )
         steps = tuple(
             Step.of(view, star, f"step {i}", done[i] if i < len(done) else None, moved[i], noise[i])
@@ -435,19 +564,31 @@ class Trace:
 
     def without_displacements(self) -> Trace:
         """The same trace, as if the robot had no odometry."""
-        return replace(self, steps=tuple(replace(step, displacement=None, covariance=None) for step in self.steps), odometry=None)
+        return replace(
+            self,
+            steps=tuple(replace(step, displacement=None, covariance=None) for step in self.steps),
+            odometry=None,
+        )
 
     def without_displacements_at(self, steps: Collection[int]) -> Trace:
         """The same trace, as if the displacements that lead to these steps were not known."""
-        unknown = {a_whole_number(f"steps[{i}]", step, TraceError) for i, step in enumerate(a_list("steps", steps, TraceError))}
+        unknown = {
+            a_whole_number(f"steps[{i}]", step, TraceError)
+            for i, step in enumerate(a_list("steps", steps, TraceError))
+        }
         if not unknown:
             return self
         return replace(
             self,
-            steps=tuple(replace(step, displacement=None, covariance=None) if t in unknown else step for t, step in enumerate(self.steps)),
+            steps=tuple(
+                replace(step, displacement=None, covariance=None) if t in unknown else step
+                for t, step in enumerate(self.steps)
+            ),
         )
 
-    def with_views(self, views: Iterable[View | None], confidences: Iterable[float | None] | None = None) -> Trace:
+    def with_views(
+        self, views: Iterable[View | None], confidences: Iterable[float | None] | None = None
+    ) -> Trace:
         """This trace with these views, None where one is unknown, and perhaps how probable it is that each is right, one for each step. Raises TraceError."""
         seen = _listed(views, "views")
         sure = [None] * len(seen) if confidences is None else _listed(confidences, "confidences")
@@ -455,12 +596,18 @@ class Trace:
             if len(values) != len(self):
                 raise TraceError(f"{name}: expected {len(self)}, one a step, got {len(values)}")
         checked = [
-            (_view_or_unknown(view, f"views[{i}]"), None if c is None else _probability(c, f"confidences[{i}]"))
+            (
+                _view_or_unknown(view, f"views[{i}]"),
+                None if c is None else _probability(c, f"confidences[{i}]"),
+            )
             for i, (view, c) in enumerate(zip(seen, sure, strict=True))
         ]
         return replace(
             self,
-            steps=tuple(replace(step, view=view, confidence=c) for step, (view, c) in zip(self.steps, checked, strict=True)),
+            steps=tuple(
+                replace(step, view=view, confidence=c)
+                for step, (view, c) in zip(self.steps, checked, strict=True)
+            ),
         )
 
     def prefix(self, steps: int) -> Trace:
@@ -478,14 +625,18 @@ class Trace:
         try:
             if path == "-":
                 if sys.stdin is None:
-                    raise TraceError("standard input: expected a trace, got a closed stream; name a file")
+                    raise TraceError(
+                        "standard input: expected a trace, got a closed stream; name a file"
+                    )
                 return _parse(sys.stdin.buffer, source, source)
             with Path(path).open("rb") as file:
                 return _parse(file, source, path)
         except TraceError:
             raise
         except OSError as error:
-            raise TraceError(f"{source}: expected a readable trace file: {error.strerror or error}; check the path") from None
+            raise TraceError(
+                f"{source}: expected a readable trace file: {error.strerror or error}; check the path"
+            ) from None
         except ValueError as error:  # a null character in the path
             raise TraceError(f"{source}: expected the path of a trace file: {error}") from None
 
@@ -497,22 +648,32 @@ class Trace:
             write_file(path, lines.encode("utf-8"))
         except UnicodeEncodeError as error:
             half = f"half a character, \\u{ord(error.object[error.start]):04x}"
-            raise TraceError(f"trace: expected texts and file names in UTF-8, got {half}; rename it") from None
+            raise TraceError(
+                f"trace: expected texts and file names in UTF-8, got {half}; rename it"
+            ) from None
         except OSError as error:
-            raise TraceError(f"{named(path)}: cannot write the trace: {error.strerror or error}; check the folder") from None
+            raise TraceError(
+                f"{named(path)}: cannot write the trace: {error.strerror or error}; check the folder"
+            ) from None
         except ValueError as error:
-            raise TraceError(f"{brief(str(path))}: cannot write the trace: {error}; name a file") from None
+            raise TraceError(
+                f"{brief(str(path))}: cannot write the trace: {error}; name a file"
+            ) from None
 
     @property
     def digest(self) -> str:
         """A short digest of the trace's file, by which a report can name the trace."""
-        return hashlib.sha256("\n".join(self.to_lines()).encode("utf-8", "backslashreplace")).hexdigest()[:16]
+        return hashlib.sha256(
+            "\n".join(self.to_lines()).encode("utf-8", "backslashreplace")
+        ).hexdigest()[:16]
 
     def to_lines(self) -> Iterator[str]:
         """The lines of the trace's file: the header, and then a line for each step."""
         header = {"format": FORMAT, "version": VERSION, "name": self.name, "images": self.images}
         odometry = {} if self.odometry is None else {"odometry": self.odometry.to_json()}
-        yield _dump({**{k: v for k, v in header.items() if v is not None}, **odometry, **self.extra})
+        yield _dump(
+            {**{k: v for k, v in header.items() if v is not None}, **odometry, **self.extra}
+        )
         for step in self.steps:
             yield _dump(step.to_json())
 
@@ -520,7 +681,9 @@ class Trace:
 def checked_trace(value: object) -> Trace:
     """The trace that a caller gives. Raises TraceError."""
     if not isinstance(value, Trace):
-        raise TraceError(f"trace: expected a Trace, got {brief(value)}; make one with Trace.load or Trace.from_steps")
+        raise TraceError(
+            f"trace: expected a Trace, got {brief(value)}; make one with Trace.load or Trace.from_steps"
+        )
     return value
 
 
@@ -528,7 +691,9 @@ def _dump(value: Mapping[str, Any]) -> str:
     try:
         return json_line(value)
     except (TypeError, ValueError, RecursionError) as error:
-        raise TraceError(f"trace: expected what JSON can hold, got {brief(dict(value))} ({error}); mend the field") from None
+        raise TraceError(
+            f"trace: expected what JSON can hold, got {brief(dict(value))} ({error}); mend the field"
+        ) from None
 
 
 def _parse(file: BinaryIO, source: str, path: str) -> Trace:
@@ -553,7 +718,9 @@ def _parse(file: BinaryIO, source: str, path: str) -> Trace:
             empty_line = empty_line or number
             continue
         if empty_line:
-            raise TraceError(f"{source}:{empty_line}: line: expected a step, got an empty line; remove it")
+            raise TraceError(
+                f"{source}:{empty_line}: line: expected a step, got an empty line; remove it"
+            )
         record = _record(raw, where)
         if header is None:
             header = _header(record, where)
@@ -564,10 +731,18 @@ def _parse(file: BinaryIO, source: str, path: str) -> Trace:
             f'{source}:1: header: expected {{"format": "{FORMAT}", "version": {VERSION}}}, got an empty file; write the header, then a line a step'
         )
     if not steps:
-        raise TraceError(f"{source}:2: step: expected at least one after the header, got none; add what the robot saw first")
-    extra = {k: v for k, v in header.items() if k not in ("format", "version", "name", "images", "odometry")}
+        raise TraceError(
+            f"{source}:2: step: expected at least one after the header, got none; add what the robot saw first"
+        )
+    extra = {
+        k: v
+        for k, v in header.items()
+        if k not in ("format", "version", "name", "images", "odometry")
+    }
     odometry = header.get("odometry")
-    return Trace(tuple(steps), header.get("name"), header.get("images"), odometry, extra=extra, source=path)
+    return Trace(
+        tuple(steps), header.get("name"), header.get("images"), odometry, extra=extra, source=path
+    )
 
 
 def _kind_of_log(raw: bytes) -> str:
@@ -586,7 +761,9 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
             f"{where}: header: expected a trace, got maps, as solve prints them; name the two files in the other order, or solve's trace"
         )
     if b"\0" in raw:
-        raise TraceError(f"{where}: line: expected text in UTF-8, got a null byte at column {raw.index(0) + 1}; is this a binary file?")
+        raise TraceError(
+            f"{where}: line: expected text in UTF-8, got a null byte at column {raw.index(0) + 1}; is this a binary file?"
+        )
     try:
         record = parse_json(raw.rstrip().decode("utf-8-sig" if where.endswith(":1") else "utf-8"))
     except UnicodeDecodeError as error:
@@ -606,22 +783,32 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
     except ValueError as error:
         raise TraceError(f"{where}: line: expected one JSON object, got {error}") from None
     if not isinstance(record, dict):
-        raise TraceError(f"{where}: line: expected a JSON object in braces, got {brief(record)}; write one step a line")
+        raise TraceError(
+            f"{where}: line: expected a JSON object in braces, got {brief(record)}; write one step a line"
+        )
     return record
 
 
 def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
     if record.get("format") != FORMAT:
-        came = brief(record["format"]) if "format" in record else f"a line without it: {brief(dict(record))}"
+        came = (
+            brief(record["format"])
+            if "format" in record
+            else f"a line without it: {brief(dict(record))}"
+        )
         raise TraceError(
             f'{where}: format: expected "{FORMAT}" in a header, got {came}; put {{"format": "{FORMAT}", "version": {VERSION}}} on the first line'
         )
     version = record.get("version")
     if version != VERSION or isinstance(version, bool):
-        raise TraceError(f"{where}: version: expected {VERSION}, got {brief(version)}; convert the file, or take a newer ssh-abduction")
+        raise TraceError(
+            f"{where}: version: expected {VERSION}, got {brief(version)}; convert the file, or take a newer ssh-abduction"
+        )
     for key in ("name", "images"):
         if not isinstance(record.get(key), str | None):
-            raise TraceError(f"{where}: {key}: expected a text, got {brief(record[key])}; quote it or leave it out")
+            raise TraceError(
+                f"{where}: {key}: expected a text, got {brief(record[key])}; quote it or leave it out"
+            )
     if record.get("odometry") is None:
         return dict(record)
     try:
@@ -641,7 +828,11 @@ def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> 
     if (raw := record.get("action")) is not None:
         action = _action(raw, f"{where}: action")
         if not action.extra:
-            action = actions.setdefault(action.name, action) if actions.get(action.name, action) == action else action
+            action = (
+                actions.setdefault(action.name, action)
+                if actions.get(action.name, action) == action
+                else action
+            )
     star = parse_star(record["star"], f"{where}: star") if record.get("star") is not None else None
     extra = {k: v for k, v in record.items() if k not in _STEP_FIELDS}
     try:
@@ -684,19 +875,29 @@ def _view(value: Any, where: str) -> View:
     if is_whole(value):
         value = int(value)  # numpy's, too
     if isinstance(value, bool) or not isinstance(value, str | int):
-        raise TraceError(f"{where}: expected a text or an integer, got {brief(value)}; name the view")
+        raise TraceError(
+            f"{where}: expected a text or an integer, got {brief(value)}; name the view"
+        )
     if isinstance(value, int) and not -(2**31) < value < 2**31:
-        raise TraceError(f"{where}: expected an integer of 32 bits, got {brief(value)}; write it as a text")
+        raise TraceError(
+            f"{where}: expected an integer of 32 bits, got {brief(value)}; write it as a text"
+        )
     if isinstance(value, str) and "\0" in value:
-        raise TraceError(f"{where}: expected a text without null characters, got {brief(value)}; rename the view")
+        raise TraceError(
+            f"{where}: expected a text without null characters, got {brief(value)}; rename the view"
+        )
     if isinstance(value, str) and not is_writable(value):
-        raise TraceError(f"{where}: expected a text that UTF-8 can hold, got half a character in {brief(value)}; rename the view")
+        raise TraceError(
+            f"{where}: expected a text that UTF-8 can hold, got half a character in {brief(value)}; rename the view"
+        )
     return value
 
 
 def _probability(value: Any, where: str) -> float:
     if not is_finite(value) or not 0 <= value <= 1:
-        raise TraceError(f"{where}: expected a probability from 0 to 1, got {brief(value)}; leave it out where none is known")
+        raise TraceError(
+            f"{where}: expected a probability from 0 to 1, got {brief(value)}; leave it out where none is known"
+        )
     return float(value)
 
 
@@ -704,10 +905,18 @@ def _action(value: Any, where: str) -> Action:
     if isinstance(value, str):
         value = {"name": value}
     if not isinstance(value, Mapping):
-        raise TraceError(f'{where}: expected a name or {{"name": …, "kind": …}}, got {brief(value)}; name the action')
+        raise TraceError(
+            f'{where}: expected a name or {{"name": …, "kind": …}}, got {brief(value)}; name the action'
+        )
     name, kind, turn, gateway, bearing = (value.get(key) for key in _ACTION_FIELDS)
     standard = STANDARD_ACTIONS.get(name) if isinstance(name, str) else None
-    if kind is None and turn is None and gateway is None and bearing is None and standard is not None:
+    if (
+        kind is None
+        and turn is None
+        and gateway is None
+        and bearing is None
+        and standard is not None
+    ):
         kind, turn = standard.kind, standard.turn
     if kind == "turn" and turn is None and bearing is None and name in _TURNS:
         turn = name
@@ -720,17 +929,25 @@ def _action(value: Any, where: str) -> Action:
 
 def _numbers(value: Any, where: str) -> list[float]:
     if not isinstance(value, list | tuple):
-        raise TraceError(f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]")
+        raise TraceError(
+            f"{where}: expected a list of numbers, got {brief(value)}; write [1, 2, …]"
+        )
     for i, x in enumerate(value):
         if not is_finite(x):
-            raise TraceError(f"{where}[{i}]: expected a finite number, got {brief(x)}; replace it, or leave the field out")
-    return [x if type(x) in (int, float) else int(x) if is_whole(x) else float(x) for x in value]  # numpy's numbers are no JSON
+            raise TraceError(
+                f"{where}[{i}]: expected a finite number, got {brief(x)}; replace it, or leave the field out"
+            )
+    return [
+        x if type(x) in (int, float) else int(x) if is_whole(x) else float(x) for x in value
+    ]  # numpy's numbers are no JSON
 
 
 def _image(value: Any, where: str) -> tuple[float, ...] | int:
     if is_whole(value):
         if value < 0:
-            raise TraceError(f"{where}: expected an index of 0 or more into the sidecar file, got {value}; count from 0")
+            raise TraceError(
+                f"{where}: expected an index of 0 or more into the sidecar file, got {value}; count from 0"
+            )
         return value
     return tuple(_numbers(value, where))
 

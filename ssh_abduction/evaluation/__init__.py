@@ -3,7 +3,14 @@
 from ssh_abduction.evaluation.names import Evaluation, MapEvaluation, evaluate, tells_names
 from ssh_abduction.evaluation.relations import Relation, Relations
 from ssh_abduction.evaluation.trajectory import Trajectory, TrajectoryWarning
-from ssh_abduction.evaluation.visits import MapPairs, MapVisits, Pairs, VisitsEvaluation, evaluate_visits, told_poses
+from ssh_abduction.evaluation.visits import (
+    MapPairs,
+    MapVisits,
+    Pairs,
+    VisitsEvaluation,
+    evaluate_visits,
+    told_poses,
+)
 
 __all__ = [
     "Evaluation",

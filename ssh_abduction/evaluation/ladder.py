@@ -82,7 +82,9 @@ class UnderWay:
         assert self.search
         return self.search.snapshot("interrupted")
 
-    def solve(self, trace: Trace, theory: Theory, *, time_limit: float | None, max_maps: int | None) -> Solution:
+    def solve(
+        self, trace: Trace, theory: Theory, *, time_limit: float | None, max_maps: int | None
+    ) -> Solution:
         """Do as `ssh_abduction.solve` does. Ctrl-C that ends this search ends the others, too."""
         theory.check_steps(trace)
         self.search = Search(trace, theory, time_limit=time_limit, max_maps=max_maps)
@@ -95,7 +97,10 @@ class UnderWay:
 
 def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[str, Theory]]:
     """The theories of the ladder, each with one kind of evidence more, as far as the trace has it."""
-    jumped, theory = theory.jumped, theory.replace(star="none", displacement="none", planar=False, jumped=0)
+    jumped, theory = (
+        theory.jumped,
+        theory.replace(star="none", displacement="none", planar=False, jumped=0),
+    )
     yield "views", theory
     topological = theory.level == "topological"
     if trace.has_stars and stars:
@@ -136,19 +141,35 @@ def ladder(
     a_count_of_maps(max_maps, SolverError)
     a_flag("stars", stars, TheoryError)
     if known is not None:
-        an_instance("known", known, Solution, MapError, mend="give what solve returned for this trace, or leave it out")
+        an_instance(
+            "known",
+            known,
+            Solution,
+            MapError,
+            mend="give what solve returned for this trace, or leave it out",
+        )
     if under_way is not None:
-        an_instance("under_way", under_way, UnderWay, SolverError, mend="give an UnderWay, or leave it out")
+        an_instance(
+            "under_way", under_way, UnderWay, SolverError, mend="give an UnderWay, or leave it out"
+        )
     return _solved(trace, theory, time_limit, max_maps, stars, known, under_way or UnderWay())
 
 
 def _solved(
-    trace: Trace, theory: Theory, limit: float | None, maps: int | None, stars: bool, known: Solution | None, under_way: UnderWay
+    trace: Trace,
+    theory: Theory,
+    limit: float | None,
+    maps: int | None,
+    stars: bool,
+    known: Solution | None,
+    under_way: UnderWay,
 ) -> Iterator[Rung]:
     has_truth = tells_names(trace)
     for name, chosen in rungs(trace, theory, stars):
         solution = (
-            known if known and known.theory == chosen.resolve(trace) else under_way.solve(trace, chosen, time_limit=limit, max_maps=maps)
+            known
+            if known and known.theory == chosen.resolve(trace)
+            else under_way.solve(trace, chosen, time_limit=limit, max_maps=maps)
         )
         is_judged = has_truth and solution.maps and not under_way.interrupted
         yield Rung(name, solution, evaluate(solution.maps, trace) if is_judged else None)

@@ -75,7 +75,11 @@ class MapEvaluation:
     @property
     def isomorphic(self) -> bool | None:
         """Whether the map is the true one up to renaming: its dstates are right, and so are its places and paths where these can be said."""
-        return False if False in (self.dstates_right, self.places_right, self.paths_right) else self.dstates_right
+        return (
+            False
+            if False in (self.dstates_right, self.places_right, self.paths_right)
+            else self.dstates_right
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The values under their names, as `evaluate --json` prints them."""
@@ -100,7 +104,9 @@ class Evaluation:
     ambiguity: float | None
 
     def __repr__(self) -> str:
-        which = "no map is the true one" if self.rank is None else f"map {self.rank} is the true one"
+        which = (
+            "no map is the true one" if self.rank is None else f"map {self.rank} is the true one"
+        )
         return f"<Evaluation: {which}, of {counted(len(self.maps), 'maps')}; the truth is told at {counted(self.steps, 'steps')}>"
 
     @property
@@ -110,7 +116,10 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """The values under their names, as `evaluate --json` prints them."""
-        own = {name: getattr(self, name) for name in ("rank", "steps", "true_dstates", "true_places", "true_paths", "ambiguity")}
+        own = {
+            name: getattr(self, name)
+            for name in ("rank", "steps", "true_dstates", "true_places", "true_paths", "ambiguity")
+        }
         return {"count": len(self.maps), **own, "maps": [found.to_dict() for found in self.maps]}
 
 
@@ -122,7 +131,10 @@ def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
     maps = checked_maps(maps)
     truth = _Truth(checked_trace(trace))
     return Evaluation(
-        maps=tuple(_evaluated(checked_map(ssh_map, f"maps[{i}]", trace), truth) for i, ssh_map in enumerate(maps)),
+        maps=tuple(
+            _evaluated(checked_map(ssh_map, f"maps[{i}]", trace), truth)
+            for i, ssh_map in enumerate(maps)
+        ),
         steps=sum(any(told) for told in zip(truth.dstates, truth.places, truth.paths, strict=True)),
         true_dstates=_different(truth.dstates),
         true_places=_different(truth.places),
@@ -133,7 +145,11 @@ def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
 
 def tells_names(trace: Trace) -> bool:
     """Whether the truth of some step names a dstate, a place or a path. Raises TraceError for what cannot be a name."""
-    return any(name for t, step in enumerate(trace.steps) for name in _told(step.truth, trace.at(t)).values())
+    return any(
+        name
+        for t, step in enumerate(trace.steps)
+        for name in _told(step.truth, trace.at(t)).values()
+    )
 
 
 class _Truth:
@@ -142,7 +158,9 @@ class _Truth:
     def __init__(self, trace: Trace) -> None:
         self.trace = trace
         told = [_told(step.truth, trace.at(t)) for t, step in enumerate(trace.steps)]
-        self.dstates, self.places, self.paths, self.courses = ([step.get(sort) for step in told] for sort in _SORTS)
+        self.dstates, self.places, self.paths, self.courses = (
+            [step.get(sort) for step in told] for sort in _SORTS
+        )
         if not any((*self.dstates, *self.places, *self.paths)):
             raise TraceError(
                 f"{named(trace.source or 'trace')}: truth: expected the true dstate or place of some step, got none; "
@@ -151,7 +169,9 @@ class _Truth:
         first: dict[Hashable, dict[str, tuple[int, Hashable]]] = {}
         for t, step in enumerate(told):
             for sort in ("place", "path", "course"):
-                if (name := step.get(sort)) is not None and (dstate := step.get("dstate")) is not None:
+                if (name := step.get(sort)) is not None and (
+                    dstate := step.get("dstate")
+                ) is not None:
                     before, known = first.setdefault(dstate, {}).setdefault(sort, (t, name))
                     if known != name:
                         field = "direction" if sort == "course" else sort
@@ -179,11 +199,15 @@ def _told(value: Any, where: str) -> dict[str, Hashable]:
         try:
             return None if value is None else json.dumps(value, sort_keys=True, allow_nan=False)
         except (TypeError, ValueError, RecursionError):
-            raise TraceError(f"{where}: truth: expected what JSON can hold, got {brief(value)}; name dstates by texts or numbers") from None
+            raise TraceError(
+                f"{where}: truth: expected what JSON can hold, got {brief(value)}; name dstates by texts or numbers"
+            ) from None
 
     if not isinstance(value, Mapping):
         return {} if value is None else {"dstate": name(value)}
-    told: dict[str, Hashable] = {sort: name(value.get(sort)) for sort in ("dstate", "place", "path")}
+    told: dict[str, Hashable] = {
+        sort: name(value.get(sort)) for sort in ("dstate", "place", "path")
+    }
     heading, direction = name(value.get("heading")), name(value.get("direction"))
     if told["dstate"] is None and None not in (told["place"], heading):
         told["dstate"] = told["place"], heading  # a distinctive state is a position and a heading
@@ -199,7 +223,9 @@ def _hops(names: Sequence[Hashable]) -> list[int]:
 def checked_map(ssh_map: object, where: str, trace: Trace) -> SSHMap:
     """A map that has a label for each step of the trace. Raises MapError."""
     if not isinstance(ssh_map, SSHMap):
-        raise MapError(f"{where}: expected an SSHMap, got {brief(ssh_map)}; take the maps of a solution, or SSHMap.load")
+        raise MapError(
+            f"{where}: expected an SSHMap, got {brief(ssh_map)}; take the maps of a solution, or SSHMap.load"
+        )
     if len(ssh_map.labels) != len(trace):
         raise MapError(
             f"{where}: labels: expected {len(trace)}, one for each step of the trace, got {len(ssh_map.labels)}; solve this trace"
@@ -219,8 +245,12 @@ def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
     courses = _Sort([None if s.path is None else (s.path, s.direction) for s in at], truth.courses)
     actions = truth.trace.actions
     place_precision, place_recall = places.pairs()
-    edge_precision, edge_recall = places.edges(truth.place_hops(), lambda _, here, there: frozenset((here, there)))
-    link_precision, link_recall = dstates.edges(truth.dstate_hops(), lambda t, here, there: (here, actions[t].name, there))
+    edge_precision, edge_recall = places.edges(
+        truth.place_hops(), lambda _, here, there: frozenset((here, there))
+    )
+    link_precision, link_recall = dstates.edges(
+        truth.dstate_hops(), lambda t, here, there: (here, actions[t].name, there)
+    )
     return MapEvaluation(
         dstates_right=dstates.right,
         places_right=places.right,
@@ -267,17 +297,26 @@ class _Sort:
     @cached_property
     def assignment(self) -> dict[Hashable, Hashable]:
         """What the map has, each with another one of the truth, so that as many steps as can be are at what they are assigned to."""
-        rows, columns = ({name: i for i, name in enumerate(names)} for names in (self.of_map, self.of_truth))
+        rows, columns = (
+            {name: i for i, name in enumerate(names)} for names in (self.of_map, self.of_truth)
+        )
         table = np.zeros((len(rows), len(columns)))
         for (x, y), steps in self.steps.items():
             if x is not None:
                 table[rows[x], columns[y]] = steps
-        return {self.of_map[i]: self.of_truth[j] for i, j in zip(*linear_sum_assignment(table, maximize=True), strict=True)}
+        return {
+            self.of_map[i]: self.of_truth[j]
+            for i, j in zip(*linear_sum_assignment(table, maximize=True), strict=True)
+        }
 
     @property
     def accuracy(self) -> float | None:
         """The share of steps that are at what is assigned to what the map says."""
-        return _share(sum(self.steps[pair] for pair in self.assignment.items()), self.steps.total()) if self.of_map else None
+        return (
+            _share(sum(self.steps[pair] for pair in self.assignment.items()), self.steps.total())
+            if self.of_map
+            else None
+        )
 
     def pairs(self) -> tuple[float | None, float | None]:
         """Precision and recall of pairs of steps at one thing."""
@@ -289,20 +328,28 @@ class _Sort:
             true[y] += steps
         del said[None]
         both = sum(comb(steps, 2) for (x, _), steps in self.steps.items() if x is not None)
-        return _share(both, sum(comb(n, 2) for n in said.values())), _share(both, sum(comb(n, 2) for n in true.values()))
+        return _share(both, sum(comb(n, 2) for n in said.values())), _share(
+            both, sum(comb(n, 2) for n in true.values())
+        )
 
-    def edges(self, hops: Iterable[int], edge: Callable[[int, Hashable, Hashable], Hashable]) -> tuple[float | None, float | None]:
+    def edges(
+        self, hops: Iterable[int], edge: Callable[[int, Hashable, Hashable], Hashable]
+    ) -> tuple[float | None, float | None]:
         """Precision and recall of edges, each between a step and the next one, under the assignment.
 
         edge  what joins two things, after this step: edges that are equal count once
         """
         if not self.of_map:
             return None, None
-        said: dict[Hashable, Hashable] = {}  # each edge of the map, and the edge that it is assigned to
+        said: dict[
+            Hashable, Hashable
+        ] = {}  # each edge of the map, and the edge that it is assigned to
         true = set()
         for t in hops:
             here, there = self.said[t], self.said[t + 1]
-            said[edge(t, here, there)] = edge(t, self.assignment.get(here), self.assignment.get(there))
+            said[edge(t, here, there)] = edge(
+                t, self.assignment.get(here), self.assignment.get(there)
+            )
             true.add(edge(t, self.true[t], self.true[t + 1]))
         right = sum(assigned in true for assigned in said.values())
         return _share(right, len(said)), _share(right, len(true))
@@ -322,6 +369,10 @@ def _ambiguity(views: Sequence[View | None], dstates: Sequence[Hashable]) -> flo
     for view, dstate in zip(views, dstates, strict=True):
         if view is not None and dstate is not None:
             seen.setdefault(dstate, set()).add(view)
-    alike = Counter(frozenset(own) for own in seen.values())  # most dstates have one view, so there are few sets of views
-    shared = sum(comb(n, 2) for n in alike.values()) + sum(n * m for (a, n), (b, m) in combinations(alike.items(), 2) if a & b)
+    alike = Counter(
+        frozenset(own) for own in seen.values()
+    )  # most dstates have one view, so there are few sets of views
+    shared = sum(comb(n, 2) for n in alike.values()) + sum(
+        n * m for (a, n), (b, m) in combinations(alike.items(), 2) if a & b
+    )
     return _share(shared, comb(len(seen), 2))

@@ -58,8 +58,12 @@ class Relations:
         self._to: dict[tuple[int, int], Displacement] = {}
         relations = tuple(relations)
         if not relations:
-            raise TraceError("relations: expected one or more, got none; give a file of relative poses")
-        self.times = sorted({time for relation in relations for time in (relation.first, relation.second)})
+            raise TraceError(
+                "relations: expected one or more, got none; give a file of relative poses"
+            )
+        self.times = sorted(
+            {time for relation in relations for time in (relation.first, relation.second)}
+        )
         number = {time: i for i, time in enumerate(self.times)}
         for relation in relations:
             a, b = number[relation.first], number[relation.second]
@@ -67,7 +71,9 @@ class Relations:
             self._to[b, a] = between(relation.displacement, (0.0, 0.0, 0.0))
         ends = np.array(list(self._to)).T
         metres = [math.hypot(x, y) + EACH for x, y, _ in self._to.values()]
-        self._graph = coo_array((metres, (ends[0], ends[1])), shape=(len(self.times), len(self.times))).tocsr()
+        self._graph = coo_array(
+            (metres, (ends[0], ends[1])), shape=(len(self.times), len(self.times))
+        ).tocsr()
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Relations:
@@ -75,8 +81,14 @@ class Relations:
         try:
             text = read_at_most(path, LARGEST).decode("utf-8")
         except ValueError as error:  # bytes that are no text are one, too
-            raise TraceError(f"{named(path)}: expected a text of relations, got another file ({error}); give one of numbers") from None
-        lines = [(number, fields) for number, line in enumerate(text.splitlines(), 1) if (fields := line.partition("#")[0].split())]
+            raise TraceError(
+                f"{named(path)}: expected a text of relations, got another file ({error}); give one of numbers"
+            ) from None
+        lines = [
+            (number, fields)
+            for number, line in enumerate(text.splitlines(), 1)
+            if (fields := line.partition("#")[0].split())
+        ]
         if is_trajectory(fields for _, fields in lines):
             raise TraceError(
                 f"{named(path)}: expected relations, {' '.join(FIELDS)}, got a trajectory: each line ends in a quaternion; "
@@ -84,14 +96,18 @@ class Relations:
             )
         found = [_relation(fields, f"{named(path)}:{number}") for number, fields in lines]
         if not found:
-            raise TraceError(f"{named(path)}: expected lines of {' '.join(FIELDS)}, got none; give a file of relations")
+            raise TraceError(
+                f"{named(path)}: expected lines of {' '.join(FIELDS)}, got none; give a file of relations"
+            )
         return Relations(found)
 
     def covers(self, time: float | None) -> bool:
         """Whether a moment has related times around it, or near it."""
         return self._near(time) is not None
 
-    def between(self, times: Sequence[float | None], origin: int) -> list[tuple[Pose, float] | None]:
+    def between(
+        self, times: Sequence[float | None], origin: int
+    ) -> list[tuple[Pose, float] | None]:
         """For each moment the pose of the robot as seen from where it was at the moment `origin`, and the metres of relations that were composed for it.
 
         times  of the moments, in seconds; None where a moment has no time
@@ -113,7 +129,14 @@ class Relations:
                 found.append(((0.0, 0.0, 0.0), 0.0))
             else:
                 pose = moved(self._composed(moment[0], before, poses), moment[1])
-                found.append((pose, float(metres[moment[0]]) + math.hypot(*offset[:2]) + math.hypot(*moment[1][:2])))
+                found.append(
+                    (
+                        pose,
+                        float(metres[moment[0]])
+                        + math.hypot(*offset[:2])
+                        + math.hypot(*moment[1][:2]),
+                    )
+                )
         return found
 
     def _composed(self, node: int, before: Sequence[int], poses: dict[int, Pose]) -> Pose:
@@ -137,7 +160,11 @@ class Relations:
         (other,) = [i for i in around if i != node] or [node]
         if (whole := self._to.get((node, other))) is not None:
             share = (time - self.times[node]) / (self.times[other] - self.times[node])
-            return node, (share * whole[0], share * whole[1], share * math.remainder(whole[2], math.tau))
+            return node, (
+                share * whole[0],
+                share * whole[1],
+                share * math.remainder(whole[2], math.tau),
+            )
         return (node, (0.0, 0.0, 0.0)) if abs(self.times[node] - time) <= NEAREST else None
 
 
@@ -146,9 +173,15 @@ def _relation(fields: Sequence[str], where: str) -> Relation:
     try:
         first, second, x, y, _, _, _, yaw = (float(field) for field in fields)
     except ValueError:
-        raise TraceError(f"{where}: expected the numbers {' '.join(FIELDS)}, got {brief(' '.join(fields))}; mend the line") from None
+        raise TraceError(
+            f"{where}: expected the numbers {' '.join(FIELDS)}, got {brief(' '.join(fields))}; mend the line"
+        ) from None
     if not all(math.isfinite(value) for value in (first, second, x, y, yaw)):
-        raise TraceError(f"{where}: expected finite numbers, got {brief(' '.join(fields))}; mend the line")
+        raise TraceError(
+            f"{where}: expected finite numbers, got {brief(' '.join(fields))}; mend the line"
+        )
     if first == second:
-        raise TraceError(f"{where}: time2: expected another time than time1, got {fields[1]} twice; mend the line")
+        raise TraceError(
+            f"{where}: time2: expected another time than time1, got {fields[1]} twice; mend the line"
+        )
     return Relation(first, second, (x, y, yaw))

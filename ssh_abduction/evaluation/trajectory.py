@@ -57,11 +57,15 @@ class Trajectory:
         self.source = source
         found = sorted(dict.fromkeys(poses))
         if not found:
-            raise TraceError(f"{named(source)}: expected lines of {' '.join(FIELDS)}, got none; give a trajectory in TUM format")
+            raise TraceError(
+                f"{named(source)}: expected lines of {' '.join(FIELDS)}, got none; give a trajectory in TUM format"
+            )
         self.times, self.poses = [time for time, _ in found], [pose for _, pose in found]
         for before, after in zip(self.times[:-1], self.times[1:], strict=True):
             if before == after:
-                raise TraceError(f"{named(source)}: expected one pose at a time, got different ones at {before:.10g} s; keep one of them")
+                raise TraceError(
+                    f"{named(source)}: expected one pose at a time, got different ones at {before:.10g} s; keep one of them"
+                )
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Trajectory:
@@ -75,7 +79,9 @@ class Trajectory:
         try:
             text = read_at_most(path, LARGEST).decode("utf-8-sig")
         except ValueError as error:  # bytes that are no text are one, too
-            raise TraceError(f"{named(source)}: expected a trajectory in TUM format, got another file ({error}); give a text") from None
+            raise TraceError(
+                f"{named(source)}: expected a trajectory in TUM format, got another file ({error}); give a text"
+            ) from None
         found: list[tuple[float, Pose]] = []
         heights: list[float] = []
         upright = 0
@@ -104,9 +110,16 @@ class Trajectory:
         if first == last or self.times[last] - self.times[first] > 2 * NEAREST:
             return self.poses[nearest]
         share = (time - self.times[first]) / (self.times[last] - self.times[first])
-        (x, y, heading), (dx, dy, turned) = self.poses[first], between((0.0, 0.0, 0.0), self.poses[last])
+        (x, y, heading), (dx, dy, turned) = (
+            self.poses[first],
+            between((0.0, 0.0, 0.0), self.poses[last]),
+        )
         turned = math.remainder(turned - heading, math.tau)
-        return x + share * (dx - x), y + share * (dy - y), math.remainder(heading + share * turned, math.tau)
+        return (
+            x + share * (dx - x),
+            y + share * (dy - y),
+            math.remainder(heading + share * turned, math.tau),
+        )
 
     def told_to(self, trace: Trace) -> Trace:
         """The trace with the poses of this trajectory as the truth of its steps, in place of others.
@@ -117,7 +130,9 @@ class Trajectory:
         Raises:
             TraceError: No step has a time, or none is near a time of this trajectory.
         """
-        times = [checked_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)]
+        times = [
+            checked_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)
+        ]
         robots = [self.at(time) for time in times]
         told = sum(robot is not None for robot in robots)
         if not told:
@@ -133,7 +148,13 @@ class Trajectory:
             trace,
             steps=tuple(
                 replace(
-                    step, truth=_truth(step, None if robot is None else moved(robot, checked_pose(step.extra.get("seen"), trace.at(t))))
+                    step,
+                    truth=_truth(
+                        step,
+                        None
+                        if robot is None
+                        else moved(robot, checked_pose(step.extra.get("seen"), trace.at(t))),
+                    ),
                 )
                 for t, (step, robot) in enumerate(zip(trace.steps, robots, strict=True))
             ),
@@ -157,14 +178,20 @@ def is_trajectory(lines: Iterable[Sequence[str]]) -> bool:
         tails = [[float(field) for field in fields[4:8]] for fields in lines]
     except ValueError:
         return False
-    unit = bool(tails) and all(len(tail) == 4 and abs(math.hypot(*tail) - 1) <= ROUNDED for tail in tails)
-    return unit and (any(any(tail[:3]) for tail in tails) or all(abs(tail[3]) == 1 for tail in tails))
+    unit = bool(tails) and all(
+        len(tail) == 4 and abs(math.hypot(*tail) - 1) <= ROUNDED for tail in tails
+    )
+    return unit and (
+        any(any(tail[:3]) for tail in tails) or all(abs(tail[3]) == 1 for tail in tails)
+    )
 
 
 def checked_time(value: Any, where: str) -> float | None:
     """The time of a step in seconds. Raises TraceError."""
     if value is not None and not is_finite(value):
-        raise TraceError(f"{where}: time: expected seconds, got {brief(value)}; mend it, or leave it out")
+        raise TraceError(
+            f"{where}: time: expected seconds, got {brief(value)}; mend it, or leave it out"
+        )
     return None if value is None else float(value)
 
 
@@ -172,14 +199,27 @@ def checked_pose(value: Any, where: str) -> Pose:
     """Where a robot saw a dstate, as JSON has it; in front of it where nothing is told. Raises TraceError."""
     if value is None:
         return 0.0, 0.0, 0.0
-    if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 3 and all(is_finite(number) for number in value):
+    if (
+        isinstance(value, Sequence)
+        and not isinstance(value, str)
+        and len(value) == 3
+        and all(is_finite(number) for number in value)
+    ):
         return float(value[0]), float(value[1]), float(value[2])
-    raise TraceError(f"{where}: seen: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it")
+    raise TraceError(
+        f"{where}: seen: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it"
+    )
 
 
 def _truth(step: Step, pose: Pose | None) -> Any:
     """The truth of a step with this pose, and without another one."""
-    told = dict(step.truth) if isinstance(step.truth, Mapping) else {} if step.truth is None else {"dstate": step.truth}
+    told = (
+        dict(step.truth)
+        if isinstance(step.truth, Mapping)
+        else {}
+        if step.truth is None
+        else {"dstate": step.truth}
+    )
     told.pop("pose", None)
     if pose is not None:
         told["pose"] = list(pose)
@@ -196,14 +236,19 @@ def _is_number(field: str) -> bool:
 def _pose(fields: Sequence[str], where: str) -> tuple[float, Pose, float, float]:
     """The time of a line, its pose on the floor, its height, and how upright it is: the cosine of what its axis leans. Raises TraceError."""
     if len(fields) != len(FIELDS) or not all(map(_is_number, fields)):
-        hint = {12: "; this looks like a file of KITTI, which has no times", 17: "; this looks like a file of EuRoC: evo_traj converts it"}
+        hint = {
+            12: "; this looks like a file of KITTI, which has no times",
+            17: "; this looks like a file of EuRoC: evo_traj converts it",
+        }
         raise TraceError(
             f"{where}: expected the numbers {' '.join(FIELDS)}, got {brief(' '.join(fields))}{hint.get(len(fields), '; mend the line')}"
         )
     time, x, y, z, *quaternion = map(float, fields)
     length = math.hypot(*quaternion)
     if abs(length - 1) > ROUNDED:
-        raise TraceError(f"{where}: qx qy qz qw: expected a quaternion of length 1, got one of {length:.3g}; mend the line")
+        raise TraceError(
+            f"{where}: qx qy qz qw: expected a quaternion of length 1, got one of {length:.3g}; mend the line"
+        )
     qx, qy, qz, qw = (number / length for number in quaternion)
     heading = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
     return time, (x, y, heading), z, 1 - 2 * (qx * qx + qy * qy)

@@ -98,7 +98,13 @@ class MapPairs:
 
     def to_dict(self) -> dict[str, Any]:
         """The counts, precision and recall under their names."""
-        return {"things": self.things, "joined": self.joined, "right": self.right, "precision": self.precision, "recall": self.recall}
+        return {
+            "things": self.things,
+            "joined": self.joined,
+            "right": self.right,
+            "precision": self.precision,
+            "recall": self.recall,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,14 +150,22 @@ class VisitsEvaluation:
             "places": asdict(self.places),
             "dstates": asdict(self.dstates),
         }
-        maps = [{"places": found.places and found.places.to_dict(), "dstates": found.dstates.to_dict()} for found in self.maps]
+        maps = [
+            {"places": found.places and found.places.to_dict(), "dstates": found.dstates.to_dict()}
+            for found in self.maps
+        ]
         if self.by_both is not None:
             own |= {"by_both": self.by_both[0], "alike": self.by_both[1]}
         return {**own, "maps": maps}
 
 
 def evaluate_visits(
-    maps: Iterable[SSHMap], trace: Trace, *, near: float = NEAR, turned: float = TURNED, relations: Relations | None = None
+    maps: Iterable[SSHMap],
+    trace: Trace,
+    *,
+    near: float = NEAR,
+    turned: float = TURNED,
+    relations: Relations | None = None,
 ) -> VisitsEvaluation:
     """How right these maps of a trace are: precision and recall of the pairs of visits, and of steps, that they have at one place, and at one dstate.
 
@@ -168,7 +182,13 @@ def evaluate_visits(
             )
     maps = checked_maps(maps)
     if relations is not None:
-        an_instance("relations", relations, Relations, TraceError, mend="make them with Relations.load, or leave them out")
+        an_instance(
+            "relations",
+            relations,
+            Relations,
+            TraceError,
+            mend="make them with Relations.load, or leave them out",
+        )
     truth: _Poses | _Related = _Poses(trace) if relations is None else _Related(trace, relations)
     visit = np.cumsum([0, *(action.kind != "turn" for action in trace.actions)])
     places, dstates = _verdicts(truth, visit, near, turned)
@@ -184,14 +204,19 @@ def evaluate_visits(
         visits=len(places),
         places=_pairs(places, np.arange(len(places))),
         dstates=_pairs(dstates, visit),
-        maps=tuple(_evaluated(checked_map(ssh_map, f"maps[{i}]", trace), visit, places, dstates) for i, ssh_map in enumerate(maps)),
+        maps=tuple(
+            _evaluated(checked_map(ssh_map, f"maps[{i}]", trace), visit, places, dstates)
+            for i, ssh_map in enumerate(maps)
+        ),
         by_both=by_both,
     )
 
 
 def told_poses(trace: Trace) -> list[Pose | None]:
     """The true pose of each step, (x, y, heading) in metres and radians; None where it is not told. Raises TraceError for one that is malformed."""
-    told = [step.truth.get("pose") if isinstance(step.truth, Mapping) else None for step in trace.steps]
+    told = [
+        step.truth.get("pose") if isinstance(step.truth, Mapping) else None for step in trace.steps
+    ]
     return [_pose(value, f"{trace.at(t)}: truth.pose") for t, value in enumerate(told)]
 
 
@@ -199,9 +224,16 @@ def _pose(value: Any, where: str) -> Pose | None:
     """A pose as JSON has it; None where there is none. Raises TraceError."""
     if value is None:
         return None
-    if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 3 and all(is_finite(number) for number in value):
+    if (
+        isinstance(value, Sequence)
+        and not isinstance(value, str)
+        and len(value) == 3
+        and all(is_finite(number) for number in value)
+    ):
         return float(value[0]), float(value[1]), float(value[2])
-    raise TraceError(f"{where}: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it")
+    raise TraceError(
+        f"{where}: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it"
+    )
 
 
 class _Poses:
@@ -232,8 +264,12 @@ class _Related:
 
     def __init__(self, trace: Trace, relations: Relations) -> None:
         self._relations = relations
-        self._times = [checked_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)]
-        self._seen = [checked_pose(step.extra.get("seen"), trace.at(t)) for t, step in enumerate(trace.steps)]
+        self._times = [
+            checked_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)
+        ]
+        self._seen = [
+            checked_pose(step.extra.get("seen"), trace.at(t)) for t, step in enumerate(trace.steps)
+        ]
         self.told = np.array([relations.covers(time) for time in self._times])
         if not self.told.any():
             began, ended = relations.times[0], relations.times[-1]
@@ -248,7 +284,9 @@ class _Related:
         origin = self._seen[step]
         dx, dy, turned, way = np.array(
             [
-                (math.nan,) * 4 if robot is None else (*between(origin, moved(robot[0], seen)), robot[1])
+                (math.nan,) * 4
+                if robot is None
+                else (*between(origin, moved(robot[0], seen)), robot[1])
                 for robot, seen in zip(robots, self._seen, strict=True)
             ]
         ).T
@@ -260,27 +298,35 @@ def _degrees(radians: Array) -> Array:
     return np.abs(np.degrees((radians + math.pi) % math.tau - math.pi))
 
 
-def _verdicts(truth: _Poses | _Related, visit: Steps, near: float, turned: float) -> tuple[Verdicts, Verdicts]:
+def _verdicts(
+    truth: _Poses | _Related, visit: Steps, near: float, turned: float
+) -> tuple[Verdicts, Verdicts]:
     """What is true of each pair of visits, and of each pair of steps, the earlier one first. UNKNOWN where a pair is none.
 
     visit  of each step, counted from 0
     """
     steps = np.arange(len(visit))
     # A visit is where the first of its steps is whose pose is known.
-    at = np.array([min(steps[visit == v], key=lambda t: not truth.told[t]) for v in range(visit[-1] + 1)])
+    at = np.array(
+        [min(steps[visit == v], key=lambda t: not truth.told[t]) for v in range(visit[-1] + 1)]
+    )
     places = np.full((len(at), len(at)), UNKNOWN, np.uint8)
     dstates = np.full((len(visit), len(visit)), UNKNOWN, np.uint8)
     for v, first in enumerate(at):
         distance, _, doubt = truth.seen_from(first)
         far, unknown = distance[at] > near, ~(np.abs(distance[at] - near) >= doubt[at])
-        left = np.cumsum((far & ~unknown)[v:-1]) > 0  # for each later visit, whether the robot was away at one before
+        left = (
+            np.cumsum((far & ~unknown)[v:-1]) > 0
+        )  # for each later visit, whether the robot was away at one before
         places[v, v + 1 :] = np.where(unknown, UNKNOWN, np.where(far, APART, STAYED))[v + 1 :]
         places[v, v + 1 :][left & (places[v, v + 1 :] == STAYED)] = RETURN
         later = visit > v
         for step in steps[visit == v]:
             distance, heading, doubt = (told[later] for told in truth.seen_from(step))
             far, unknown = distance > near, ~(np.abs(distance - near) >= doubt)
-            returned = np.where(left[visit[later] - v - 1], np.where(heading <= turned, RETURN, APART), STAYED)
+            returned = np.where(
+                left[visit[later] - v - 1], np.where(heading <= turned, RETURN, APART), STAYED
+            )
             dstates[step, later] = np.where(unknown, UNKNOWN, np.where(far, APART, returned))
     return places, dstates
 
@@ -299,10 +345,16 @@ def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdict
     one = np.equal.outer(*[[s.id for s in at]] * 2)
     if not ssh_map.places:
         return MapVisits(None, _joined(one, dstates, len(ssh_map.dstates)))
-    own = np.array([math.nan if s.place is None else s.place for s in at])  # which is not equal to itself
+    own = np.array(
+        [math.nan if s.place is None else s.place for s in at]
+    )  # which is not equal to itself
     starts = np.flatnonzero(np.diff(visit, prepend=-1))
-    together = np.logical_or.reduceat(np.logical_or.reduceat(np.equal.outer(own, own), starts, axis=0), starts, axis=1)
-    return MapVisits(_joined(together, places, len(ssh_map.places)), _joined(one, dstates, len(ssh_map.dstates)))
+    together = np.logical_or.reduceat(
+        np.logical_or.reduceat(np.equal.outer(own, own), starts, axis=0), starts, axis=1
+    )
+    return MapVisits(
+        _joined(together, places, len(ssh_map.places)), _joined(one, dstates, len(ssh_map.dstates))
+    )
 
 
 def _joined(one: NDArray[np.bool_], verdicts: Verdicts, things: int) -> MapPairs:
@@ -310,4 +362,9 @@ def _joined(one: NDArray[np.bool_], verdicts: Verdicts, things: int) -> MapPairs
     one  of each pair, whether the map has it as one; pairs that are none are UNKNOWN, so that they do not count
     """
     right = int((one & (verdicts == RETURN)).sum())
-    return MapPairs(things, right + int((one & (verdicts == APART)).sum()), right, int((verdicts == RETURN).sum()))
+    return MapPairs(
+        things,
+        right + int((one & (verdicts == APART)).sum()),
+        right,
+        int((verdicts == RETURN).sum()),
+    )

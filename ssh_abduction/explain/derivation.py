@@ -31,7 +31,9 @@ from ssh_abduction.theory.theory import EXCUSED
 
 FEW_STEPS = 14  # An argument about so few steps may speak of all of them. In a longer piece it speaks of those that the axioms name, as conclusions are many.
 IN_A_LINE, INDENT = 2, " " * 7  # More reasons than these have a line each, with this indent.
-OF_ACTIONS = EXCUSED["slipped"] | {"branch_side"}  # axioms that are broken at a step by the action that led to it
+OF_ACTIONS = EXCUSED["slipped"] | {
+    "branch_side"
+}  # axioms that are broken at a step by the action that led to it
 # What has one value for a dstate. A map shows only that value, so an axiom of these should hold in a map that the checker is to judge.
 SHOWN = ("one_place", "one_course", "one_heading", "functional_view", "deterministic")
 
@@ -54,7 +56,12 @@ _WORDS = {
     "turned": "steps {0} and {1} {are} at one place, and step {1} {faces} {turn} step {0}",
 }
 # How a step faces that faces so many quarters clockwise from another one.
-_TURNED = ("the same way as", "a quarter to the right of", "the opposite way of", "a quarter to the left of")
+_TURNED = (
+    "the same way as",
+    "a quarter to the right of",
+    "the opposite way of",
+    "a quarter to the left of",
+)
 # Conclusions that say most are kept where one of several would do.
 _PREFERRED = (
     "on",
@@ -150,7 +157,11 @@ class Derivation:
             if inference.supposed and not supposed:
                 lines.append(f"suppose that {self.supposition}; then")
                 supposed = True
-            by = f" (by {', '.join(str(p + 1) for p in inference.premises)})" if inference.premises else ""
+            by = (
+                f" (by {', '.join(str(p + 1) for p in inference.premises)})"
+                if inference.premises
+                else ""
+            )
             names = "; ".join(f"{link.axiom}, {_steps(link.steps)}" for link in inference.links)
             says, because = f"{number:3}. {'; '.join(inference.says)}{by}:", [*inference.because]
             named = [f"[{names}]"] if names else []
@@ -167,14 +178,24 @@ class Derivation:
         """Plain data, without the maps of the links."""
         return {
             "steps": list(self.steps),
-            "clashes": [{"axiom": clash.axiom, "steps": list(clash.steps)} for clash in self.clashes],
+            "clashes": [
+                {"axiom": clash.axiom, "steps": list(clash.steps)} for clash in self.clashes
+            ],
             "supposition": self.supposition,
             "inferences": [inference.to_dict() for inference in self.inferences],
             "summary": self.summary,
         }
 
 
-def derive(piece: Piece, trace: Trace, first: int, second: int, *, one: bool, stop: Callable[[], bool] = lambda: False) -> Derivation:
+def derive(
+    piece: Piece,
+    trace: Trace,
+    first: int,
+    second: int,
+    *,
+    one: bool,
+    stop: Callable[[], bool] = lambda: False,
+) -> Derivation:
     """The argument that two steps are one dstate in all maps of a piece of a trace (`one`), or in none. That has to be so.
 
     trace  the whole trace, which displacements speak of
@@ -195,7 +216,15 @@ class _Line:
 class _Argument:
     """Finds an argument. Steps are those of the piece until they are put into words."""
 
-    def __init__(self, piece: Piece, trace: Trace, first: int, second: int, one: bool, stop: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        piece: Piece,
+        trace: Trace,
+        first: int,
+        second: int,
+        one: bool,
+        stop: Callable[[], bool],
+    ) -> None:
         self._piece, self._trace, self._one = piece, trace, one
         self._pair = piece.steps.index(first), piece.steps.index(second)
         self._axioms = Axioms(piece, stop, relaxed=True)
@@ -205,7 +234,9 @@ class _Argument:
         self._links = sorted(clash, key=lambda link: (order.index(link[0]), link[1]))
         self._axioms.tell_of(self._named_steps())
         self._lines: list[_Line] = []
-        self._born: dict[clingo.Symbol, int] = {}  # the line at which each conclusion is drawn first
+        self._born: dict[
+            clingo.Symbol, int
+        ] = {}  # the line at which each conclusion is drawn first
         self._words = _Words(piece, trace)
 
     def _named_steps(self) -> Iterable[int]:
@@ -214,7 +245,10 @@ class _Argument:
         if size <= FEW_STEPS or self._piece.theory.level == "causal":
             return range(size)
         first, second = self._pair
-        named = {t for _, step in self._links for t in (step - 1, step, step - second + first)} | {first, second}
+        named = {t for _, step in self._links for t in (step - 1, step, step - second + first)} | {
+            first,
+            second,
+        }
         return [t for t in named if 0 <= t < size]
 
     def derivation(self) -> Derivation:
@@ -222,8 +256,21 @@ class _Argument:
         inferences, summary = self._told()
         first, second = (self._piece.steps[k] for k in self._pair)
         supposed = any(inference.supposed for inference in inferences)
-        supposition = f"steps {first} and {second} {'are different dstates' if self._one else 'are one dstate'}" if supposed else None
-        return Derivation(self._piece.steps, first, second, self._one, tuple(self._checked_links()), inferences, supposition, summary)
+        supposition = (
+            f"steps {first} and {second} {'are different dstates' if self._one else 'are one dstate'}"
+            if supposed
+            else None
+        )
+        return Derivation(
+            self._piece.steps,
+            first,
+            second,
+            self._one,
+            tuple(self._checked_links()),
+            inferences,
+            supposition,
+            summary,
+        )
 
     # Which conclusions follow from the links, in which order
 
@@ -237,7 +284,9 @@ class _Argument:
             known = self._axioms.consequences(_active(placed), assumed, self._born)
             self._add((), known, supposed)
             while left:
-                group = self._next(placed, left, assumed, known) or (tuple(left) if supposed else None)
+                group = self._next(placed, left, assumed, known) or (
+                    tuple(left) if supposed else None
+                )
                 if group is None:
                     break
                 placed += group
@@ -270,7 +319,9 @@ class _Argument:
                 return (link,)
         return None
 
-    def _add(self, group: tuple[tuple[str, int], ...], known: frozenset[clingo.Symbol], supposed: bool) -> None:
+    def _add(
+        self, group: tuple[tuple[str, int], ...], known: frozenset[clingo.Symbol], supposed: bool
+    ) -> None:
         new = known - self._born.keys()
         if new:
             self._born.update(dict.fromkeys(new, len(self._lines)))
@@ -281,7 +332,11 @@ class _Argument:
     def _told(self) -> tuple[tuple[Inference, ...], str]:
         """The lines that the argument needs, premises before what follows from them, and the argument in one sentence."""
         last = self._lines[-1]
-        goal = None if not last.conclusions else facts.conclusion("one_dstate" if self._one else "two_dstates", *self._pair)
+        goal = (
+            None
+            if not last.conclusions
+            else facts.conclusion("one_dstate" if self._one else "two_dstates", *self._pair)
+        )
         order: list[clingo.Symbol | None] = []
         premises: dict[clingo.Symbol | None, list[clingo.Symbol]] = {}
         links: dict[clingo.Symbol | None, tuple[tuple[str, int], ...]] = {}
@@ -290,18 +345,28 @@ class _Argument:
             if conclusion in premises:
                 return
             premises[conclusion], links[conclusion] = self._support(conclusion)
-            for premise in sorted(premises[conclusion], key=lambda premise: facts.read_conclusion(premise)[1]):
+            for premise in sorted(
+                premises[conclusion], key=lambda premise: facts.read_conclusion(premise)[1]
+            ):
                 visit(premise)
             order.append(conclusion)
 
         visit(goal)
-        order.sort(key=lambda conclusion: self._line_of(conclusion).supposed)  # what holds in every map comes first
+        order.sort(
+            key=lambda conclusion: self._line_of(conclusion).supposed
+        )  # what holds in every map comes first
         # Conclusions that follow from the same links and premises are one line.
         numbers: dict[clingo.Symbol | None, int] = {}
-        lines: list[tuple[list[clingo.Symbol | None], tuple[int, ...], tuple[tuple[str, int], ...]]] = []
+        lines: list[
+            tuple[list[clingo.Symbol | None], tuple[int, ...], tuple[tuple[str, int], ...]]
+        ] = []
         for conclusion in order:
             before = tuple(sorted({numbers[p] for p in premises[conclusion] if p in numbers}))
-            if lines and lines[-1][1:] == (before, links[conclusion]) and self._line_of(lines[-1][0][0]) is self._line_of(conclusion):
+            if (
+                lines
+                and lines[-1][1:] == (before, links[conclusion])
+                and self._line_of(lines[-1][0][0]) is self._line_of(conclusion)
+            ):
                 lines[-1][0].append(conclusion)
             else:
                 lines.append(([conclusion], before, links[conclusion]))
@@ -312,22 +377,34 @@ class _Argument:
     def _line_of(self, conclusion: clingo.Symbol | None) -> _Line:
         return self._lines[-1 if conclusion is None else self._born[conclusion]]
 
-    def _support(self, conclusion: clingo.Symbol | None) -> tuple[list[clingo.Symbol], tuple[tuple[str, int], ...]]:
+    def _support(
+        self, conclusion: clingo.Symbol | None
+    ) -> tuple[list[clingo.Symbol], tuple[tuple[str, int], ...]]:
         """What a conclusion follows from: what has to be known, none of which can be spared, and links; those of its line, and earlier ones that are needed once more."""
         line = self._line_of(conclusion)
         number = len(self._lines) - 1 if conclusion is None else self._born[conclusion]
         known = [
-            (symbol, True) for symbol, born in self._born.items() if born < number and (line.supposed or not self._lines[born].supposed)
+            (symbol, True)
+            for symbol, born in self._born.items()
+            if born < number and (line.supposed or not self._lines[born].supposed)
         ]
         known.sort(key=lambda assumption: self._rank(assumption[0]))
         earlier = [link for before in self._lines[:number] for link in before.group]
-        given = [*([(conclusion, False)] if conclusion is not None else []), *([self._supposed] if line.supposed else []), *known]
+        given = [
+            *([(conclusion, False)] if conclusion is not None else []),
+            *([self._supposed] if line.supposed else []),
+            *known,
+        ]
         core = self._axioms.core(_active(line.group), given)
         if core is None:
-            core = self._axioms.core(_active(line.group), [*given, *((facts.active(*link), True) for link in earlier)])
+            core = self._axioms.core(
+                _active(line.group), [*given, *((facts.active(*link), True) for link in earlier)]
+            )
         needed = {symbol for symbol, _ in core or ()}
         again = tuple(link for link in earlier if facts.active(*link) in needed)
-        return [symbol for symbol, _ in core or () if symbol in self._born and symbol != conclusion], again + line.group
+        return [
+            symbol for symbol, _ in core or () if symbol in self._born and symbol != conclusion
+        ], again + line.group
 
     def _rank(self, symbol: clingo.Symbol) -> tuple[bool, bool, int, int, tuple[int, ...]]:
         """Premises of lower rank are kept. What holds in every map is said of the first step of the pair, what is supposed of the second one."""
@@ -345,17 +422,28 @@ class _Argument:
     # Words
 
     def _inference(
-        self, conclusions: Sequence[clingo.Symbol | None], premises: tuple[int, ...], needed: Sequence[tuple[str, int]]
+        self,
+        conclusions: Sequence[clingo.Symbol | None],
+        premises: tuple[int, ...],
+        needed: Sequence[tuple[str, int]],
     ) -> Inference:
         line = self._line_of(conclusions[0])
         known = [symbol for symbol, born in self._born.items() if born <= self._lines.index(line)]
         self._words.know(known)
         said = [facts.read_conclusion(c) for c in conclusions if c is not None]
-        says = tuple(dict.fromkeys(self._words.of(c, would=line.supposed) for c in said)) or ("that is a contradiction",)
-        because = tuple(dict.fromkeys(self._words.reason(axiom, t, said, self._pair) for axiom, t in needed))
+        says = tuple(dict.fromkeys(self._words.of(c, would=line.supposed) for c in said)) or (
+            "that is a contradiction",
+        )
+        because = tuple(
+            dict.fromkeys(self._words.reason(axiom, t, said, self._pair) for axiom, t in needed)
+        )
         links = _clashes((axiom, self._piece.steps[t]) for axiom, t in needed)
         return Inference(
-            says, because or ("by what is supposed" if line.supposed else "by the trace alone",), links, premises, line.supposed
+            says,
+            because or ("by what is supposed" if line.supposed else "by the trace alone",),
+            links,
+            premises,
+            line.supposed,
         )
 
     def _summary(
@@ -374,11 +462,20 @@ class _Argument:
         obvious = (self._pair, ("one_place", "one_dstate", "two_dstates"))  # by what is supposed
         told = [
             self._words.of(facts.read_conclusion(p), would=self._lines[self._born[p]].supposed)
-            for p in sorted(premises[conclusion], key=lambda p: (self._lines[self._born[p]].supposed, facts.read_conclusion(p)[1]))
-            if not (facts.read_conclusion(p)[1] == obvious[0] and facts.read_conclusion(p)[0] in obvious[1])
+            for p in sorted(
+                premises[conclusion],
+                key=lambda p: (self._lines[self._born[p]].supposed, facts.read_conclusion(p)[1]),
+            )
+            if not (
+                facts.read_conclusion(p)[1] == obvious[0]
+                and facts.read_conclusion(p)[0] in obvious[1]
+            )
         ]
         said = [] if conclusion is None else [facts.read_conclusion(conclusion)]
-        reasons = [self._words.reason(axiom, t, said, self._pair, short=True) for axiom, t in links[conclusion]]
+        reasons = [
+            self._words.reason(axiom, t, said, self._pair, short=True)
+            for axiom, t in links[conclusion]
+        ]
         return _that_path("; ".join(dict.fromkeys([*told, *reasons])))
 
     # Is each link needed?
@@ -389,21 +486,33 @@ class _Argument:
         names = {axiom for axiom, _ in self._links} | set(unchecked(theory))
         left_out = [axiom for axiom in theory.axioms if axiom not in names]
         own = {axiom.name for rules in theory.rules for axiom in rules.axioms}
-        of_argument = theory.replace(without=[*dict.fromkeys([*theory.without, *(name for name in left_out if name not in own)])])
+        of_argument = theory.replace(
+            without=[
+                *dict.fromkeys([*theory.without, *(name for name in left_out if name not in own)])
+            ]
+        )
         ordered = list(dict.fromkeys(link for line in self._lines for link in line.group))
         for axiom, t in [*ordered, *(link for link in self._links if link not in ordered)]:
             found = self._map_without((axiom, t))
-            yield Link(axiom, self._piece.steps[t], found, check(self._piece.trace, found, of_argument))
+            yield Link(
+                axiom, self._piece.steps[t], found, check(self._piece.trace, found, of_argument)
+            )
 
     def _map_without(self, link: tuple[str, int]) -> SSHMap:
         """A map in which the other links hold, and those axioms, where they can, that say what a dstate has one of."""
         supposed = [self._supposed]
         active = _active(other for other in self._links if other != link)
         for axiom in SHOWN:
-            several = [symbol for symbol in self._axioms.instances if str(symbol.arguments[0]) == axiom and symbol != facts.active(*link)]
+            several = [
+                symbol
+                for symbol in self._axioms.instances
+                if str(symbol.arguments[0]) == axiom and symbol != facts.active(*link)
+            ]
             for some in ([several], [[symbol] for symbol in several]):
                 for more in some:
-                    if not set(more) <= set(active) and self._axioms.consistent([*active, *more], supposed):
+                    if not set(more) <= set(active) and self._axioms.consistent(
+                        [*active, *more], supposed
+                    ):
                         active += more
         found = self._axioms.map_with(active, supposed)
         assert found is not None
@@ -421,30 +530,59 @@ class _Words:
 
     def know(self, conclusions: Iterable[clingo.Symbol]) -> None:
         """What is known by now: paths are named by two steps that are along them."""
-        self._courses = {steps for name, steps in map(facts.read_conclusion, conclusions) if name == "one_course"}  # type: ignore[misc]
+        self._courses = {
+            steps for name, steps in map(facts.read_conclusion, conclusions) if name == "one_course"
+        }  # type: ignore[misc]
 
     def of(self, conclusion: tuple[str, tuple[int, ...]], *, would: bool) -> str:
         """A conclusion as a clause; `would` where it is only supposed."""
         name, steps = conclusion
-        if name in ("one_dstate", "one_place", "two_places", "two_dstates", "one_course", "opposite", "two_paths"):
+        if name in (
+            "one_dstate",
+            "one_place",
+            "two_places",
+            "two_dstates",
+            "one_course",
+            "opposite",
+            "two_paths",
+        ):
             steps = tuple(sorted(steps))
         turn = ""
         if name == "turned":
             steps, turn = steps[:2], _TURNED[steps[2]]
         shown = [str(self._piece.steps[t]) for t in steps]
         paths = {f"path{k}": self._path(t) for k, t in enumerate(steps)}
-        verbs = {"is": "would be", "are": "would be", "leaves": "would leave", "faces": "would face"} if would else {}
-        return _WORDS[name].format(*shown, turn=turn, **paths, **{verb: verbs.get(verb, verb) for verb in ("is", "are", "leaves", "faces")})
+        verbs = (
+            {"is": "would be", "are": "would be", "leaves": "would leave", "faces": "would face"}
+            if would
+            else {}
+        )
+        return _WORDS[name].format(
+            *shown,
+            turn=turn,
+            **paths,
+            **{verb: verbs.get(verb, verb) for verb in ("is", "are", "leaves", "faces")},
+        )
 
     def _path(self, t: int) -> str:
         """The path of a step of the piece, named by a travel along it, if one is known."""
-        pairs = sorted((j - i, abs(i - t), i, j) for i, j in self._courses if t in (i, j) and j == i + 1)
+        pairs = sorted(
+            (j - i, abs(i - t), i, j) for i, j in self._courses if t in (i, j) and j == i + 1
+        )
         if not pairs:
             return f"the path of step {self._piece.steps[t]}"
         _, _, i, j = pairs[0]
         return f"the path that steps {self._piece.steps[i]} and {self._piece.steps[j]} define"
 
-    def reason(self, axiom: str, t: int, said: Sequence[tuple[str, tuple[int, ...]]], pair: tuple[int, int], *, short: bool = False) -> str:
+    def reason(
+        self,
+        axiom: str,
+        t: int,
+        said: Sequence[tuple[str, tuple[int, ...]]],
+        pair: tuple[int, int],
+        *,
+        short: bool = False,
+    ) -> str:
         """Why an axiom at a step of the piece says so."""
         steps, sentence = self._piece.steps, self._sentences.get(axiom, axiom).rstrip(".")
         sentence = sentence[:1].lower() + sentence[1:]
@@ -452,14 +590,25 @@ class _Words:
             return sentence
         if axiom in OF_ACTIONS and t and (action := self._piece.trace.steps[t - 1].action):
             return f"{sentence}, and the action of step {steps[t - 1]} is {action.name!r}"
-        pairs = [s for name, s in said if name in ("one_dstate", "two_dstates", "two_places", "one_place")] or [tuple(sorted(pair))]
+        pairs = [
+            s
+            for name, s in said
+            if name in ("one_dstate", "two_dstates", "two_places", "one_place")
+        ] or [tuple(sorted(pair))]
         i, j = next((s for s in pairs if t in s), pairs[0])[:2]
         if axiom == "functional_view":
             seen = self._piece.trace.views
             named = (i, j) if t in (i, j) and seen[i] != seen[j] else (t,)
-            return f"{sentence}, and {', '.join(f'step {steps[k]} sees {seen[k]!r}' for k in named)}"
+            return (
+                f"{sentence}, and {', '.join(f'step {steps[k]} sees {seen[k]!r}' for k in named)}"
+            )
         if axiom == "one_pose" and (
-            apart := why_apart(self._trace, steps[i], steps[j], self._piece.theory.replace(same=(), different=(), elsewhere=()))
+            apart := why_apart(
+                self._trace,
+                steps[i],
+                steps[j],
+                self._piece.theory.replace(same=(), different=(), elsewhere=()),
+            )
         ):
             return f"{sentence}; {apart}"
         return sentence

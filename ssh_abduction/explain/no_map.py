@@ -62,7 +62,10 @@ class Explanation:
         return tuple(clash.axiom for clash in self.clashes)
 
     def __str__(self) -> str:
-        parts = [f"{c.axiom} ({'step' if len(c.steps) == 1 else 'steps'} {', '.join(map(str, c.steps))})" for c in self.clashes]
+        parts = [
+            f"{c.axiom} ({'step' if len(c.steps) == 1 else 'steps'} {', '.join(map(str, c.steps))})"
+            for c in self.clashes
+        ]
         return f"no map satisfies the axioms: in steps {self.first} to {self.last} these clash: {', '.join(parts)}"
 
     def to_dict(self) -> dict[str, object]:
@@ -78,7 +81,9 @@ class Interrupted(Exception):  # noqa: N818 - not an error
     """The caller's `stop` returned True."""
 
 
-def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool] = lambda: False) -> Explanation | None:
+def explain(
+    trace: Trace, theory: Theory | None = None, stop: Callable[[], bool] = lambda: False
+) -> Explanation | None:
     """Why the trace has no map under a theory (default Theory.topological()), or None if it has one.
 
     The stretch is found by dropping steps from the end and then from the start, the clashes by dropping axioms one by one.
@@ -87,14 +92,28 @@ def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool]
     """
     theory = checked_theory(theory).resolve(checked_trace(trace))
     if theory.jumped:
-        raise TheoryError("jumped: expected displacements that hold where a trace is explained; leave it out (--jumped)")
+        raise TheoryError(
+            "jumped: expected displacements that hold where a trace is explained; leave it out (--jumped)"
+        )
     theory.check_steps(trace)
     check_rules(theory)
-    length = shortest(len(trace), lambda n: not Axioms(Piece.of(trace, theory, range(n)), stop).consistent())
+    length = shortest(
+        len(trace), lambda n: not Axioms(Piece.of(trace, theory, range(n)), stop).consistent()
+    )
     if length is None:
         return None
     last = length - 1
-    length = shortest(length, lambda n: not Axioms(Piece.of(trace, theory, range(last + 1 - n, last + 1)), stop).consistent()) or length
+    length = (
+        shortest(
+            length,
+            lambda n: (
+                not Axioms(
+                    Piece.of(trace, theory, range(last + 1 - n, last + 1)), stop
+                ).consistent()
+            ),
+        )
+        or length
+    )
     first = last + 1 - length
     clashes: dict[str, list[int]] = {}
     axioms = Axioms(Piece.of(trace, theory, range(first, last + 1)), stop, relaxed=True)
@@ -102,7 +121,9 @@ def explain(trace: Trace, theory: Theory | None = None, stop: Callable[[], bool]
     for axiom, step in clash:
         clashes.setdefault(axiom, []).append(first + step)
     order = theory.axioms
-    found = tuple(Clash(name, tuple(sorted(clashes[name]))) for name in sorted(clashes, key=order.index))
+    found = tuple(
+        Clash(name, tuple(sorted(clashes[name]))) for name in sorted(clashes, key=order.index)
+    )
     return Explanation(first, last, found, axioms.sentences(clash))
 
 
@@ -114,16 +135,24 @@ def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = Non
     theory = checked_theory(theory).resolve(checked_trace(trace))
     for step in (first, second):
         if not is_whole(step) or not 0 <= step < len(trace):
-            raise TraceError(f"step: expected a step from 0 to {len(trace) - 1}, got {brief(step)}; steps are counted from 0")
+            raise TraceError(
+                f"step: expected a step from 0 to {len(trace) - 1}, got {brief(step)}; steps are counted from 0"
+            )
     if first == second:
         raise TraceError(f"step: expected two steps, got {first} twice; take another one")
     displacement = _displacement(theory)
-    return displacement.returns_of(trace).why_apart(min(first, second), max(first, second)) if displacement else None
+    return (
+        displacement.returns_of(trace).why_apart(min(first, second), max(first, second))
+        if displacement
+        else None
+    )
 
 
 def _displacement(theory: Theory) -> Displacement | None:
     """What displacements say, where they take part in a theory."""
-    return next((evidence for evidence in evidence_of(theory) if isinstance(evidence, Displacement)), None)
+    return next(
+        (evidence for evidence in evidence_of(theory) if isinstance(evidence, Displacement)), None
+    )
 
 
 @dataclass(frozen=True)
@@ -156,11 +185,18 @@ class Piece:
             kept.append(step)
         number = {t: k for k, t in enumerate(steps)}
         pairs = {
-            name: tuple((number[i], number[j]) for i, j in getattr(theory, name) if i in number and j in number) for name in ASSERTIONS
+            name: tuple(
+                (number[i], number[j])
+                for i, j in getattr(theory, name)
+                if i in number and j in number
+            )
+            for name in ASSERTIONS
         }
         gap = steps[-1] - steps[0] + 1 > len(steps)
         facts_across = _said_across(trace, theory, number) if gap else ""
-        return Piece(replace(trace, steps=tuple(kept)), theory.replace(**pairs), tuple(steps), facts_across)
+        return Piece(
+            replace(trace, steps=tuple(kept)), theory.replace(**pairs), tuple(steps), facts_across
+        )
 
 
 def _said_across(trace: Trace, theory: Theory, number: Mapping[int, int]) -> str:
@@ -170,7 +206,10 @@ def _said_across(trace: Trace, theory: Theory, number: Mapping[int, int]) -> str
         return ""
     pairs = displacement.pairs(trace)
     told = []
-    for name, earlier in (("excluded", pairs.apart), ("elsewhere", pairs.elsewhere if theory.level == "topological" else {})):
+    for name, earlier in (
+        ("excluded", pairs.apart),
+        ("elsewhere", pairs.elsewhere if theory.level == "topological" else {}),
+    ):
         told += [
             f"{name}({displacement.axiom},{number[i]},{number[t]})."
             for t, others in earlier.items()
@@ -220,7 +259,9 @@ class _Seen(NamedTuple):
 
     def suits(self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]) -> bool:
         """Whether these axioms hold in it, and what is assumed of steps that are one."""
-        return self.broken.isdisjoint(active) and all((symbol in self.one) == true for symbol, true in assumed)
+        return self.broken.isdisjoint(active) and all(
+            (symbol in self.one) == true for symbol, true in assumed
+        )
 
 
 def _forget(_: clingo.Model) -> None:
@@ -243,8 +284,12 @@ class Axioms:
         self._told = 0  # rules that were added since
         self._conclusions: list[clingo.Symbol] = []
         self._seen: list[_Seen] = []
-        self._last_core: tuple[int, ...] = ()  # of what was assumed last, as clingo's literals, a part that cannot all hold
-        self._control = clingo.Control(["--warn=none", *(["--heuristic=Domain"] if relaxed else [])])
+        self._last_core: tuple[
+            int, ...
+        ] = ()  # of what was assumed last, as clingo's literals, a part that cannot all hold
+        self._control = clingo.Control(
+            ["--warn=none", *(["--heuristic=Domain"] if relaxed else [])]
+        )
         names = [name for name in facts.encoding_names(theory) if name != "preference"]
         for name in [*names, "explain", "derivation"] if relaxed else names:
             self._control.load(encodings.path(name))
@@ -252,12 +297,18 @@ class Axioms:
         self._control.add(
             "base",
             [],
-            facts.theory_facts(theory, len(trace) if relaxed else facts.most_paths(trace, theory, len(trace)))
+            facts.theory_facts(
+                theory, len(trace) if relaxed else facts.most_paths(trace, theory, len(trace))
+            )
             + facts.trace_facts(trace, theory, 0, len(trace)),
         )
         self._control.add("base", [], facts.own_rules(theory))
         self._control.add("base", [], piece.facts)
-        parts = [("base", list[clingo.Symbol]()), *(("step", facts.numbers(t)) for t in range(len(trace))), ("check", facts.numbers(last))]
+        parts = [
+            ("base", list[clingo.Symbol]()),
+            *(("step", facts.numbers(t)) for t in range(len(trace))),
+            ("check", facts.numbers(last)),
+        ]
         for start in range(0, len(parts), AT_A_TIME):
             if stop():
                 raise Interrupted
@@ -265,10 +316,17 @@ class Axioms:
         self._control.assign_external(facts.query(last), True)
         self._control.assign_external(facts.run_by_steps(), True)
         # Whether a map can be drawn is asked of the whole piece, and only where each dstate is at one place: else nothing can be drawn.
-        pairs = ((axiom, t) for axiom in theory.axioms for t in range(len(trace)) if axiom != Planar.axiom or t == last)
+        pairs = (
+            (axiom, t)
+            for axiom in theory.axioms
+            for t in range(len(trace))
+            if axiom != Planar.axiom or t == last
+        )
         self._pairs = {facts.active(axiom, t): (axiom, t) for axiom, t in pairs} if relaxed else {}
         self._drawn = {facts.active(Planar.axiom, last)} & self._pairs.keys()
-        self._placed = [symbol for symbol, (axiom, _) in self._pairs.items() if axiom == "one_place"]
+        self._placed = [
+            symbol for symbol, (axiom, _) in self._pairs.items() if axiom == "one_place"
+        ]
         if self._drawn:
             self._control.add("placed", [], facts.rests_on(Planar.axiom, last, "one_place"))
             self._control.ground([("placed", [])])
@@ -278,21 +336,28 @@ class Axioms:
         """Where the axioms are relaxed: each of them at each step, as what makes it active."""
         return tuple(self._pairs)
 
-    def consistent(self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()) -> bool:
+    def consistent(
+        self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()
+    ) -> bool:
         """Whether there is a map. Where the axioms are relaxed, only the active ones have to hold.
 
         assumed  atoms that are true, or are false, in it
         """
         return self.map_with(active, assumed) is not None
 
-    def map_with(self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()) -> SSHMap | None:
+    def map_with(
+        self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()
+    ) -> SSHMap | None:
         """Such a map, if there is one."""
         while answer := self._answer(active, assumed):
             refused = self._refused(answer, {self._pairs[symbol] for symbol in active})
             if refused is None:
                 return answer.ssh_map
             axiom, refusal = refused
-            self._forbid(refusal, facts.active(axiom, self._judged_at(axiom, refusal)) if self._pairs else None)
+            self._forbid(
+                refusal,
+                facts.active(axiom, self._judged_at(axiom, refusal)) if self._pairs else None,
+            )
         return None
 
     def tell_of(self, steps: Iterable[int]) -> None:
@@ -304,7 +369,10 @@ class Axioms:
         self._control.ground([("may_fail", [])])
 
     def consequences(
-        self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption] = (), known: Collection[clingo.Symbol] = ()
+        self,
+        active: Sequence[clingo.Symbol],
+        assumed: Sequence[Assumption] = (),
+        known: Collection[clingo.Symbol] = (),
     ) -> frozenset[clingo.Symbol]:
         """The conclusions that hold in all maps in which these axioms hold. There has to be such a map.
 
@@ -333,7 +401,9 @@ class Axioms:
             doubtful &= found
         return found
 
-    def core(self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]) -> list[Assumption] | None:
+    def core(
+        self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]
+    ) -> list[Assumption] | None:
         """Of what is assumed, a part that cannot all hold where these axioms do, none of which can be spared; None where all of it can hold.
 
         What comes first in `assumed` is taken rather than what comes later: the last that is taken comes as early as it can, then the one before, and so on.
@@ -350,7 +420,13 @@ class Axioms:
                 if self._solve(_forget, active, [*rest[:middle], *needed]):
                     least = middle
                 else:
-                    most = min(middle, 1 + max((rest.index(a) for a in self._of_last_core(rest[:middle])), default=-1))
+                    most = min(
+                        middle,
+                        1
+                        + max(
+                            (rest.index(a) for a in self._of_last_core(rest[:middle])), default=-1
+                        ),
+                    )
                     most = max(most, least + 1)
             needed.append(rest[most - 1])
             rest = rest[: most - 1]
@@ -359,19 +435,34 @@ class Axioms:
     def _of_last_core(self, assumed: Sequence[Assumption]) -> list[Assumption]:
         """Those of these assumptions that clingo found to clash when it was asked last."""
         core = set(self._last_core)
-        literals = [(assumption, self._control.symbolic_atoms[assumption[0]]) for assumption in assumed]
-        return [(symbol, true) for (symbol, true), atom in literals if atom is None or atom.literal * (1 if true else -1) in core]
+        literals = [
+            (assumption, self._control.symbolic_atoms[assumption[0]]) for assumption in assumed
+        ]
+        return [
+            (symbol, true)
+            for (symbol, true), atom in literals
+            if atom is None or atom.literal * (1 if true else -1) in core
+        ]
 
-    def _answer(self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption] = ()) -> _Answer | None:
+    def _answer(
+        self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption] = ()
+    ) -> _Answer | None:
         """An answer of clingo in which these axioms hold."""
         found: list[_Answer] = []
 
         def keep(model: clingo.Model) -> None:
-            found.append(_Answer(*facts.read_steps(model), facts.read_map(model, self._trace, self._theory)))
+            found.append(
+                _Answer(*facts.read_steps(model), facts.read_map(model, self._trace, self._theory))
+            )
 
         return found[0] if self._solve(keep, active, assumed) else None
 
-    def _solve(self, keep: Callable[[clingo.Model], None], active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]) -> bool:
+    def _solve(
+        self,
+        keep: Callable[[clingo.Model], None],
+        active: Sequence[clingo.Symbol],
+        assumed: Sequence[Assumption],
+    ) -> bool:
         """Whether there is an answer; each one found is kept."""
         if self._stop():
             raise Interrupted
@@ -385,17 +476,30 @@ class Axioms:
             self._last_core = () if satisfiable else tuple(handle.core())
             return satisfiable
 
-    def _refused(self, answer: _Answer, active: Collection[tuple[str, int]]) -> tuple[str, Refusal] | None:
+    def _refused(
+        self, answer: _Answer, active: Collection[tuple[str, int]]
+    ) -> tuple[str, Refusal] | None:
         """What some evidence finds out cannot all hold in an answer, and its axiom. Where the axioms are relaxed, that has to be active at the last of the steps."""
         for evidence in self._evidence:
             if not self._pairs:
                 found = [evidence.refuse(self._trace, answer.ssh_map)]
             elif isinstance(evidence, Displacement):
-                found = [self._refused_together(evidence, answer, t) for axiom, t in sorted(active) if axiom == evidence.axiom]
+                found = [
+                    self._refused_together(evidence, answer, t)
+                    for axiom, t in sorted(active)
+                    if axiom == evidence.axiom
+                ]
             else:
-                found = [evidence.refuse(self._trace, answer.ssh_map)] if any(axiom == evidence.axiom for axiom, _ in active) else []
+                found = (
+                    [evidence.refuse(self._trace, answer.ssh_map)]
+                    if any(axiom == evidence.axiom for axiom, _ in active)
+                    else []
+                )
             for refusal in filter(None, found):
-                if not self._pairs or (answer.has(refusal) and (evidence.axiom, self._judged_at(evidence.axiom, refusal)) in active):
+                if not self._pairs or (
+                    answer.has(refusal)
+                    and (evidence.axiom, self._judged_at(evidence.axiom, refusal)) in active
+                ):
                     return evidence.axiom, refusal
         return None
 
@@ -403,7 +507,9 @@ class Axioms:
         """The step at which an axiom has to be active for this to be refused."""
         return len(self._trace) - 1 if axiom == Planar.axiom else _last_step(refusal)
 
-    def _refused_together(self, displacement: Displacement, answer: _Answer, step: int) -> Refusal | None:
+    def _refused_together(
+        self, displacement: Displacement, answer: _Answer, step: int
+    ) -> Refusal | None:
         """Two returns of an answer that are refused together, the later of which ends at a step."""
         if displacement.joint == 1:
             return None
@@ -427,15 +533,27 @@ class Axioms:
             return ()
         returns = displacement.returns_of(self._trace)
         said: dict[int, list[tuple[float, str]]] = {t: [] for t in steps}
-        others = [symbol for symbol, pair in self._pairs.items() if pair in clash and pair[0] != displacement.axiom]
+        others = [
+            symbol
+            for symbol, pair in self._pairs.items()
+            if pair in clash and pair[0] != displacement.axiom
+        ]
         while answer := self._answer(others):
-            alone = [e for t in steps for e in returns.refused_alone_at(answer.labels, answer.places, t)]
+            alone = [
+                e for t in steps for e in returns.refused_alone_at(answer.labels, answer.places, t)
+            ]
             if alone:
                 clearest = max(alone, key=returns.excess)
                 refusal: Refusal | None = frozenset([clearest])
-                found = returns.excess(clearest), returns.why_apart(clearest.first, clearest.second, self._first) or ""
+                found = (
+                    returns.excess(clearest),
+                    returns.why_apart(clearest.first, clearest.second, self._first) or "",
+                )
             else:
-                refusal = next(filter(None, (self._refused_together(displacement, answer, t) for t in steps)), None)
+                refusal = next(
+                    filter(None, (self._refused_together(displacement, answer, t) for t in steps)),
+                    None,
+                )
                 found = 0.0, returns.why_not_both(refusal or (), self._first)
             if refusal is None:
                 break
@@ -450,20 +568,30 @@ class Axioms:
         There are many such sets. To get one that is short to read, whole axioms are dropped before single steps, once in the order of the axioms and once
         in reverse, and the smaller result is returned.
         """
-        found = [self._shrunk(list(order), assumed) for order in (self._pairs, reversed(self._pairs))]
-        shortest = min(found, key=lambda pairs: (len({self._pairs[p][0] for p in pairs}), len(pairs)))
+        found = [
+            self._shrunk(list(order), assumed) for order in (self._pairs, reversed(self._pairs))
+        ]
+        shortest = min(
+            found, key=lambda pairs: (len({self._pairs[p][0] for p in pairs}), len(pairs))
+        )
         return [self._pairs[symbol] for symbol in shortest]
 
-    def _shrunk(self, kept: list[clingo.Symbol], assumed: Sequence[Assumption]) -> list[clingo.Symbol]:
+    def _shrunk(
+        self, kept: list[clingo.Symbol], assumed: Sequence[Assumption]
+    ) -> list[clingo.Symbol]:
         """Pairs that still leave no map after all that can be dropped were dropped, in their order."""
-        core: set[clingo.Symbol] | None = None  # some that clingo found to clash: while all of them are kept there is no need to ask
+        core: set[clingo.Symbol] | None = (
+            None  # some that clingo found to clash: while all of them are kept there is no need to ask
+        )
 
         def clash(some: list[clingo.Symbol]) -> bool:
             nonlocal core
             if core is None or not core <= set(some):
                 if self.consistent(some, assumed):
                     return False
-                core = {symbol for symbol, _ in self._of_last_core([(symbol, True) for symbol in some])}
+                core = {
+                    symbol for symbol, _ in self._of_last_core([(symbol, True) for symbol in some])
+                }
             return True
 
         for axiom in dict.fromkeys(self._pairs[symbol][0] for symbol in kept):

@@ -25,7 +25,18 @@ from ssh_abduction.data.errors import AbductionError, SolverError, TraceError, b
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View, checked_trace
 from ssh_abduction.explain.derivation import Derivation, derive
 from ssh_abduction.explain.no_map import Axioms, Explanation, Interrupted, Piece, explain
-from ssh_abduction.solver import Cost, LimitError, Progress, Search, Status, Stop, Watch, check_limit, check_rules, facts
+from ssh_abduction.solver import (
+    Cost,
+    LimitError,
+    Progress,
+    Search,
+    Status,
+    Stop,
+    Watch,
+    check_limit,
+    check_rules,
+    facts,
+)
 from ssh_abduction.theory.theory import ASSERTIONS, Theory, checked_theory
 
 SMALL = 14  # Pieces of up to so many steps are asked before the whole trace: that takes less than a second.
@@ -65,7 +76,12 @@ class Side:
     maps: int = 0
 
     def to_dict(self) -> dict[str, Any]:
-        return {"possible": self.possible, "cost": self.cost.to_dict() if self.cost else None, "proven": self.proven, "maps": self.maps}
+        return {
+            "possible": self.possible,
+            "cost": self.cost.to_dict() if self.cost else None,
+            "proven": self.proven,
+            "maps": self.maps,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +143,9 @@ class PairExplanation:
     def _of_costs(self) -> Iterator[str]:
         """What the rival that lost costs."""
         lost, won, equal = (
-            (self.same, self.different, "=") if self.verdict is Verdict.DIFFERENT_IN_MINIMAL else (self.different, self.same, "≠")
+            (self.same, self.different, "=")
+            if self.verdict is Verdict.DIFFERENT_IN_MINIMAL
+            else (self.different, self.same, "≠")
         )
         if self.verdict not in (Verdict.DIFFERENT_IN_MINIMAL, Verdict.SAME_IN_MINIMAL):
             return
@@ -137,14 +155,20 @@ class PairExplanation:
         elif lost.cost is None or won.cost is None:
             yield f"whether there is any map {rival} was not found out"
         else:
-            known = f"the best map {rival}" if lost.proven else f"the best map {rival} that was found"
+            known = (
+                f"the best map {rival}" if lost.proven else f"the best map {rival} that was found"
+            )
             yield f"{known} has {_difference(lost.cost, won.cost, self.theory)}"
 
     @property
     def assuming(self) -> dict[str, str]:
         """What it costs to assume that the steps are one dstate (`same`), and that they are not (`different`), in words."""
         sides = {"same": self.same, "different": self.different}
-        best = min((s.cost for s in sides.values() if s.cost), key=lambda cost: cost.preferred_by(self.theory), default=None)
+        best = min(
+            (s.cost for s in sides.values() if s.cost),
+            key=lambda cost: cost.preferred_by(self.theory),
+            default=None,
+        )
         told = {}
         for name, side in sides.items():
             other = self.different if side is self.same else self.same
@@ -158,7 +182,9 @@ class PairExplanation:
                 known = "costs nothing" if side.proven else "nothing that costs less is known"
                 told[name] = f"{known}: {_told(side.cost, self.theory.priorities)}"
             else:
-                told[name] = f"{'' if side.proven else 'at most, '}{_difference(side.cost, best, self.theory)}"
+                told[name] = (
+                    f"{'' if side.proven else 'at most, '}{_difference(side.cost, best, self.theory)}"
+                )
         return told
 
     def __str__(self) -> str:
@@ -209,7 +235,9 @@ class Mend:
         elif self.instead is None:
             what = f"if the {self.kind} at step {self.step}, {self.seen}, were wrong"
         else:
-            what = f"if the {self.kind} at step {self.step} were {self.instead}, and not {self.seen}"
+            what = (
+                f"if the {self.kind} at step {self.step} were {self.instead}, and not {self.seen}"
+            )
         return f"{what}, {'the trace' if self.proven else 'at least that stretch'} would have a map"
 
     def to_dict(self) -> dict[str, Any]:
@@ -243,9 +271,13 @@ class TraceExplanation:
     @property
     def sentences(self) -> tuple[str, ...]:
         if self.possible:
-            return ("the trace has a map; name two steps to hear why they are one dstate, or are not",)
+            return (
+                "the trace has a map; name two steps to hear why they are one dstate, or are not",
+            )
         if self.clash is None:
-            return (f"whether the trace has a map was not found out ({self.stopped or 'no proof'})",)
+            return (
+                f"whether the trace has a map was not found out ({self.stopped or 'no proof'})",
+            )
         mends = tuple(map(str, self.mends))
         if not mends and self.complete:
             mends = ("no single observation of that stretch, if it were wrong, would mend it",)
@@ -292,26 +324,44 @@ def explain_pair(
     """
     a_count_of_maps(max_maps, SolverError)
     return PairQuestion(
-        trace, first, second, checked_theory(theory), time_limit=time_limit, memory_limit=memory_limit, max_maps=max_maps
+        trace,
+        first,
+        second,
+        checked_theory(theory),
+        time_limit=time_limit,
+        memory_limit=memory_limit,
+        max_maps=max_maps,
     ).answer()
 
 
 @renamed_parameters("limit", "memory")
 def explain_trace(
-    trace: Trace, theory: Theory | None = None, *, time_limit: float | None = None, memory_limit: int | None = None
+    trace: Trace,
+    theory: Theory | None = None,
+    *,
+    time_limit: float | None = None,
+    memory_limit: int | None = None,
 ) -> TraceExplanation:
     """Why a trace has no map, and which one observation, if it were wrong, would mend it.
 
     Parameters as in `explain_pair`. An observation is a view, a star, an action, a displacement, or what a person says of steps. Each one of the clashing
     stretch is tried: it is taken for another one of the trace, or for none, and that is a mend where the whole trace then has a map.
     """
-    return TraceQuestion(trace, checked_theory(theory), time_limit=time_limit, memory_limit=memory_limit).answer()
+    return TraceQuestion(
+        trace, checked_theory(theory), time_limit=time_limit, memory_limit=memory_limit
+    ).answer()
 
 
 class _Question:
     """What is asked, under limits. `answer` may be called once; `known` tells what is known so far, in any thread."""
 
-    def __init__(self, trace: Trace, theory: Theory | None, time_limit: float | None, memory_limit: int | None) -> None:
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory | None,
+        time_limit: float | None,
+        memory_limit: int | None,
+    ) -> None:
         check_limit("time_limit (--time-limit)", "seconds", time_limit)
         check_limit("memory_limit (--memory-limit)", "MiB", memory_limit)
         self.trace = checked_trace(trace)
@@ -346,7 +396,14 @@ class _Question:
                 search.interrupt()
 
         limit = None if seconds == float("inf") else max(seconds, SHORTEST)
-        search = self._search = Search(trace, theory, time_limit=limit, memory_limit=self.memory, max_maps=maps, on_progress=end_with_this)
+        search = self._search = Search(
+            trace,
+            theory,
+            time_limit=limit,
+            memory_limit=self.memory,
+            max_maps=maps,
+            on_progress=end_with_this,
+        )
         return search
 
     def _ended(self, search: Search) -> None:
@@ -374,7 +431,9 @@ class PairQuestion(_Question):
         super().__init__(trace, theory, time_limit, memory_limit)
         for step in (first, second):
             if not is_whole(step) or not 0 <= step < len(trace):
-                raise TraceError(f"step: expected a step from 0 to {len(trace) - 1}, got {brief(step)}; steps are counted from 0")
+                raise TraceError(
+                    f"step: expected a step from 0 to {len(trace) - 1}, got {brief(step)}; steps are counted from 0"
+                )
         if first == second:
             raise TraceError(f"step: expected two steps, got {first} twice; take another one")
         self.first, self.second = int(min(first, second)), int(max(first, second))
@@ -426,7 +485,10 @@ class PairQuestion(_Question):
             return Verdict.SAME if two.possible is False else Verdict.DIFFERENT
         if self._minimal[True] and self._minimal[False]:
             return Verdict.DISAGREE
-        for here, there, verdict in ((True, False, Verdict.SAME_IN_MINIMAL), (False, True, Verdict.DIFFERENT_IN_MINIMAL)):
+        for here, there, verdict in (
+            (True, False, Verdict.SAME_IN_MINIMAL),
+            (False, True, Verdict.DIFFERENT_IN_MINIMAL),
+        ):
             if self._minimal[here] and (self._listed or self._is_dearer(self._sides[there])):
                 return verdict
             if self._is_beaten(self._sides[there], self._sides[here]):
@@ -464,7 +526,9 @@ class PairQuestion(_Question):
                 self._ask_pieces(one, LARGE)
             if one in self._ruling_out:
                 piece = self._shrunk(self._ruling_out[one], one)
-                self._derivation = derive(piece, self.trace, self.first, self.second, one=not one, stop=self._over)
+                self._derivation = derive(
+                    piece, self.trace, self.first, self.second, one=not one, stop=self._over
+                )
 
     # Few steps around the pair
 
@@ -487,8 +551,15 @@ class PairQuestion(_Question):
         before: list[int] = []
         width = 0
         while True:
-            near = {t for middle in (self.first, self.second) for t in range(middle - width, middle + width + 1) if t in whole}
-            if self.second - self.first <= most // 2:  # the way from one to the other is short, and says much
+            near = {
+                t
+                for middle in (self.first, self.second)
+                for t in range(middle - width, middle + width + 1)
+                if t in whole
+            }
+            if (
+                self.second - self.first <= most // 2
+            ):  # the way from one to the other is short, and says much
                 near |= set(range(self.first, self.second + 1))
             steps = sorted(near)
             if len(steps) > most or steps == before:
@@ -521,7 +592,11 @@ class PairQuestion(_Question):
     def _list_minimal_maps(self, settled: bool) -> None:
         """List minimal maps, and count those in which the steps are one. Where the verdict is settled, it is only asked whether there is any map."""
         left = self._watch.left()
-        seconds = min(left, max(CONFIRMING, 0.0 if self.limit is None else self.limit / 10)) if settled else left * SHARE
+        seconds = (
+            min(left, max(CONFIRMING, 0.0 if self.limit is None else self.limit / 10))
+            if settled
+            else left * SHARE
+        )
         search = self._solved(self.trace, self.theory, 1 if settled else self._maps, seconds)
         for found in search:
             one = found.labels[self.first] == found.labels[self.second]
@@ -529,7 +604,9 @@ class PairQuestion(_Question):
             if search.status is Status.OPTIMAL:
                 self._minimum = search.cost
                 self._minimal[one] = True
-                self._sides[one] = replace(side, possible=True, cost=search.cost, proven=True, maps=side.maps + 1)
+                self._sides[one] = replace(
+                    side, possible=True, cost=search.cost, proven=True, maps=side.maps + 1
+                )
             elif side.cost is None:
                 self._sides[one] = replace(side, possible=True, cost=search.cost)
         if search.status is Status.UNSATISFIABLE:
@@ -540,22 +617,45 @@ class PairQuestion(_Question):
     def _find_best(self, one: bool) -> None:
         """Find the best map in which the steps are one, or are not."""
         name = "same" if one else "different"
-        theory = self.theory.replace(**{name: (*getattr(self.theory, name), (self.first, self.second))})
-        search = self._solved(self.trace, theory, 1, self._watch.left() * (SHARE if self._minimum is None else 2 * SHARE))
+        theory = self.theory.replace(
+            **{name: (*getattr(self.theory, name), (self.first, self.second))}
+        )
+        search = self._solved(
+            self.trace,
+            theory,
+            1,
+            self._watch.left() * (SHARE if self._minimum is None else 2 * SHARE),
+        )
         for _ in search:
-            self._sides[one] = replace(self._sides[one], possible=True, cost=search.cost, proven=search.status is Status.OPTIMAL)
+            self._sides[one] = replace(
+                self._sides[one],
+                possible=True,
+                cost=search.cost,
+                proven=search.status is Status.OPTIMAL,
+            )
         if search.status is Status.UNSATISFIABLE:
             self._sides[one] = Side(possible=False)
-        elif self._sides[one].cost and self._minimum and self._sides[one].proven and not self._is_dearer(self._sides[one]):
+        elif (
+            self._sides[one].cost
+            and self._minimum
+            and self._sides[one].proven
+            and not self._is_dearer(self._sides[one])
+        ):
             self._minimal[one] = True
             self._sides[one] = replace(self._sides[one], maps=max(1, self._sides[one].maps))
-        elif self._minimum is None and all(side.proven and side.cost for side in self._sides.values()):
+        elif self._minimum is None and all(
+            side.proven and side.cost for side in self._sides.values()
+        ):
             self._settle_minimum()
         self._ended(search)
 
     def _settle_minimum(self) -> None:
         """The best maps of both kinds are known: the better of them are minimal."""
-        costs = {one: side.cost.preferred_by(self.theory) for one, side in self._sides.items() if side.cost}
+        costs = {
+            one: side.cost.preferred_by(self.theory)
+            for one, side in self._sides.items()
+            if side.cost
+        }
         least = min(costs, key=lambda one: costs[one])
         self._minimum = self._sides[least].cost
         self._minimal = {one: cost == costs[least] for one, cost in costs.items()}
@@ -565,7 +665,12 @@ class TraceQuestion(_Question):
     """Asks why a trace has no map, and what would mend it. Parameters as in `explain_trace`."""
 
     def __init__(
-        self, trace: Trace, theory: Theory | None = None, *, time_limit: float | None = None, memory_limit: int | None = None
+        self,
+        trace: Trace,
+        theory: Theory | None = None,
+        *,
+        time_limit: float | None = None,
+        memory_limit: int | None = None,
     ) -> None:
         super().__init__(trace, theory, time_limit, memory_limit)
         self._possible: bool | None = None
@@ -590,7 +695,9 @@ class TraceQuestion(_Question):
         why  what is about to end the search
         """
         mends = tuple(sorted(self._mends, key=lambda mend: (mend.step, mend.kind)))
-        return TraceExplanation(self._possible, self._clash, mends, self._complete, why or self.stopped)
+        return TraceExplanation(
+            self._possible, self._clash, mends, self._complete, why or self.stopped
+        )
 
     def _find_out(self) -> None:
         search = self._solved(self.trace, self.theory, 1, self._watch.left() * SHARE)
@@ -631,9 +738,13 @@ class TraceQuestion(_Question):
         search = self._solved(trace, theory, 1, self._watch.left() * SHARE)
         found = next(iter(search), None)
         self._ended(search)
-        return True if found is not None else False if search.status is Status.UNSATISFIABLE else None
+        return (
+            True if found is not None else False if search.status is Status.UNSATISFIABLE else None
+        )
 
-    def _observations(self, stretch: range) -> Iterator[tuple[int, str, str, Iterable[tuple[str | None, Trace, Theory]]]]:
+    def _observations(
+        self, stretch: range
+    ) -> Iterator[tuple[int, str, str, Iterable[tuple[str | None, Trace, Theory]]]]:
         """Each observation of a stretch, and what it could have been: the step, its kind, what was seen, and the traces in which it is another one."""
         trace, theory = self.trace, self.theory
         for t in stretch:
@@ -645,17 +756,28 @@ class TraceQuestion(_Question):
                 yield t, "action", repr(step.action.name), self._with_actions(t)
             if t > stretch[0] and step.displacement is not None and theory.displacement == "use":
                 unknown = _with_step(trace, t, replace(step, displacement=None, covariance=None))
-                yield t, "displacement", str(tuple(round(x, 3) for x in step.displacement)), [(None, unknown, theory)]
+                yield (
+                    t,
+                    "displacement",
+                    str(tuple(round(x, 3) for x in step.displacement)),
+                    [(None, unknown, theory)],
+                )
         for name in ASSERTIONS:
             pairs = getattr(theory, name)
             for pair in pairs:
                 if set(pair) <= set(stretch):
-                    left = theory.replace(**{name: tuple(other for other in pairs if other != pair)})
+                    left = theory.replace(
+                        **{name: tuple(other for other in pairs if other != pair)}
+                    )
                     yield pair[1], name, f"{pair[0]} and {pair[1]}", [(None, trace, left)]
 
     def _with_views(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
         step = self.trace.steps[t]
-        views = [view for view in dict.fromkeys(self.trace.views) if view is not None and view != step.view]
+        views = [
+            view
+            for view in dict.fromkeys(self.trace.views)
+            if view is not None and view != step.view
+        ]
         new: View = next(name for name in _names("new view") if name not in views)
         for view in views:
             yield repr(view), _with_step(self.trace, t, replace(step, view=view)), self.theory
@@ -663,7 +785,9 @@ class TraceQuestion(_Question):
 
     def _with_stars(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
         step = self.trace.steps[t]
-        for star in dict.fromkeys(other.star for other in self.trace.steps if other.star is not None):
+        for star in dict.fromkeys(
+            other.star for other in self.trace.steps if other.star is not None
+        ):
             if star != step.star:
                 changed = replace(step, star=star)
                 yield _star(changed), _with_step(self.trace, t, changed), self.theory
@@ -673,11 +797,23 @@ class TraceQuestion(_Question):
         known = {action.name: action for action in self.trace.actions}
         if self.theory.level == "topological":
             kinds = {(action.kind, action.turn) for action in known.values()}
-            known |= {a.name: a for a in STANDARD_ACTIONS.values() if (a.kind, a.turn) not in kinds and a.name not in known}
+            known |= {
+                a.name: a
+                for a in STANDARD_ACTIONS.values()
+                if (a.kind, a.turn) not in kinds and a.name not in known
+            }
         for action in known.values():
             if step.action is not None and action.name != step.action.name:
-                yield repr(action.name), _with_step(self.trace, t, replace(step, action=action)), self.theory
-        yield None, _with_step(self.trace, t, replace(step, action=Action.that_slipped(t))), self.theory
+                yield (
+                    repr(action.name),
+                    _with_step(self.trace, t, replace(step, action=action)),
+                    self.theory,
+                )
+        yield (
+            None,
+            _with_step(self.trace, t, replace(step, action=Action.that_slipped(t))),
+            self.theory,
+        )
 
 
 def _with_step(trace: Trace, t: int, step: Step) -> Trace:
@@ -705,7 +841,10 @@ def _counts(cost: Cost, names: Iterable[str]) -> Iterator[tuple[str, float]]:
 
 def _told(cost: Cost, names: Iterable[str]) -> str:
     """The preferred counts of a cost in words."""
-    return ", ".join(f"{number:g} {_noun(name, number)}" for name, number in _counts(cost, names)) or "no count is preferred"
+    return (
+        ", ".join(f"{number:g} {_noun(name, number)}" for name, number in _counts(cost, names))
+        or "no count is preferred"
+    )
 
 
 def _noun(name: str, number: float) -> str:
@@ -716,8 +855,12 @@ def _noun(name: str, number: float) -> str:
 def _difference(lost: Cost, won: Cost, theory: Theory) -> str:
     """What a rival costs that lost: the first preferred count in which it differs, and those before it, which are the same."""
     same: list[str] = []
-    for (name, one), (_, other) in zip(_counts(lost, theory.priorities), _counts(won, theory.priorities), strict=True):
+    for (name, one), (_, other) in zip(
+        _counts(lost, theory.priorities), _counts(won, theory.priorities), strict=True
+    ):
         if one != other:
-            return f"{one:g} {_noun(name, one)}, not {other:g}" + (f", with {' and '.join(same)}" if same else "")
+            return f"{one:g} {_noun(name, one)}, not {other:g}" + (
+                f", with {' and '.join(same)}" if same else ""
+            )
         same.append(f"{one:g} {_noun(name, one)}")
     return f"{_told(lost, theory.priorities)}, as many as the minimal maps"

@@ -26,14 +26,18 @@ class AmbiguousMapWarning(UserWarning):
     """Several minimal maps remain, and only the labels that they agree on are learnt from; or the map is not proven minimal."""
 
 
-def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool = True, proven: bool = True) -> NDArray[np.intp]:
+def labels_of(
+    maps: Sequence[SSHMap], choose: int | None = None, complete: bool = True, proven: bool = True
+) -> NDArray[np.intp]:
     """The label of each step, (n,): its dstate in the chosen map; or, if none is chosen, in the first map, and -1 where the maps disagree.
 
     Maps agree on a step if the first step at its dstate is the same in all of them. Warns if no map is chosen and they do not agree
     everywhere, if there may be more (`complete` is false), or if they are not `proven` minimal. Raises LearnerError where no map or no label is left.
     """
     if not maps:
-        raise LearnerError("maps: expected at least one to take labels from, got none; see the solution's status")
+        raise LearnerError(
+            "maps: expected at least one to take labels from, got none; see the solution's status"
+        )
     if choose is not None and (not is_whole(choose) or not 0 <= choose < len(maps)):
         raise LearnerError(f"map: expected an index from 0 to {len(maps) - 1}, got {brief(choose)}")
     labels = np.array(maps[choose or 0].labels, np.intp)
@@ -48,11 +52,19 @@ def labels_of(maps: Sequence[SSHMap], choose: int | None = None, complete: bool 
     agreed = np.all([f == first[0] for f in first], axis=0)
     if not proven:
         unsure = f"the map of {len(maps[0].dstates)} dstates is the best that was found, and not proven minimal"
-        warnings.warn(f"{unsure}: its labels may be wrong; give more time, or look for bad views", AmbiguousMapWarning, stacklevel=2)
+        warnings.warn(
+            f"{unsure}: its labels may be wrong; give more time, or look for bad views",
+            AmbiguousMapWarning,
+            stacklevel=2,
+        )
     elif not agreed.all() or not complete:
         told = f"{'' if complete else 'at least '}{len(maps)} minimal map{'' if len(maps) == 1 else 's'}"
         unsure = f"{told} remain{'s' if len(maps) == 1 else ''}, and agree on {agreed.sum()} of {len(agreed)} labels"
-        warnings.warn(f"{unsure}: only these are learnt from; choose a map, or explore more", AmbiguousMapWarning, stacklevel=2)
+        warnings.warn(
+            f"{unsure}: only these are learnt from; choose a map, or explore more",
+            AmbiguousMapWarning,
+            stacklevel=2,
+        )
     if not agreed.any():
         raise LearnerError("labels: expected some that all maps agree on, got none; choose a map")
     return np.where(agreed, labels, -1)
@@ -65,7 +77,11 @@ def map_of(solution: Solution, choose: int | None = None) -> tuple[SSHMap, NDArr
 
 
 def labels_of_all(
-    ssh_map: SSHMap, labels: NDArray[np.intp], traces: Traces, views: NDArray[np.intp], features: Any = None
+    ssh_map: SSHMap,
+    labels: NDArray[np.intp],
+    traces: Traces,
+    views: NDArray[np.intp],
+    features: Any = None,
 ) -> NDArray[np.intp]:
     """The label of each step of several traces, (n,): of the longest trace its labels, as the map was made for it, and of the others what the map tells.
 
@@ -74,7 +90,11 @@ def labels_of_all(
     if len(traces.each) == 1:
         return np.where(views == NOISE, -1, labels)
     own = traces.parts(traces.images)[traces.longest]
-    looks = recogniser(features=features).fit(own[labels >= 0], labels[labels >= 0]).predict(traces.images)
+    looks = (
+        recogniser(features=features)
+        .fit(own[labels >= 0], labels[labels >= 0])
+        .predict(traces.images)
+    )
     found = labels_on(ssh_map, traces, views, looks)
     for i, part in enumerate(traces.parts(found)):
         if i == traces.longest:
@@ -82,23 +102,31 @@ def labels_of_all(
         elif (part < 0).all():
             text = f"trace {i}: the map of the longest trace does not tell where any of its {len(part)} steps is"
             warnings.warn(
-                f"{text}: it is not learnt from; drive it longer, or where the longest one was", AmbiguousMapWarning, stacklevel=3
+                f"{text}: it is not learnt from; drive it longer, or where the longest one was",
+                AmbiguousMapWarning,
+                stacklevel=3,
             )
     return np.where(views == NOISE, -1, found)
 
 
-def labels_on(ssh_map: SSHMap, traces: Traces, views: NDArray[np.intp], looks: NDArray[np.intp]) -> NDArray[np.intp]:
+def labels_on(
+    ssh_map: SSHMap, traces: Traces, views: NDArray[np.intp], looks: NDArray[np.intp]
+) -> NDArray[np.intp]:
     """The dstate of each step of all traces, (n,), where the map tells it, else -1.
 
     views  (n,) of the steps, -1 where there is none
     looks  (n,) dstates that the images look like: dstates that are not among these are not told
     """
     parts = zip(traces.each, traces.parts(views), traces.parts(looks), strict=True)
-    found = np.concatenate([_followed(ssh_map, trace, seen.tolist(), like) for trace, seen, like in parts])
+    found = np.concatenate(
+        [_followed(ssh_map, trace, seen.tolist(), like) for trace, seen, like in parts]
+    )
     return np.where(np.isin(found, looks), found, -1)
 
 
-def _followed(ssh_map: SSHMap, trace: Trace, views: Sequence[int], looks: NDArray[np.intp]) -> NDArray[np.intp]:
+def _followed(
+    ssh_map: SSHMap, trace: Trace, views: Sequence[int], looks: NDArray[np.intp]
+) -> NDArray[np.intp]:
     """The dstate of each step of a trace that may begin anywhere on a map: of all beginnings that no view contradicts, the one that fits most images.
 
     Where an action was never tried in a dstate, a way is lost: from there on it tells nothing (-1), and contradicts nothing. Where two ways fit equally many
@@ -119,7 +147,11 @@ def _followed(ssh_map: SSHMap, trace: Trace, views: Sequence[int], looks: NDArra
             ways.append(np.array(way, np.intp))
     ways.sort(key=lambda way: -np.count_nonzero(way == looks))
     fits = [np.count_nonzero(way == looks) for way in ways[:2]]
-    sure = fits and fits[0] >= np.count_nonzero(ways[0] >= 0) / 2 and fits[0] > max(fits[1:], default=0)
+    sure = (
+        fits
+        and fits[0] >= np.count_nonzero(ways[0] >= 0) / 2
+        and fits[0] > max(fits[1:], default=0)
+    )
     return ways[0] if sure else np.full(len(views), -1, np.intp)
 
 

@@ -48,7 +48,11 @@ class SecondMap:
             instead = "" if self.dstates is None else f" instead of {self.dstates}"
             other = f"give another map, of {self.solution.cost.dstates} dstates{instead}{proven}"
         else:
-            other = "have no map" if self.solution.status is Status.UNSATISFIABLE else "have no map that was found in time"
+            other = (
+                "have no map"
+                if self.solution.status is Status.UNSATISFIABLE
+                else "have no map that was found in time"
+            )
         return (
             f"{self.views} views may be too {'few' if self.views < self.other_views else 'many'}: {self.other_views} also separate the images well, "
             f"and {other}; cluster the images into {self.other_views} views to see it (cluster --k {self.other_views}), or log more images"
@@ -58,9 +62,20 @@ class SecondMap:
 def with_runner_up(trace: Trace, views: Iterable[View] | None) -> Trace:
     """The trace with the views of the runner-up at its steps, or, for None, without any that it may have had. Raises TraceError."""
     if views is None:
-        return replace(trace, steps=tuple(replace(s, extra={k: v for k, v in s.extra.items() if k != FIELD}) for s in trace.steps))
+        return replace(
+            trace,
+            steps=tuple(
+                replace(s, extra={k: v for k, v in s.extra.items() if k != FIELD})
+                for s in trace.steps
+            ),
+        )
     seen = trace.with_views(views).views
-    return replace(trace, steps=tuple(replace(s, extra={**s.extra, FIELD: v}) for s, v in zip(trace.steps, seen, strict=True)))
+    return replace(
+        trace,
+        steps=tuple(
+            replace(s, extra={**s.extra, FIELD: v}) for s, v in zip(trace.steps, seen, strict=True)
+        ),
+    )
 
 
 def runner_up(trace: Trace) -> Trace | None:
@@ -69,7 +84,9 @@ def runner_up(trace: Trace) -> Trace | None:
         return None
     for i, step in enumerate(trace.steps):
         if FIELD not in step.extra:
-            raise TraceError(f"{trace.at(i)}: {FIELD}: expected a view, as other steps have one, got none; cluster the images again")
+            raise TraceError(
+                f"{trace.at(i)}: {FIELD}: expected a view, as other steps have one, got none; cluster the images again"
+            )
     try:
         return trace.with_views(step.extra[FIELD] for step in trace.steps)
     except TraceError as error:
@@ -77,7 +94,11 @@ def runner_up(trace: Trace) -> Trace | None:
 
 
 def second_map(
-    trace: Trace, maps: Sequence[SSHMap], theory: Theory | None = None, limit: float | None = None, memory: int | None = None
+    trace: Trace,
+    maps: Sequence[SSHMap],
+    theory: Theory | None = None,
+    limit: float | None = None,
+    memory: int | None = None,
 ) -> SecondMap | None:
     """The map of the runner-up, where it is none of `maps`, which the views of the trace give; None where there is no runner-up, or it gives one of these.
 
@@ -88,13 +109,25 @@ def second_map(
     other = runner_up(trace)
     if other is None:
         return None
-    solution = solve(other, theory, time_limit=SECONDS if limit is None else min(limit, SECONDS), memory_limit=memory)
+    solution = solve(
+        other,
+        theory,
+        time_limit=SECONDS if limit is None else min(limit, SECONDS),
+        memory_limit=memory,
+    )
     if {partition(m) for m in maps} & {partition(m) for m in solution.maps}:
         return None
-    return SecondMap(len(set(trace.views)), len(set(other.views)), len(maps[0].dstates) if maps else None, solution)
+    return SecondMap(
+        len(set(trace.views)),
+        len(set(other.views)),
+        len(maps[0].dstates) if maps else None,
+        solution,
+    )
 
 
-def warn_of_second_map(trace: Trace, maps: Sequence[SSHMap], theory: Theory | None, limit: float | None) -> SecondMap | None:
+def warn_of_second_map(
+    trace: Trace, maps: Sequence[SSHMap], theory: Theory | None, limit: float | None
+) -> SecondMap | None:
     """The same, with a RunnerUpWarning where there is one."""
     found = second_map(trace, maps, theory, limit)
     if found:

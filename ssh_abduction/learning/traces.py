@@ -32,7 +32,13 @@ class Traces:
         """One trace, or several. Raises TraceError."""
         if isinstance(given, Traces):
             return given
-        each = (given,) if isinstance(given, Trace) else tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else ()
+        each = (
+            (given,)
+            if isinstance(given, Trace)
+            else tuple(given)
+            if isinstance(given, Sequence) and not isinstance(given, str)
+            else ()
+        )
         if not each or not all(isinstance(trace, Trace) for trace in each):
             raise TraceError(
                 f"traces: expected a Trace, or a list of them, got {brief(given)}; make one with Trace.load or Trace.from_steps"
@@ -42,7 +48,9 @@ class Traces:
     @classmethod
     def are(cls, given: Any) -> bool:
         """Whether something is a trace, or traces."""
-        return isinstance(given, Traces | Trace) or (isinstance(given, Sequence) and len(given) > 0 and isinstance(given[0], Trace))
+        return isinstance(given, Traces | Trace) or (
+            isinstance(given, Sequence) and len(given) > 0 and isinstance(given[0], Trace)
+        )
 
     @cached_property
     def images(self) -> NDArray[np.float64]:
@@ -82,14 +90,27 @@ class Traces:
         return np.split(of_all, np.cumsum([len(trace) for trace in self.each])[:-1])
 
     def with_views(
-        self, images: NDArray[np.float64], views: Integers, second: Integers | None, sure: NDArray[np.float64] | None = None
+        self,
+        images: NDArray[np.float64],
+        views: Integers,
+        second: Integers | None,
+        sure: NDArray[np.float64] | None = None,
     ) -> Traces:
         """These traces with views, (n,), how sure they are, (n,), and, where there is a runner-up, its views.
 
         Noise has the view of the nearest centre among the images, (n, d), and the confidence 0.
         """
         of_steps = np.ones(len(images)) if sure is None else sure.round(4)
-        parts = zip(self.each, self.parts(nearest_views(images, views)), self.parts(of_steps), strict=True)
-        seen = [trace.with_views(part.tolist(), None if sure is None else c.tolist()) for trace, part, c in parts]
-        others = [None] * len(seen) if second is None else [part.tolist() for part in self.parts(second)]
-        return Traces(tuple(with_runner_up(t, other) for t, other in zip(seen, others, strict=True)))
+        parts = zip(
+            self.each, self.parts(nearest_views(images, views)), self.parts(of_steps), strict=True
+        )
+        seen = [
+            trace.with_views(part.tolist(), None if sure is None else c.tolist())
+            for trace, part, c in parts
+        ]
+        others = (
+            [None] * len(seen) if second is None else [part.tolist() for part in self.parts(second)]
+        )
+        return Traces(
+            tuple(with_runner_up(t, other) for t, other in zip(seen, others, strict=True))
+        )

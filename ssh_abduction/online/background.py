@@ -25,7 +25,9 @@ def guessed_map(trace: Trace, theory: Theory, speedups: Speedups, watch: Watch) 
     return found.map if found else None
 
 
-def mended_map(trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None) -> SSHMap | None:
+def mended_map(
+    trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None
+) -> SSHMap | None:
     """A map of a trace near one of its first steps that its later steps contradict, if there is one in which all that does not fit is new."""
     watch = watch or Watch()
     found = FramedEngine(Task.of(trace, theory, watch, speedups)).map_mended_from(known.labels)
@@ -42,13 +44,22 @@ class MapGuess(Beside[SSHMap]):
     """
 
     def __init__(
-        self, steps: Sequence[Step], odometry: Odometry | None, theory: Theory, speedups: Speedups, known: SSHMap | None = None
+        self,
+        steps: Sequence[Step],
+        odometry: Odometry | None,
+        theory: Theory,
+        speedups: Speedups,
+        known: SSHMap | None = None,
     ) -> None:
         super().__init__(partial(_make, steps, odometry, theory, speedups, known))
 
     @staticmethod
     def begun(
-        steps: Sequence[Step], odometry: Odometry | None, theory: Theory, speedups: Speedups, known: SSHMap | None = None
+        steps: Sequence[Step],
+        odometry: Odometry | None,
+        theory: Theory,
+        speedups: Speedups,
+        known: SSHMap | None = None,
     ) -> MapGuess | None:
         """None where there is no second processor, or guesses are not wanted."""
         wanted = speedups.annealed and speedups.processes and has_processors(speedups)
@@ -60,9 +71,18 @@ class MapGuess(Beside[SSHMap]):
 
 
 def _make(
-    steps: Sequence[Step], odometry: Odometry | None, theory: Theory, speedups: Speedups, known: SSHMap | None, watch: Watch
+    steps: Sequence[Step],
+    odometry: Odometry | None,
+    theory: Theory,
+    speedups: Speedups,
+    known: SSHMap | None,
+    watch: Watch,
 ) -> SSHMap | None:
-    known = known or in_process(guessed_map, Trace(tuple(steps), odometry=odometry), theory, speedups, watch=watch)
+    known = known or in_process(
+        guessed_map, Trace(tuple(steps), odometry=odometry), theory, speedups, watch=watch
+    )
     if known and len(steps) > len(known.labels):
-        known = in_process(mended_map, Trace(tuple(steps), odometry=odometry), theory, known, speedups, watch=watch)
+        known = in_process(
+            mended_map, Trace(tuple(steps), odometry=odometry), theory, known, speedups, watch=watch
+        )
     return known

@@ -96,7 +96,11 @@ class Exploration:
     @property
     def sentence(self) -> str:
         """What came of it, in a few words."""
-        truth = {None: "", True: ", and true", False: ", and not true"}[self.is_true] if self.is_unique else ""
+        truth = (
+            {None: "", True: ", and true", False: ", and not true"}[self.is_true]
+            if self.is_unique
+            else ""
+        )
         why = _ENDINGS[self.ending]
         if self.is_unique and self.rival:
             more = len(self.rival.dstates) - len(self.solution.maps[0].dstates)
@@ -136,13 +140,26 @@ class Explorer:
 
     @renamed_parameters("limit", "maps")
     def __init__(
-        self, robot: Robot, theory: Theory | None = None, *, margin: int = 2, time_limit: float | None = 2.0, max_maps: int | None = 100
+        self,
+        robot: Robot,
+        theory: Theory | None = None,
+        *,
+        margin: int = 2,
+        time_limit: float | None = 2.0,
+        max_maps: int | None = 100,
     ) -> None:
         if not is_whole(margin) or margin < 0:
-            raise TraceError(f"margin: expected a number of dstates, 0 or more, got {brief(margin)}")
+            raise TraceError(
+                f"margin: expected a number of dstates, 0 or more, got {brief(margin)}"
+            )
         check_limit("time_limit", "seconds", time_limit)
         for name in ("look", "can", "do"):
-            a_function(f"robot.{name}", getattr(robot, name, None), TraceError, what="a method of the robot")
+            a_function(
+                f"robot.{name}",
+                getattr(robot, name, None),
+                TraceError,
+                what="a method of the robot",
+            )
         if theory is not None and checked_theory(theory).has_faults:
             raise TheoryError(
                 "theory: expected one without faults, as what contradicts all maps ends an exploration, got misread or slipped; leave them out"
@@ -150,15 +167,25 @@ class Explorer:
         self._robot, self._margin, self._limit, self._most = robot, margin, time_limit, max_maps
         first = self._look()
         assert first.view is not None
-        self.mapper = OnlineMapper(first.view, theory, star=first.star, time_limit=time_limit, max_maps=max_maps)  # type: ignore[arg-type]
+        self.mapper = OnlineMapper(
+            first.view, theory, star=first.star, time_limit=time_limit, max_maps=max_maps
+        )  # type: ignore[arg-type]
         self._truths = [first.truth]
         self._actions: dict[str, Action] = {}  # all that it was ever able to do
-        self._abilities: dict[tuple[object, object], set[str]] = {}  # what it can do wherever it sees this
-        self._longer: Solution | None = None  # the answer for all steps, where the mapper had too little time for it
+        self._abilities: dict[
+            tuple[object, object], set[str]
+        ] = {}  # what it can do wherever it sees this
+        self._longer: Solution | None = (
+            None  # the answer for all steps, where the mapper had too little time for it
+        )
         self._plan: list[str] = []
-        self._least: dict[Doubt, int] = {}  # how many dstates a map has at least in which two steps are not where the map says
+        self._least: dict[
+            Doubt, int
+        ] = {}  # how many dstates a map has at least in which two steps are not where the map says
         self._undecided: set[Doubt] = set()  # doubts of which nothing was found out in time
-        self._twins: dict[Doubt, SSHMap] = {}  # rivals with few dstates more that nothing tells apart from the minimal map
+        self._twins: dict[
+            Doubt, SSHMap
+        ] = {}  # rivals with few dstates more that nothing tells apart from the minimal map
         self._stuck = False  # nothing was left to do when it was last asked
         self._note(first)
 
@@ -169,7 +196,13 @@ class Explorer:
     def trace(self) -> Trace:
         """All that was seen and done, with the truth that the robot's looks tell."""
         trace = self.mapper.trace
-        return replace(trace, steps=tuple(replace(step, truth=truth) for step, truth in zip(trace.steps, self._truths, strict=True)))
+        return replace(
+            trace,
+            steps=tuple(
+                replace(step, truth=truth)
+                for step, truth in zip(trace.steps, self._truths, strict=True)
+            ),
+        )
 
     @property
     def solution(self) -> Solution:
@@ -196,7 +229,13 @@ class Explorer:
         self._robot.do(action)
         seen = self._look()
         assert seen.view is not None
-        self.mapper.observe(action, seen.view, star=seen.star, displacement=seen.displacement, covariance=seen.covariance)  # type: ignore[arg-type]
+        self.mapper.observe(
+            action,
+            seen.view,
+            star=seen.star,
+            displacement=seen.displacement,
+            covariance=seen.covariance,
+        )  # type: ignore[arg-type]
         self._truths.append(seen.truth)
         self._note(seen)
         if self.mapper.searches > asked or self.mapper.solution.count != known:
@@ -213,7 +252,14 @@ class Explorer:
         solution = self.solution
         unique = _is_unique(solution)
         rival = next(iter(self._twins.values()), None)
-        return Exploration(len(self.trace) - 1, self._ending(unique), unique, self._is_true(unique), solution, rival)
+        return Exploration(
+            len(self.trace) - 1,
+            self._ending(unique),
+            unique,
+            self._is_true(unique),
+            solution,
+            rival,
+        )
 
     def _ending(self, unique: bool) -> Ending:
         if self.solution.status is Status.UNSATISFIABLE:
@@ -232,12 +278,16 @@ class Explorer:
         if not unique:
             return False
         found = evaluate(self.solution.maps, self.trace).maps
-        return all(said.dstates_right is not False and said.places_right is not False for said in found)
+        return all(
+            said.dstates_right is not False and said.places_right is not False for said in found
+        )
 
     def _look(self) -> Step:
         seen = self._robot.look()
         if not isinstance(seen, Step) or seen.view is None:
-            raise TraceError(f"look: expected a Step with a view, got {brief(seen)}; let the robot say what it sees, as in Step('hall')")
+            raise TraceError(
+                f"look: expected a Step with a view, got {brief(seen)}; let the robot say what it sees, as in Step('hall')"
+            )
         return seen
 
     def _note(self, seen: Step) -> None:
@@ -245,10 +295,14 @@ class Explorer:
         self._able = {action.name: action for action in map(Action.of, self._robot.can())}
         self._actions |= self._able
         for star in {seen.star, None}:
-            self._abilities.setdefault((seen.view, star), set(self._able)).intersection_update(self._able)
+            self._abilities.setdefault((seen.view, star), set(self._able)).intersection_update(
+                self._able
+            )
 
     def _can(self, seen: Seen) -> set[str]:
-        return self._abilities.get((seen.view, seen.star)) or self._abilities.get((seen.view, None), set())
+        return self._abilities.get((seen.view, seen.star)) or self._abilities.get(
+            (seen.view, None), set()
+        )
 
     def _planned(self) -> bool:
         """Whether there is a next action, which is the first one of the plan then."""
@@ -264,9 +318,13 @@ class Explorer:
         found = self._experiment(maps)
         if not found.plan.branches and (tour := self._tour(maps[0])):
             return tour
-        if not found.actions and not (self.solution.status is Status.OPTIMAL and self.solution.complete):
+        if not found.actions and not (
+            self.solution.status is Status.OPTIMAL and self.solution.complete
+        ):
             longer = None if self._limit is None else LONGER * self._limit
-            self._longer = solve(self.mapper.trace, self.mapper.theory, time_limit=longer, max_maps=self._most)
+            self._longer = solve(
+                self.mapper.trace, self.mapper.theory, time_limit=longer, max_maps=self._most
+            )
             if self._longer.maps:
                 found = self._experiment(list(self._longer.maps))
         if found.actions or not self._margin or not self.solution.maps:
@@ -286,30 +344,56 @@ class Explorer:
 
     def _experiment(self, maps: list[SSHMap]) -> Experiment:
         return next_experiment(
-            maps, self.mapper.trace, theory=self.mapper.theory, actions=self._actions.values(), can=self._can, implied=True
+            maps,
+            self.mapper.trace,
+            theory=self.mapper.theory,
+            actions=self._actions.values(),
+            can=self._can,
+            implied=True,
         )
 
     def _tour(self, ssh_map: SSHMap) -> tuple[str, ...]:
         """The actions that lead soonest through all that is untried in a map."""
         return next_tour(
-            ssh_map, self.mapper.trace, theory=self.mapper.theory, actions=self._actions.values(), can=self._can, margin=DOUBTED
+            ssh_map,
+            self.mapper.trace,
+            theory=self.mapper.theory,
+            actions=self._actions.values(),
+            can=self._can,
+            margin=DOUBTED,
         )
 
     def _doubts(self, ssh_map: SSHMap) -> Iterator[Doubt]:
         """The returns of a map that are still in doubt, the latest first, as least is known of these."""
         at = [ssh_map.dstates[label].place if ssh_map.places else label for label in ssh_map.labels]
-        comes = [0, *(t for t, action in enumerate(self.mapper.trace.actions, 1) if not ssh_map.places or action.kind == "travel")]
+        comes = [
+            0,
+            *(
+                t
+                for t, action in enumerate(self.mapper.trace.actions, 1)
+                if not ssh_map.places or action.kind == "travel"
+            ),
+        ]
         first: dict[int | None, int] = {}
         for t in comes:
             first.setdefault(at[t], t)
         enough = len(ssh_map.dstates) + self._margin
-        yield from ((first[at[t]], t) for t in reversed(comes) if first[at[t]] != t and self._least.get((first[at[t]], t), 0) <= enough)
+        yield from (
+            (first[at[t]], t)
+            for t in reversed(comes)
+            if first[at[t]] != t and self._least.get((first[at[t]], t), 0) <= enough
+        )
 
     def _without(self, doubt: Doubt, dstates: int) -> Iterator[SSHMap]:
         """The best map in which two steps are not where the minimal maps say, if it has few dstates more."""
         theory = self.mapper.theory
         kind = "different" if theory.level == "causal" else "elsewhere"
-        found = solve(self.mapper.trace, theory.replace(**{kind: (*getattr(theory, kind), doubt)}), max_maps=1, time_limit=self._limit)
+        found = solve(
+            self.mapper.trace,
+            theory.replace(**{kind: (*getattr(theory, kind), doubt)}),
+            max_maps=1,
+            time_limit=self._limit,
+        )
         if found.maps and len(found.maps[0].dstates) <= dstates + self._margin:
             yield found.maps[0]
             return
@@ -324,9 +408,17 @@ def _is_unique(solution: Solution) -> bool:
     if solution.status is not Status.OPTIMAL or not solution.maps:
         return False
     maps = solution.maps
-    if len({ssh_map.labels for ssh_map in maps}) > 1 or len({tuple(s.place for s in ssh_map.dstates) for ssh_map in maps}) > 1:
+    if (
+        len({ssh_map.labels for ssh_map in maps}) > 1
+        or len({tuple(s.place for s in ssh_map.dstates) for ssh_map in maps}) > 1
+    ):
         return False
     if solution.complete:
         return True
     shared = solution.backbone
-    return shared is not None and shared.proven and not shared.dstates.sometimes and not (shared.places and shared.places.sometimes)
+    return (
+        shared is not None
+        and shared.proven
+        and not shared.dstates.sometimes
+        and not (shared.places and shared.places.sometimes)
+    )

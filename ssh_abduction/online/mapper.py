@@ -64,7 +64,18 @@ from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
-from ssh_abduction.solver import AT_ONCE, Cost, Judging, Outcome, Seconds, Sketch, Solution, Status, check_limit, observation
+from ssh_abduction.solver import (
+    AT_ONCE,
+    Cost,
+    Judging,
+    Outcome,
+    Seconds,
+    Sketch,
+    Solution,
+    Status,
+    check_limit,
+    observation,
+)
 from ssh_abduction.solver.search import ALL, Search
 from ssh_abduction.theory.evidence import NO_PAIRS, Pairs, evidence_of, pairs_of, said_by
 from ssh_abduction.theory.evidence.displacement import count_returns
@@ -125,7 +136,9 @@ class OnlineMapper:
         checked_speedups(speedups)
         self._odometry = None if odometry is None else Odometry.of(odometry)
         self.trace = Trace((first,), odometry=self._odometry)  # the steps so far
-        settled = theory.replace(displacement="none").resolve(self.trace)  # of displacements the first step says nothing
+        settled = theory.replace(displacement="none").resolve(
+            self.trace
+        )  # of displacements the first step says nothing
         self._without_stars = theory.star == "auto" and settled.star == "none"
         self._unsettled = theory.replace(star=settled.star)
         self._steps = [first]
@@ -136,10 +149,14 @@ class OnlineMapper:
             from ssh_abduction.online.recovery import Recovery  # loads numpy
 
             self.theory = self._settled_theory()
-            self._recovery = Recovery(self.trace, self.theory, time_limit=time_limit, max_maps=max_maps, speedups=speedups)
+            self._recovery = Recovery(
+                self.trace, self.theory, time_limit=time_limit, max_maps=max_maps, speedups=speedups
+            )
             self.solution = self._recovery.solution
             return
-        if theory.level == "causal":  # now rather than at the step that first needs it, as it takes its time
+        if (
+            theory.level == "causal"
+        ):  # now rather than at the step that first needs it, as it takes its time
             importlib.import_module("ssh_abduction.solver.engines.causal")
         elif row("visits").holds_for(settled):
             importlib.import_module("ssh_abduction.online.background")
@@ -172,7 +189,9 @@ class OnlineMapper:
         self.theory = theory
         self._evidence = evidence_of(theory)
         # What evidence says is asked of evidence itself, as sketches grow; of all else they are certain, or the checker is asked.
-        self._without_evidence = theory.replace(without=(*theory.without, *(kind.axiom for kind in self._evidence)))
+        self._without_evidence = theory.replace(
+            without=(*theory.without, *(kind.axiom for kind in self._evidence))
+        )
         self._replays = row("prefixes").holds_for(theory)
         self._may_mend = row("visits").holds_for(theory)
         self._may_sketch = self._replays and not unchecked(theory)
@@ -186,7 +205,9 @@ class OnlineMapper:
         self._sketches = [_Draft(sketch) for sketch in Sketch.all_of(self._steps[0], theory)]
         for before, step in pairwise(self._steps):
             assert before.action
-            self._sketches = [draft for draft in self._sketches if draft.sketch.extend(before.action, step)]
+            self._sketches = [
+                draft for draft in self._sketches if draft.sketch.extend(before.action, step)
+            ]
         self._search: Search | None = None
         self._asked: Solution | None = None  # what it said
         self._next_search = 0  # not before the trace has so many steps
@@ -206,7 +227,9 @@ class OnlineMapper:
         """Whether the theory is still as the trace so far settles it."""
         if self.theory.displacement == "none":
             return self._unsettled.displacement == "none" or self._steps[-1].displacement is None
-        return bool(self._unsettled.returns) or self.theory.returns == count_returns(self.trace, self.theory)
+        return bool(self._unsettled.returns) or self.theory.returns == count_returns(
+            self.trace, self.theory
+        )
 
     def __repr__(self) -> str:
         cost = self.solution.cost
@@ -232,7 +255,13 @@ class OnlineMapper:
         """
         began = time.perf_counter()
         done = Action.of(action)
-        step = Step.of(_known(view, len(self._steps)), star, f"step {len(self._steps)}", displacement=displacement, covariance=covariance)
+        step = Step.of(
+            _known(view, len(self._steps)),
+            star,
+            f"step {len(self._steps)}",
+            displacement=displacement,
+            covariance=covariance,
+        )
         step = replace(step, confidence=confidence)
         self._take(done, step, began)
         self.solution = self._recovery.solution if self._recovery else self._answer(began)
@@ -263,13 +292,19 @@ class OnlineMapper:
         if self._may_guess():
             contradicted = known if not self._drafts else None
             mended = contradicted is not None and self._mend(contradicted, began)
-            if not self._guess and not mended and (contradicted or len(self._steps) >= self._next_guess):
+            if (
+                not self._guess
+                and not mended
+                and (contradicted or len(self._steps) >= self._next_guess)
+            ):
                 self._begin_guess(contradicted)
 
     def _settle_anew(self) -> None:
         """Begin anew, with the theory that the trace so far settles. Maps of the steps before go on as drafts, if they were judged by displacements, too."""
         uses, steps = self.theory.displacement == "use", len(self._steps) - 1
-        known = [m.map() for m in self._maps[:DRAFTS]] + [draft.sketch.map() for draft in self._drafts]
+        known = [m.map() for m in self._maps[:DRAFTS]] + [
+            draft.sketch.map() for draft in self._drafts
+        ]
         self._begin_with(self._settled_theory())
         self._pairs = pairs_of(self.trace, self.theory)
         for ssh_map in known if uses else ():
@@ -289,14 +324,22 @@ class OnlineMapper:
         self.theory.require(last, f"step {n - 1}")
         self.theory.require(step, f"step {n}")
         if self._without_stars and step.star is not None:
-            raise TraceError(f"step {n}: star: expected none, as the first step has none; give all steps stars, or take star=none")
+            raise TraceError(
+                f"step {n}: star: expected none, as the first step has none; give all steps stars, or take star=none"
+            )
 
     def _replay(self, action: Action, step: Step) -> None:
         """Keep the maps that predict the step."""
         self._pairs = pairs_of(self.trace, self.theory)
         outcomes = [self._outcome(m, action) for m in self._maps]
-        lost = [m for m, outcome in zip(self._maps, outcomes, strict=True) if outcome is Outcome.UNKNOWN]
-        self._maps = [m for m, outcome in zip(self._maps, outcomes, strict=True) if outcome is Outcome.PREDICTED]
+        lost = [
+            m for m, outcome in zip(self._maps, outcomes, strict=True) if outcome is Outcome.UNKNOWN
+        ]
+        self._maps = [
+            m
+            for m, outcome in zip(self._maps, outcomes, strict=True)
+            if outcome is Outcome.PREDICTED
+        ]
         self._drafts = [draft for draft in self._drafts if draft.sketch.extend(action, step)]
         self._sketches = [draft for draft in self._sketches if draft.sketch.extend(action, step)]
         self._complete = self._complete and Outcome.UNKNOWN not in outcomes
@@ -312,7 +355,9 @@ class OnlineMapper:
     def _outcome(self, replayed: _Replayed, action: Action) -> Outcome:
         """What a map and evidence say of the last step."""
         outcome = replayed.follow(action.name, self._seen[-1], self._pairs)
-        if outcome is Outcome.PREDICTED and not self._judging.allows_grown(self.trace, replayed.map(), len(self._steps) - 1):
+        if outcome is Outcome.PREDICTED and not self._judging.allows_grown(
+            self.trace, replayed.map(), len(self._steps) - 1
+        ):
             return Outcome.CONTRADICTED
         return outcome
 
@@ -344,7 +389,12 @@ class OnlineMapper:
 
     def _may_guess(self) -> bool:
         """Whether a small map is wanted, and the steps are not too many to be compared in pairs."""
-        return self._status is Status.UNKNOWN and self._limit is not None and self._may_mend and len(self._steps) <= AT_ONCE
+        return (
+            self._status is Status.UNKNOWN
+            and self._limit is not None
+            and self._may_mend
+            and len(self._steps) <= AT_ONCE
+        )
 
     def _absorb_guess(self) -> None:
         """Take the map that came of a guess."""
@@ -360,7 +410,9 @@ class OnlineMapper:
 
         if not known:
             self._next_guess = int(GUESS_AGAIN * len(self._steps))
-        self._guess = MapGuess.begun(self._steps, self._odometry, self.theory, self._speedups, known)
+        self._guess = MapGuess.begun(
+            self._steps, self._odometry, self.theory, self._speedups, known
+        )
 
     def _settled(self) -> bool:
         """Whether clingo could add nothing."""
@@ -371,15 +423,29 @@ class OnlineMapper:
         self._searches += 1
         known = self._maps[0].map() if self._status is Status.OPTIMAL else None
         search = Search(
-            self.trace, self.theory, time_limit=self._limit, max_maps=self._most, speedups=self._speedups, after=self._search, minimal=known
+            self.trace,
+            self.theory,
+            time_limit=self._limit,
+            max_maps=self._most,
+            speedups=self._speedups,
+            after=self._search,
+            minimal=known,
         )
         found = tuple(search.unranked())  # as that takes longer than a step may
         self._search = search
         steps = len(self._steps)
-        self._next_search = max(steps + PAUSE, int(RETRY * steps)) if search.stopped in ("time limit", "interrupted") else 0
+        self._next_search = (
+            max(steps + PAUSE, int(RETRY * steps))
+            if search.stopped in ("time limit", "interrupted")
+            else 0
+        )
         self._asked = search.solution()
         if search.status in (Status.OPTIMAL, Status.UNSATISFIABLE) or not self._replays:
-            self._status, self._complete, self._cost = search.status, search.complete, self._asked.cost
+            self._status, self._complete, self._cost = (
+                search.status,
+                search.complete,
+                self._asked.cost,
+            )
             self._drafts = []
             if len(found) >= len(self._maps) or known is None:
                 self._maps = [_Replayed(m, self._seen) for m in found]
@@ -408,9 +474,17 @@ class OnlineMapper:
             steps=len(self._steps),
             prefix=self._search.prefix,
             basis=last.basis,
-            seconds=Seconds(time.perf_counter() - began, last.seconds.ground if asked else 0.0, last.seconds.solve if asked else 0.0),
+            seconds=Seconds(
+                time.perf_counter() - began,
+                last.seconds.ground if asked else 0.0,
+                last.seconds.solve if asked else 0.0,
+            ),
             stopped=None if self._complete else self._search.stopped,
-            evidence=said_by(self._evidence, self.trace, {name: said["refused"] for name, said in last.evidence.items()}),
+            evidence=said_by(
+                self._evidence,
+                self.trace,
+                {name: said["refused"] for name, said in last.evidence.items()},
+            ),
         )
 
     def _best_draft(self) -> _Draft | None:
@@ -427,7 +501,9 @@ class OnlineMapper:
         if self._evidence and draft.passed < steps:
             ssh_map = sketch.map()
             place_of = [s.place for s in ssh_map.dstates]
-            if not all(self._pairs.allow(t, sketch.labels, place_of) for t in range(draft.passed, steps)):
+            if not all(
+                self._pairs.allow(t, sketch.labels, place_of) for t in range(draft.passed, steps)
+            ):
                 return False
             if not self._judging.allows_grown(self.trace, ssh_map, draft.passed):
                 return False
@@ -440,7 +516,9 @@ class OnlineMapper:
 def _known(view: View, step: int) -> View:
     """The view of a step. Raises TraceError where it is unknown: only a whole trace may have such steps."""
     if view is None:
-        raise TraceError(f"step {step}: view: expected one while a robot drives, got none; log the trace, and solve it as a whole")
+        raise TraceError(
+            f"step {step}: view: expected one while a robot drives, got none; log the trace, and solve it as a whole"
+        )
     return view
 
 

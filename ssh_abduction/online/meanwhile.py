@@ -12,7 +12,9 @@ from ssh_abduction.solver import Bound, Status, Stop, Watch, has_processors, in_
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-MEANWHILE = 60.0  # For so many seconds a trace is solved; what it has grown to since is more worth it then.
+MEANWHILE = (
+    60.0  # For so many seconds a trace is solved; what it has grown to since is more worth it then.
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +29,18 @@ class Solved:
     stopped: Stop | None
 
 
-def solved(trace: Trace, theory: Theory, limit: float | None, maps: int | None, speedups: Speedups, watch: Watch | None = None) -> Solved:
+def solved(
+    trace: Trace,
+    theory: Theory,
+    limit: float | None,
+    maps: int | None,
+    speedups: Speedups,
+    watch: Watch | None = None,
+) -> Solved:
     """What `solve` finds for the steps so far."""
-    found = solve(trace, theory.of_steps(0, len(trace)), time_limit=limit, max_maps=maps, speedups=speedups)
+    found = solve(
+        trace, theory.of_steps(0, len(trace)), time_limit=limit, max_maps=maps, speedups=speedups
+    )
     return Solved(len(trace), found.status, found.maps, found.bound, found.complete, found.stopped)
 
 
@@ -40,10 +51,18 @@ class Meanwhile(Beside[Solved]):
         super().__init__(partial(_solve, trace, theory, maps, speedups))
 
     @staticmethod
-    def begun(trace: Trace, theory: Theory, maps: int | None, speedups: Speedups) -> Meanwhile | None:
+    def begun(
+        trace: Trace, theory: Theory, maps: int | None, speedups: Speedups
+    ) -> Meanwhile | None:
         """None where there is no second processor, or processes are not wanted."""
-        return Meanwhile(trace, theory, maps, speedups) if speedups.processes and has_processors(speedups) else None
+        return (
+            Meanwhile(trace, theory, maps, speedups)
+            if speedups.processes and has_processors(speedups)
+            else None
+        )
 
 
-def _solve(trace: Trace, theory: Theory, maps: int | None, speedups: Speedups, watch: Watch) -> Solved:
+def _solve(
+    trace: Trace, theory: Theory, maps: int | None, speedups: Speedups, watch: Watch
+) -> Solved:
     return in_process(solved, trace, theory, MEANWHILE, maps, speedups, watch=watch)

@@ -18,7 +18,7 @@ the logical representation can be restored" (Kuipers & Beeson 2002). Here these 
   that disbelieves the last step would, without that step, be a map that costs less than the least. And of the causal theory no minimal map is lost where an action was never tried: a link to each dstate
   that looks right is all that costs nothing. Only where none goes on is the trace solved anew, in the time that a step has, and else in a process of its own while the robot drives.
 * **Rivals** (`rivals.py`): beside the minimal maps all explanations that cost more, but not much more, each with its probability.
-* **Where the robot is**, by Markov localisation (`localize.py`) in the map that is best now, from the dstate before the one at which it broke: or nowhere that this map knows.
+* **Where the robot is**, by Markov localisation (`localiser.py`) in the map that is best now, from the dstate before the one at which it broke: or nowhere that this map knows.
 
 The mapper is certain where one map is minimal, proven, has the probability CERTAIN among its rivals, and, after something broke, is also where localisation has the robot located.
 """
@@ -34,10 +34,18 @@ import numpy as np
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.online.localize import Belief, Chances, Localiser
+from ssh_abduction.online.localiser import Belief, Chances, Localiser
 from ssh_abduction.online.meanwhile import Meanwhile, Solved, solved
 from ssh_abduction.online.rivals import Rival, Scale
-from ssh_abduction.solver import Bound, Judging, Seconds, Solution, Status, cost_as_counted, observation
+from ssh_abduction.solver import (
+    Bound,
+    Judging,
+    Seconds,
+    Solution,
+    Status,
+    cost_as_counted,
+    observation,
+)
 from ssh_abduction.theory.evidence import evidence_of, pairs_of
 from ssh_abduction.theory.speedups import Speedups, row
 from ssh_abduction.theory.theory import Theory
@@ -97,7 +105,10 @@ def chances_of(theory: Theory) -> Chances:
     """How likely it is that a map does not hold, by what faults cost: those of a kind that costs twice as much are as rare as two of the other. A kind that a theory does not
     know costs twice as much here: localisation would take any error to be of the only kind that it knows."""
     cheapest = min(price for price in (theory.misread, theory.slipped) if price)
-    misread, slipped = (RARE ** min(2.0, (price or 2 * cheapest) / cheapest) for price in (theory.misread, theory.slipped))
+    misread, slipped = (
+        RARE ** min(2.0, (price or 2 * cheapest) / cheapest)
+        for price in (theory.misread, theory.slipped)
+    )
     return Chances(misread=misread, slipped=slipped)
 
 
@@ -109,13 +120,23 @@ class Recovery:
     The others are those of OnlineMapper.
     """
 
-    def __init__(self, trace: Trace, theory: Theory, *, time_limit: float | None, max_maps: int | None, speedups: Speedups) -> None:
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory,
+        *,
+        time_limit: float | None,
+        max_maps: int | None,
+        speedups: Speedups,
+    ) -> None:
         self.searches = 0  # how often the trace was solved anew, in a step
         self._limit, self._most, self._speedups = time_limit, max_maps, speedups
         self._views = {trace.steps[0].view}
         self._known: SSHMap | None = None  # the map that was certain last, or best before
         self._broke: list[tuple[int, str]] = []  # since then
-        self._localiser: tuple[object, Localiser, Belief, int] | None = None  # of which map, and the belief after so many steps
+        self._localiser: tuple[object, Localiser, Belief, int] | None = (
+            None  # of which map, and the belief after so many steps
+        )
         self._began = time.perf_counter()
         self._spent = 0.0  # seconds that all steps took since the maps were sought anew
         self._trace = trace
@@ -131,7 +152,12 @@ class Recovery:
         self._replays = row("prefixes").holds_for(without_faults)
         self._evidence = evidence_of(theory)
         # Which links are free to be assumed is known where nothing but the two causal axioms holds.
-        self._lists_links = theory.level == "causal" and not self._evidence and not theory.rules and not theory.without
+        self._lists_links = (
+            theory.level == "causal"
+            and not self._evidence
+            and not theory.rules
+            and not theory.without
+        )
         self._chances = chances_of(theory)
         self._judging = Judging(self._trace, theory)
         self._rivals: list[Rival] = []
@@ -139,7 +165,9 @@ class Recovery:
         self._proven = self._complete = self._impossible = False
         self._bound = Bound()
         self._next_search = 0
-        self._is_slow = False  # whether clingo could not be stopped in time: it cannot while it grounds a step
+        self._is_slow = (
+            False  # whether clingo could not be stopped in time: it cannot while it grounds a step
+        )
         self._meanwhile: Meanwhile | None = None
 
     def take(self, trace: Trace, theory: Theory, began: float) -> None:
@@ -161,11 +189,15 @@ class Recovery:
 
     def _settled(self) -> bool:
         """Whether solving anew could add nothing."""
-        return self._impossible or (self._proven and (self._complete or len(self._minimal()) == self._most))
+        return self._impossible or (
+            self._proven and (self._complete or len(self._minimal()) == self._most)
+        )
 
     def _minimal(self) -> list[Rival]:
         """The rivals that are proven minimal."""
-        return [rival for rival in self._rivals if rival.cost == self._least] if self._proven else []
+        return (
+            [rival for rival in self._rivals if rival.cost == self._least] if self._proven else []
+        )
 
     def _advance(self) -> None:
         """Let the rivals go on with the last step."""
@@ -179,7 +211,10 @@ class Recovery:
         contradicted = lead.contradiction(done.name, seen) if lead else None
         if lead and self._known is None:
             self._known = lead.explained()
-        before, unknown = self._rivals, any(rival.is_unknown(done.name) for rival in self._minimal())
+        before, unknown = (
+            self._rivals,
+            any(rival.is_unknown(done.name) for rival in self._minimal()),
+        )
         self._rivals = self._gone_on(before, t)
         if not self._replays:  # what a map of fewer steps says of more is not known
             self._rivals, self._proven, self._complete = [], False, False
@@ -188,7 +223,12 @@ class Recovery:
         if self._proven and not self._minimal():
             self._proven = self._complete = False
             self._next_search = 0  # the cost was proven, so the next one may be
-        if lead and contradicted is not None and self._replays and all(rival.cost > lead.cost for rival in self._rivals):
+        if (
+            lead
+            and contradicted is not None
+            and self._replays
+            and all(rival.cost > lead.cost for rival in self._rivals)
+        ):
             self._note_break(t, lead, contradicted, seen)
 
     def _gone_on(self, rivals: Iterable[Rival], t: int) -> list[Rival]:
@@ -196,14 +236,17 @@ class Recovery:
         done, step = self._trace.steps[t - 1].action, self._trace.steps[t]
         assert done
         seen = observation(step, self._theory)
-        new = [way for rival in rivals for way in rival.ways_on(done.name, step, seen, self._theory)]
+        new = [
+            way for rival in rivals for way in rival.ways_on(done.name, step, seen, self._theory)
+        ]
         if self._evidence:
             trace = self._trace.prefix(t + 1)
             pairs = pairs_of(trace, self._theory.of_steps(0, t + 1))
             new = [
                 rival
                 for rival in new
-                if pairs.allow(t, rival.labels, rival.places) and self._judging.allows_grown(trace, rival.explained(), t)
+                if pairs.allow(t, rival.labels, rival.places)
+                and self._judging.allows_grown(trace, rival.explained(), t)
             ]
         return self._ranked(new)
 
@@ -214,7 +257,11 @@ class Recovery:
         least = min(rival.cost for rival in rivals)
         shares = self._scale(rivals).shares(rivals)
         order = sorted(range(len(rivals)), key=lambda i: (rivals[i].cost != least, -shares[i]))
-        ranked = [rivals[i] for i in order if rivals[i].cost == least or shares[i] >= LEAST_SHARE * max(shares)]
+        ranked = [
+            rivals[i]
+            for i in order
+            if rivals[i].cost == least or shares[i] >= LEAST_SHARE * max(shares)
+        ]
         ties = sum(rival.cost == least for rival in ranked)
         if self._most and ties > self._most:
             ranked = ranked[: self._most] + ranked[ties:]
@@ -229,8 +276,14 @@ class Recovery:
         """Note what broke at a step, which the best map took to be at another dstate."""
         kinds = [kind for kind in ("misread", "slipped") if getattr(self._theory, kind)]
         expected = lead.shows[there]
-        what = f"seen {seen[0]}, expected {expected[0]}" if seen[0] != expected[0] else "seen another star than expected"
-        self._broke.append((t, f"step {t}: {what} at dstate {there}: {', '.join(kinds)}, or the map is wrong"))
+        what = (
+            f"seen {seen[0]}, expected {expected[0]}"
+            if seen[0] != expected[0]
+            else "seen another star than expected"
+        )
+        self._broke.append(
+            (t, f"step {t}: {what} at dstate {there}: {', '.join(kinds)}, or the map is wrong")
+        )
 
     def _solve(self) -> None:
         """Solve the trace in the time that a step has, and else while the robot drives; only then, if a step took much longer than it may, and there is a map."""
@@ -249,7 +302,9 @@ class Recovery:
 
     def _begin_meanwhile(self) -> bool:
         """Solve the trace in another process, if there can be one, unless that is under way."""
-        self._meanwhile = self._meanwhile or Meanwhile.begun(self._trace, self._theory, self._most, self._speedups)
+        self._meanwhile = self._meanwhile or Meanwhile.begun(
+            self._trace, self._theory, self._most, self._speedups
+        )
         return self._meanwhile is not None
 
     def _excused(self) -> set[Fault]:
@@ -265,7 +320,9 @@ class Recovery:
 
     def _is_outgrown(self, found: Solved) -> bool:
         """Whether maps of the first steps cost less than what is proven since."""
-        return not found.maps or Rival.of(found.maps[0], self._trace, self._theory).cost < self._least
+        return (
+            not found.maps or Rival.of(found.maps[0], self._trace, self._theory).cost < self._least
+        )
 
     def _absorb(self, found: Solved) -> None:
         """Take the answer for the steps so far, or for the first of them."""
@@ -280,7 +337,11 @@ class Recovery:
         if optimal:
             self._proven, self._complete, self._least = True, found.complete, rivals[0].cost
         for t in range(found.steps, steps):
-            unknown = any(rival.is_unknown(self._trace.actions[t - 1].name) for rival in rivals if rival.cost == self._least)
+            unknown = any(
+                rival.is_unknown(self._trace.actions[t - 1].name)
+                for rival in rivals
+                if rival.cost == self._least
+            )
             rivals = self._gone_on(rivals, t)
             self._complete = self._complete and (self._lists_links or not unknown)
         if optimal and not any(rival.cost == self._least for rival in rivals):
@@ -289,7 +350,8 @@ class Recovery:
         others = [
             rival
             for rival in self._rivals
-            if (rival.labels, rival.faults) not in told and not (self._complete and rival.cost <= self._least)
+            if (rival.labels, rival.faults) not in told
+            and not (self._complete and rival.cost <= self._least)
         ]
         self._rivals = self._ranked([*rivals, *others])
 
@@ -297,9 +359,17 @@ class Recovery:
         """The answer for the steps so far."""
         self._drop_inconsistent()
         lead = self._rivals[0] if self._rivals else None
-        maps = tuple(rival.explained() for rival in self._minimal()) or ((lead.explained(),) if lead else ())
+        maps = tuple(rival.explained() for rival in self._minimal()) or (
+            (lead.explained(),) if lead else ()
+        )
         status = (
-            Status.OPTIMAL if self._proven else Status.FEASIBLE if maps else Status.UNSATISFIABLE if self._impossible else Status.UNKNOWN
+            Status.OPTIMAL
+            if self._proven
+            else Status.FEASIBLE
+            if maps
+            else Status.UNSATISFIABLE
+            if self._impossible
+            else Status.UNKNOWN
         )
         self._spent += time.perf_counter() - self._began
         if maps and self._judging.has_time_for(len(self._trace), self._spent):
@@ -329,13 +399,23 @@ class Recovery:
     def _stand(self) -> Standing:
         """How sure the mapper is now."""
         if not self._rivals:
-            said = "no map satisfies the axioms" if self._impossible else "no map of these steps is known yet"
-            return Standing(False, tuple(what for _, what in self._broke), (Hypothesis(1.0, None, said),))
+            said = (
+                "no map satisfies the axioms"
+                if self._impossible
+                else "no map of these steps is known yet"
+            )
+            return Standing(
+                False, tuple(what for _, what in self._broke), (Hypothesis(1.0, None, said),)
+            )
         lead, rivals = self._rivals[0], self._undecided()
         shares = self._scale(rivals).shares(rivals)
         where = self._located(lead) if self._broke else None
-        certain = self._is_decided(rivals, shares) and (where is None or self._has_recovered(where, lead))
-        standing = Standing(certain, tuple(said for _, said in self._broke), self._hypotheses(rivals, shares), where)
+        certain = self._is_decided(rivals, shares) and (
+            where is None or self._has_recovered(where, lead)
+        )
+        standing = Standing(
+            certain, tuple(said for _, said in self._broke), self._hypotheses(rivals, shares), where
+        )
         if certain:
             self._known, self._localiser = self.solution.maps[0], None
             self._broke.clear()
@@ -343,7 +423,11 @@ class Recovery:
 
     def _has_recovered(self, where: Belief, lead: Rival) -> bool:
         """Whether something was predicted since the last step that broke, and localisation, too, has the robot where the best map has it, more likely than not."""
-        return self._broke[-1][0] < len(self._trace) - 1 and where.likeliest == lead.here and where.probability > 0.5
+        return (
+            self._broke[-1][0] < len(self._trace) - 1
+            and where.likeliest == lead.here
+            and where.probability > 0.5
+        )
 
     def _is_decided(self, rivals: Sequence[Rival], shares: Sequence[float]) -> bool:
         """Whether all minimal maps are known, and they and nearly all that may be true agree on what is from here on, though perhaps not on what was."""
@@ -353,17 +437,25 @@ class Recovery:
         if any(rival.future() != lead for rival in minimal[1:]):
             return False
         return (
-            sum(share for rival, share in zip(rivals, shares, strict=True) if rival.cost == self._least or rival.future() == lead)
+            sum(
+                share
+                for rival, share in zip(rivals, shares, strict=True)
+                if rival.cost == self._least or rival.future() == lead
+            )
             >= CERTAIN
         )
 
-    def _hypotheses(self, rivals: Sequence[Rival], shares: Sequence[float]) -> tuple[Hypothesis, ...]:
+    def _hypotheses(
+        self, rivals: Sequence[Rival], shares: Sequence[float]
+    ) -> tuple[Hypothesis, ...]:
         """The most probable ones, and what is left."""
         order = sorted(range(len(shares)), key=lambda i: -shares[i])
         first = order if len(order) <= TOLD else order[: TOLD - 1]
         told = [Hypothesis(shares[i], rivals[i].explained(), self._said(rivals[i])) for i in first]
         if rest := order[len(first) :]:
-            told.append(Hypothesis(sum(shares[i] for i in rest), None, f"one of {len(rest)} others"))
+            told.append(
+                Hypothesis(sum(shares[i] for i in rest), None, f"one of {len(rest)} others")
+            )
         return tuple(told)
 
     def _undecided(self) -> list[Rival]:

@@ -27,7 +27,9 @@ from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver import Cost, observation
 from ssh_abduction.theory.theory import Theory
 
-Seen = tuple[object, object]  # as `observation` returns it: the view, and the star where the theory uses stars
+Seen = tuple[
+    object, object
+]  # as `observation` returns it: the view, and the star where the theory uses stars
 DSTATE = 10  # What a dstate costs, in tenths of dstates.
 
 
@@ -60,7 +62,14 @@ class Rival:
                 looks.setdefault(label, observation(trace.steps[t], theory))
         shows = tuple(looks.get(s.id, (s.view, None)) for s in ssh_map.dstates)
         links = {(s, action): x for s, action, x in ssh_map.links}
-        return cls(ssh_map, ssh_map.labels, shows, links, ssh_map.faults, Cost.of(ssh_map).preferred_by(theory))
+        return cls(
+            ssh_map,
+            ssh_map.labels,
+            shows,
+            links,
+            ssh_map.faults,
+            Cost.of(ssh_map).preferred_by(theory),
+        )
 
     @property
     def here(self) -> int:
@@ -70,7 +79,9 @@ class Rival:
     @property
     def places(self) -> list[int | None]:
         """The place of each dstate, if it has one."""
-        return [s.place for s in self.map.dstates] + [None] * (len(self.shows) - len(self.map.dstates))
+        return [s.place for s in self.map.dstates] + [None] * (
+            len(self.shows) - len(self.map.dstates)
+        )
 
     def explained(self) -> SSHMap:
         """The map of all steps, and its faults."""
@@ -82,7 +93,14 @@ class Rival:
         if len(links) < len(self.links):
             links = tuple(sorted((s, action, x) for (s, action), x in self.links.items()))
         faults = tuple(sorted(self.faults, key=lambda fault: (fault.step, fault.kind)))
-        return replace(self.map, labels=self.labels, dstates=(*known, *new), links=links, faults=faults, fit=None)
+        return replace(
+            self.map,
+            labels=self.labels,
+            dstates=(*known, *new),
+            links=links,
+            faults=faults,
+            fit=None,
+        )
 
     def contradiction(self, action: str, seen: Seen) -> int | None:
         """The dstate that the action leads to, where that looks different; else None."""
@@ -137,7 +155,15 @@ class Rival:
             if is_causal:
                 yield self._to(len(self.shows), new=seen, faults=slipped, tenths=tenths)
 
-    def _to(self, there: int, *, link: str | None = None, new: Seen | None = None, faults: Sequence[Fault] = (), tenths: int = 0) -> Rival:
+    def _to(
+        self,
+        there: int,
+        *,
+        link: str | None = None,
+        new: Seen | None = None,
+        faults: Sequence[Fault] = (),
+        tenths: int = 0,
+    ) -> Rival:
         """The rival whose next step is at a dstate, with a link there, or the dstate, if they are new."""
         tenths += DSTATE if new else 0
         return Rival(
@@ -175,7 +201,11 @@ class Scale:
         """The negative logarithm of the weight, in nats."""
         kinds = Counter(fault.kind for fault in rival.faults)
         ways = (len(rival.links) + kinds["slipped"]) * math.log(self.dstates)
-        return self.odds * rival.cost[0] / self.price + ways + (kinds["misread"] + kinds["misseen"]) * math.log(self.views)
+        return (
+            self.odds * rival.cost[0] / self.price
+            + ways
+            + (kinds["misread"] + kinds["misseen"]) * math.log(self.views)
+        )
 
     def shares(self, rivals: Sequence[Rival]) -> list[float]:
         """How probable each of these is, if one of them is true. They sum to 1."""

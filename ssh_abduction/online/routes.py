@@ -185,7 +185,9 @@ def route(
     Raises MapError where there is no such dstate, place or map, where no route exists, and where metres are asked of a map without poses.
     """
     if not isinstance(by, str) or by not in BY:
-        raise MapError(f"by: expected {', '.join(BY[:-1])} or {BY[-1]}, got {brief(by)}; say what the route shall have the fewest of")
+        raise MapError(
+            f"by: expected {', '.join(BY[:-1])} or {BY[-1]}, got {brief(by)}; say what the route shall have the fewest of"
+        )
     listing = Listing.of(maps)
     number = listing.number(str(map))
     return _Roads(listing.maps[number], by).route(start, goal, avoid, number, listing.maps)
@@ -208,14 +210,25 @@ class _Roads:
         self.travel, self.around = self._only_action(onward=True), self._only_action(onward=False)
         self.graph = self._graph()
 
-    def route(self, start: int | str | None, goal: int | str, avoid: Iterable[int | str], number: int, maps: Sequence[SSHMap]) -> Route:
+    def route(
+        self,
+        start: int | str | None,
+        goal: int | str,
+        avoid: Iterable[int | str],
+        number: int,
+        maps: Sequence[SSHMap],
+    ) -> Route:
         here, _ = self._nodes(self.map.labels[-1] if start is None else start, "from")
         there, told = self._nodes(goal, "to")
         if told.startswith("place"):
             wanted = {self._place(node) for node in there}
             there = {node for node in self.graph if self._place(node) in wanted}
         closed: set[Node] = set()
-        for i, name in enumerate([avoid] if isinstance(avoid, str | int) else a_list("avoid", avoid, MapError, what="dstates and places")):
+        for i, name in enumerate(
+            [avoid]
+            if isinstance(avoid, str | int)
+            else a_list("avoid", avoid, MapError, what="dstates and places")
+        ):
             closed |= self._nodes(name, f"avoid[{i}]")[0]
         for nodes, name in ((here, "from"), (there, "to")):
             if nodes <= closed:
@@ -229,7 +242,17 @@ class _Roads:
         first = way[0]
         assert isinstance(first, int)  # routes begin at dstates
         agree = self._agreeing(first, moves, maps) if all(move.known for move in moves) else ()
-        return Route(number + 1, self.by, first, told, self.map.dstates[first].view, self.map.dstates[first].place, moves, agree, len(maps))
+        return Route(
+            number + 1,
+            self.by,
+            first,
+            told,
+            self.map.dstates[first].view,
+            self.map.dstates[first].place,
+            moves,
+            agree,
+            len(maps),
+        )
 
     def _graph(self) -> nx.DiGraph[Any]:
         graph: nx.DiGraph[Any] = nx.DiGraph()
@@ -238,7 +261,9 @@ class _Roads:
             self.map.links, reverse=True
         ):  # of several actions between two dstates the first by name stays
             if source != target:
-                graph.add_edge(source, target, action=action, cost=self._cost(source, target, KNOWN_MOVE))
+                graph.add_edge(
+                    source, target, action=action, cost=self._cost(source, target, KNOWN_MOVE)
+                )
         if self.by == "places":
             self._add_implied(graph)
         return graph
@@ -255,7 +280,9 @@ class _Roads:
                 at.setdefault(s.place, set()).add(s.id)
         for path in self.map.paths:
             for place in path.order:
-                at.setdefault(place, set()).update(facing.get((place, path.id, way), (place, path.id, way)) for way in (1, -1))
+                at.setdefault(place, set()).update(
+                    facing.get((place, path.id, way), (place, path.id, way)) for way in (1, -1)
+                )
             for p, q in pairwise(path.order):
                 for a, b, way in ((p, q, 1), (q, p, -1)):
                     self._imply(
@@ -267,12 +294,23 @@ class _Roads:
         for courses in at.values():
             for course in courses:
                 for other in courses - {course}:
-                    self._imply(graph, course, other, self.around if self._is_around(course, other) else None)
+                    self._imply(
+                        graph,
+                        course,
+                        other,
+                        self.around if self._is_around(course, other) else None,
+                    )
 
-    def _imply(self, graph: nx.DiGraph[Any], source: Node, target: Node, action: str | None) -> None:
+    def _imply(
+        self, graph: nx.DiGraph[Any], source: Node, target: Node, action: str | None
+    ) -> None:
         if not graph.has_edge(source, target):
             graph.add_edge(
-                source, target, action=action, implied=True, cost=self._cost(source, target, UNTRIED_MOVE if action else OPEN_TURN)
+                source,
+                target,
+                action=action,
+                implied=True,
+                cost=self._cost(source, target, UNTRIED_MOVE if action else OPEN_TURN),
             )
 
     def _is_around(self, source: Node, target: Node) -> bool:
@@ -287,18 +325,23 @@ class _Roads:
             return (self._metres(source, target) or 0.0) + MICROMETRE
         # A route has no more moves than there are courses, so that one travel costs more than all turns that it might spare.
         return move + (
-            OPEN_TURN * (len(self.map.dstates) + 2 * sum(len(path.order) for path in self.map.paths))
+            OPEN_TURN
+            * (len(self.map.dstates) + 2 * sum(len(path.order) for path in self.map.paths))
             if self._place(source) != self._place(target)
             else 0.0
         )
 
     def _only_action(self, *, onward: bool) -> str | None:
         """The action that moves onward along paths from place to place, or the one that turns around on a path, if there is one alone."""
-        ends = [(self.map.dstates[s], action, self.map.dstates[x]) for s, action, x in self.map.links]
+        ends = [
+            (self.map.dstates[s], action, self.map.dstates[x]) for s, action, x in self.map.links
+        ]
         names = {
             action
             for s, action, x in ends
-            if s.path is not None and s.path == x.path and (s.place != x.place if onward else s.direction != x.direction)
+            if s.path is not None
+            and s.path == x.path
+            and (s.place != x.place if onward else s.direction != x.direction)
         }
         return names.pop() if len(names) == 1 else None
 
@@ -311,33 +354,57 @@ class _Roads:
             members: set[Node] = {s.id for s in self.map.dstates if s.place == place}
             if not members:
                 known = sorted({s.place for s in self.map.dstates if s.place is not None})
-                there = f"p{known[0]} to p{known[-1]}" if known else "a dstate, as the map has no places"
-                raise MapError(f"{field}: expected {there}, got {brief(text)}; ssh-abduction show lists them")
+                there = (
+                    f"p{known[0]} to p{known[-1]}"
+                    if known
+                    else "a dstate, as the map has no places"
+                )
+                raise MapError(
+                    f"{field}: expected {there}, got {brief(text)}; ssh-abduction show lists them"
+                )
             return members, f"place {place}"
-        if (is_whole(name) or (isinstance(name, str) and _is_number(text))) and 0 <= int(text) < count:
+        if (is_whole(name) or (isinstance(name, str) and _is_number(text))) and 0 <= int(
+            text
+        ) < count:
             return {int(text)}, f"dstate {int(text)}"
         places = f", or a place as p{self.map.places[0]}" if self.map.places else ""
-        raise MapError(f"{field}: expected a dstate, 0 to {count - 1}{places}, got {brief(name)}; ssh-abduction show lists them")
+        raise MapError(
+            f"{field}: expected a dstate, 0 to {count - 1}{places}, got {brief(name)}; ssh-abduction show lists them"
+        )
 
     def _shortest(self, here: set[Node], there: set[Node], closed: set[Node]) -> list[Node] | None:
-        places = {self._place(node) for node in closed if all(s.id in closed for s in self.map.dstates if s.place == self._place(node))}
+        places = {
+            self._place(node)
+            for node in closed
+            if all(s.id in closed for s in self.map.dstates if s.place == self._place(node))
+        }
         graph = self.graph.subgraph(
-            [node for node in self.graph if node not in closed and not (isinstance(node, tuple) and node[0] in places)]
+            [
+                node
+                for node in self.graph
+                if node not in closed and not (isinstance(node, tuple) and node[0] in places)
+            ]
         )
         cost, way = nx.multi_source_dijkstra(graph, here, weight="cost")
         found = min(((cost[node], str(node), node) for node in there if node in cost), default=None)
         return None if found is None else way[found[2]]
 
-    def _raise_no_route(self, here: set[Node], there: set[Node], closed: set[Node], told: str) -> NoReturn:
+    def _raise_no_route(
+        self, here: set[Node], there: set[Node], closed: set[Node], told: str
+    ) -> NoReturn:
         if closed and self._shortest(here, there, set()) is not None:
-            raise MapError(f"avoid: expected a way round what is avoided, got none to {told}; avoid less")
+            raise MapError(
+                f"avoid: expected a way round what is avoided, got none to {told}; avoid less"
+            )
         mend = (
             "take --by places, which may lead where the robot has not driven, or drive on"
             if self.by != "places" and self.map.paths
             else "drive on: next says what to try"
         )
         reached = len({node for node in self._reached(here) if isinstance(node, int)})
-        raise MapError(f"to: expected one of the {counted(reached, 'dstates')} that known links lead to, got {told}; {mend}")
+        raise MapError(
+            f"to: expected one of the {counted(reached, 'dstates')} that known links lead to, got {told}; {mend}"
+        )
 
     def _reached(self, here: set[Node]) -> set[Node]:
         return set(nx.multi_source_dijkstra_path_length(self.graph, here))
@@ -347,8 +414,26 @@ class _Roads:
         known = "implied" not in edge
         place, path, direction = self._course(target)
         if isinstance(target, tuple):
-            return Move(edge["action"], known, None, None, place, path, direction, self._metres(source, target))
-        return Move(edge["action"], known, target, self.map.dstates[target].view, place, path, direction, self._metres(source, target))
+            return Move(
+                edge["action"],
+                known,
+                None,
+                None,
+                place,
+                path,
+                direction,
+                self._metres(source, target),
+            )
+        return Move(
+            edge["action"],
+            known,
+            target,
+            self.map.dstates[target].view,
+            place,
+            path,
+            direction,
+            self._metres(source, target),
+        )
 
     def _course(self, node: Node) -> tuple[int | None, int | None, int | None]:
         if isinstance(node, tuple):
@@ -372,18 +457,25 @@ class _Roads:
             return poses[node]
         return poses[next(s.id for s in self.map.dstates if s.place == node[0])]
 
-    def _agreeing(self, start: int, moves: Sequence[Move], maps: Sequence[SSHMap]) -> tuple[int, ...]:
+    def _agreeing(
+        self, start: int, moves: Sequence[Move], maps: Sequence[SSHMap]
+    ) -> tuple[int, ...]:
         """The numbers of the maps in which the moves, from wherever the robot was when this map has it at the start, lead to the same views."""
         steps = [t for t, label in enumerate(self.map.labels) if label == start]
         agree = []
         for i, rival in enumerate(maps):
             leads = {(source, action): target for source, action, target in rival.links}
-            if all(_leads_to(leads, rival.dstates, label, moves) for label in {rival.labels[t] for t in steps}):
+            if all(
+                _leads_to(leads, rival.dstates, label, moves)
+                for label in {rival.labels[t] for t in steps}
+            ):
                 agree.append(i + 1)
         return tuple(agree)
 
 
-def _leads_to(leads: dict[tuple[int, str], int], dstates: Sequence[DState], dstate: int, moves: Sequence[Move]) -> bool:
+def _leads_to(
+    leads: dict[tuple[int, str], int], dstates: Sequence[DState], dstate: int, moves: Sequence[Move]
+) -> bool:
     """Whether the links of a map lead from a dstate along these moves, to the views that they expect."""
     for move in moves:
         target = leads.get((dstate, move.action or ""))

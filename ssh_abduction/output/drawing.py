@@ -18,7 +18,15 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7
 ALARM = "#b00020"  # what is disbelieved
 
 
-def text(x: float, y: float, label: str, colour: str, size: float = 12, weight: str = "normal", halo: bool = False) -> str:
+def text(
+    x: float,
+    y: float,
+    label: str,
+    colour: str,
+    size: float = 12,
+    weight: str = "normal",
+    halo: bool = False,
+) -> str:
     """A label with its middle at a point."""
     edge = ' stroke="white" stroke-width="3" paint-order="stroke"' if halo else ""
     return (

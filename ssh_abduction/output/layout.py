@@ -36,9 +36,18 @@ Turns: TypeAlias = Mapping[str, "str | float"]
 # Degrees clockwise that turns go by, where nothing but their side is known.
 SIDES = {"right": 90.0, "around": 180.0, "left": 270.0}
 FARTHEST = 1e7  # metres: positions farther away are not those of a robot
-SURE, GUESSED = 1.0, 0.2  # the weights of a turn of so many degrees, and of one of which the side is known alone
-WRONG, WRONG_GUESS = math.radians(46), math.radians(61)  # turns of either kind that a drawing misses by more may go to the wrong side
-SWEEPS, REWEIGHTED = 60, 15  # of averaging, where turns do not agree on the headings of courses; and how often turns are weighted anew
+SURE, GUESSED = (
+    1.0,
+    0.2,
+)  # the weights of a turn of so many degrees, and of one of which the side is known alone
+WRONG, WRONG_GUESS = (
+    math.radians(46),
+    math.radians(61),
+)  # turns of either kind that a drawing misses by more may go to the wrong side
+SWEEPS, REWEIGHTED = (
+    60,
+    15,
+)  # of averaging, where turns do not agree on the headings of courses; and how often turns are weighted anew
 LEAST_MISSED = 0.02  # radians: turns that are missed by less weigh all the same
 EXACT = 1e-6  # radians by which headings may miss turns that they agree with
 # What a unit that a street leaves its heading costs, one that it is too short, and streets that lie on each other: in units of length of a street.
@@ -70,8 +79,12 @@ class Layout:
         """The layout as plain data: `places` as pairs [id, [x, y]], `dstates` as [x, y, heading or null], and `metric`."""
         return {
             "metric": self.metric,
-            "places": [[place, [round(x, 4), round(y, 4)]] for place, (x, y) in self.places.items()],
-            "dstates": [[None if number is None else round(number, 4) for number in s] for s in self.dstates],
+            "places": [
+                [place, [round(x, 4), round(y, 4)]] for place, (x, y) in self.places.items()
+            ],
+            "dstates": [
+                [None if number is None else round(number, 4) for number in s] for s in self.dstates
+            ],
         }
 
 
@@ -81,13 +94,24 @@ def located(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
     It cannot where displacements are missing between parts of the map: each part has poses of its own then, seen from its own first dstate.
     """
     poses = ssh_map.fit.poses if ssh_map.fit else ()
-    if not poses or any(abs(number) > FARTHEST for pose in poses for number in (pose.x, pose.y, *pose.spread)):
+    if not poses or any(
+        abs(number) > FARTHEST for pose in poses for number in (pose.x, pose.y, *pose.spread)
+    ):
         return None
     if set(ssh_map.places) - {s.place for s in ssh_map.dstates}:
         return None
     here = ssh_map.dstates[ssh_map.labels[0]]
-    away = (s for s in ssh_map.dstates if s.id != here.id and (s.place is None or s.place != here.place))
-    return None if any((pose := poses[s.id]).x == pose.y == pose.heading == 0.0 and not any(pose.spread) for s in away) else poses
+    away = (
+        s for s in ssh_map.dstates if s.id != here.id and (s.place is None or s.place != here.place)
+    )
+    return (
+        None
+        if any(
+            (pose := poses[s.id]).x == pose.y == pose.heading == 0.0 and not any(pose.spread)
+            for s in away
+        )
+        else poses
+    )
 
 
 def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
@@ -99,8 +123,16 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
     Raises MapError where a turn is none of these.
     """
     if (poses := located(ssh_map)) is not None:
-        at = {s.place: (poses[s.id].x, poses[s.id].y) for s in reversed(ssh_map.dstates) if s.place is not None}
-        return Layout({p: at[p] for p in ssh_map.places}, tuple((pose.x, pose.y, pose.heading) for pose in poses), True)
+        at = {
+            s.place: (poses[s.id].x, poses[s.id].y)
+            for s in reversed(ssh_map.dstates)
+            if s.place is not None
+        }
+        return Layout(
+            {p: at[p] for p in ssh_map.places},
+            tuple((pose.x, pose.y, pose.heading) for pose in poses),
+            True,
+        )
     return _Drawing(ssh_map, degrees_of(turns)).layout()
 
 
@@ -109,7 +141,10 @@ def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
     known: dict[str, str | float] = {name: name for name in SIDES}
     if isinstance(turns, Trace):
         actions = {action.name: action for action in turns.actions if action.turn is not None}
-        known |= {name: action.turn or "" if action.bearing is None else float(action.bearing) for name, action in actions.items()}
+        known |= {
+            name: action.turn or "" if action.bearing is None else float(action.bearing)
+            for name, action in actions.items()
+        }
     elif turns is not None:
         known |= an_object("turns", turns, MapError)
     degrees = {}
@@ -119,7 +154,9 @@ def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
         elif is_finite(turn):
             degrees[name] = (float(turn), SURE)
         else:
-            raise MapError(f'turns[{brief(name)}]: expected "right", "left", "around" or degrees clockwise, got {brief(turn)}; say which')
+            raise MapError(
+                f'turns[{brief(name)}]: expected "right", "left", "around" or degrees clockwise, got {brief(turn)}; say which'
+            )
     return degrees
 
 
@@ -127,7 +164,9 @@ def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
     """The pairs of places on a path between which the robot travelled, the lower number first."""
     ends = [(ssh_map.dstates[s], ssh_map.dstates[x]) for s, _, x in ssh_map.links]
     pairs = {(a.place, b.place) for a, b in ends if a.path == b.path == path.id}
-    return sorted({(min(p, q), max(p, q)) for p, q in pairs if p is not None and q is not None and p != q})
+    return sorted(
+        {(min(p, q), max(p, q)) for p, q in pairs if p is not None and q is not None and p != q}
+    )
 
 
 class _Drawing:
@@ -137,16 +176,23 @@ class _Drawing:
         self.map, self.degrees = ssh_map, degrees
         self.spot = [s.place if s.place is not None else -1 - s.id for s in ssh_map.dstates]
         self.spots = list(dict.fromkeys([*ssh_map.places, *self.spot]))
-        ends = [(ssh_map.dstates[source], ssh_map.dstates[target]) for source, _, target in ssh_map.links]
+        ends = [
+            (ssh_map.dstates[source], ssh_map.dstates[target])
+            for source, _, target in ssh_map.links
+        ]
         self.travels = {
             (s.path, *sorted((self.spot[s.id], self.spot[x.id])))
             for s, x in ends
             if s.path is not None and s.path == x.path and s.place != x.place
         }
-        self.segments: Any = nx.utils.UnionFind((path.id, place) for path in ssh_map.paths for place in path.order)
+        self.segments: Any = nx.utils.UnionFind(
+            (path.id, place) for path in ssh_map.paths for place in path.order
+        )
         for path, p, q in self.travels:
             self.segments.union((path, p), (path, q))
-        self.in_quarters = all(abs(math.remainder(turn, math.pi / 2)) < EXACT for _, _, turn, _ in self._turned())
+        self.in_quarters = all(
+            abs(math.remainder(turn, math.pi / 2)) < EXACT for _, _, turn, _ in self._turned()
+        )
 
     def layout(self) -> Layout:
         """The best of these: with paths straight, or only segments of them; each with most turns as they are, and with all of them a little wrong."""
@@ -163,7 +209,10 @@ class _Drawing:
                         best, fewest = (headings, program), wrong + program.bent
         assert best is not None  # the first always is better than none
         headings, at = best[0], self._packed(best[1].put_apart())
-        return Layout({p: at[p] for p in self.map.places}, tuple((*at[self.spot[s.id]], headings[s.id]) for s in self.map.dstates))
+        return Layout(
+            {p: at[p] for p in self.map.places},
+            tuple((*at[self.spot[s.id]], headings[s.id]) for s in self.map.dstates),
+        )
 
     def _spread(self) -> Layout:
         """Dstates without places so that neighbours are near each other (Kamada & Kawai 1989): turns need not fit any headings there."""
@@ -171,7 +220,9 @@ class _Drawing:
         graph.add_nodes_from(s.id for s in self.map.dstates)
         graph.add_edges_from((s, x) for s, _, x in self.map.links if s != x)
         graph.add_edges_from(pairwise([min(part) for part in nx.connected_components(graph)]))
-        found = nx.kamada_kawai_layout(graph) if len(graph) > 1 else dict.fromkeys(graph, (0.0, 0.0))
+        found = (
+            nx.kamada_kawai_layout(graph) if len(graph) > 1 else dict.fromkeys(graph, (0.0, 0.0))
+        )
         at = np.array([found[s.id] for s in self.map.dstates])
         nearest = float(np.min(pdist(at))) if len(at) > 1 else 1.0
         return Layout({}, tuple((float(x), float(y), None) for x, y in at / max(nearest, EXACT)))
@@ -190,11 +241,20 @@ class _Drawing:
         for members in _grouped(dstates).values():
             facing = [s for s in members if s.heading is not None]
             for a, b in pairwise(facing):
-                yield a, b, -math.radians(((b.heading or 0) - (a.heading or 0)) * (90 if slots else 1)), SURE
+                yield (
+                    a,
+                    b,
+                    -math.radians(((b.heading or 0) - (a.heading or 0)) * (90 if slots else 1)),
+                    SURE,
+                )
         for s, action, x in self.map.links:
             if action in self.degrees:
                 turn, weight = self.degrees[action]
-                if dstates[s].heading is None or dstates[x].heading is None or dstates[s].place != dstates[x].place:
+                if (
+                    dstates[s].heading is None
+                    or dstates[x].heading is None
+                    or dstates[s].place != dstates[x].place
+                ):
                     yield dstates[s], dstates[x], -math.radians(turn), weight
             elif dstates[s].path is None and self.spot[s] != self.spot[x]:
                 yield dstates[s], dstates[x], 0.0, SURE
@@ -215,23 +275,49 @@ class _Drawing:
         angles: dict[tuple[int, ...], float] = {}
         for part in nx.weakly_connected_components(graph):
             first, ahead = next((course, off) for course, off in courses.values() if course in part)
-            angles |= {course: angle - ahead for course, angle in _synchronised(graph.subgraph(part), first, robust).items()}
+            angles |= {
+                course: angle - ahead
+                for course, angle in _synchronised(graph.subgraph(part), first, robust).items()
+            }
         if robust and self.in_quarters:
-            angles = {course: round(angle / (math.pi / 2)) * math.pi / 2 for course, angle in angles.items()}
-        headings = {s: math.remainder(angles[course] + off, math.tau) for s, (course, off) in courses.items()}
-        missed = ((abs(math.remainder(headings[a.id] + turn - headings[b.id], math.tau)), weight) for a, b, turn, weight in turned)
-        return headings, sum(miss > (WRONG if weight == SURE else WRONG_GUESS) for miss, weight in missed)
+            angles = {
+                course: round(angle / (math.pi / 2)) * math.pi / 2
+                for course, angle in angles.items()
+            }
+        headings = {
+            s: math.remainder(angles[course] + off, math.tau)
+            for s, (course, off) in courses.items()
+        }
+        missed = (
+            (abs(math.remainder(headings[a.id] + turn - headings[b.id], math.tau)), weight)
+            for a, b, turn, weight in turned
+        )
+        return headings, sum(
+            miss > (WRONG if weight == SURE else WRONG_GUESS) for miss, weight in missed
+        )
 
-    def _streets(self, headings: Mapping[int, float], whole: bool) -> dict[tuple[int, int], tuple[float, float]]:
+    def _streets(
+        self, headings: Mapping[int, float], whole: bool
+    ) -> dict[tuple[int, int], tuple[float, float]]:
         """The heading of the street from one spot to another, and what share of the costs it has: neighbours on a path and, where only segments are straight, travels."""
-        facing = {(s.path, self.spot[s.id]): headings[s.id] + (0.0 if s.direction == 1 else math.pi) for s in reversed(self.map.dstates)}
+        facing = {
+            (s.path, self.spot[s.id]): headings[s.id] + (0.0 if s.direction == 1 else math.pi)
+            for s in reversed(self.map.dstates)
+        }
         streets = {}
         for path in self.map.paths:
             pairs = list(pairwise(path.order))
             if not whole:
                 index = {place: i for i, place in enumerate(path.order)}
-                ends = [(p, q) for known, p, q in self.travels if known == path.id and p in index and q in index]
-                pairs = [*sorted((p, q) if index[p] < index[q] else (q, p) for p, q in ends), *pairs]
+                ends = [
+                    (p, q)
+                    for known, p, q in self.travels
+                    if known == path.id and p in index and q in index
+                ]
+                pairs = [
+                    *sorted((p, q) if index[p] < index[q] else (q, p) for p, q in ends),
+                    *pairs,
+                ]
             for p, q in pairs:
                 travelled = whole or (path.id, *sorted((p, q))) in self.travels
                 way = facing.get((path.id, p), facing.get((path.id, q), 0.0))
@@ -255,7 +341,9 @@ class _Drawing:
         return packed
 
 
-def _once(streets: Mapping[tuple[int, int], tuple[float, float]]) -> dict[tuple[int, int], tuple[float, float]]:
+def _once(
+    streets: Mapping[tuple[int, int], tuple[float, float]],
+) -> dict[tuple[int, int], tuple[float, float]]:
     """The streets without those that go back along another one; of two, the one that weighs more is kept, or else the first."""
     kept: dict[tuple[int, int], tuple[float, float]] = {}
     for (p, q), (way, share) in sorted(streets.items(), key=lambda street: -street[1][1]):
@@ -285,7 +373,10 @@ def _synchronised(graph: nx.MultiDiGraph[Any], first: Any, robust: bool) -> dict
         angles[b] = angles[a] + turn
     courses = list(angles)
     number = {course: i for i, course in enumerate(courses)}
-    turns = [(number[a], number[b], data["turn"], data["weight"]) for a, b, data in graph.edges(data=True)]
+    turns = [
+        (number[a], number[b], data["turn"], data["weight"])
+        for a, b, data in graph.edges(data=True)
+    ]
     found = np.array([angles[course] for course in courses])
     if turns:
         source, target, turn, weight = (np.array(column) for column in zip(*turns, strict=True))
@@ -311,7 +402,9 @@ def _synchronised(graph: nx.MultiDiGraph[Any], first: Any, robust: bool) -> dict
     }
 
 
-_Condition: TypeAlias = tuple[dict[int, float], float]  # a sum of variables, and what it is at least
+_Condition: TypeAlias = tuple[
+    dict[int, float], float
+]  # a sum of variables, and what it is at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,16 +423,25 @@ class _Program:
     Its variables are x and y of each spot, then for each street by how much it leaves its heading, and by how much it is too short.
     """
 
-    def __init__(self, spots: Sequence[int], streets: Mapping[tuple[int, int], tuple[float, float]]) -> None:
+    def __init__(
+        self, spots: Sequence[int], streets: Mapping[tuple[int, int], tuple[float, float]]
+    ) -> None:
         self.spots = list(spots)
         number = {spot: i for i, spot in enumerate(spots)}
         self.ends = np.array([(number[p], number[q]) for p, q in streets], dtype=int).reshape(-1, 2)
-        self.along = np.round(np.array([(math.cos(way), math.sin(way)) for way, _ in streets.values()]).reshape(-1, 2), 12)
+        self.along = np.round(
+            np.array([(math.cos(way), math.sin(way)) for way, _ in streets.values()]).reshape(
+                -1, 2
+            ),
+            12,
+        )
         self.across = self.along[:, ::-1] * (-1, 1)
         self.share = np.array([share for _, share in streets.values()])
         e, f = np.triu_indices(len(streets), 1)
         common = (self.ends[e][:, :, None] == self.ends[f][:, None, :]).any(axis=(1, 2))
-        self.pairs = np.column_stack((e, f))[(self.share[e] == 1.0) & (self.share[f] == 1.0) & ~common]
+        self.pairs = np.column_stack((e, f))[
+            (self.share[e] == 1.0) & (self.share[f] == 1.0) & ~common
+        ]
         self.rows: list[_Condition] = []
         self.cost = self._cost()
         self.at, self.value = self._asked([])
@@ -348,7 +450,9 @@ class _Program:
     def bent(self) -> int:
         """How many streets leave their headings, or are too short."""
         way = self.at[self.ends[:, 1]] - self.at[self.ends[:, 0]]
-        astray = np.maximum(np.abs(np.sum(way * self.across, axis=1)), 1 - np.sum(way * self.along, axis=1))
+        astray = np.maximum(
+            np.abs(np.sum(way * self.across, axis=1)), 1 - np.sum(way * self.along, axis=1)
+        )
         return int(np.sum((astray > CROOKED) & (self.share == 1.0)))
 
     def _cost(self) -> NDArray[np.float64]:
@@ -371,18 +475,23 @@ class _Program:
         while beam and left > 0:
             children = []
             for state in beam:
-                pair = next((pair for pair in self._near(state.at) if pair not in state.left_alone), None)
+                pair = next(
+                    (pair for pair in self._near(state.at) if pair not in state.left_alone), None
+                )
                 if pair is None:
                     continue
                 children.append(replace(state, left_alone=state.left_alone | {pair}))
                 for condition in self._conditions(*pair):
                     at, value = self._asked([*state.conditions, *condition])
-                    children.append(_State(value, at, (*state.conditions, *condition), state.left_alone))
+                    children.append(
+                        _State(value, at, (*state.conditions, *condition), state.left_alone)
+                    )
                     left -= 1
             beam = sorted(children, key=lambda state: state.value)[:BEAM]
             best = min([best, *beam], key=lambda state: state.value)
         return {
-            spot: (round(float(x), 9) + 0.0, round(float(y), 9) + 0.0) for spot, (x, y) in zip(self.spots, best.at, strict=True)
+            spot: (round(float(x), 9) + 0.0, round(float(y), 9) + 0.0)
+            for spot, (x, y) in zip(self.spots, best.at, strict=True)
         }  # no -0.0
 
     def _asked(self, more: Sequence[_Condition]) -> tuple[NDArray[np.float64], float]:
@@ -390,12 +499,26 @@ class _Program:
         if not len(self.ends):
             return np.zeros((len(self.spots), 2)), 0.0
         rows = [*self.rows, *more]
-        where = [(i, variable, -factor) for i, (factors, _) in enumerate(rows) for variable, factor in factors.items()]
+        where = [
+            (i, variable, -factor)
+            for i, (factors, _) in enumerate(rows)
+            for variable, factor in factors.items()
+        ]
         i, variables, factors = zip(*where, strict=True)
         matrix = coo_array((factors, (i, variables)), (len(rows), len(self.cost))).tocsr()
         n = len(self.spots)
-        bounds = [(0.0, 0.0)] * 2 + [(None, None)] * (2 * n - 2) + [(0.0, None)] * (len(self.cost) - 2 * n)
-        answer = linprog(self.cost, A_ub=matrix, b_ub=[-least for _, least in rows], bounds=bounds, method="highs-ds")
+        bounds = (
+            [(0.0, 0.0)] * 2
+            + [(None, None)] * (2 * n - 2)
+            + [(0.0, None)] * (len(self.cost) - 2 * n)
+        )
+        answer = linprog(
+            self.cost,
+            A_ub=matrix,
+            b_ub=[-least for _, least in rows],
+            bounds=bounds,
+            method="highs-ds",
+        )
         if answer.x is None:  # conditions that cannot hold together
             return np.zeros((n, 2)), math.inf
         at = np.asarray(answer.x[: 2 * n], dtype=float).reshape(n, 2)
@@ -406,15 +529,26 @@ class _Program:
         parallel = abs(float(self.across[e] @ self.along[f])) < PARALLEL
         for normal in (self.across[e], self.along[e] if parallel else self.across[f]):
             for sign in (1.0, -1.0):
-                yield [(_difference(p, q, sign * normal), APART) for p in self.ends[e] for q in self.ends[f]]
+                yield [
+                    (_difference(p, q, sign * normal), APART)
+                    for p in self.ends[e]
+                    for q in self.ends[f]
+                ]
 
     def _near(self, at: NDArray[np.float64]) -> list[tuple[int, int]]:
         """Pairs of streets without a common end that are nearer to each other than they should be."""
         e, f = self.ends[self.pairs[:, 0]], self.ends[self.pairs[:, 1]]
         a, b, c, d = at[e[:, 0]], at[e[:, 1]], at[f[:, 0]], at[f[:, 1]]
-        ends = (_from_street(a, c, d), _from_street(b, c, d), _from_street(c, a, b), _from_street(d, a, b))
+        ends = (
+            _from_street(a, c, d),
+            _from_street(b, c, d),
+            _from_street(c, a, b),
+            _from_street(d, a, b),
+        )
         crossing = (_side(a, b, c) * _side(a, b, d) < 0) & (_side(c, d, a) * _side(c, d, b) < 0)
-        near: list[tuple[int, int]] = [(int(i), int(j)) for i, j in self.pairs[(np.min(ends, axis=0) < NEAR) | crossing]]
+        near: list[tuple[int, int]] = [
+            (int(i), int(j)) for i, j in self.pairs[(np.min(ends, axis=0) < NEAR) | crossing]
+        ]
         return near
 
 
@@ -424,15 +558,23 @@ def _difference(p: int, q: int, way: NDArray[np.float64]) -> dict[int, float]:
     return {2 * int(q): x, 2 * int(q) + 1: y, 2 * int(p): -x, 2 * int(p) + 1: -y}
 
 
-def _side(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
+def _side(
+    a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """On which side of the line from a to b c is: above 0 to the left."""
-    found: NDArray[np.float64] = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    found: NDArray[np.float64] = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (
+        c[:, 0] - a[:, 0]
+    )
     return found
 
 
-def _from_street(p: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _from_street(
+    p: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """How far points are from streets."""
     way = b - a
-    share = np.clip(np.sum((p - a) * way, axis=1) / np.maximum(np.sum(way * way, axis=1), 1e-12), 0, 1)
+    share = np.clip(
+        np.sum((p - a) * way, axis=1) / np.maximum(np.sum(way * way, axis=1), 1e-12), 0, 1
+    )
     far: NDArray[np.float64] = np.linalg.norm(p - a - share[:, None] * way, axis=1)
     return far

@@ -26,11 +26,11 @@ NEAREST, APART, LARGEST = 110.0, 240.0, 1600.0
 DOT, BEGIN, END = 4.5, 8.0, 27.0
 MARGIN = 24.0
 SMALLEST = 0.6  # where places are near each other all marks are smaller, down to this share
-WIDEST = LARGEST / 4  # half axes of ellipses that are longer are not drawn: the page would hold little else
+WIDEST = (
+    LARGEST / 4
+)  # half axes of ellipses that are longer are not drawn: the page would hold little else
 DEVIATIONS = 2.0  # the half axes of ellipses, in standard deviations
-TURNS = (
-    0.1  # dstates of a causal map that are nearer than this share of its longest link are drawn as if the robot only turned between them
-)
+TURNS = 0.1  # dstates of a causal map that are nearer than this share of its longest link are drawn as if the robot only turned between them
 
 
 def metric_svg(ssh_map: SSHMap, poses: Sequence[Pose]) -> str:
@@ -57,20 +57,38 @@ class _Picture:
 
     @classmethod
     def of(cls, ssh_map: SSHMap, poses: Sequence[Pose]) -> _Picture:
-        return cls(ssh_map, poses, *_scale(_spots(ssh_map, poses), NEAREST if ssh_map.places else 1.4 * NEAREST))
+        return cls(
+            ssh_map,
+            poses,
+            *_scale(_spots(ssh_map, poses), NEAREST if ssh_map.places else 1.4 * NEAREST),
+        )
 
     def svg(self) -> str:
         sites = _sites(self.map)
         at = {site: self.on_page(self.poses[members[0].id]) for site, members in sites.items()}
         for x, y in at.values():
-            self.keep_clear(x - DOT * self.unit, y - DOT * self.unit, x + DOT * self.unit, y + DOT * self.unit)
-        ellipses = [mark for site, members in sites.items() for mark in self.ellipse(at[site], self.poses[members[0].id].spread)]
+            self.keep_clear(
+                x - DOT * self.unit, y - DOT * self.unit, x + DOT * self.unit, y + DOT * self.unit
+            )
+        ellipses = [
+            mark
+            for site, members in sites.items()
+            for mark in self.ellipse(at[site], self.poses[members[0].id].spread)
+        ]
         arrows = [self.arrow(s) for s in self.map.dstates]
         lines = self.paths(at) if self.map.places else self.links()
         first = _site(self.map.dstates[self.map.labels[0]])
         dots = [self.dot(*at[site], site) for site in sorted(at, key=lambda site: site == first)]
-        labels = self.place_labels(at) + self.dstate_labels() + (self.path_labels(at) if self.map.places else self.link_labels())
-        return page([*lines, *ellipses, *arrows, *dots, *labels, *self.faults(), *self.scale_bar()], self.points, MARGIN)
+        labels = (
+            self.place_labels(at)
+            + self.dstate_labels()
+            + (self.path_labels(at) if self.map.places else self.link_labels())
+        )
+        return page(
+            [*lines, *ellipses, *arrows, *dots, *labels, *self.faults(), *self.scale_bar()],
+            self.points,
+            MARGIN,
+        )
 
     def on_page(self, pose: Pose) -> Point:
         return pose.x * self.scale, -pose.y * self.scale
@@ -122,7 +140,10 @@ class _Picture:
         faults: dict[int, list[str]] = {}
         for fault in self.map.faults:
             faults.setdefault(self.map.labels[fault.step], []).append(str(fault))
-        return [fault_mark(*self.along(self.map.dstates[s], END), "; ".join(said), self.unit) for s, said in faults.items()]
+        return [
+            fault_mark(*self.along(self.map.dstates[s], END), "; ".join(said), self.unit)
+            for s, said in faults.items()
+        ]
 
     def along(self, s: DState, far: float, aside: float = 0.0) -> Point:
         """A point so far ahead of a dstate, and so far to its left."""
@@ -138,7 +159,11 @@ class _Picture:
         """
         orders, travels = [], []
         for path in self.map.paths:
-            colour, u, streets = COLOURS[path.id % len(COLOURS)], self.unit, travelled(self.map, path)
+            colour, u, streets = (
+                COLOURS[path.id % len(COLOURS)],
+                self.unit,
+                travelled(self.map, path),
+            )
             for p, q in pairwise(path.order):
                 if (min(p, q), max(p, q)) not in streets:
                     orders.append(
@@ -159,7 +184,10 @@ class _Picture:
         curves = []
         for (source, target), names in actions.items():
             a, b = self.map.dstates[source], self.map.dstates[target]
-            turned = math.dist(self.on_page(self.poses[source]), self.on_page(self.poses[target])) < 2 * END * self.unit
+            turned = (
+                math.dist(self.on_page(self.poses[source]), self.on_page(self.poses[target]))
+                < 2 * END * self.unit
+            )
             start, end = self.along(a, END + 2), self.along(b, END + 2 if turned else -BEGIN)
             bend = math.dist(start, end) * (0.35 if turned else 0.08)
             mx, my = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
@@ -169,7 +197,14 @@ class _Picture:
             else:  # links to and fro are beside each other
                 away = (start[1] - end[1], end[0] - start[0])
             far = math.hypot(*away) or 1.0
-            curves.append((start, (mx + away[0] / far * bend, my + away[1] / far * bend), end, ", ".join(names)))
+            curves.append(
+                (
+                    start,
+                    (mx + away[0] / far * bend, my + away[1] / far * bend),
+                    end,
+                    ", ".join(names),
+                )
+            )
         return curves
 
     def links(self) -> list[str]:
@@ -185,11 +220,16 @@ class _Picture:
             )
         return marks
 
-    def label(self, label: str, spots: Iterable[Point], colour: str, size: float, weight: str = "normal") -> list[str]:
+    def label(
+        self, label: str, spots: Iterable[Point], colour: str, size: float, weight: str = "normal"
+    ) -> list[str]:
         """A label at the first of these spots that is clear, if any is."""
         w, h = self.half(label, size)
         for x, y in spots:
-            if all(x + w <= left or right <= x - w or y + h <= top or bottom <= y - h for left, top, right, bottom in self.boxes):
+            if all(
+                x + w <= left or right <= x - w or y + h <= top or bottom <= y - h
+                for left, top, right, bottom in self.boxes
+            ):
                 self.keep_clear(x - w, y - h, x + w, y + h)
                 return [text(x, y, label, colour, size=self.size(size), weight=weight, halo=True)]
         return []
@@ -207,7 +247,10 @@ class _Picture:
         for place in self.map.places:
             x, y = at[place]
             spots = [
-                (x + far * self.unit * math.cos(k * math.pi / 4), y + far * self.unit * math.sin(k * math.pi / 4))
+                (
+                    x + far * self.unit * math.cos(k * math.pi / 4),
+                    y + far * self.unit * math.sin(k * math.pi / 4),
+                )
                 for far in (17, 22, 30)
                 for k in (-1, 1, 3, 5, 0, 2, 4, 6)
             ]
@@ -220,18 +263,32 @@ class _Picture:
             first = s.id == self.map.labels[0]
             label = f"x{s.id} start" if first else f"x{s.id}"
             w, h = self.half(label, 11)
-            sin, cos = abs(math.sin(self.poses[s.id].heading)), abs(math.cos(self.poses[s.id].heading))
-            aside, beyond = 4.5 + (w * sin + h * cos) / self.unit, END + 5 + (w * cos + h * sin) / self.unit
+            sin, cos = (
+                abs(math.sin(self.poses[s.id].heading)),
+                abs(math.cos(self.poses[s.id].heading)),
+            )
+            aside, beyond = (
+                4.5 + (w * sin + h * cos) / self.unit,
+                END + 5 + (w * cos + h * sin) / self.unit,
+            )
             sides = [(far, side * aside) for far in (20.0, 27.0, 34.0) for side in (-1, 1)]
             ahead = [(beyond, side * h / self.unit) for side in (0, -1, 1)]
-            spots = [self.along(s, *spot) for spot in (sides + ahead if self.map.places else ahead + sides)]
-            marks += self.label(label, spots, "#000" if first else "#444", 11, "bold" if first else "normal")
+            spots = [
+                self.along(s, *spot)
+                for spot in (sides + ahead if self.map.places else ahead + sides)
+            ]
+            marks += self.label(
+                label, spots, "#000" if first else "#444", 11, "bold" if first else "normal"
+            )
         return marks
 
     def path_labels(self, at: Mapping[int, Point]) -> list[str]:
         marks = []
         for path in self.map.paths:
-            stretches = sorted(((at[p], at[q]) for p, q in travelled(self.map, path)), key=lambda ends: -math.dist(*ends))
+            stretches = sorted(
+                ((at[p], at[q]) for p, q in travelled(self.map, path)),
+                key=lambda ends: -math.dist(*ends),
+            )
             spots = []
             for (ax, ay), (bx, by) in stretches:
                 far = math.dist((ax, ay), (bx, by)) or 1.0
@@ -239,7 +296,9 @@ class _Picture:
                 for share in (0.5, 0.6, 0.4):
                     for side in (1, -1):
                         away = side * (12 + 18 * abs(uy)) * self.unit
-                        spots.append((ax + (bx - ax) * share - uy * away, ay + (by - ay) * share + ux * away))
+                        spots.append(
+                            (ax + (bx - ax) * share - uy * away, ay + (by - ay) * share + ux * away)
+                        )
             marks += self.label(f"path {path.id}", spots, COLOURS[path.id % len(COLOURS)], 12)
         return marks
 
@@ -247,7 +306,12 @@ class _Picture:
         return [
             mark
             for start, bend, end, names in self.curves()
-            for mark in self.label(names, [((start[0] + 2 * bend[0] + end[0]) / 4, (start[1] + 2 * bend[1] + end[1]) / 4)], "#777", 10)
+            for mark in self.label(
+                names,
+                [((start[0] + 2 * bend[0] + end[0]) / 4, (start[1] + 2 * bend[1] + end[1]) / 4)],
+                "#777",
+                10,
+            )
         ]
 
     def scale_bar(self) -> list[str]:
@@ -264,7 +328,9 @@ def axes(spread: tuple[float, float, float]) -> tuple[tuple[float, float], float
     """The standard deviations along the two axes of a covariance, the greater first, and the angle of the first, in radians counterclockwise from x."""
     xx, xy, yy = spread
     mean, half = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
-    return (math.sqrt(max(0.0, mean + half)), math.sqrt(max(0.0, mean - half))), math.atan2(2 * xy, xx - yy) / 2
+    return (math.sqrt(max(0.0, mean + half)), math.sqrt(max(0.0, mean - half))), math.atan2(
+        2 * xy, xx - yy
+    ) / 2
 
 
 def _line(a: Point, b: Point) -> str:
@@ -284,12 +350,18 @@ def _sites(ssh_map: SSHMap) -> dict[int, list[DState]]:
 
 
 def _colour(s: DState) -> str:
-    return (COLOURS[0] if s.place is None else "#555") if s.path is None else COLOURS[s.path % len(COLOURS)]
+    return (
+        (COLOURS[0] if s.place is None else "#555")
+        if s.path is None
+        else COLOURS[s.path % len(COLOURS)]
+    )
 
 
 def _spots(ssh_map: SSHMap, poses: Sequence[Pose]) -> list[Point]:
     """Where the places are, in metres. Dstates without places that are hardly a link apart count as one."""
-    spots = [(poses[members[0].id].x, poses[members[0].id].y) for members in _sites(ssh_map).values()]
+    spots = [
+        (poses[members[0].id].x, poses[members[0].id].y) for members in _sites(ssh_map).values()
+    ]
     if ssh_map.places:
         return spots
     near = TURNS * max((math.dist(spots[s], spots[x]) for s, _, x in ssh_map.links), default=0.0)
@@ -305,7 +377,10 @@ def _scale(spots: Sequence[Point], nearest: float) -> tuple[float, float]:
     extent = max((max(numbers) - min(numbers) for numbers in zip(*spots, strict=True)), default=0.0)
     if extent < 1e-3:  # one place, or all in one spot
         return nearest, 1.0
-    gaps = [min(math.dist(spot, other) for other in [*spots[:i], *spots[i + 1 :]]) for i, spot in enumerate(spots)]
+    gaps = [
+        min(math.dist(spot, other) for other in [*spots[:i], *spots[i + 1 :]])
+        for i, spot in enumerate(spots)
+    ]
     usual = max(median(gaps), extent / LARGEST)
     scale = min(nearest / max(min(gaps), 1e-9), APART / usual, LARGEST / extent)
     return scale, min(1.0, max(SMALLEST, usual * scale / NEAREST))

@@ -67,7 +67,9 @@ def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]
             marks += _path_name(f"path {path.id}", at[ends[0]], at[ends[1]], colour)
     for place in ssh_map.places:
         x, y = at[place]
-        marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{RADIUS}" fill="white" stroke="#222" stroke-width="2"/>')
+        marks.append(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{RADIUS}" fill="white" stroke="#222" stroke-width="2"/>'
+        )
         marks.append(text(x, y, str(place), "#222", size=15, weight="bold"))
         marks += _dstates(ssh_map, place, at[place], found)
     return lines + marks, list(at.values())
@@ -96,12 +98,16 @@ def _dstates(ssh_map: SSHMap, place: int, at: Point, found: Layout) -> list[str]
     taken: list[float] = []
     marks = []
     faults = _faults(ssh_map)
-    facing: list[tuple[DState, float | None]] = [(s, found.dstates[s.id][2]) for s in ssh_map.dstates if s.place == place]
+    facing: list[tuple[DState, float | None]] = [
+        (s, found.dstates[s.id][2]) for s in ssh_map.dstates if s.place == place
+    ]
     for s, heading in sorted(facing, key=lambda pair: pair[1] is None):
         bearing = _freest(taken) if heading is None else -heading
         taken.append(bearing)
         dx, dy = math.cos(bearing), math.sin(bearing)
-        aside = (0.0, 0.0) if s.path is None else (-dy * LANE, dx * LANE)  # drawn to the right of the line of the path
+        aside = (
+            (0.0, 0.0) if s.path is None else (-dy * LANE, dx * LANE)
+        )  # drawn to the right of the line of the path
         colour = "#555" if s.path is None else COLOURS[s.path % len(COLOURS)]
         title = f"dstate {s.id}: {s.shown}"
         px, py = x + dx * (RADIUS + 6) + aside[0], y + dy * (RADIUS + 6) + aside[1]
@@ -119,7 +125,10 @@ def _dstates(ssh_map: SSHMap, place: int, at: Point, found: Layout) -> list[str]
 def _freest(taken: list[float]) -> float:
     """Of 16 bearings, the one that is farthest from those taken."""
     bearings = [k * math.pi / 8 for k in range(16)]
-    return max(bearings, key=lambda b: min((abs(math.remainder(b - t, math.tau)) for t in taken), default=0.0))
+    return max(
+        bearings,
+        key=lambda b: min((abs(math.remainder(b - t, math.tau)) for t in taken), default=0.0),
+    )
 
 
 def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
@@ -136,16 +145,28 @@ def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
         ux, uy = (bx - ax) / far, (by - ay) / far
         mx, my = (ax + bx) / 2 - uy * 24, (ay + by) / 2 + ux * 24
         ex, ey = bx - ux * (RADIUS + 4), by - uy * (RADIUS + 4)
-        marks.append(f'<path d="M{ax:.1f},{ay:.1f} Q{mx:.1f},{my:.1f} {ex:.1f},{ey:.1f}" fill="none" stroke="#888" stroke-width="1.5"/>')
+        marks.append(
+            f'<path d="M{ax:.1f},{ay:.1f} Q{mx:.1f},{my:.1f} {ex:.1f},{ey:.1f}" fill="none" stroke="#888" stroke-width="1.5"/>'
+        )
         angle = math.degrees(math.atan2(ey - my, ex - mx))
-        marks.append(f'<path d="M-8,-4 L0,0 L-8,4 Z" fill="#888" transform="translate({ex:.1f},{ey:.1f}) rotate({angle:.1f})"/>')
+        marks.append(
+            f'<path d="M-8,-4 L0,0 L-8,4 Z" fill="#888" transform="translate({ex:.1f},{ey:.1f}) rotate({angle:.1f})"/>'
+        )
         marks.append(text(mx - ux * 12, my - uy * 12, ", ".join(names), "#555", halo=True))
     for s in ssh_map.dstates:
         x, y = at[s.id]
-        marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{RADIUS}" fill="white" stroke="{COLOURS[0]}" stroke-width="2"/>')
+        marks.append(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{RADIUS}" fill="white" stroke="{COLOURS[0]}" stroke-width="2"/>'
+        )
         marks.append(text(x, y, f"x{s.id}", "#222", weight="bold"))
-        label = str(s.shown) if len(str(s.shown)) <= LONGEST_LABEL else f"…{str(s.shown)[1 - LONGEST_LABEL :]}"
-        marks.append(f"<g><title>{escaped(f'dstate {s.id}: {s.shown}')}</title>{text(x, y + RADIUS + 12, label, '#222', halo=True)}</g>")
+        label = (
+            str(s.shown)
+            if len(str(s.shown)) <= LONGEST_LABEL
+            else f"…{str(s.shown)[1 - LONGEST_LABEL :]}"
+        )
+        marks.append(
+            f"<g><title>{escaped(f'dstate {s.id}: {s.shown}')}</title>{text(x, y + RADIUS + 12, label, '#222', halo=True)}</g>"
+        )
         if s.id in faults:
             marks.append(fault_mark(x + RADIUS, y - RADIUS, faults[s.id]))
     return marks, at

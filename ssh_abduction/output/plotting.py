@@ -27,7 +27,9 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
     Returns the axes. Raises MapError where matplotlib is not installed.
     """
     if ax is not None and not hasattr(ax, "annotate"):
-        raise MapError(f"ax: expected axes of matplotlib, got {brief(ax)}; make some with matplotlib.pyplot.subplots, or leave them out")
+        raise MapError(
+            f"ax: expected axes of matplotlib, got {brief(ax)}; make some with matplotlib.pyplot.subplots, or leave them out"
+        )
     found = layout(ssh_map, turns)
     spots = list(found.places.values()) or [(x, y) for x, y, _ in found.dstates]
     unit = _nearest(spots)
@@ -36,9 +38,21 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
         colour, streets = COLOURS[path.id % len(COLOURS)], travelled(ssh_map, path)
         for p, q in pairwise(path.order):
             if (min(p, q), max(p, q)) not in streets:
-                axes.plot(*zip(found.places[p], found.places[q], strict=True), color=colour, linewidth=1, linestyle=":", alpha=0.7)
+                axes.plot(
+                    *zip(found.places[p], found.places[q], strict=True),
+                    color=colour,
+                    linewidth=1,
+                    linestyle=":",
+                    alpha=0.7,
+                )
         for p, q in streets:
-            axes.plot(*zip(found.places[p], found.places[q], strict=True), color=colour, linewidth=6, alpha=0.55, solid_capstyle="round")
+            axes.plot(
+                *zip(found.places[p], found.places[q], strict=True),
+                color=colour,
+                linewidth=6,
+                alpha=0.55,
+                solid_capstyle="round",
+            )
     if not ssh_map.places:
         for source, _, target in ssh_map.links:
             axes.annotate(
@@ -57,13 +71,41 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
             dx, dy = math.cos(heading) * unit, math.sin(heading) * unit
             mark = (x + AHEAD * dx + LANE * dy, y + AHEAD * dy - LANE * dx)
             colour = "#555" if s.path is None else COLOURS[s.path % len(COLOURS)]
-            axes.plot(*mark, marker=(3, 0, math.degrees(heading) - 90), color=colour, markersize=6, linestyle="none")
-            axes.text(mark[0] + 0.09 * dx, mark[1] + 0.09 * dy, f"x{s.id}", fontsize=5, ha="center", va="center")
+            axes.plot(
+                *mark,
+                marker=(3, 0, math.degrees(heading) - 90),
+                color=colour,
+                markersize=6,
+                linestyle="none",
+            )
+            axes.text(
+                mark[0] + 0.09 * dx,
+                mark[1] + 0.09 * dy,
+                f"x{s.id}",
+                fontsize=5,
+                ha="center",
+                va="center",
+            )
         else:
             mark = (x, y)
-            axes.text(x, y, f"x{s.id}", fontsize=7, ha="center", va="center", bbox={"boxstyle": "circle", "facecolor": "white"})
+            axes.text(
+                x,
+                y,
+                f"x{s.id}",
+                fontsize=7,
+                ha="center",
+                va="center",
+                bbox={"boxstyle": "circle", "facecolor": "white"},
+            )
         if s.id in doubted:
-            axes.plot(*mark, marker="D", color=ALARM, markersize=9, markerfacecolor="none", linestyle="none")
+            axes.plot(
+                *mark,
+                marker="D",
+                color=ALARM,
+                markersize=9,
+                markerfacecolor="none",
+                linestyle="none",
+            )
     axes.set_aspect("equal")
     axes.axis("on" if found.metric else "off")
     if found.metric:
@@ -73,13 +115,21 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
 
 def _nearest(spots: list[tuple[float, float]]) -> float:
     """How far the two nearest spots that are not one are apart; 1 where there are no two."""
-    return min((far for i, p in enumerate(spots) for q in spots[:i] if (far := math.dist(p, q)) > 1e-6), default=1.0)
+    return min(
+        (far for i, p in enumerate(spots) for q in spots[:i] if (far := math.dist(p, q)) > 1e-6),
+        default=1.0,
+    )
 
 
 def _new_axes(spots: list[tuple[float, float]], unit: float) -> Any:
     try:
         from matplotlib import pyplot
     except ImportError:
-        raise MapError("plot: expected matplotlib, got none; install 'ssh-abduction[plot]'") from None
-    width, height = (min(20.0, (max(numbers) - min(numbers)) / unit * APART + 2) for numbers in zip(*spots, strict=True))
+        raise MapError(
+            "plot: expected matplotlib, got none; install 'ssh-abduction[plot]'"
+        ) from None
+    width, height = (
+        min(20.0, (max(numbers) - min(numbers)) / unit * APART + 2)
+        for numbers in zip(*spots, strict=True)
+    )
     return pyplot.subplots(figsize=(width, height), layout="constrained")[1]

@@ -8,7 +8,9 @@ from ssh_abduction.solver import Solution, Watch, solve
 from ssh_abduction.theory.theory import Theory
 
 
-def explained(trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch) -> PairExplanation:
+def explained(
+    trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch
+) -> PairExplanation:
     """Why two steps are one dstate or not. The watch is not needed, as the process is ended from outside."""
     return explain_pair(trace, first, second, theory, time_limit=limit)
 

@@ -22,7 +22,9 @@ from ssh_abduction.theory.theory import Theory
 Pair = tuple[int, int]
 
 
-def assumptions(listing: Listing, trace: Trace, theory: Theory, seconds: float) -> dict[Pair, dict[str, str]]:
+def assumptions(
+    listing: Listing, trace: Trace, theory: Theory, seconds: float
+) -> dict[Pair, dict[str, str]]:
     """By pairs of steps that all minimal maps have as one dstate, or all have as different ones: what either costs, in words, as `PairExplanation.assuming` has it.
 
     listing  the minimal maps
@@ -45,7 +47,9 @@ def assumptions(listing: Listing, trace: Trace, theory: Theory, seconds: float) 
         won = Side(possible=True, cost=best, proven=True)
         same, different = (won, lost) if one else (lost, won)
         verdict = Verdict.SAME_IN_MINIMAL if one else Verdict.DIFFERENT_IN_MINIMAL
-        told = PairExplanation(*pair, verdict, same, different, bool(listing.complete), None, None, None, theory)
+        told = PairExplanation(
+            *pair, verdict, same, different, bool(listing.complete), None, None, None, theory
+        )
         known[pair] = told.assuming
 
     piece = Piece.of(trace, theory, range(len(trace) if len(trace) <= UNCUT else SMALL))
@@ -62,7 +66,12 @@ def assumptions(listing: Listing, trace: Trace, theory: Theory, seconds: float) 
         if (rest := end - time.monotonic()) <= 0:
             break
         field = "different" if one else "same"
-        found = solve(trace, theory.replace(**{field: (*getattr(theory, field), pair)}), time_limit=rest, max_maps=1)
+        found = solve(
+            trace,
+            theory.replace(**{field: (*getattr(theory, field), pair)}),
+            time_limit=rest,
+            max_maps=1,
+        )
         if found.status is Status.OPTIMAL:
             tell(pair, one, Side(possible=True, cost=found.cost, proven=True))
         elif found.status is Status.UNSATISFIABLE:

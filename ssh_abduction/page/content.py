@@ -27,9 +27,15 @@ from ssh_abduction.rivals.listing import Listing, Maps
 Steps: TypeAlias = tuple[int, ...]
 Spot: TypeAlias = tuple[float, float, float | None]
 
-DRAWING = 3.0  # seconds of the processor that drawings of other maps than the first may take together
-DRAWN = 10_000  # dstates that all drawings may have together: with more of them the page would be large
-BELIEVING = 5.0  # seconds of the processor that beliefs in other maps than the first may take together
+DRAWING = (
+    3.0  # seconds of the processor that drawings of other maps than the first may take together
+)
+DRAWN = (
+    10_000  # dstates that all drawings may have together: with more of them the page would be large
+)
+BELIEVING = (
+    5.0  # seconds of the processor that beliefs in other maps than the first may take together
+)
 BELIEVED = 12  # dstates of a belief that are shown at most
 LEAST = 0.01  # of this probability at least
 CUT = 0.5  # ellipses of uncertainty with a half axis longer than this share of the map's extent are not drawn: the page would hold little else
@@ -57,7 +63,9 @@ class Run:
     beliefs: Callable[[SSHMap], Iterable[Any] | None] = field(repr=False)
 
 
-def content_of(source: Maps, trace: Trace | None = None, run: Run | None = None, called: Called | None = None) -> dict[str, Any]:
+def content_of(
+    source: Maps, trace: Trace | None = None, run: Run | None = None, called: Called | None = None
+) -> dict[str, Any]:
     """All that the page shows.
 
     trace   the trace that was mapped: it tells the actions and the images
@@ -78,7 +86,9 @@ def content_of(source: Maps, trace: Trace | None = None, run: Run | None = None,
     for ssh_map, name in zip(maps, found.ids, strict=True):
         one: dict[str, Any] = {
             "id": name,
-            "labeling": labelings.number((ssh_map.labels, tuple(str(s.shown) for s in ssh_map.dstates))),
+            "labeling": labelings.number(
+                (ssh_map.labels, tuple(str(s.shown) for s in ssh_map.dstates))
+            ),
             "places": places.number(tuple((s.place, s.path, s.direction) for s in ssh_map.dstates)),
             "orders": orders.number(tuple((path.id, path.order) for path in ssh_map.paths)),
         }
@@ -107,7 +117,9 @@ def content_of(source: Maps, trace: Trace | None = None, run: Run | None = None,
         "orders": orders.items,
         "faults": faults.items,
         "layouts": drawings,
-        "spots": [[round(x, 3), round(y, 3), None if h is None else round(h, 3)] for x, y, h in spots],
+        "spots": [
+            [round(x, 3), round(y, 3), None if h is None else round(h, 3)] for x, y, h in spots
+        ],
         "overview": _overview(maps, spots),
     }
 
@@ -138,7 +150,9 @@ def _choice(data: dict[str, Any]) -> dict[str, Any]:
     """A choice with the sentences of its questions, and for each option its answers and its maps."""
     return {
         "questions": [question["sentence"] for question in data["questions"]],
-        "options": [{"answers": option["answers"], "maps": option["maps"]} for option in data["options"]],
+        "options": [
+            {"answers": option["answers"], "maps": option["maps"]} for option in data["options"]
+        ],
     }
 
 
@@ -153,9 +167,17 @@ def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
         called: dict[Any, Counter[Any]] = {}
         for (_, before, _), (_, now, _) in zip(first, item, strict=False):
             called.setdefault(before, Counter())[now] += 1
-        names = {before: counts.most_common(1)[0][0] for before, counts in called.items() if before is not None}
+        names = {
+            before: counts.most_common(1)[0][0]
+            for before, counts in called.items()
+            if before is not None
+        }
         expected = [(place, names.get(path, path), direction) for place, path, direction in first]
-        differing: dict[str, Any] = {str(i): value for i, (value, other) in enumerate(zip(item, expected, strict=False)) if value != other}
+        differing: dict[str, Any] = {
+            str(i): value
+            for i, (value, other) in enumerate(zip(item, expected, strict=False))
+            if value != other
+        }
         if len(item) == len(first) and 2 * len(differing) < len(item):
             renamed = {str(before): now for before, now in names.items() if before != now}
             told.append({**differing, **({"paths": renamed} if renamed else {})})
@@ -164,25 +186,41 @@ def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
     return told
 
 
-def _replays(maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], trace: Trace | None, run: Run | None) -> list[dict[str, Any]]:
+def _replays(
+    maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], trace: Trace | None, run: Run | None
+) -> list[dict[str, Any]]:
     """What the slider replays: the trace that was mapped and, where another one is localised in the maps, that one."""
     first = maps[0]
     if trace is None:
         mapped = {"name": "the trace that was mapped", "steps": _steps_of_map(first)}
     else:
-        mapped = _replay(trace, "the trace that was mapped", [str(first.dstates[label].shown) for label in first.labels])
+        mapped = _replay(
+            trace,
+            "the trace that was mapped",
+            [str(first.dstates[label].shown) for label in first.labels],
+        )
     if run is None:
         return [mapped]
     beliefs = _beliefs(maps, told, run)
     if run.trace == trace:
         return [{**mapped, "beliefs": beliefs}]
     views = ["not known"] * len(run.trace)
-    return [{**_replay(run.trace, f"localised: {run.trace.name or 'another run'}", views), "beliefs": beliefs, "other": True}, mapped]
+    return [
+        {
+            **_replay(run.trace, f"localised: {run.trace.name or 'another run'}", views),
+            "beliefs": beliefs,
+            "other": True,
+        },
+        mapped,
+    ]
 
 
 def _replay(trace: Trace, name: str, views: Sequence[str]) -> dict[str, Any]:
     """The steps of a trace, and its images; the views are those of steps that have none of their own."""
-    replay: dict[str, Any] = {"name": name, "steps": [_step(step, view) for step, view in zip(trace.steps, views, strict=True)]}
+    replay: dict[str, Any] = {
+        "name": name,
+        "steps": [_step(step, view) for step, view in zip(trace.steps, views, strict=True)],
+    }
     images = drawn_images(trace)
     return replay if images is None else {**replay, "images": images}
 
@@ -198,7 +236,9 @@ def _step(step: Step, view: str) -> dict[str, Any]:
     if step.confidence is not None:
         told["confidence"] = round(step.confidence, 3)
     if step.gateways is not None:
-        told["star"] = [[round(gateway.bearing, 1), gateway.open] for gateway in step.gateways.gateways]
+        told["star"] = [
+            [round(gateway.bearing, 1), gateway.open] for gateway in step.gateways.gateways
+        ]
     return told
 
 
@@ -213,7 +253,10 @@ def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
     for fault in first.faults:
         if fault.kind == "misread" and fault.seen is not None:
             views[fault.step] = fault.seen
-    return [{"view": str(view), "action": action} for view, action in zip(views, [*names, None], strict=True)]
+    return [
+        {"view": str(view), "action": action}
+        for view, action in zip(views, [*names, None], strict=True)
+    ]
 
 
 def _beliefs(maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], run: Run) -> dict[str, Any]:
@@ -230,7 +273,9 @@ def _beliefs(maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], run: Run) -
             continue
         listed = [belief if isinstance(belief, dict) else belief.to_dict() for belief in beliefs]
         if len(listed) != len(run.trace):
-            raise MapError(f"beliefs: expected {len(run.trace)}, one for each step of the run, got {len(listed)}; localise this run")
+            raise MapError(
+                f"beliefs: expected {len(run.trace)}, one for each step of the run, got {len(listed)}; localise this run"
+            )
         found[str(one["labeling"])] = [_belief(belief, len(ssh_map.dstates)) for belief in listed]
     return found
 
@@ -238,7 +283,9 @@ def _beliefs(maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], run: Run) -
 def _belief(belief: dict[str, Any], count: int) -> list[Any]:
     """What a belief comes to, the probability of being nowhere, and the dstates that are most probable. Raises MapError."""
     try:
-        likely = sorted(((int(s), float(p)) for s, p in belief["probabilities"]), key=lambda pair: -pair[1])
+        likely = sorted(
+            ((int(s), float(p)) for s, p in belief["probabilities"]), key=lambda pair: -pair[1]
+        )
         verdict, nowhere = str(belief["verdict"]), float(belief["nowhere"])
         if not all(0 <= s < count and 0 <= p <= 1 for s, p in likely) or not 0 <= nowhere <= 1:
             raise ValueError
@@ -247,10 +294,16 @@ def _belief(belief: dict[str, Any], count: int) -> list[Any]:
             f"beliefs: expected verdict, nowhere and probabilities of dstates 0 to {count - 1}, as localize --json prints them, got something else; "
             "localise in these maps again"
         ) from None
-    return [verdict, round(nowhere, 3), [[s, round(p, 3)] for s, p in likely[:BELIEVED] if p >= LEAST]]
+    return [
+        verdict,
+        round(nowhere, 3),
+        [[s, round(p, 3)] for s, p in likely[:BELIEVED] if p >= LEAST],
+    ]
 
 
-def _layouts(maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], trace: Trace | None) -> list[tuple[int, Layout]]:
+def _layouts(
+    maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], trace: Trace | None
+) -> list[tuple[int, Layout]]:
     """The drawings of the first map and, as long as there are time and room, of others that have other dstates or places, each with the number of its map. Maps are told
     the numbers of theirs."""
     layouts: list[tuple[int, Layout]] = []
@@ -258,7 +311,11 @@ def _layouts(maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], trace: Trac
     end, room = time.process_time() + DRAWING, DRAWN
     for i, (ssh_map, one) in enumerate(zip(maps, told, strict=True)):
         key = (one["labeling"], one["places"], one["id"] if ssh_map.fit else None)
-        can = time.process_time() < end and len(ssh_map.dstates) <= room and (ssh_map.places or not maps[0].places)
+        can = (
+            time.process_time() < end
+            and len(ssh_map.dstates) <= room
+            and (ssh_map.places or not maps[0].places)
+        )
         if key not in drawn and (not layouts or can):
             drawn[key] = len(layouts)
             room -= len(ssh_map.dstates)
@@ -271,7 +328,10 @@ def _layouts(maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], trace: Trac
 def _unit(found: Layout) -> float:
     """How far places, or dstates without places, are from the nearest other one, in the middle."""
     points = list(found.places.values()) or [(x, y) for x, y, _ in found.dstates]
-    nearest = [min((abs(x - u) + abs(y - v) for u, v in points if (u, v) != (x, y)), default=0.0) for x, y in points[:200]]
+    nearest = [
+        min((abs(x - u) + abs(y - v) for u, v in points if (u, v) != (x, y)), default=0.0)
+        for x, y in points[:200]
+    ]
     return median([d for d in nearest if d > 0] or [1.0])
 
 
@@ -281,8 +341,13 @@ def _numbers(found: Layout, ssh_map: SSHMap) -> dict[str, Any]:
     return {
         "metric": found.metric,
         "unit": round(unit, 3),
-        "places": [[p, round(x / unit, 2), round(y / unit, 2)] for p, (x, y) in found.places.items()],
-        "dstates": [[round(x / unit, 2), round(y / unit, 2), None if h is None else round(h, 2)] for x, y, h in found.dstates],
+        "places": [
+            [p, round(x / unit, 2), round(y / unit, 2)] for p, (x, y) in found.places.items()
+        ],
+        "dstates": [
+            [round(x / unit, 2), round(y / unit, 2), None if h is None else round(h, 2)]
+            for x, y, h in found.dstates
+        ],
         **({"ellipses": _ellipses(found, ssh_map, unit)} if found.metric else {}),
     }
 
@@ -291,7 +356,10 @@ def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
     """How uncertain positions are: for a dstate of each place, or for each dstate without places, its number, the standard deviations along two axes, and the angle of the
     first axis, in radians counterclockwise."""
     assert ssh_map.fit is not None
-    extent = max(max(numbers) - min(numbers) for numbers in zip(*((x, y) for x, y, _ in found.dstates), strict=True))
+    extent = max(
+        max(numbers) - min(numbers)
+        for numbers in zip(*((x, y) for x, y, _ in found.dstates), strict=True)
+    )
     seen: set[int | None] = set()
     ellipses: list[list[float]] = []
     for s in ssh_map.dstates:
@@ -323,22 +391,37 @@ def _overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
     Streets are those that the robot travelled. `path` is how many maps agree, at most, on what is along the path of a dstate or street. Orders of paths where nobody travelled are
     witnesses only, and there may be thousands.
     """
-    counts: Counter[tuple[int, int]] = Counter()  # maps that are the same in what is counted here are counted at once
+    counts: Counter[tuple[int, int]] = (
+        Counter()
+    )  # maps that are the same in what is counted here are counted at once
     example: dict[tuple[int, int], SSHMap] = {}
     labelings, placings = _Pool(), _Pool()
     for ssh_map in maps:
-        key = labelings.number(ssh_map.labels), placings.number(tuple((s.place, s.path) for s in ssh_map.dstates))
+        key = (
+            labelings.number(ssh_map.labels),
+            placings.number(tuple((s.place, s.path) for s in ssh_map.dstates)),
+        )
         counts[key] += 1
         example[key] = ssh_map
     dstates: Counter[Steps] = Counter()
     places: Counter[Steps] = Counter()
     streets: Counter[frozenset[Steps]] = Counter()
-    along: Counter[tuple[Any, int]] = Counter()  # a dstate or street, and which steps are along its path, by their number
+    along: Counter[tuple[Any, int]] = (
+        Counter()
+    )  # a dstate or street, and which steps are along its path, by their number
     together = _Pool()
     for key, count in counts.items():
         ssh_map = example[key]
-        of_dstate, of_place = _members(ssh_map.labels), _members([ssh_map.dstates[label].place for label in ssh_map.labels])
-        of_path = {h: together.number(steps) for h, steps in _members([ssh_map.dstates[label].path for label in ssh_map.labels]).items()}
+        of_dstate, of_place = (
+            _members(ssh_map.labels),
+            _members([ssh_map.dstates[label].place for label in ssh_map.labels]),
+        )
+        of_path = {
+            h: together.number(steps)
+            for h, steps in _members(
+                [ssh_map.dstates[label].path for label in ssh_map.labels]
+            ).items()
+        }
         for steps in of_dstate.values():
             dstates[steps] += count
             if (h := ssh_map.dstates[ssh_map.labels[steps[0]]].path) is not None:
@@ -346,12 +429,22 @@ def _overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
         for steps in of_place.values():
             places[steps] += count
         pairs: dict[frozenset[Steps], int | None] = {}
-        for a, b in ((ssh_map.dstates[s], ssh_map.dstates[x]) for s, x in set(pairwise(ssh_map.labels))):
-            if a.place is not None and b.place is not None and a.place != b.place and a.path is not None and a.path == b.path:
+        for a, b in (
+            (ssh_map.dstates[s], ssh_map.dstates[x]) for s, x in set(pairwise(ssh_map.labels))
+        ):
+            if (
+                a.place is not None
+                and b.place is not None
+                and a.place != b.place
+                and a.path is not None
+                and a.path == b.path
+            ):
                 pairs[frozenset((of_place[a.place], of_place[b.place]))] = of_path[a.path]
         if not ssh_map.places:
             pairs = {
-                frozenset((of_dstate[s], of_dstate[x])): None for s, _, x in ssh_map.links if s != x and s in of_dstate and x in of_dstate
+                frozenset((of_dstate[s], of_dstate[x])): None
+                for s, _, x in ssh_map.links
+                if s != x and s in of_dstate and x in of_dstate
             }
         for pair, path in pairs.items():
             streets[pair] += count
@@ -363,14 +456,25 @@ def _overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
     nodes = list(places) or list(dstates)
     number = {steps: i for i, steps in enumerate(nodes)}
     return {
-        "nodes": [{"steps": steps, "maps": (places or dstates)[steps], **_middle(steps, spots)} for steps in nodes],
+        "nodes": [
+            {"steps": steps, "maps": (places or dstates)[steps], **_middle(steps, spots)}
+            for steps in nodes
+        ],
         "dstates": [
-            {"steps": steps, "maps": count, "path": agreed.get(steps, count), **_middle(steps, spots)} for steps, count in dstates.items()
+            {
+                "steps": steps,
+                "maps": count,
+                "path": agreed.get(steps, count),
+                **_middle(steps, spots),
+            }
+            for steps, count in dstates.items()
         ]
         if places
         else [],
         "streets": [
-            [*sorted(number[steps] for steps in pair), count, agreed.get(pair, count)] for pair, count in streets.items() if len(pair) == 2
+            [*sorted(number[steps] for steps in pair), count, agreed.get(pair, count)]
+            for pair, count in streets.items()
+            if len(pair) == 2
         ],
     }
 
@@ -385,4 +489,8 @@ def _members(names: Sequence[int | None]) -> dict[int | None, Steps]:
 
 def _middle(steps: Steps, spots: Sequence[Spot]) -> dict[str, Any]:
     at = list(dict.fromkeys(spots[t][:2] for t in steps))
-    return {"x": round(fmean(x for x, _ in at), 3), "y": round(fmean(y for _, y in at), 3), "heading": spots[steps[0]][2]}
+    return {
+        "x": round(fmean(x for x, _ in at), 3),
+        "y": round(fmean(y for _, y in at), 3),
+        "heading": spots[steps[0]][2],
+    }

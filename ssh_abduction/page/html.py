@@ -71,14 +71,20 @@ def view_page(
     if beliefs is not None:
         a_function("beliefs", beliefs, MapError, what="a function of a map")
     if (run is None) != (beliefs is None):
-        raise MapError("beliefs: expected a run that they are of, and beliefs for a run, got one of the two; give both, or none")
-    return Page(content_of(source, trace, None if run is None or beliefs is None else Run(run, beliefs)))
+        raise MapError(
+            "beliefs: expected a run that they are of, and beliefs for a run, got one of the two; give both, or none"
+        )
+    return Page(
+        content_of(source, trace, None if run is None or beliefs is None else Run(run, beliefs))
+    )
 
 
 def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:
     """The page of this content; `served` says that a server answers its questions."""
     style, script = _file("page.css"), _file("page.js")
-    text = json.dumps({**content, "served": served}, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    text = json.dumps(
+        {**content, "served": served}, ensure_ascii=False, separators=(",", ":"), allow_nan=False
+    )
     for character, escape in ESCAPED.items():
         text = text.replace(character, escape)
     policy = (
@@ -86,7 +92,12 @@ def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:
         "base-uri 'none'; form-action 'none'"
     )
     page = _file("page.html")
-    for name, value in {"POLICY": policy, "STYLE": style, "SCRIPT": script, "CONTENT": text}.items():
+    for name, value in {
+        "POLICY": policy,
+        "STYLE": style,
+        "SCRIPT": script,
+        "CONTENT": text,
+    }.items():
         before, mark, after = page.partition(f"@{name}@")
         assert mark, name
         page = before + value + after

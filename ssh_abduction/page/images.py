@@ -21,7 +21,10 @@ from ssh_abduction.data.trace import Trace
 ALPHABET = "".join(chr(c) for c in range(35, 127) if chr(c) not in "&<>\\")
 LOST = "!"  # a beam that measured nothing
 MOST = 100_000  # characters that all images of a page may have together
-BEAMS, FEWEST = 181, 24  # beams of an image that are shown, and how few they may become before images are left out
+BEAMS, FEWEST = (
+    181,
+    24,
+)  # beams of an image that are shown, and how few they may become before images are left out
 PIXELS = (12, 90)  # rows and columns of a panorama that are shown
 FAR = 95  # the longest range that is drawn: this percentile of all ranges, as a single look down a long corridor would make all rooms small
 HALF = 180.0
@@ -39,7 +42,12 @@ def beams_of(trace: Trace, count: int) -> tuple[float, float]:
         return -usual * (count - 1) / 2, usual
     first = told.get("first") if isinstance(told, dict) else None
     step = told.get("step") if isinstance(told, dict) else None
-    if not is_finite(first) or not is_finite(step) or step == 0 or abs(step) * (count - 1) > 360 + 1e-6:
+    if (
+        not is_finite(first)
+        or not is_finite(step)
+        or step == 0
+        or abs(step) * (count - 1) > 360 + 1e-6
+    ):
         raise TraceError(
             f'{named(trace.source or "trace")}: beams: expected {{"first": degrees, "step": degrees}}, counterclockwise from straight ahead, with which {count} beams '
             f"go round once at most, got {brief(told)}; mend the header, or leave it out"
@@ -86,12 +94,21 @@ def drawn_images(trace: Trace) -> dict[str, Any] | None:
 def _text(shares: NDArray[np.float64]) -> str:
     """Numbers from 0 to 1 as characters: what is greater is as 1, and what is no number is LOST."""
     last = len(ALPHABET) - 1
-    return "".join(LOST if math.isnan(x) else ALPHABET[round(last * min(max(x, 0.0), 1.0))] for x in shares.tolist())
+    return "".join(
+        LOST if math.isnan(x) else ALPHABET[round(last * min(max(x, 0.0), 1.0))]
+        for x in shares.tolist()
+    )
 
 
-def _panoramas(held: Sequence[NDArray[np.float64] | None], shape: Any, each: int) -> dict[str, Any] | None:
+def _panoramas(
+    held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
+) -> dict[str, Any] | None:
     """Panoramas of so many characters each at most, made smaller by leaving out rows and columns; None where the header's shape is not theirs."""
-    if not isinstance(shape, list) or len(shape) != 3 or any(not isinstance(n, int) or n < 1 for n in shape):
+    if (
+        not isinstance(shape, list)
+        or len(shape) != 3
+        or any(not isinstance(n, int) or n < 1 for n in shape)
+    ):
         return None
     if any(image is not None and len(image) != math.prod(shape) for image in held):
         return None
@@ -101,15 +118,23 @@ def _panoramas(held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
             _warn_of_too_many(sum(image is not None for image in held))
             return None
         rows, columns = max(1, rows // 2), max(1, columns // 2)
-    row, column = (np.linspace(0, n - 1, k).round().astype(int) for n, k in ((shape[0], rows), (shape[1], columns)))
+    row, column = (
+        np.linspace(0, n - 1, k).round().astype(int)
+        for n, k in ((shape[0], rows), (shape[1], columns))
+    )
     return {
         "kind": "panorama",
         "rows": rows,
         "columns": columns,
         "colours": shape[2],
-        "images": [None if image is None else _text(image.reshape(shape)[row][:, column].ravel() / 255) for image in held],
+        "images": [
+            None if image is None else _text(image.reshape(shape)[row][:, column].ravel() / 255)
+            for image in held
+        ],
     }
 
 
 def _warn_of_too_many(count: int) -> None:
-    warnings.warn(f"{count} images are more than a page holds; the page is made without images", stacklevel=3)
+    warnings.warn(
+        f"{count} images are more than a page holds; the page is made without images", stacklevel=3
+    )

@@ -93,12 +93,19 @@ class PageServer(ThreadingHTTPServer):
         pair = self._pair(data.get("pair")) if question == "explain" else None
         with self._turn(watch):
             if pair is not None:
-                why = in_process(answers.explained, self._trace, *pair, theory, self._limit, watch=watch)
+                why = in_process(
+                    answers.explained, self._trace, *pair, theory, self._limit, watch=watch
+                )
                 return {"text": str(why), "assuming": why.assuming}
-            found = in_process(answers.solved, self._trace, theory, self._maps, self._limit, watch=watch)
+            found = in_process(
+                answers.solved, self._trace, theory, self._maps, self._limit, watch=watch
+            )
         if not found.maps:
             return {"text": found.headline}
-        return {"text": found.headline, "content": content_of(found, self._trace, self._run, self._called)}
+        return {
+            "text": found.headline,
+            "content": content_of(found, self._trace, self._run, self._called),
+        }
 
     @contextmanager
     def _turn(self, watch: Watch) -> Iterator[None]:
@@ -127,12 +134,18 @@ class PageServer(ThreadingHTTPServer):
             pairs = data.get(name, [])
             if not isinstance(pairs, list):
                 raise MapError(f"{name}: expected pairs of steps, got {brief(pairs)}")
-            theory = theory.replace(**{name: tuple(dict.fromkeys([*getattr(theory, name), *map(self._pair, pairs)]))})
+            theory = theory.replace(
+                **{name: tuple(dict.fromkeys([*getattr(theory, name), *map(self._pair, pairs)]))}
+            )
         return theory
 
     def _pair(self, pair: Any) -> tuple[int, int]:
         last = len(self._trace) - 1
-        if not isinstance(pair, list) or len(pair) != 2 or not all(is_whole(t) and 0 <= t <= last for t in pair):
+        if (
+            not isinstance(pair, list)
+            or len(pair) != 2
+            or not all(is_whole(t) and 0 <= t <= last for t in pair)
+        ):
             raise MapError(f"expected a pair of steps from 0 to {last}, got {brief(pair)}")
         return min(pair), max(pair)
 
@@ -151,7 +164,9 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         asked = self._asked()
         lengths = self.headers.get_all("Content-Length", [])
-        length = int(lengths[0]) if len(lengths) == 1 and LENGTH.fullmatch(lengths[0]) else LARGEST + 1
+        length = (
+            int(lengths[0]) if len(lengths) == 1 and LENGTH.fullmatch(lengths[0]) else LARGEST + 1
+        )
         if not asked or length > LARGEST or self.headers.get_content_type() != "application/json":
             self._refuse()
             return
@@ -174,7 +189,9 @@ class _Handler(BaseHTTPRequestHandler):
         """What is asked for, if who asks may."""
         hosts = [f"{name}:{self.server.port}" for name in ("127.0.0.1", "localhost")]
         origin = self.headers.get("Origin")
-        if self.headers.get("Host") not in hosts or (origin is not None and origin not in [f"http://{host}" for host in hosts]):
+        if self.headers.get("Host") not in hosts or (
+            origin is not None and origin not in [f"http://{host}" for host in hosts]
+        ):
             return None
         return self.server.is_known(self.path)
 
@@ -213,7 +230,9 @@ def _while_there(connection: socket.socket, watch: Watch) -> Iterator[None]:
     def look() -> None:
         while not done.wait(POLL):
             try:
-                if select.select([connection], [], [], 0)[0] and not connection.recv(1, socket.MSG_PEEK):
+                if select.select([connection], [], [], 0)[0] and not connection.recv(
+                    1, socket.MSG_PEEK
+                ):
                     watch.interrupted = True
                     return
             except (OSError, ValueError):  # it was reset, or closed here

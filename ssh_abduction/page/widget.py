@@ -24,6 +24,8 @@ def widget_of(html: str) -> Any:
         import anywidget
         import traitlets
     except ImportError:
-        raise MapError("widget: expected anywidget, got none; install it with pip install 'ssh-abduction[notebook]'") from None
+        raise MapError(
+            "widget: expected anywidget, got none; install it with pip install 'ssh-abduction[notebook]'"
+        ) from None
     members = {"_esm": SHOW, "html": traitlets.Unicode(html).tag(sync=True)}
     return type("PageWidget", (anywidget.AnyWidget,), members)()

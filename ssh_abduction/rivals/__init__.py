@@ -5,4 +5,12 @@ from ssh_abduction.rivals.differences import Difference, difference
 from ssh_abduction.rivals.explore import Experiment, next_experiment
 from ssh_abduction.rivals.listing import Listing
 
-__all__ = ["Comparison", "Difference", "Experiment", "Listing", "compare", "difference", "next_experiment"]
+__all__ = [
+    "Comparison",
+    "Difference",
+    "Experiment",
+    "Listing",
+    "compare",
+    "difference",
+    "next_experiment",
+]

@@ -37,7 +37,12 @@ from ssh_abduction.solver import SORTS, Backbone, Shared, stretches
 Matter: TypeAlias = Literal["faults", "dstates", "places", "paths", "courses"]
 
 MATTERS: tuple[Matter, ...] = ("faults", *SORTS)  # in the order of causes
-WORDS: dict[Matter, str] = {"dstates": "dstate", "places": "place", "paths": "path", "courses": "path and direction"}
+WORDS: dict[Matter, str] = {
+    "dstates": "dstate",
+    "places": "place",
+    "paths": "path",
+    "courses": "path and direction",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,15 +73,24 @@ class Question:
         if self.first == self.later:
             return f"{_steps(self.there)} {'is' if len(self.there) == 1 else 'are'} {'at a place' if self.sort == 'places' else 'along a path'}"
         word = WORDS[self.sort]
-        here, there = (f"{_steps(steps)}{self._at(k)}" for k, steps in enumerate((self.here, self.there)))
+        here, there = (
+            f"{_steps(steps)}{self._at(k)}" for k, steps in enumerate((self.here, self.there))
+        )
         return f"the {word} of {here} and that of {there} are one"
 
     def _at(self, side: int) -> str:
         places = self.places[side] if self.places else ()
-        return f" ({'place' if len(places) == 1 else 'places'} {stretches(places)})" if places else ""
+        return (
+            f" ({'place' if len(places) == 1 else 'places'} {stretches(places)})" if places else ""
+        )
 
     def to_dict(self) -> dict[str, Any]:
-        data: dict[str, Any] = {"sort": self.sort, "first": self.first, "later": self.later, "yes": self.yes}
+        data: dict[str, Any] = {
+            "sort": self.sort,
+            "first": self.first,
+            "later": self.later,
+            "yes": self.yes,
+        }
         data |= {"here": list(self.here), "there": list(self.there), "sentence": str(self)}
         if self.places:
             data["places"] = [list(places) for places in self.places]
@@ -144,8 +158,16 @@ class Others:
     def sentence(self) -> str:
         """How many maps are in both lists."""
         if not self.here and not self.there:
-            return f"the {self.count} maps are the same in both" if self.count > 1 else "the map is the same in both"
-        told = [f"{len(self.both)} in both", f"{len(self.here)} only in the first", f"{len(self.there)} only in {printable(self.source)}"]
+            return (
+                f"the {self.count} maps are the same in both"
+                if self.count > 1
+                else "the map is the same in both"
+            )
+        told = [
+            f"{len(self.both)} in both",
+            f"{len(self.here)} only in the first",
+            f"{len(self.there)} only in {printable(self.source)}",
+        ]
         return "of the maps, " + ", ".join(told[:-1]) + " and " + told[-1]
 
     def to_dict(self) -> dict[str, Any]:
@@ -217,14 +239,18 @@ class Comparison:
     @property
     def _differences(self) -> str:
         faults = self.variants.get("faults", 0) > 1
-        return (f"what they disbelieve differs ({self.variants['faults']} ways); " if faults else "") + self.shared.sentence
+        return (
+            f"what they disbelieve differs ({self.variants['faults']} ways); " if faults else ""
+        ) + self.shared.sentence
 
     @property
     def product(self) -> str:
         """The number of maps as the product of the numbers of options: 780 = 195 x 2 x 2. Empty where there are no two choices."""
         if len(self.choices) < 2:
             return ""
-        return f"{len(self.ids)} = {' x '.join(str(len(choice.options)) for choice in self.choices)}"
+        return (
+            f"{len(self.ids)} = {' x '.join(str(len(choice.options)) for choice in self.choices)}"
+        )
 
     @property
     def unlisted(self) -> dict[Matter, tuple[int, ...]]:
@@ -252,7 +278,8 @@ class Comparison:
             "together": {sort: list(steps) for sort, steps in self.together.items()},
             "deciding": [question.to_dict() for question in self.deciding],
             "sizes": [
-                {"dstates": dstates, "places": places, "paths": paths, "count": count} for (dstates, places, paths), count in self.sizes
+                {"dstates": dstates, "places": places, "paths": paths, "count": count}
+                for (dstates, places, paths), count in self.sizes
             ],
         }
         if self.stopped:
@@ -284,9 +311,16 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     listed = replace(table.shared(), proven=listing.complete is True)
     shared = listing.backbone if listing.backbone and listing.complete is False else listed
     _check_backbone(shared, listed, listing)
-    asked = _questions(table, listing.maps, same_places=bool(listed.places and not listed.places.sometimes))
-    order = deciding([a.column for a in asked], len(table), [MATTERS.index(a.question.sort) for a in asked])
-    choices = [[asked[order[k]] for k in choice] for choice in independent([asked[i].column for i in order])]
+    asked = _questions(
+        table, listing.maps, same_places=bool(listed.places and not listed.places.sometimes)
+    )
+    order = deciding(
+        [a.column for a in asked], len(table), [MATTERS.index(a.question.sort) for a in asked]
+    )
+    choices = [
+        [asked[order[k]] for k in choice]
+        for choice in independent([asked[i].column for i in order])
+    ]
     options = [options_of([a.column for a in choice], len(table)) for choice in choices]
     of_choice, together = _depending(asked, options, table)
     fits = [ssh_map.fit.chi2 for ssh_map in listing.maps if ssh_map.fit]
@@ -324,8 +358,18 @@ def _questions(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> li
     for fault in sorted(faults, key=lambda f: (f.step, f.kind, str(f.seen), str(f.expected))):
         column = np.array([fault in ssh_map.faults for ssh_map in maps])
         if not column.all():
-            question = Question("faults", fault.step, fault.step, int(column.sum()), (fault.step,), (fault.step,), fault=fault)
-            found.setdefault(_key(column), _Asked(question, column, {})).steps.setdefault("faults", set()).add(fault.step)
+            question = Question(
+                "faults",
+                fault.step,
+                fault.step,
+                int(column.sum()),
+                (fault.step,),
+                (fault.step,),
+                fault=fault,
+            )
+            found.setdefault(_key(column), _Asked(question, column, {})).steps.setdefault(
+                "faults", set()
+            ).add(fault.step)
     places = [maps[0].dstates[label].place for label in maps[0].labels] if same_places else []
     steps_by_class = _members(table.classes.tolist())
     for sort in table.ones:
@@ -334,8 +378,18 @@ def _questions(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> li
         for c, d, column in table.questions(sort):
             key = _key(column)
             if key not in found:
-                sides = [sorted(t for k in together[heads[side]] for t in steps_by_class[k]) for side in (c, d)]
-                stand = [tuple(sorted({p for t in side if (p := places[t]) is not None})) for side in sides] if places else []
+                sides = [
+                    sorted(t for k in together[heads[side]] for t in steps_by_class[k])
+                    for side in (c, d)
+                ]
+                stand = (
+                    [
+                        tuple(sorted({p for t in side if (p := places[t]) is not None}))
+                        for side in sides
+                    ]
+                    if places
+                    else []
+                )
                 question = Question(
                     sort,
                     first=int(table.firsts[c]),
@@ -347,7 +401,10 @@ def _questions(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> li
                 )
                 found[key] = _Asked(question, column, {})
             found[key].steps.setdefault(sort, set()).update(steps_by_class[d])
-    return sorted(found.values(), key=lambda a: (MATTERS.index(a.question.sort), a.question.later, a.question.first))
+    return sorted(
+        found.values(),
+        key=lambda a: (MATTERS.index(a.question.sort), a.question.later, a.question.first),
+    )
 
 
 def _key(column: Bools) -> bytes:
@@ -387,20 +444,29 @@ def _in_order(steps: dict[Matter, set[int]]) -> dict[Matter, tuple[int, ...]]:
     return {sort: tuple(sorted(steps[sort])) for sort in MATTERS if sort in steps}
 
 
-def _choice(asked: Sequence[_Asked], option: NDArray[np.intp], differing: dict[Matter, tuple[int, ...]]) -> Choice:
+def _choice(
+    asked: Sequence[_Asked], option: NDArray[np.intp], differing: dict[Matter, tuple[int, ...]]
+) -> Choice:
     members = _members(option.tolist())
-    options = [Option(tuple(bool(a.column[maps[0]]) for a in asked), tuple(i + 1 for i in maps)) for maps in members.values()]
+    options = [
+        Option(tuple(bool(a.column[maps[0]]) for a in asked), tuple(i + 1 for i in maps))
+        for maps in members.values()
+    ]
     return Choice(tuple(a.question for a in asked), tuple(options), differing)
 
 
 def _variants(table: Table, maps: Sequence[SSHMap]) -> dict[Matter, int]:
     """How many different ones there are of each sort."""
-    faults: dict[Matter, int] = {"faults": len({m.faults for m in maps})} if any(m.faults for m in maps) else {}
+    faults: dict[Matter, int] = (
+        {"faults": len({m.faults for m in maps})} if any(m.faults for m in maps) else {}
+    )
     return faults | {sort: table.variants(sort) for sort in table.ones}
 
 
 def _sizes(maps: Sequence[SSHMap]) -> tuple[tuple[tuple[int, int, int], int], ...]:
-    counts = Counter((len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths)) for ssh_map in maps)
+    counts = Counter(
+        (len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths)) for ssh_map in maps
+    )
     return tuple(sorted(counts.items()))
 
 
@@ -410,8 +476,17 @@ def _others(here: Listing, there: Listing) -> Others:
     pairs = tuple((i, j) for i, j in both.items() if j)
     shared = {here.maps[i - 1].renumbered() for i, _ in pairs}
     best = difference(here.maps[0], there.maps[0], ("map 1", f"map 1 of {there.source}"))
-    only_there = tuple(j for j, ssh_map in enumerate(there.maps, 1) if ssh_map.renumbered() not in shared)
-    return Others(len(there.maps), pairs, tuple(i for i, j in both.items() if not j), only_there, best, there.source)
+    only_there = tuple(
+        j for j, ssh_map in enumerate(there.maps, 1) if ssh_map.renumbered() not in shared
+    )
+    return Others(
+        len(there.maps),
+        pairs,
+        tuple(i for i, j in both.items() if not j),
+        only_there,
+        best,
+        there.source,
+    )
 
 
 def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> None:
@@ -425,7 +500,9 @@ def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> Non
         if seen is not None and (wrong := _contradiction(told, seen, in_one)):
             first, later = wrong
             mend = "the file was changed by hand, or its maps are of another search: solve again"
-            raise MapError(f"{listing.source}: backbone: {sort}: steps {first} and {later} are not as the maps listed have them; {mend}")
+            raise MapError(
+                f"{listing.source}: backbone: {sort}: steps {first} and {later} are not as the maps listed have them; {mend}"
+            )
 
 
 def _contradiction(told: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[int, int] | None:
@@ -445,7 +522,11 @@ def _contradiction(told: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[i
     one = [*seen.sometimes, *((first, t) for first, t in firsts if in_one[first] != in_one[t])]
     for i, j in one:
         pair = told.always[i], told.always[j]
-        if (pair[0] != pair[1] or i == j != seen.always.index(seen.always[i])) and pair not in may_be and pair[::-1] not in may_be:
+        if (
+            (pair[0] != pair[1] or i == j != seen.always.index(seen.always[i]))
+            and pair not in may_be
+            and pair[::-1] not in may_be
+        ):
             return i, j
     return None
 

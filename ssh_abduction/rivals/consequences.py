@@ -49,10 +49,14 @@ class Consequence:
             return False
         one, two = self.seen, other.seen
         views_differ = one.view is not None and two.view is not None and one.view != two.view
-        return views_differ or (one.star is not None and two.star is not None and one.star != two.star)
+        return views_differ or (
+            one.star is not None and two.star is not None and one.star != two.star
+        )
 
     def to_dict(self) -> dict[str, Any]:
-        return {"how": self.how, "dstate": self.dstate} | (self.seen.to_dict() if self.seen else {"view": None})
+        return {"how": self.how, "dstate": self.dstate} | (
+            self.seen.to_dict() if self.seen else {"view": None}
+        )
 
 
 OPEN = Consequence("open")
@@ -66,15 +70,27 @@ class Consequences:
     theory  the axioms that tell; None for all
     """
 
-    def __init__(self, ssh_map: SSHMap, links: dict[int, dict[str, int]], looks: Sequence[Seen], theory: Theory | None) -> None:
+    def __init__(
+        self,
+        ssh_map: SSHMap,
+        links: dict[int, dict[str, int]],
+        looks: Sequence[Seen],
+        theory: Theory | None,
+    ) -> None:
         self._dstates, self._links, self._looks = ssh_map.dstates, links, looks
         headed = [s for s in ssh_map.dstates if s.heading is not None and s.place is not None]
-        has_frames = all((s.heading or 0) < 4 for s in headed) if theory is None else theory.star == "frame" and theory.hard >= OF_FRAMES
+        has_frames = (
+            all((s.heading or 0) < 4 for s in headed)
+            if theory is None
+            else theory.star == "frame" and theory.hard >= OF_FRAMES
+        )
         has_courses = theory is None or theory.hard >= _OF_COURSES
         self._framed = {(s.place, s.heading): s.id for s in headed} if has_frames else {}
         self._seen_at = {s.place: s for s in headed} if has_frames else {}  # a dstate at each place
         self._at: dict[tuple[int | None, int | None, int | None], int] = {
-            (s.place, s.path, s.direction): s.id for s in ssh_map.dstates if s.path is not None and s.place is not None
+            (s.place, s.path, s.direction): s.id
+            for s in ssh_map.dstates
+            if s.path is not None and s.place is not None
         }
         self._turns_back = has_courses
         self._orders = {path.id: path.order for path in ssh_map.paths}
@@ -97,9 +113,14 @@ class Consequences:
         if not (self._framed or (self._turns_back and self._at)):
             return ()
         found = (
-            (s.id, action.name, self._turned(s, action)) for s in self._dstates for action in turns if action.name not in self._links[s.id]
+            (s.id, action.name, self._turned(s, action))
+            for s in self._dstates
+            for action in turns
+            if action.name not in self._links[s.id]
         )
-        return tuple((s, action, says.dstate) for s, action, says in found if says.dstate is not None)
+        return tuple(
+            (s, action, says.dstate) for s, action, says in found if says.dstate is not None
+        )
 
     def _turned(self, s: DState, action: Action) -> Consequence:
         assert action.turn is not None
@@ -135,7 +156,11 @@ class Consequences:
 
 def _is_four(seen: Seen) -> bool:
     """Whether a star is read as four openings."""
-    return seen.star is not None and len(seen.star) == 4 and all(isinstance(entry, bool) for entry in seen.star)
+    return (
+        seen.star is not None
+        and len(seen.star) == 4
+        and all(isinstance(entry, bool) for entry in seen.star)
+    )
 
 
 def is_possible(action: Action, seen: Seen) -> bool:

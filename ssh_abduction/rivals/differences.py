@@ -27,8 +27,27 @@ from ssh_abduction.solver import Sort, stretches
 Steps: TypeAlias = tuple[int, ...]
 Link: TypeAlias = tuple[int, str, int]
 
-NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
-SORTED_BY = {"dstates": "dstates", "places": "places", "paths": "paths", "courses": "directions along paths"}
+NUMBERS = (
+    "no",
+    "one",
+    "two",
+    "three",
+    "four",
+    "five",
+    "six",
+    "seven",
+    "eight",
+    "nine",
+    "ten",
+    "eleven",
+    "twelve",
+)
+SORTED_BY = {
+    "dstates": "dstates",
+    "places": "places",
+    "paths": "paths",
+    "courses": "directions along paths",
+}
 # So many changes of a sort, and so many links, are told in words, at most.
 TOLD = 12
 
@@ -52,10 +71,16 @@ class Change:
     def told(self, names: tuple[str, str]) -> str:
         """The change in words, where the two maps are called so."""
         sides = ((self.first, self.first_none), (self.other, self.other_none))
-        return ", ".join(f"in {name} {_told(*side)}" for name, side in zip(names, sides, strict=True))
+        return ", ".join(
+            f"in {name} {_told(*side)}" for name, side in zip(names, sides, strict=True)
+        )
 
     def to_dict(self) -> dict[str, Any]:
-        data: dict[str, Any] = {"sort": self.sort, "first": [list(g) for g in self.first], "other": [list(g) for g in self.other]}
+        data: dict[str, Any] = {
+            "sort": self.sort,
+            "first": [list(g) for g in self.first],
+            "other": [list(g) for g in self.other],
+        }
         if self.first_none or self.other_none:
             data |= {"first_none": list(self.first_none), "other_none": list(self.other_none)}
         return data
@@ -104,13 +129,18 @@ class Difference:
             if len(changes) > TOLD:
                 told.append(f"{word}: {len(changes) - TOLD} more changes")
         for name, links in zip(self.names, self.links, strict=True):
-            some = [f"{printable(action)} from the dstate of step {s} to that of step {x}" for s, action, x in links[:TOLD]]
+            some = [
+                f"{printable(action)} from the dstate of step {s} to that of step {x}"
+                for s, action, x in links[:TOLD]
+            ]
             more = f", and {len(links) - TOLD} more" if len(links) > TOLD else ""
             told += [f"links: only in {name} {', '.join(some)}{more}"] if some else []
         if any(self.has_places) and not all(self.has_places):
             told.append(f"places and paths: only in {self.names[self.has_places.index(True)]}")
         if self.chi2 and self.chi2[0] != self.chi2[1]:
-            told.append(f"fit: a chi-square of {self.chi2[0]:.1f} for {self.names[0]}, {self.chi2[1]:.1f} for {self.names[1]}")
+            told.append(
+                f"fit: a chi-square of {self.chi2[0]:.1f} for {self.names[0]}, {self.chi2[1]:.1f} for {self.names[1]}"
+            )
         return tuple(told)
 
     def __str__(self) -> str:
@@ -118,7 +148,10 @@ class Difference:
 
     def to_dict(self) -> dict[str, Any]:
         """As `compare --diff --json` prints it (docs/formats.md)."""
-        sizes = [dict(zip(("dstates", "places", "paths", "links"), size, strict=True)) for size in self.sizes]
+        sizes = [
+            dict(zip(("dstates", "places", "paths", "links"), size, strict=True))
+            for size in self.sizes
+        ]
         data: dict[str, Any] = {
             "ids": list(self.ids),
             "same": self.same,
@@ -126,7 +159,10 @@ class Difference:
             "changes": [change.to_dict() for change in self.changes],
             "links": [[list(link) for link in links] for links in self.links],
             "has_places": list(self.has_places),
-            "faults": [[{k: v for k, v in asdict(fault).items() if v is not None} for fault in faults] for faults in self.faults],
+            "faults": [
+                [{k: v for k, v in asdict(fault).items() if v is not None} for fault in faults]
+                for faults in self.faults
+            ],
             "words": list(self.lines),
         }
         if self.chi2:
@@ -134,31 +170,54 @@ class Difference:
         return data
 
 
-def difference(first: SSHMap, other: SSHMap, names: tuple[str, str] = ("the first map", "the other one")) -> Difference:
+def difference(
+    first: SSHMap, other: SSHMap, names: tuple[str, str] = ("the first map", "the other one")
+) -> Difference:
     """What tells two maps of one trace apart. Raises MapError where they have other numbers of steps.
 
     names  what the maps are called in words
     """
     checked_map(first, "first")
     checked_map(other, "other")
-    called = tuple(a_text(f"names[{i}]", name, MapError) for i, name in enumerate(a_list("names", names, MapError)))
+    called = tuple(
+        a_text(f"names[{i}]", name, MapError)
+        for i, name in enumerate(a_list("names", names, MapError))
+    )
     if len(called) != 2:
         raise MapError(f"names: expected two, one for each map, got {brief(names)}; name both")
     if len(first.labels) != len(other.labels):
-        raise MapError(f"maps: expected two of one trace, got one of {len(first.labels)} steps and one of {len(other.labels)}")
+        raise MapError(
+            f"maps: expected two of one trace, got one of {len(first.labels)} steps and one of {len(other.labels)}"
+        )
     first, other = first.renumbered(), other.renumbered()
     table = Table([first, other])
     changes: list[Change] = []
     for sort in table.ones:
         found = list(_changes(table, sort))
         if sort == "courses":  # a step along another path is along another course
-            moved = {t for change in changes if change.sort == "paths" for group in (*change.first, *change.other) for t in group}
-            found = [change for change in found if moved.isdisjoint(t for group in (*change.first, *change.other) for t in group)]
+            moved = {
+                t
+                for change in changes
+                if change.sort == "paths"
+                for group in (*change.first, *change.other)
+                for t in group
+            }
+            found = [
+                change
+                for change in found
+                if moved.isdisjoint(t for group in (*change.first, *change.other) for t in group)
+            ]
         changes += found
     links = (_named_links(first), _named_links(other))
     unmoved = _unmoved(first, other)
-    only = [tuple(sorted(k for k in mine - theirs if k[0] in unmoved and k[2] in unmoved)) for mine, theirs in (links, links[::-1])]
-    faults = [tuple(f for f in mine.faults if f not in theirs.faults) for mine, theirs in ((first, other), (other, first))]
+    only = [
+        tuple(sorted(k for k in mine - theirs if k[0] in unmoved and k[2] in unmoved))
+        for mine, theirs in (links, links[::-1])
+    ]
+    faults = [
+        tuple(f for f in mine.faults if f not in theirs.faults)
+        for mine, theirs in ((first, other), (other, first))
+    ]
     return Difference(
         ids=(first.id, other.id),
         names=(called[0], called[1]),
@@ -180,7 +239,10 @@ def _changes(table: Table, sort: Sort) -> Iterable[Change]:
         linked.add_edges_from((c, one) for c, one in enumerate(row) if one != NONE)
     for classes in sorted(map(sorted, nx.connected_components(linked))):
         if (ones[0, classes] != ones[1, classes]).any():
-            first, other = (tuple(table.steps_of(group) for group in _groups(classes, row.tolist())) for row in ones)
+            first, other = (
+                tuple(table.steps_of(group) for group in _groups(classes, row.tolist()))
+                for row in ones
+            )
             nowhere = [table.steps_of([c for c in classes if row[c] == NONE]) for row in ones]
             yield Change(sort, first, other, nowhere[0], nowhere[1])
 
@@ -198,7 +260,9 @@ def _named_links(ssh_map: SSHMap) -> set[Link]:
     first: dict[int, int] = {}
     for t, label in enumerate(ssh_map.labels):
         first.setdefault(label, t)
-    return {(first[s], action, first[x]) for s, action, x in ssh_map.links if s in first and x in first}
+    return {
+        (first[s], action, first[x]) for s, action, x in ssh_map.links if s in first and x in first
+    }
 
 
 def _unmoved(first: SSHMap, other: SSHMap) -> set[int]:

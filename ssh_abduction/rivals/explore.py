@@ -45,7 +45,18 @@ from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Trace, checked_trace
 from ssh_abduction.rivals.consequences import Consequence, Consequences, is_possible
-from ssh_abduction.rivals.machines import UNKNOWN, Machine, Row, Seen, Sights, Table, Walk, links_of, machine_of, with_ends
+from ssh_abduction.rivals.machines import (
+    UNKNOWN,
+    Machine,
+    Row,
+    Seen,
+    Sights,
+    Table,
+    Walk,
+    links_of,
+    machine_of,
+    with_ends,
+)
 from ssh_abduction.solver import LimitError, Solution, Stop, Watch, check_limit, stretches
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -83,7 +94,13 @@ class Untried:
 
     def to_dict(self) -> dict[str, Any]:
         expects = [expectation.to_dict() for expectation in self.expects]
-        return {"way": list(self.way), "action": self.action, "worst": self.worst, "pairs": self.pairs, "expects": expects}
+        return {
+            "way": list(self.way),
+            "action": self.action,
+            "worst": self.worst,
+            "pairs": self.pairs,
+            "expects": expects,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +150,10 @@ class Plan:
     def to_dict(self) -> dict[str, Any]:
         told: dict[str, Any] = {"rivals": list(self.rivals)}
         if self.branches:
-            told |= {"actions": list(self.actions), "branches": [branch.to_dict() for branch in self.branches]}
+            told |= {
+                "actions": list(self.actions),
+                "branches": [branch.to_dict() for branch in self.branches],
+            }
         return told | ({"untried": self.untried.to_dict()} if self.untried else {})
 
 
@@ -200,9 +220,13 @@ class Experiment:
                 if self.count > 1
                 else "this map is not known to be the only minimal one"
             )
-            told.append(f"{known}, and the experiment says nothing of others; list all (solve -n 0)")
+            told.append(
+                f"{known}, and the experiment says nothing of others; list all (solve -n 0)"
+            )
         if self.stopped:
-            told.append(f"the search for the experiment was stopped ({self.stopped}), and there may be a better one")
+            told.append(
+                f"the search for the experiment was stopped ({self.stopped}), and there may be a better one"
+            )
         return "; ".join(told) or None
 
     def to_dict(self) -> dict[str, Any]:
@@ -264,7 +288,11 @@ def next_experiment(
     extra = [Action.of(action) for action in a_list("actions", actions, MapError)]
     if isinstance(maps, Solution):
         theory, complete, maps = theory or maps.theory, maps.complete, maps.maps
-    rivals = [maps] if isinstance(maps, SSHMap) else a_list("maps", maps, MapError, what="a Solution or maps")
+    rivals = (
+        [maps]
+        if isinstance(maps, SSHMap)
+        else a_list("maps", maps, MapError, what="a Solution or maps")
+    )
     _check(rivals, trace)
     if watch is None:
         watch = Watch(time_limit, memory_limit)
@@ -274,7 +302,13 @@ def next_experiment(
     plan = laboratory.plan()
     watch.stop()
     return Experiment(
-        len(rivals), laboratory.alike, laboratory.predictions(plan.actions), plan, _sharing(rivals), complete, laboratory.stopped
+        len(rivals),
+        laboratory.alike,
+        laboratory.predictions(plan.actions),
+        plan,
+        _sharing(rivals),
+        complete,
+        laboratory.stopped,
     )
 
 
@@ -298,19 +332,30 @@ class _Laboratory:
         settled = theory if theory is None or trace is None else theory.resolve(trace)
         self._can, self._watch = can, watch
         self._sights = Sights(rivals, trace, theory)
-        self._links = [_to_known_views(links_of(ssh_map, i), ssh_map) for i, ssh_map in enumerate(rivals)]
+        self._links = [
+            _to_known_views(links_of(ssh_map, i), ssh_map) for i, ssh_map in enumerate(rivals)
+        ]
         self.stopped: Stop | None = None
         known = {action.name: action for action in (*actions, *(trace.actions if trace else ()))}
-        names = sorted({action for ssh_map in rivals for _, action, _ in ssh_map.links} | {action.name for action in actions})
+        names = sorted(
+            {action for ssh_map in rivals for _, action, _ in ssh_map.links}
+            | {action.name for action in actions}
+        )
         self._actions = [known.get(name) or Action.of(name) for name in names]
         self._consequences = [
-            Consequences(ssh_map, self._links[i], [self._sights.seen[k] for k in self._sights.of[i]], settled)
+            Consequences(
+                ssh_map, self._links[i], [self._sights.seen[k] for k in self._sights.of[i]], settled
+            )
             for i, ssh_map in enumerate(rivals)
         ]
         self._said: dict[tuple[int, int, int], Consequence] = {}
         found: dict[Machine, list[int]] = {}
-        self._reached: list[tuple[int, ...]] = []  # for each rival the dstate that each state of its machine is
-        same: dict[object, tuple[Machine, tuple[int, ...]]] = {}  # as of many rivals that differ in paths alone there is one machine
+        self._reached: list[
+            tuple[int, ...]
+        ] = []  # for each rival the dstate that each state of its machine is
+        same: dict[
+            object, tuple[Machine, tuple[int, ...]]
+        ] = {}  # as of many rivals that differ in paths alone there is one machine
         for i, ssh_map in enumerate(rivals):
             known_ends = self._consequences[i].sure_ends(self._actions) if implied else ()
             key = (ssh_map.labels[-1], ssh_map.links, known_ends, tuple(self._sights.of[i]))
@@ -343,7 +388,14 @@ class _Laboratory:
                 seen.append(int(self._table.sights[machine, state]))
             found.setdefault(tuple(seen), []).extend(group)
         looks = self._sights.seen
-        return tuple(Prediction(_numbers(group), tuple(looks[k] for k in seen)) for seen, group in found.items()) if actions else ()
+        return (
+            tuple(
+                Prediction(_numbers(group), tuple(looks[k] for k in seen))
+                for seen, group in found.items()
+            )
+            if actions
+            else ()
+        )
 
     def _plan_for(self, machines: Sequence[int], start: Row) -> Plan:
         """The plan for some machines, each in a state. What is still to be planned is kept in a list, as plans may be deep."""
@@ -357,12 +409,16 @@ class _Laboratory:
             return Plan(rivals)
         actions, parts = split
         branches = tuple(
-            Branch(self._sights.seen[seen], self._plan_for([machines[k] for k in part], tuple(states)))
+            Branch(
+                self._sights.seen[seen], self._plan_for([machines[k] for k in part], tuple(states))
+            )
             for seen, (part, states) in sorted(parts.items())
         )
         return Plan(rivals, tuple(self._actions[a].name for a in actions), branches)
 
-    def _split(self, machines: Sequence[int], start: Row) -> tuple[list[int], dict[int, tuple[list[int], list[int]]]] | None:
+    def _split(
+        self, machines: Sequence[int], start: Row
+    ) -> tuple[list[int], dict[int, tuple[list[int], list[int]]]] | None:
         """The actions after which predictions differ, and for each prediction which machines make it, by place in the list, and their states. None where known links do not tell.
 
         Of all sequences up to the first difference it is one that gains most per action.
@@ -380,7 +436,11 @@ class _Laboratory:
                     worst = int(np.bincount(seen[i], weights).max())
                     gain = math.log(total / worst) / (layer.depth + 1)
                     if best is None or gain > best[0]:
-                        best, end, sights = (gain, first + i, action), there[i].tolist(), seen[i].tolist()
+                        best, end, sights = (
+                            (gain, first + i, action),
+                            there[i].tolist(),
+                            seen[i].tolist(),
+                        )
         if best is None:
             return None
         parts: dict[int, tuple[list[int], list[int]]] = {}
@@ -406,10 +466,20 @@ class _Laboratory:
         if best is None:
             return None
         (worst, pairs), row, action, said = best
-        expects = tuple(Expectation(_numbers(group), consequence) for consequence, group in said.items())
-        return Untried(tuple(self._actions[a].name for a in walk.way(row)), self._actions[action].name, expects, worst, -pairs)
+        expects = tuple(
+            Expectation(_numbers(group), consequence) for consequence, group in said.items()
+        )
+        return Untried(
+            tuple(self._actions[a].name for a in walk.way(row)),
+            self._actions[action].name,
+            expects,
+            worst,
+            -pairs,
+        )
 
-    def _say(self, machines: Sequence[int], states: Sequence[int], action: int) -> dict[Consequence, list[int]] | None:
+    def _say(
+        self, machines: Sequence[int], states: Sequence[int], action: int
+    ) -> dict[Consequence, list[int]] | None:
         """What rivals say of an action at a joint state. None where it cannot be done there, or where all of them know what comes, and it is the same."""
         here = int(self._table.sights[machines[0], states[0]])
         done = self._actions[action]
@@ -420,8 +490,13 @@ class _Laboratory:
         said: dict[Consequence, list[int]] = {}
         for machine, state in zip(machines, states, strict=True):
             for rival in self._groups[machine]:
-                said.setdefault(self._consequence(rival, self._reached[rival][state], action), []).append(rival)
-        if all(consequence.is_sure and consequence.dstate is not None for consequence in said) and len({c.seen for c in said}) == 1:
+                said.setdefault(
+                    self._consequence(rival, self._reached[rival][state], action), []
+                ).append(rival)
+        if (
+            all(consequence.is_sure and consequence.dstate is not None for consequence in said)
+            and len({c.seen for c in said}) == 1
+        ):
             return None
         return said
 
@@ -451,10 +526,14 @@ def _numbers(rivals: Iterable[int]) -> tuple[int, ...]:
 def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
     """Whether these are maps of one trace, and of this one. Raises MapError."""
     if not maps:
-        raise MapError("maps: expected at least one to seek an experiment for, got none; see the status that solve gave")
+        raise MapError(
+            "maps: expected at least one to seek an experiment for, got none; see the status that solve gave"
+        )
     for i, ssh_map in enumerate(maps):
         if not isinstance(ssh_map, SSHMap):
-            raise MapError(f"maps[{i}]: expected an SSHMap, got {brief(ssh_map)}; take a Solution, or its maps")
+            raise MapError(
+                f"maps[{i}]: expected an SSHMap, got {brief(ssh_map)}; take a Solution, or its maps"
+            )
         labels = ssh_map.labels
         if len(labels) != len(maps[0].labels):
             raise MapError(
@@ -463,7 +542,9 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
         if trace is None:
             continue
         if len(labels) != len(trace):
-            raise MapError(f"maps[{i}]: labels: expected {len(trace)}, one for each step of the trace, got {len(labels)}; solve this trace")
+            raise MapError(
+                f"maps[{i}]: labels: expected {len(trace)}, one for each step of the trace, got {len(labels)}; solve this trace"
+            )
         wrong = {(fault.step, fault.kind) for fault in ssh_map.faults}
         links = set(ssh_map.links)
         for t, step in enumerate(trace.steps):
@@ -472,9 +553,15 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
                 raise MapError(
                     f"maps[{i}]: dstates[{labels[t]}].view: expected {brief(step.view)}, as at {trace.at(t)}, got {brief(view)}; solve this trace"
                 )
-            if step.action and (labels[t], step.action.name, labels[t + 1]) not in links and (t, "slipped") not in wrong:
+            if (
+                step.action
+                and (labels[t], step.action.name, labels[t + 1]) not in links
+                and (t, "slipped") not in wrong
+            ):
                 link = [labels[t], step.action.name, labels[t + 1]]
-                raise MapError(f"maps[{i}]: links: expected {brief(link)}, as at {trace.at(t)}, got none; solve this trace")
+                raise MapError(
+                    f"maps[{i}]: links: expected {brief(link)}, as at {trace.at(t)}, got none; solve this trace"
+                )
 
 
 def _sharing(maps: Sequence[SSHMap]) -> str:
@@ -496,17 +583,27 @@ def _sentence(experiment: Experiment) -> str:
             if plan.worst == 1
             else f"which leaves {plan.worst} of them in the worst case; known links tell no more of these"
         )
-        more = "" if all(not branch.plan.branches for branch in plan.branches) else f", and the plan takes {plan.longest} actions at most"
-        greedy = "" if len(experiment.alike) == 2 else " (the plan is greedy: another one may leave fewer or be shorter)"
+        more = (
+            ""
+            if all(not branch.plan.branches for branch in plan.branches)
+            else f", and the plan takes {plan.longest} actions at most"
+        )
+        greedy = (
+            ""
+            if len(experiment.alike) == 2
+            else " (the plan is greedy: another one may leave fewer or be shorter)"
+        )
         return f"{count} maps: {after}, {left}{more}{greedy}"
     if experiment.stopped:
         return f"{count} maps: no experiment was found in time"
     alike = len(experiment.alike) == 1
     why = f"predict the same {'along all links' if alike else 'along all links that all of them know'}"
-    same = {"dstates and places": ", as they have the same dstates and places, and differ in paths alone"}.get(
-        experiment.sharing, ", as they have the same dstates" if experiment.sharing else ""
+    same = {
+        "dstates and places": ", as they have the same dstates and places, and differ in paths alone"
+    }.get(experiment.sharing, ", as they have the same dstates" if experiment.sharing else "")
+    return (
+        f"{count} maps {why}{same}: known links cannot tell them apart{_told_untried(plan.untried)}"
     )
-    return f"{count} maps {why}{same}: known links cannot tell them apart{_told_untried(plan.untried)}"
 
 
 def _told_untried(untried: Untried | None) -> str:
@@ -515,7 +612,11 @@ def _told_untried(untried: Untried | None) -> str:
     way = f", after {_acts(untried.way)}" if untried.way else ""
     if not untried.pairs:
         several = sum(len(expectation.rivals) for expectation in untried.expects) > 1
-        none = "; along these there is no untried action of which they say anything different" if several else ""
+        none = (
+            "; along these there is no untried action of which they say anything different"
+            if several
+            else ""
+        )
         return f"{none}; the nearest untried action is {printable(untried.action)}{way}"
     return f"; the most informative untried action is {printable(untried.action)}{way}"
 
@@ -529,6 +630,11 @@ def told_rivals(rivals: Sequence[int]) -> str:
     return f"{'map' if len(rivals) == 1 else 'maps'} {stretches(rivals)}"
 
 
-def _to_known_views(links: Mapping[int, Mapping[str, int]], ssh_map: SSHMap) -> dict[int, dict[str, int]]:
+def _to_known_views(
+    links: Mapping[int, Mapping[str, int]], ssh_map: SSHMap
+) -> dict[int, dict[str, int]]:
     """The links to dstates whose views are known. What is seen at the others cannot be promised, so that they tell no maps apart."""
-    return {s: {action: x for action, x in tried.items() if ssh_map.dstates[x].view is not None} for s, tried in links.items()}
+    return {
+        s: {action: x for action, x in tried.items() if ssh_map.dstates[x].view is not None}
+        for s, tried in links.items()
+    }

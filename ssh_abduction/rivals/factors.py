@@ -39,7 +39,8 @@ def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] =
     groups = np.zeros(maps, dtype=np.intp)
     # What a question splits becomes less as others are asked. So it need be counted again only when it seems to be the best one.
     waiting = [
-        (tier, -_split(column, groups), i) for i, (column, tier) in enumerate(zip(columns, tiers or [0] * len(columns), strict=True))
+        (tier, -_split(column, groups), i)
+        for i, (column, tier) in enumerate(zip(columns, tiers or [0] * len(columns), strict=True))
     ]
     heapq.heapify(waiting)
     chosen: list[int] = []
@@ -69,9 +70,13 @@ def independent(columns: Sequence[Bools] | Bools) -> list[list[int]]:
         return []
     table = np.unique(np.asarray(columns, dtype=bool), axis=1)
     choices = _linked(table)
-    while (dependent := _dependent([options_of(table[choice], table.shape[1]) for choice in choices])) is not None:
+    while (
+        dependent := _dependent([options_of(table[choice], table.shape[1]) for choice in choices])
+    ) is not None:
         merged = sorted(i for k in dependent for i in choices[k])
-        choices = sorted([choice for k, choice in enumerate(choices) if k not in dependent] + [merged])
+        choices = sorted(
+            [choice for k, choice in enumerate(choices) if k not in dependent] + [merged]
+        )
     return choices
 
 

@@ -54,18 +54,26 @@ class Listing:
         if isinstance(source, Listing):
             return source
         if isinstance(source, Solution):
-            minimal = (source.levels[0].count if source.levels else source.count) if source.status is Status.OPTIMAL else None
+            minimal = (
+                (source.levels[0].count if source.levels else source.count)
+                if source.status is Status.OPTIMAL
+                else None
+            )
             backbone = source.backbone if source.maps else None
             listing = cls(source.maps, minimal, source.minimal_listed, source.stopped, backbone)
             return listing.checked(one_view=_has_one_view(source.theory))
         if isinstance(source, SSHMap):
             source = [source]
         if isinstance(source, str | os.PathLike | Mapping) or not isinstance(source, Iterable):
-            raise MapError(f"maps: expected a solution or maps, got {brief(source)}; read a file with Listing.load")
+            raise MapError(
+                f"maps: expected a solution or maps, got {brief(source)}; read a file with Listing.load"
+            )
         maps = tuple(source)
         for i, ssh_map in enumerate(maps):
             if not isinstance(ssh_map, SSHMap):
-                raise MapError(f"maps[{i}]: expected a map, got {brief(ssh_map)}; give the maps of a solution")
+                raise MapError(
+                    f"maps[{i}]: expected a map, got {brief(ssh_map)}; give the maps of a solution"
+                )
         return cls(maps).checked()
 
     @classmethod
@@ -82,7 +90,9 @@ class Listing:
         for i, (record, ssh_map) in enumerate(zip(told.get("maps", [data]), maps, strict=True)):
             if "id" in record and record["id"] != ssh_map.id:
                 mend = "the map was changed by hand: solve again, or leave the id out"
-                raise MapError(f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got {brief(record['id'])}; {mend}")
+                raise MapError(
+                    f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got {brief(record['id'])}; {mend}"
+                )
         if maps and "steps" in told and told["steps"] != len(maps[0].labels):
             raise MapError(
                 f"{where}: steps: expected {len(maps[0].labels)}, as map 1 has, got {brief(told['steps'])}; solve the trace again"
@@ -90,7 +100,9 @@ class Listing:
         first_with: dict[str, int] = {}
         for i, ssh_map in enumerate(maps):
             if (known := first_with.setdefault(ssh_map.id, i)) != i:
-                raise MapError(f"{where}: maps[{i}]: expected another map, got that of maps[{known}] again; leave it out")
+                raise MapError(
+                    f"{where}: maps[{i}]: expected another map, got that of maps[{known}] again; leave it out"
+                )
         theory = theory_in(told["theory"], where) if "theory" in told else None
         status, count = told.get("status"), told.get("count", len(maps))
         if status is not None and status not in [known.value for known in Status]:
@@ -98,7 +110,9 @@ class Listing:
                 f"{where}: status: expected one of {', '.join(known.value for known in Status)}, got {brief(status)}; solve again"
             )
         if not is_whole(count) or count < 0:
-            raise MapError(f"{where}: count: expected how many minimal maps were found, got {brief(count)}; solve again")
+            raise MapError(
+                f"{where}: count: expected how many minimal maps were found, got {brief(count)}; solve again"
+            )
         levels = told.get("levels")
         minimal: Any = len(maps)
         if levels is not None:
@@ -110,13 +124,19 @@ class Listing:
                 )
         complete = told.get("complete")
         if complete is not None and not isinstance(complete, bool):
-            raise MapError(f"{where}: complete: expected true or false, got {brief(complete)}; solve again")
+            raise MapError(
+                f"{where}: complete: expected true or false, got {brief(complete)}; solve again"
+            )
         backbone = None
         if maps and "backbone" in told:
-            backbone = Backbone.from_dict(told["backbone"], len(maps[0].labels), f"{where}: backbone")
+            backbone = Backbone.from_dict(
+                told["backbone"], len(maps[0].labels), f"{where}: backbone"
+            )
         is_optimal = status == Status.OPTIMAL.value
         listed = complete or (minimal < len(maps)) if is_optimal else complete
-        listing = cls(maps, minimal if is_optimal else None, listed, told.get("stopped"), backbone, where)
+        listing = cls(
+            maps, minimal if is_optimal else None, listed, told.get("stopped"), backbone, where
+        )
         return listing.checked(one_view=theory is None or _has_one_view(theory))
 
     def checked(self, *, one_view: bool = True) -> Listing:
@@ -126,12 +146,16 @@ class Listing:
         """
         a_flag("one_view", one_view, MapError)
         if not self.maps:
-            raise MapError(f"{self.source}: expected maps, got none; see the status that solve gave")
+            raise MapError(
+                f"{self.source}: expected maps, got none; see the status that solve gave"
+            )
         first = None
         for i, ssh_map in enumerate(self.maps):
             if len(ssh_map.labels) != self.steps:
                 mend = "compare maps of one trace"
-                raise MapError(f"{self._name(i)}: expected {self.steps} steps, as {self._name(0)} has, got {len(ssh_map.labels)}; {mend}")
+                raise MapError(
+                    f"{self._name(i)}: expected {self.steps} steps, as {self._name(0)} has, got {len(ssh_map.labels)}; {mend}"
+                )
             if not one_view:
                 continue
             seen = _seen(ssh_map)
@@ -142,11 +166,17 @@ class Listing:
 
     def check_same_trace(self, other: Listing) -> None:
         """Raises MapError where the maps of another listing are of another trace."""
-        an_instance("other", other, Listing, MapError, mend="make one with Listing.of or Listing.load")
+        an_instance(
+            "other", other, Listing, MapError, mend="make one with Listing.of or Listing.load"
+        )
         if other.steps != self.steps:
             mend = "compare maps of one trace"
-            raise MapError(f"{other.source}: expected {self.steps} steps, as the maps of {self.source} have, got {other.steps}; {mend}")
-        for t, (here, there) in enumerate(zip(_seen(self.maps[0]), _seen(other.maps[0]), strict=True)):
+            raise MapError(
+                f"{other.source}: expected {self.steps} steps, as the maps of {self.source} have, got {other.steps}; {mend}"
+            )
+        for t, (here, there) in enumerate(
+            zip(_seen(self.maps[0]), _seen(other.maps[0]), strict=True)
+        ):
             if here != there:
                 raise MapError(
                     f"{other.source}: expected the view {brief(here)} at step {t}, as the maps of {self.source} have, "
@@ -156,7 +186,12 @@ class Listing:
     def number(self, name: str) -> int:
         """Which map is meant, from 0: by its number, counted from 1, or by its id. Raises MapError."""
         text = str(name)
-        if len(text) < ID_LENGTH and text.isdecimal() and text.isascii() and 1 <= int(text) <= len(self.maps):
+        if (
+            len(text) < ID_LENGTH
+            and text.isdecimal()
+            and text.isascii()
+            and 1 <= int(text) <= len(self.maps)
+        ):
             return int(text) - 1
         found = [i for i, ssh_map in enumerate(self.maps) if ssh_map.id == text]
         if not found:
@@ -168,7 +203,9 @@ class Listing:
     def _name(self, i: int) -> str:
         return f"maps[{i}]" if self.source == "maps" else f"{self.source}: maps[{i}]"
 
-    def _raise_other_trace(self, first: tuple[View | None, ...], seen: tuple[View | None, ...], i: int) -> None:
+    def _raise_other_trace(
+        self, first: tuple[View | None, ...], seen: tuple[View | None, ...], i: int
+    ) -> None:
         step = next(t for t, (a, b) in enumerate(zip(first, seen, strict=True)) if a != b)
         raise MapError(
             f"{self._name(i)}: expected the view {brief(first[step])} at step {step}, as {self._name(0)} has, got {brief(seen[step])}; "

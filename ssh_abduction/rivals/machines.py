@@ -48,16 +48,28 @@ class Seen:
         return view if self.star is None else f"{view} {_star_text(self.star)}"
 
     def to_dict(self) -> dict[str, Any]:
-        return {"view": self.view} | ({} if self.star is None else {"star": [_entry(entry) for entry in self.star]})
+        return {"view": self.view} | (
+            {} if self.star is None else {"star": [_entry(entry) for entry in self.star]}
+        )
 
 
 def _entry(entry: Any) -> Any:
-    return entry.to_json() if hasattr(entry, "to_json") else int(entry) if isinstance(entry, bool) else entry
+    return (
+        entry.to_json()
+        if hasattr(entry, "to_json")
+        else int(entry)
+        if isinstance(entry, bool)
+        else entry
+    )
 
 
 def _star_text(star: Sequence[Any]) -> str:
     if all(isinstance(entry, bool) for entry in star):
-        ways = [name for name, is_open in zip(("ahead", "right", "back", "left"), star, strict=True) if is_open]
+        ways = [
+            name
+            for name, is_open in zip(("ahead", "right", "back", "left"), star, strict=True)
+            if is_open
+        ]
         return f"(open: {', '.join(ways) or 'nothing'})"
     return f"({len(star)} gateways)"
 
@@ -82,7 +94,9 @@ class Sights:
         stars = _first_steps(ssh_map) if trace is not None and reading is not None else {}
         return [self._number(s.view, stars.get(s.id), trace, reading) for s in ssh_map.dstates]
 
-    def _number(self, view: View | None, step: int | None, trace: Trace | None, reading: _Reading | None) -> int:
+    def _number(
+        self, view: View | None, step: int | None, trace: Trace | None, reading: _Reading | None
+    ) -> int:
         if step is None or trace is None or reading is None:
             return self._add((view, None), Seen(view))
         key, star = reading(step)
@@ -117,16 +131,28 @@ def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None)
         settled = theory.resolve(trace)
         if settled.star == "none":
             return None
-        return _Reading(trace, settled, sorted({t for ssh_map in maps for t in _first_steps(ssh_map).values()}))
+        return _Reading(
+            trace, settled, sorted({t for ssh_map in maps for t in _first_steps(ssh_map).values()})
+        )
     if trace.in_quarters:
         reading = _Reading(trace, Theory(star="frame"))
         looks = [reading(t)[0] for t in range(len(trace))]
-        is_read = all(len({(label, looks[t]) for t, label in _sound(m)}) == len({label for _, label in _sound(m)}) for m in maps)
+        is_read = all(
+            len({(label, looks[t]) for t, label in _sound(m)})
+            == len({label for _, label in _sound(m)})
+            for m in maps
+        )
         return reading if is_read else None
     stars = [step.gateways or Star(()) for step in trace.steps]
-    if any(not are_alike(stars[_first_steps(m)[label]], stars[t]) for m in maps for t, label in _sound(m)):
+    if any(
+        not are_alike(stars[_first_steps(m)[label]], stars[t])
+        for m in maps
+        for t, label in _sound(m)
+    ):
         return None
-    return _Reading(trace, Theory(star="alike"), sorted({t for m in maps for t in _first_steps(m).values()}))
+    return _Reading(
+        trace, Theory(star="alike"), sorted({t for m in maps for t in _first_steps(m).values()})
+    )
 
 
 def _sound(ssh_map: SSHMap) -> list[tuple[int, int]]:
@@ -149,7 +175,9 @@ def _classes(trace: Trace, steps: Sequence[int]) -> dict[int, int]:
     groups: dict[object, list[list[int]]] = {}  # for each view
     for t in steps:
         known = groups.setdefault(trace.steps[t].view, [])
-        near = [group for group in known if any(are_alike(stars[t], stars[other]) for other in group)]
+        near = [
+            group for group in known if any(are_alike(stars[t], stars[other]) for other in group)
+        ]
         joined = [other for group in near for other in group]
         known[:] = [*(group for group in known if group not in near), [*joined, t]]
     return {t: group[0] for known in groups.values() for group in known for t in group}
@@ -179,7 +207,9 @@ def links_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
     return found
 
 
-def with_ends(links: Mapping[int, Mapping[str, int]], ends: Sequence[tuple[int, str, int]]) -> dict[int, dict[str, int]]:
+def with_ends(
+    links: Mapping[int, Mapping[str, int]], ends: Sequence[tuple[int, str, int]]
+) -> dict[int, dict[str, int]]:
     """Links, and others beside them, in the order of the names of actions."""
     found: dict[int, dict[str, int]] = {s: dict(tried) for s, tried in links.items()}
     for source, action, target in ends:
@@ -187,7 +217,9 @@ def with_ends(links: Mapping[int, Mapping[str, int]], ends: Sequence[tuple[int, 
     return {s: dict(sorted(tried.items())) for s, tried in found.items()}
 
 
-def machine_of(start: int, links: Mapping[int, Mapping[str, int]], sights: Sequence[int]) -> tuple[Machine, tuple[int, ...]]:
+def machine_of(
+    start: int, links: Mapping[int, Mapping[str, int]], sights: Sequence[int]
+) -> tuple[Machine, tuple[int, ...]]:
     """The machine of a map, and the dstate that each of its states is."""
     number, reached = {start: 0}, [start]
     ends: list[tuple[tuple[str, int], ...]] = []
@@ -248,10 +280,14 @@ class Walk:
     ([[[0, 0]], [[1, 1]]], [0])
     """
 
-    def __init__(self, table: Table, group: Sequence[int], start: Row, limits: Limits | None) -> None:
+    def __init__(
+        self, table: Table, group: Sequence[int], start: Row, limits: Limits | None
+    ) -> None:
         self.table, self.group, self._limits = table, np.array(group, np.int32), limits
         self._start = start
-        self._came: list[tuple[int, int]] = [(0, 0)]  # for each row the row before it, and the action
+        self._came: list[tuple[int, int]] = [
+            (0, 0)
+        ]  # for each row the row before it, and the action
 
     def layers(self) -> Iterator[Layer]:
         """The joint states, the nearest first."""
@@ -269,7 +305,11 @@ class Walk:
                         rows.append(there[i])
                         self._came.append((numbers + i, action))
             width = len(self.group)
-            layer = Layer(layer.depth + 1, layer.first + len(layer.rows), np.array(rows, np.int32).reshape(len(rows), width))
+            layer = Layer(
+                layer.depth + 1,
+                layer.first + len(layer.rows),
+                np.array(rows, np.int32).reshape(len(rows), width),
+            )
 
     def moves(self, layer: Layer) -> Iterator[tuple[int, int, Array, Array]]:
         """For parts of a layer and each action: the number of the part's first row, the action, where it leads, and what is seen there."""

@@ -69,7 +69,9 @@ class Table:
 
     def heads(self, sort: Sort) -> Ints:
         """For each class the first class that goes with it in every map: they are one in all maps, or have no place, path or course in the same ones."""
-        _, first, inverse = np.unique(self.ones[sort], axis=1, return_index=True, return_inverse=True)
+        _, first, inverse = np.unique(
+            self.ones[sort], axis=1, return_index=True, return_inverse=True
+        )
         return first[inverse.reshape(-1)].astype(np.int32)
 
     def questions(self, sort: Sort) -> Iterator[tuple[int, int, Bools]]:
@@ -90,14 +92,21 @@ class Table:
     def shared(self) -> Backbone:
         """What these maps share."""
         found = {sort: self._shared(ones) for sort, ones in self.ones.items()}
-        return Backbone(found["dstates"], found.get("places"), found.get("paths"), found.get("courses"), proven=False)
+        return Backbone(
+            found["dstates"],
+            found.get("places"),
+            found.get("paths"),
+            found.get("courses"),
+            proven=False,
+        )
 
     def _shared(self, ones: Ints) -> Shared:
         _, column = np.unique(ones, axis=1, return_inverse=True)
         number: dict[Hashable, int] = {}
         named = (ones != NONE).all(axis=0).tolist()
         of_class = [
-            number.setdefault(("one", k) if named[c] else ("own", c), len(number)) for c, k in enumerate(column.reshape(-1).tolist())
+            number.setdefault(("one", k) if named[c] else ("own", c), len(number))
+            for c, k in enumerate(column.reshape(-1).tolist())
         ]
         heads = [of_class.index(n) for n in range(len(number))]
         columns = ones[:, heads]
@@ -127,7 +136,10 @@ def _common_classes(labelings: Sequence[Ints]) -> Ints:
 def _firsts_of(names: Sequence[Hashable]) -> Ints:
     """For each name where it comes first; NONE for no name."""
     first: dict[Hashable, int] = {}
-    return np.array([NONE if name is None else first.setdefault(name, i) for i, name in enumerate(names)], dtype=np.int32)
+    return np.array(
+        [NONE if name is None else first.setdefault(name, i) for i, name in enumerate(names)],
+        dtype=np.int32,
+    )
 
 
 def _name(dstate: DState, sort: Sort) -> Hashable:
@@ -135,4 +147,6 @@ def _name(dstate: DState, sort: Sort) -> Hashable:
         return dstate.id
     if sort == "places":
         return dstate.place
-    return dstate.path if sort == "paths" or dstate.path is None else (dstate.path, dstate.direction)
+    return (
+        dstate.path if sort == "paths" or dstate.path is None else (dstate.path, dstate.direction)
+    )

@@ -49,7 +49,9 @@ from ssh_abduction.rivals.machines import Seen, links_of
 from ssh_abduction.theory.theory import Theory
 
 T = TypeVar("T")
-Copy: TypeAlias = tuple[int, int]  # a place, and 0, or the step of a return to it that is not believed
+Copy: TypeAlias = tuple[
+    int, int
+]  # a place, and 0, or the step of a return to it that is not believed
 How: TypeAlias = Literal["known", "implied", "expected", "unknown"]
 # What an unknown move costs, in actions: there and back, and a turn there.
 THERE_AND_BACK = 3
@@ -98,7 +100,13 @@ def next_tour(
     """
     if margin and ssh_map.places:
         ssh_map = _doubted(ssh_map, trace, margin)
-    stances = _Stances(ssh_map, trace, (theory or Theory.topological()).resolve(trace), [*map(Action.of, actions)], can)
+    stances = _Stances(
+        ssh_map,
+        trace,
+        (theory or Theory.topological()).resolve(trace),
+        [*map(Action.of, actions)],
+        can,
+    )
     start, moves = ssh_map.labels[-1], stances.moves()
     near = _reached(moves, start)
     moves = [move for move in moves if move.source in near]
@@ -130,16 +138,31 @@ def _doubted(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
             break
         believed |= more
     numbers: dict[tuple[Copy, int], int] = {}
-    labels = tuple(numbers.setdefault(pair, len(numbers)) for pair in zip(at, ssh_map.labels, strict=True))
+    labels = tuple(
+        numbers.setdefault(pair, len(numbers)) for pair in zip(at, ssh_map.labels, strict=True)
+    )
     places: dict[Copy, int] = {}
     return replace(
         ssh_map,
         labels=labels,
         dstates=tuple(
-            replace(ssh_map.dstates[label], id=n, place=places.setdefault(copy, n), path=None, direction=None)
+            replace(
+                ssh_map.dstates[label],
+                id=n,
+                place=places.setdefault(copy, n),
+                path=None,
+                direction=None,
+            )
             for (copy, label), n in numbers.items()
         ),
-        links=tuple(sorted({(one, action.name, other) for (one, other), action in zip(pairwise(labels), trace.actions, strict=True)})),
+        links=tuple(
+            sorted(
+                {
+                    (one, action.name, other)
+                    for (one, other), action in zip(pairwise(labels), trace.actions, strict=True)
+                }
+            )
+        ),
         places=tuple(places.values()),
         paths=(),
     )
@@ -158,7 +181,9 @@ def _copies(ssh_map: SSHMap, trace: Trace, believed: Collection[int]) -> list[Co
             at.append(here)
             continue
         tried = here, ssh_map.labels[t - 1], action.name
-        there = leads.get(tried) or next((copy for copy in came.get(here, ()) if copy[0] == place), None)
+        there = leads.get(tried) or next(
+            (copy for copy in came.get(here, ()) if copy[0] == place), None
+        )
         if there is None:
             there = (place, t) if place in known and t not in believed else (place, 0)
         known.add(place)
@@ -171,7 +196,14 @@ def _copies(ssh_map: SSHMap, trace: Trace, believed: Collection[int]) -> list[Co
 class _Stances:
     """Where a robot may stand, and face: the dstates of a map, by number, and then what is a turn away from them and was never seen."""
 
-    def __init__(self, ssh_map: SSHMap, trace: Trace, theory: Theory, actions: Sequence[Action], can: Can | None) -> None:
+    def __init__(
+        self,
+        ssh_map: SSHMap,
+        trace: Trace,
+        theory: Theory,
+        actions: Sequence[Action],
+        can: Can | None,
+    ) -> None:
         self._links = links_of(ssh_map, 0)
         self._actions = {action.name: action for action in (*actions, *trace.actions)}
         self._can = can
@@ -180,7 +212,10 @@ class _Stances:
         for label, step in zip(ssh_map.labels, trace.steps, strict=True):
             first.setdefault(label, step)
         self._looks = [first[s.id] for s in ssh_map.dstates]
-        self._stars = [Star.of(step.star) if step.star is not None and theory.star != "none" else None for step in self._looks]
+        self._stars = [
+            Star.of(step.star) if step.star is not None and theory.star != "none" else None
+            for step in self._looks
+        ]
         self._frames = [_frame(star) for star in self._stars]
         self._at: list[tuple[int, float]] = [
             (s.place or 0, 90.0 * (s.heading or 0)) for s in ssh_map.dstates
@@ -196,7 +231,11 @@ class _Stances:
         """All moves from all stances. As it goes on, stances come to light that were never seen."""
         for source, tried in self._links.items():
             for name, target in tried.items():
-                if self._actions[name].kind == "travel" and self._frames[source] and self._frames[target]:
+                if (
+                    self._actions[name].kind == "travel"
+                    and self._frames[source]
+                    and self._frames[target]
+                ):
                     self._back.setdefault(self._around(target), self._around(source))
         found: list[Move] = []
         n = 0
@@ -210,7 +249,11 @@ class _Stances:
         turns: dict[int, list[tuple[int, float]]] = {n: [] for n in self._links}
         for n, tried in self._links.items():
             for name, target in tried.items():
-                degrees = _degrees(self._actions[name], self._frames[n]) if self._actions[name].kind == "turn" else None
+                degrees = (
+                    _degrees(self._actions[name], self._frames[n])
+                    if self._actions[name].kind == "turn"
+                    else None
+                )
                 if degrees is not None:
                     turns[n].append((target, degrees))
                     turns[target].append((n, -degrees))
@@ -232,16 +275,24 @@ class _Stances:
         if n < len(self._looks):
             step = self._looks[n]
             seen = Seen(step.view, step.star if self._stars[n] else None)
-            names = self._actions.keys() if self._can is None else {*self._can(seen), *self._links[n]}
+            names = (
+                self._actions.keys() if self._can is None else {*self._can(seen), *self._links[n]}
+            )
             return [
-                action for name, action in self._actions.items() if name in names and (name in self._links[n] or is_possible(action, seen))
+                action
+                for name, action in self._actions.items()
+                if name in names and (name in self._links[n] or is_possible(action, seen))
             ]
         frame = self._frames[n]
         assert frame is not None
         return [
             action
             for action in self._actions.values()
-            if (_faces(frame) is not None if action.kind == "travel" else action.kind == "turn" and _degrees(action, frame) is not None)
+            if (
+                _faces(frame) is not None
+                if action.kind == "travel"
+                else action.kind == "turn" and _degrees(action, frame) is not None
+            )
         ]
 
     def _move(self, n: int, action: Action) -> Move:
@@ -249,11 +300,20 @@ class _Stances:
             return Move(n, action, self._links[n][action.name], "known")
         frame = self._frames[n]
         if frame is not None and action.kind == "travel":
-            return Move(n, action, self._back[n], "expected") if n in self._back else Move(n, action, self._around(n), "unknown")
+            return (
+                Move(n, action, self._back[n], "expected")
+                if n in self._back
+                else Move(n, action, self._around(n), "unknown")
+            )
         degrees = _degrees(action, frame) if action.kind == "turn" else None
         if degrees is None:
             return Move(n, action, n, "unknown")
-        return Move(n, action, self._turned(n, degrees), "implied" if self._implies and action.in_quarters else "expected")
+        return Move(
+            n,
+            action,
+            self._turned(n, degrees),
+            "implied" if self._implies and action.in_quarters else "expected",
+        )
 
     def _around(self, n: int) -> int:
         """The stance that a turn around leads to."""
@@ -272,7 +332,12 @@ class _Stances:
             return near
         self._at.append((room, goal))
         self._in[room].append(len(self._at) - 1)
-        turned = Star(tuple(replace(gateway, bearing=(gateway.bearing - degrees) % 360) for gateway in star.gateways))
+        turned = Star(
+            tuple(
+                replace(gateway, bearing=(gateway.bearing - degrees) % 360)
+                for gateway in star.gateways
+            )
+        )
         self._stars.append(turned)
         self._frames.append(_frame(turned))
         return len(self._at) - 1
@@ -338,10 +403,15 @@ def _walk(moves: Sequence[Move], start: int, due: set[int], unseen: set[int]) ->
     actions: list[str] = []
     at = start
     while left:
-        choices = sorted((k for k in left if moves[k].source == at), key=lambda k: (moves[k].how != "unknown", k not in due, k))
+        choices = sorted(
+            (k for k in left if moves[k].source == at),
+            key=lambda k: (moves[k].how != "unknown", k not in due, k),
+        )
         for k in choices:
             after = {j: n - (j == k) for j, n in left.items() if n > (j == k)}
-            if {moves[j].source for j in after} <= _reached([moves[j] for j in after], moves[k].target):
+            if {moves[j].source for j in after} <= _reached(
+                [moves[j] for j in after], moves[k].target
+            ):
                 break
         else:
             return ()
@@ -353,7 +423,12 @@ def _walk(moves: Sequence[Move], start: int, due: set[int], unseen: set[int]) ->
 
 
 def shortest_flow(
-    moves: Sequence[Move], start: int, due: set[int], unseen: set[int], rounds: int = ROUNDS, patience: float = PATIENCE
+    moves: Sequence[Move],
+    start: int,
+    due: set[int],
+    unseen: set[int],
+    rounds: int = ROUNDS,
+    patience: float = PATIENCE,
 ) -> list[int] | None:
     """How often each move is made on the shortest walk that makes those that are due and gets to what is unseen; None where there is none, or no time.
 
@@ -364,10 +439,20 @@ def shortest_flow(
     """
     number = {n: i for i, n in enumerate(sorted(_reached(moves, start)))}
     m, size = len(moves), len(number)
-    sources, targets = (np.array([number[n] for n in ends]) for ends in ([x.source for x in moves], [x.target for x in moves]))
-    kinds = [np.arange(m), np.arange(m), m + np.arange(size)]  # columns: each move, and whether a stance is the last one
+    sources, targets = (
+        np.array([number[n] for n in ends])
+        for ends in ([x.source for x in moves], [x.target for x in moves])
+    )
+    kinds = [
+        np.arange(m),
+        np.arange(m),
+        m + np.arange(size),
+    ]  # columns: each move, and whether a stance is the last one
     balance = coo_array(
-        (np.r_[np.ones(m), -np.ones(m), -np.ones(size)], (np.r_[targets, sources, np.arange(size)], np.concatenate(kinds))),
+        (
+            np.r_[np.ones(m), -np.ones(m), -np.ones(size)],
+            (np.r_[targets, sources, np.arange(size)], np.concatenate(kinds)),
+        ),
         (size, m + size),
     ).tocsr()
     enters = coo_array((np.ones(m), (targets, np.arange(m))), (size, m + size)).tocsr()
@@ -379,9 +464,18 @@ def shortest_flow(
         *([LinearConstraint(enters[rows], 1, np.inf)] if rows else []),
     ]
     costs = np.r_[[float(move.cost) for move in moves], np.zeros(size)]
-    bounds = Bounds(np.r_[[float(k in due) for k in range(m)], np.zeros(size)], np.r_[np.full(m, float(size)), np.ones(size)])
+    bounds = Bounds(
+        np.r_[[float(k in due) for k in range(m)], np.zeros(size)],
+        np.r_[np.full(m, float(size)), np.ones(size)],
+    )
     for _ in range(rounds):
-        found = milp(costs, constraints=rules, integrality=np.ones(m + size), bounds=bounds, options={"time_limit": patience})
+        found = milp(
+            costs,
+            constraints=rules,
+            integrality=np.ones(m + size),
+            bounds=bounds,
+            options={"time_limit": patience},
+        )
         if found.x is None:
             return None
         times = np.round(found.x[:m]).astype(int)
@@ -390,9 +484,17 @@ def shortest_flow(
         if not parts:
             break
         for part in parts:
-            entering = [k for k, move in enumerate(moves) if move.target in part and move.source not in part]
+            entering = [
+                k for k, move in enumerate(moves) if move.target in part and move.source not in part
+            ]
             rules.append(
-                LinearConstraint(coo_array((np.ones(len(entering)), ([0] * len(entering), entering)), (1, m + size)).tocsr(), 1, np.inf)
+                LinearConstraint(
+                    coo_array(
+                        (np.ones(len(entering)), ([0] * len(entering), entering)), (1, m + size)
+                    ).tocsr(),
+                    1,
+                    np.inf,
+                )
             )
     near = _reached([move for move, n in zip(moves, times, strict=True) if n], start)
     return [int(n) if move.source in near else 0 for move, n in zip(moves, times, strict=True)]
@@ -404,7 +506,10 @@ def _parts_cut_off(used: Sequence[Move], start: int) -> list[set[int]]:
     left = [move for move in used if move.source not in near]
     parts: list[set[int]] = []
     while left:
-        part = _reached([*left, *(replace(move, source=move.target, target=move.source) for move in left)], left[0].source)
+        part = _reached(
+            [*left, *(replace(move, source=move.target, target=move.source) for move in left)],
+            left[0].source,
+        )
         parts.append(part)
         left = [move for move in left if move.source not in part]
     return parts

@@ -114,7 +114,10 @@ class LogMap:
     def files(self) -> dict[str, bytes]:
         """The folder of a run, by name: trace.jsonl, maps.json, page.html, report.html and run.json, which comes last."""
         trace, solution = self.imported.trace, self.solution
-        found = {"trace.jsonl": "".join(f"{line}\n" for line in trace.to_lines()), "maps.json": f"{json_line(solution.to_dict())}\n"}
+        found = {
+            "trace.jsonl": "".join(f"{line}\n" for line in trace.to_lines()),
+            "maps.json": f"{json_line(solution.to_dict())}\n",
+        }
         if solution.maps:
             found["page.html"] = view_page(solution, trace).html
         found["report.html"] = report(self.log, self.imported, solution, self.rungs, self.to_dict())
@@ -131,7 +134,11 @@ def seconds_driven(log: RobotLog) -> float | None:
     """Seconds that the robot drove, by the clock of a log; None where its times are cut, wrapped or missing."""
     times = [scan.time for scan in log.scans if scan.time is not None]
     steps = [later - earlier for earlier, later in itertools.pairwise(times)]
-    if not steps or any(step < 0 for step in steps) or sum(step > 0 for step in steps) < len(steps) / 2:
+    if (
+        not steps
+        or any(step < 0 for step in steps)
+        or sum(step > 0 for step in steps) < len(steps) / 2
+    ):
         return None
     usual = median(step for step in steps if step > 0)
     return math.fsum(step for step in steps if step < GAP * usual) or None
@@ -187,18 +194,26 @@ def map_log(
     _log.info("%d visits, %d steps", len(imported.visits), len(imported.trace))
     chosen = (theory or theory_for(imported)).replace(**choices or {})
     left = seconds_left(log, imported)
-    allowed = max(left * (1 - LADDER if with_ladder else 1), LEAST) if time_limit is None else time_limit
+    allowed = (
+        max(left * (1 - LADDER if with_ladder else 1), LEAST) if time_limit is None else time_limit
+    )
     notes = imported.notes
     climbed: list[Rung] = []
 
     def outcome(solution: Solution, interrupted: bool = True) -> LogMap:
         said = (*notes, INTERRUPTED) if interrupted else notes
-        return LogMap(log, imported, solution, tuple(climbed), dict(seconds), allowed, said, interrupted)
+        return LogMap(
+            log, imported, solution, tuple(climbed), dict(seconds), allowed, said, interrupted
+        )
 
     mapping.known = lambda: outcome(mapping.snapshot())
     begin = time.process_time()
     solution = mapping.solve(imported.trace, chosen, time_limit=allowed, max_maps=max_maps)
-    if solution.status is Status.UNSATISFIABLE and theory is None and not {"star", "boundary", "level"} & set(choices or ()):
+    if (
+        solution.status is Status.UNSATISFIABLE
+        and theory is None
+        and not {"star", "boundary", "level"} & set(choices or ())
+    ):
         bare = BARE.replace(**choices or {})
         if bare != chosen:
             chosen, notes = bare, (*notes, NO_STARS)
@@ -209,6 +224,14 @@ def map_log(
         begin, stars = time.process_time(), chosen.star != "none"
         share = (left - seconds["maps"]) / len(list(rungs(imported.trace, chosen, stars)))
         most = min(max(share, LEAST_RUNG), RUNG)
-        climbed += ladder(imported.trace, chosen, time_limit=most, max_maps=1, stars=stars, known=solution, under_way=mapping)
+        climbed += ladder(
+            imported.trace,
+            chosen,
+            time_limit=most,
+            max_maps=1,
+            stars=stars,
+            known=solution,
+            under_way=mapping,
+        )
         seconds["ladder"] = round(time.process_time() - begin, 3)
     return outcome(solution, mapping.interrupted)

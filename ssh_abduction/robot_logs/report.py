@@ -42,7 +42,13 @@ code { overflow-wrap: anywhere }
 """
 
 
-def report(log: RobotLog, imported: Imported, solution: Solution, rungs: Sequence[Rung], run: Mapping[str, Any]) -> str:
+def report(
+    log: RobotLog,
+    imported: Imported,
+    solution: Solution,
+    rungs: Sequence[Rung],
+    run: Mapping[str, Any],
+) -> str:
     """The page, as HTML that loads nothing.
 
     run  what run.json holds
@@ -53,7 +59,9 @@ def report(log: RobotLog, imported: Imported, solution: Solution, rungs: Sequenc
         *map(_paragraph, [_summary(solution, run), *run["notes"]]),
         _figure(log, imported, solution),
         "<h2>What each kind of evidence is worth</h2>" + _ladder(rungs) if rungs else "",
-        "<h2>Rival maps</h2>" + _paragraph(solution.summary or "There is no other minimal map.") if solution.maps else "",
+        "<h2>Rival maps</h2>" + _paragraph(solution.summary or "There is no other minimal map.")
+        if solution.maps
+        else "",
         "<h2>What the map disbelieves</h2>" + _faults(solution) if solution.maps else "",
         "<h2>Settings</h2>" + _settings(run),
         "<h2>Time</h2>" + _time(run),
@@ -63,7 +71,9 @@ def report(log: RobotLog, imported: Imported, solution: Solution, rungs: Sequenc
     return (
         f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">"
-        f"<title>{escaped(name)}</title><style>{STYLE}</style>\n" + "\n".join(part for part in parts if part) + "\n</html>\n"
+        f"<title>{escaped(name)}</title><style>{STYLE}</style>\n"
+        + "\n".join(part for part in parts if part)
+        + "\n</html>\n"
     )
 
 
@@ -77,7 +87,9 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
         if solution.complete and solution.count == 1
         else f"{'' if solution.complete else 'at least '}{solution.count} minimal maps"
     )
-    proven = of if solution.status.value == "optimal" else "a map without a proof that it is minimal"
+    proven = (
+        of if solution.status.value == "optimal" else "a map without a proof that it is minimal"
+    )
     return f"{seen} {cost.places} places, {cost.paths} paths, {cost.dstates} distinctive states: {proven}."
 
 
@@ -85,14 +97,21 @@ def _figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
     """The map over the scans."""
     corrected = all(scan.corrected is not None for scan in log.scans)
     poses: list[Pose] = (
-        [scan.corrected or (0.0, 0.0, 0.0) for scan in log.scans] if corrected else [_pose(row) for row in imported.track.poses]
+        [scan.corrected or (0.0, 0.0, 0.0) for scan in log.scans]
+        if corrected
+        else [_pose(row) for row in imported.track.poses]
     )
     walls = _walls(log, poses)
     spots = {
-        number: moved(poses[visit.scan], between(_pose(imported.track.poses[visit.scan]), (*_xy(visit.middle), 0.0)))[:2]
+        number: moved(
+            poses[visit.scan],
+            between(_pose(imported.track.poses[visit.scan]), (*_xy(visit.middle), 0.0)),
+        )[:2]
         for number, visit in enumerate(imported.visits)
     }
-    extent = np.ptp(np.concatenate([walls, [p[:2] for p in poses]]), axis=0).max() if len(walls) else 1.0
+    extent = (
+        np.ptp(np.concatenate([walls, [p[:2] for p in poses]]), axis=0).max() if len(walls) else 1.0
+    )
     unit = min(METRE, LARGEST / max(float(extent), 1.0))
 
     def on_page(point: Sequence[float]) -> Point:
@@ -103,37 +122,59 @@ def _figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
     marks = [
         f'<path d="{dots}" stroke="#9a9a9a" stroke-width="{max(GRAIN * unit * 0.7, 1):.1f}" stroke-linecap="round" fill="none"/>',
         f'<polyline points="{way}" fill="none" stroke="#b9c7d6" stroke-width="1"/>',
-        *_streets(imported, solution.maps[0] if solution.maps else None, {n: on_page(p) for n, p in spots.items()}),
+        *_streets(
+            imported,
+            solution.maps[0] if solution.maps else None,
+            {n: on_page(p) for n, p in spots.items()},
+        ),
     ]
-    poses_said = "corrected poses of the log, which were not read for the map" if corrected else "the poses of the track, which drifts"
+    poses_said = (
+        "corrected poses of the log, which were not read for the map"
+        if corrected
+        else "the poses of the track, which drifts"
+    )
     points = [on_page(p) for p in walls] + [on_page(p[:2]) for p in poses]
     picture = page(marks, points or [(0.0, 0.0)], margin=20)
     return f"<figure>{picture}<figcaption>The {'first map' if solution.maps else 'visits'} over the scans, at {poses_said}. Numbers are places; small dots are visits.</figcaption></figure>"
 
 
-def _streets(imported: Imported, ssh_map: SSHMap | None, spots: Mapping[int, Point]) -> Iterator[str]:
+def _streets(
+    imported: Imported, ssh_map: SSHMap | None, spots: Mapping[int, Point]
+) -> Iterator[str]:
     """The streets between visits, and the places: each in the mean of where it was visited."""
     trace = imported.trace
     if ssh_map is None:
-        yield from (f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="#d55e00"/>' for x, y in spots.values())
+        yield from (
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="#d55e00"/>' for x, y in spots.values()
+        )
         return
     of_label = {state.id: state for state in ssh_map.dstates}
     visit_of = [int(step.extra["visit"]) for step in trace.steps]
-    place_of = {visit: of_label[label].place for visit, label in zip(visit_of, ssh_map.labels, strict=True)}
+    place_of = {
+        visit: of_label[label].place for visit, label in zip(visit_of, ssh_map.labels, strict=True)
+    }
     visited: dict[int | None, list[Point]] = {}
     for visit, place in place_of.items():
         visited.setdefault(place, []).append(spots[visit])
-    middle = {place: (float(np.mean([x for x, _ in at])), float(np.mean([y for _, y in at]))) for place, at in visited.items()}
+    middle = {
+        place: (float(np.mean([x for x, _ in at])), float(np.mean([y for _, y in at])))
+        for place, at in visited.items()
+    }
     for (t, before), (_, after) in pairwise(enumerate(ssh_map.labels)):
         if trace.actions[t].kind == "travel":
-            a, b, path = middle[of_label[before].place], middle[of_label[after].place], of_label[before].path
+            a, b, path = (
+                middle[of_label[before].place],
+                middle[of_label[after].place],
+                of_label[before].path,
+            )
             colour = COLOURS[(path or 0) % len(COLOURS)]
             yield f'<path d="M{a[0]:.1f} {a[1]:.1f}L{b[0]:.1f} {b[1]:.1f}" stroke="{colour}" stroke-width="5" stroke-opacity=".75" fill="none"/>'
     yield from (f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="#444"/>' for x, y in spots.values())
     for place, (x, y) in middle.items():
         if place is not None:
-            yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="11" fill="white" stroke="#222" stroke-width="2"/>' + text(
-                x, y, str(place), "#222", 12, "bold"
+            yield (
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="11" fill="white" stroke="#222" stroke-width="2"/>'
+                + text(x, y, str(place), "#222", 12, "bold")
             )
 
 
@@ -144,7 +185,12 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
         x, y, heading = moved(pose, scan.laser.mount)
         near = np.isfinite(scan.ranges) & (scan.ranges < min(DRAWN, scan.laser.reach))
         angles = heading + scan.laser.bearings[near]
-        found.append(np.stack([x + scan.ranges[near] * np.cos(angles), y + scan.ranges[near] * np.sin(angles)], axis=1))
+        found.append(
+            np.stack(
+                [x + scan.ranges[near] * np.cos(angles), y + scan.ranges[near] * np.sin(angles)],
+                axis=1,
+            )
+        )
     cells = np.rint(np.concatenate(found) / GRAIN).astype(int)
     kept, counts = np.unique(cells, axis=0, return_counts=True)
     return np.asarray(kept[counts > (1 if len(log) > 100 else 0)] * GRAIN)
@@ -155,7 +201,9 @@ def _ladder(rungs: Sequence[Rung]) -> str:
     for rung in rungs:
         cost = rung.solution.cost
         counts = (cost.dstates, cost.places, cost.paths) if cost else ("–", "–", "–")
-        rows.append((rung.name, rung.solution.status.value, *counts, f"{rung.solution.seconds.total:.1f} s"))
+        rows.append(
+            (rung.name, rung.solution.status.value, *counts, f"{rung.solution.seconds.total:.1f} s")
+        )
     return _table(("evidence", "status", "dstates", "places", "paths", "time"), rows)
 
 
@@ -163,12 +211,20 @@ def _faults(solution: Solution) -> str:
     faults = solution.maps[0].faults
     if not faults:
         allowed = solution.theory.misread or solution.theory.slipped or solution.theory.jumped
-        return _paragraph("Nothing." if allowed else "Nothing: the theory allows no faults (--misread 4 would).")
-    return _table(("step", "what", "seen", "cost"), [(f.step, f.kind, f.seen, f.cost) for f in faults])
+        return _paragraph(
+            "Nothing." if allowed else "Nothing: the theory allows no faults (--misread 4 would)."
+        )
+    return _table(
+        ("step", "what", "seen", "cost"), [(f.step, f.kind, f.seen, f.cost) for f in faults]
+    )
 
 
 def _settings(run: Mapping[str, Any]) -> str:
-    theory = ", ".join(f"{name} {value}" for name, value in run["theory"].items() if value not in (None, False, [], 0))
+    theory = ", ".join(
+        f"{name} {value}"
+        for name, value in run["theory"].items()
+        if value not in (None, False, [], 0)
+    )
     rows = (
         [
             ("places", "doors", "those that the robot drove through; a path leads across a room"),
@@ -177,9 +233,21 @@ def _settings(run: Mapping[str, Any]) -> str:
         if run["scale"]["doors"]
         else [
             ("places", "junctions, corners, dead ends", "where ways part or bend"),
-            ("gateway", f"{run['scale']['gateway']:g} m", "the least width of a way out that counts"),
-            ("radius", f"{run['scale']['radius']:g} m", "how far a way out must lead from the middle of a place"),
-            ("walls", "right angles" if run["right_angles"] else "any angles", "as the ways that the robot took suggest"),
+            (
+                "gateway",
+                f"{run['scale']['gateway']:g} m",
+                "the least width of a way out that counts",
+            ),
+            (
+                "radius",
+                f"{run['scale']['radius']:g} m",
+                "how far a way out must lead from the middle of a place",
+            ),
+            (
+                "walls",
+                "right angles" if run["right_angles"] else "any angles",
+                "as the ways that the robot took suggest",
+            ),
             ("theory", theory, "the axioms, and the choices in them"),
         ]
     )
@@ -188,7 +256,10 @@ def _settings(run: Mapping[str, Any]) -> str:
 
 def _time(run: Mapping[str, Any]) -> str:
     total = math.fsum(run["seconds"].values())
-    rows = [(stage, f"{seconds:.2f} s", f"{100 * seconds / max(total, 1e-9):.0f} %") for stage, seconds in run["seconds"].items()]
+    rows = [
+        (stage, f"{seconds:.2f} s", f"{100 * seconds / max(total, 1e-9):.0f} %")
+        for stage, seconds in run["seconds"].items()
+    ]
     told = f"All stages together took {total:.1f} s of processor time"
     if run["drove"]:
         told = f"The robot drove {run['drove']:.0f} s. {told}, a share of 1/{run['drove'] / max(total, 1e-9):.0f}"
@@ -200,7 +271,9 @@ def _time(run: Mapping[str, Any]) -> str:
 def _log(log: RobotLog, run: Mapping[str, Any]) -> str:
     said = [f"{log.source}: {log.format}, {len(log)} scans.", *log.notes]
     if log.damaged:
-        said.append(f"Skipped: {counted(len(log.damaged), 'damaged parts')} of the log. The first ones:")
+        said.append(
+            f"Skipped: {counted(len(log.damaged), 'damaged parts')} of the log. The first ones:"
+        )
         said += [f"{damage.line}: {damage.what}" for damage in log.damaged[:10]]
     return "<ul>" + "".join(f"<li>{escaped(line)}</li>" for line in said) + "</ul>"
 
@@ -212,7 +285,11 @@ def _visits(imported: Imported, solution: Solution) -> str:
     for t, step in enumerate(imported.trace.steps):
         state = states[labels[t]] if labels else None
         star = " ".join(
-            "?" if entry is None else f"{entry:g}" if isinstance(entry, int | float) else f"{entry.bearing:g}°{'' if entry.open else '?'}"
+            "?"
+            if entry is None
+            else f"{entry:g}"
+            if isinstance(entry, int | float)
+            else f"{entry.bearing:g}°{'' if entry.open else '?'}"
             for entry in step.star or ()
         )
         rows.append(
@@ -232,7 +309,9 @@ def _visits(imported: Imported, solution: Solution) -> str:
 
 def _table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
     titles = "".join(f"<th>{escaped(str(cell))}</th>" for cell in head)
-    body = "".join("<tr>" + "".join(f"<td>{escaped(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{escaped(str(cell))}</td>" for cell in row) + "</tr>" for row in rows
+    )
     return f"<table><tr>{titles}</tr>{body}</table>"
 
 

@@ -10,7 +10,14 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ssh_abduction.solver.asp import facts, workers
     from ssh_abduction.solver.asp.control import has_processors
-    from ssh_abduction.solver.asp.limits import POLL, LimitError, Stop, Watch, check_limit, resident_memory
+    from ssh_abduction.solver.asp.limits import (
+        POLL,
+        LimitError,
+        Stop,
+        Watch,
+        check_limit,
+        resident_memory,
+    )
     from ssh_abduction.solver.asp.process import end_all, in_process
     from ssh_abduction.solver.asp.rules import check_rules
     from ssh_abduction.solver.engines.base import AT_ONCE, Cost, Task, cost_as_counted
@@ -21,7 +28,15 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.judging import InternalError, Judging
     from ssh_abduction.solver.ranking import Ranking
     from ssh_abduction.solver.recorded import theory_in
-    from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status, summary_of
+    from ssh_abduction.solver.result import (
+        Bound,
+        Level,
+        Progress,
+        Seconds,
+        Solution,
+        Status,
+        summary_of,
+    )
     from ssh_abduction.solver.search import Search, solve
     from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, Sharing, stretches
     from ssh_abduction.solver.steps.certificate import RESTS_ON, Certificate

@@ -60,7 +60,13 @@ class Rivals:
 
     def __getstate__(self) -> dict[str, object]:
         """What is known goes to other processes; what it takes to find out more does not."""
-        return {"sharing": self.sharing, "listed": self.listed, "engine": None, "_proven": self._proven, "_reasoned": True}
+        return {
+            "sharing": self.sharing,
+            "listed": self.listed,
+            "engine": None,
+            "_proven": self._proven,
+            "_reasoned": True,
+        }
 
     def add(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
         """Take in a minimal map, and what it costs: the preferred counts, first to last."""
@@ -79,17 +85,27 @@ class Rivals:
         if anew:
             self._task.watch.begin_anew()
         with suppress(LimitError, StageTimeError, KeyboardInterrupt):
-            self._proven = prove_backbone(self._task, self._judging, self._cost, self.sharing, self.engine)
+            self._proven = prove_backbone(
+                self._task, self._judging, self._cost, self.sharing, self.engine
+            )
         _log.info("what all minimal maps share is %s", "proven" if self._proven else "not proven")
         self.engine = None
 
     @property
     def backbone(self) -> Backbone | None:
         """What the minimal maps share that are known; None where none is."""
-        return self.sharing.backbone(proven=self.listed or self._proven) if self.sharing.maps else None
+        return (
+            self.sharing.backbone(proven=self.listed or self._proven) if self.sharing.maps else None
+        )
 
 
-def prove_backbone(task: Task, judging: Judging, cost: tuple[int, ...], sharing: Sharing, engine: Engine | None = None) -> bool:
+def prove_backbone(
+    task: Task,
+    judging: Judging,
+    cost: tuple[int, ...],
+    sharing: Sharing,
+    engine: Engine | None = None,
+) -> bool:
     """Let minimal maps be taken in until those share only what all minimal maps of the trace share. Raises LimitError.
 
     cost     what minimal maps cost: the preferred counts, first to last
@@ -109,7 +125,9 @@ def prove_backbone(task: Task, judging: Judging, cost: tuple[int, ...], sharing:
 class _Reasoning:
     """Asks for minimal maps in which other steps are one than in those that are known."""
 
-    def __init__(self, task: Task, judging: Judging, cost: tuple[int, ...], sharing: Sharing) -> None:
+    def __init__(
+        self, task: Task, judging: Judging, cost: tuple[int, ...], sharing: Sharing
+    ) -> None:
         self._task, self._judging, self._cost, self._sharing = task, judging, cost, sharing
 
     def settle_labels(self, engine: Engine) -> bool:
@@ -131,7 +149,9 @@ class _Reasoning:
                 if failed or refused:
                     break
             if refused:
-                of_prefix = all(max(equality.first, equality.second) < engine.size for equality in refused)
+                of_prefix = all(
+                    max(equality.first, equality.second) < engine.size for equality in refused
+                )
                 if refused in forbidden or not of_prefix or not engine.forbid(refused):
                     return False
                 forbidden.add(refused)
@@ -144,14 +164,22 @@ class _Reasoning:
     def _differing_map(self, settled: Settled, labels: Sequence[int]) -> SSHMap | None:
         """A map of these labels in which some doubt about places or paths holds."""
         return settled.map_with(
-            [(sort, labels[i], labels[j], one) for sort, i, j, one in self._doubts_of_classes(len(labels)) if sort != "dstates"]
+            [
+                (sort, labels[i], labels[j], one)
+                for sort, i, j, one in self._doubts_of_classes(len(labels))
+                if sort != "dstates"
+            ]
         )
 
     def settle_steps(self) -> None:
         """Take in maps until nothing is in doubt, where the readable encodings are asked."""
         # No cut of a minimal map has more paths than it.
         counts = dict(zip(self._task.theory.priorities, self._cost, strict=True))
-        names = counts["paths"] if "paths" in counts else paths_needed(self._task, len(self._task.trace), self._cost)
+        names = (
+            counts["paths"]
+            if "paths" in counts
+            else paths_needed(self._task, len(self._task.trace), self._cost)
+        )
         engine = StepEngine(self._task, names)
         size = self._first_size()
         while size:
@@ -186,16 +214,22 @@ class _Reasoning:
             else:
                 self._sharing.absorb(whole)
         replayed = self._task.log.replay(self._sharing.classes[:size])
-        return 0 if replayed.outcome is Outcome.PREDICTED else engine.next_size(len(replayed.labels))
+        return (
+            0 if replayed.outcome is Outcome.PREDICTED else engine.next_size(len(replayed.labels))
+        )
 
     def _replay(self, found: SSHMap) -> Replay:
         """The trace replayed over a map of a prefix."""
-        return self._task.log.replay(found.labels, None, [s.place for s in found.dstates] if self._task.log.pairs else None)
+        return self._task.log.replay(
+            found.labels, None, [s.place for s in found.dstates] if self._task.log.pairs else None
+        )
 
     def _doubts(self, size: int) -> Iterator[Doubt]:
         """What is in doubt about a prefix: that steps are one after all, or are not."""
         firsts = self._sharing.firsts()
-        yield from (("dstates", firsts[self._sharing.classes[t]], t, False) for t in self._entering(size))
+        yield from (
+            ("dstates", firsts[self._sharing.classes[t]], t, False) for t in self._entering(size)
+        )
         yield from self._doubts_of_classes(size)
 
     def _doubts_of_classes(self, size: int) -> Iterator[Doubt]:
@@ -209,16 +243,24 @@ class _Reasoning:
                 head = heads.setdefault(known.always[c], c)
                 if head != c:
                     yield sort, firsts[head], firsts[c], False
-                if sort == "paths" and ((c, c) in known.together) != (c in known.unnamed):  # whether it is along a path
+                if sort == "paths" and ((c, c) in known.together) != (
+                    c in known.unnamed
+                ):  # whether it is along a path
                     yield sort, firsts[c], firsts[c], c in known.unnamed
             for c, d in combinations(heads.values(), 2):
-                if (c, d) not in known.together and (sort != "dstates" or self._may_be_one(firsts[c], firsts[d])):
+                if (c, d) not in known.together and (
+                    sort != "dstates" or self._may_be_one(firsts[c], firsts[d])
+                ):
                     yield sort, firsts[c], firsts[d], True
 
     def _may_be_one(self, i: int, j: int) -> bool:
         """Whether the views of two steps let them be one dstate."""
         steps = self._task.trace.steps
-        return None in (views := {steps[i].view, steps[j].view}) or len(views) == 1 or "functional_view" not in self._task.theory.hard
+        return (
+            None in (views := {steps[i].view, steps[j].view})
+            or len(views) == 1
+            or "functional_view" not in self._task.theory.hard
+        )
 
     def _entering(self, size: int) -> Iterator[int]:
         """Steps of the prefix that are not the first of their class, and that no earlier step shows to be there, as the same action led there from the same class."""

@@ -25,7 +25,9 @@ _log = log_of(__name__)
 
 FRAMING = 30.0  # Maps with frames are sought for so many seconds at most: what they are good for is mostly found by then.
 FRAMING_SHARE = 0.4  # Or for such a share of the time that is left, if that is less, so that clingo has the larger part.
-SKETCH_SHARE = 0.4  # A sketch and its check may take such a share of the time that is left for all of them.
+SKETCH_SHARE = (
+    0.4  # A sketch and its check may take such a share of the time that is left for all of them.
+)
 # The surest sketch may take this many seconds even if less time is left. Else a slow machine would leave no map at all.
 SUREST = 1.5
 UNMAPPED = 2.0  # Until there is any map that may take so many times as long, as any map is worth more than a better one.
@@ -34,12 +36,17 @@ UNMAPPED = 2.0  # Until there is any map that may take so many times as long, as
 class Candidates:
     """Makes maps of the whole trace, and keeps each that is better than the best one known, and that the checker accepts."""
 
-    def __init__(self, task: Task, known: Known, judging: Judging, report: Callable[[], None]) -> None:
+    def __init__(
+        self, task: Task, known: Known, judging: Judging, report: Callable[[], None]
+    ) -> None:
         self._trace = task.trace  # whose views may be unknown
-        self._task, self._known, self._judging, self._report = _with_all_views(task), known, judging, report
-        self._sketching = (
-            threading.Lock()
-        )  # so that who asks for a snapshot waits for a sketch that is nearly done, rather than make another one
+        self._task, self._known, self._judging, self._report = (
+            _with_all_views(task),
+            known,
+            judging,
+            report,
+        )
+        self._sketching = threading.Lock()  # so that who asks for a snapshot waits for a sketch that is nearly done, rather than make another one
 
     def merge(self) -> None:
         """Make a causal map by merging steps greedily: at once, and not minimal."""
@@ -56,13 +63,24 @@ class Candidates:
             seconds: What it may take. Each sketch may use a share of what is left.
         """
         with self._sketching:
-            if self._known.best is not None or not self._task.speedups.greedy or not self._judging.can_accept:
+            if (
+                self._known.best is not None
+                or not self._task.speedups.greedy
+                or not self._judging.can_accept
+            ):
                 return
             whole = Watch().part(seconds)
             *smaller, surest = self._attempts()
             for attempt in (surest, *smaller):
-                before, share = self._known.best, 1.0 if attempt in (surest, smaller[-1]) else SKETCH_SHARE
-                part = Watch().part(max(seconds, SUREST)) if attempt is surest else whole.part(share * whole.left())
+                before, share = (
+                    self._known.best,
+                    1.0 if attempt in (surest, smaller[-1]) else SKETCH_SHARE,
+                )
+                part = (
+                    Watch().part(max(seconds, SUREST))
+                    if attempt is surest
+                    else whole.part(share * whole.left())
+                )
                 with suppress(LimitError), heeding(part.check):
                     attempt()
                 if seconds < math.inf and attempt is not surest and self._known.best is not before:
@@ -85,7 +103,10 @@ class Candidates:
             return False
         apart: int | None = None
         for sketch in Sketch.all_of(trace.steps[0], theory):
-            if not all(sketch.extend(action, step) for action, step in each_looking(zip(trace.actions, trace.steps[1:], strict=True))):
+            if not all(
+                sketch.extend(action, step)
+                for action, step in each_looking(zip(trace.actions, trace.steps[1:], strict=True))
+            ):
                 continue
             ssh_map = sketch.map()
             apart = apart or len(Continuations(log.seen, log.actions).clique())
@@ -107,7 +128,9 @@ class Candidates:
 
     def _offer_gated(self, *, homing: bool) -> None:
         """Offer a map whose places have gateways at any angles, if one is made at once."""
-        ssh_map = gated_map(self._task.trace, self._task.theory, homing=homing, pairs=self._task.log.pairs)
+        ssh_map = gated_map(
+            self._task.trace, self._task.theory, homing=homing, pairs=self._task.log.pairs
+        )
         if ssh_map is not None:
             self.offer(ssh_map)
 
@@ -130,7 +153,9 @@ class Candidates:
         part = watch.part(UNMAPPED * seconds)
         try:
             with heeding(part.check):
-                for ssh_map in maps_with_frames(self._task.trace, self._task.theory, part, speedups):
+                for ssh_map in maps_with_frames(
+                    self._task.trace, self._task.theory, part, speedups
+                ):
                     part.shorten(seconds)
                     self.offer(ssh_map)
                     self._report()
@@ -141,10 +166,17 @@ class Candidates:
         """Keep a map of the whole trace if it is better than the best one known, and satisfies all axioms."""
         if self._task.trace is not self._trace:
             views = facts.views_of(dict(enumerate(ssh_map.labels)), self._trace)
-            ssh_map = replace(ssh_map, dstates=tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates))
+            ssh_map = replace(
+                ssh_map, dstates=tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
+            )
         found = Found.of(ssh_map, self._task.theory)
         if self._known.is_better(found) and self._judging.accepts(ssh_map):
-            _log.info("candidate of %d dstates, %d places, %d paths", len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths))
+            _log.info(
+                "candidate of %d dstates, %d places, %d paths",
+                len(ssh_map.dstates),
+                len(ssh_map.places),
+                len(ssh_map.paths),
+            )
             self._known.keep(found, ssh_map.labels)
             self._task.watch.use_reserve()
 
@@ -159,5 +191,8 @@ def _with_all_views(task: Task) -> Task:
     known, new = set(task.trace.views), "?"
     while new in known:
         new += "?"
-    trace = task.trace.with_views([new if view is None else view for view in task.trace.views], [s.confidence for s in task.trace.steps])
+    trace = task.trace.with_views(
+        [new if view is None else view for view in task.trace.views],
+        [s.confidence for s in task.trace.steps],
+    )
     return Task.of(trace, replace(task.theory, unknown_views=False), task.watch, task.speedups)

@@ -64,11 +64,18 @@ class _Problem:
         labels = np.asarray(ssh_map.labels, dtype=int)
         self._of_step = np.asarray(steps, dtype=int)
         self._from, self._to = labels[self._of_step - 1], labels[self._of_step]
-        self._moved = np.array([trace.steps[t].displacement for t in steps], dtype=float).reshape(-1, 3)
+        self._moved = np.array([trace.steps[t].displacement for t in steps], dtype=float).reshape(
+            -1, 3
+        )
         noise = np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
         # Each dstate has one pose here, so how far off it is taken to be at a visit counts as an error of the displacements to it and from it.
-        travelled = np.array([trace.actions[t - 1].kind != "turn" for t in steps], dtype=float).reshape(-1, 1, 1)
-        noise = noise + travelled * 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
+        travelled = np.array(
+            [trace.actions[t - 1].kind != "turn" for t in steps], dtype=float
+        ).reshape(-1, 1, 1)
+        noise = (
+            noise
+            + travelled * 2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
+        )
         self._whitening = np.linalg.inv(np.linalg.cholesky(noise)) if steps else noise
         self._way = np.hypot(self._moved[:, 0], self._moved[:, 1])
         self._sigma = np.array([odometry.scale, odometry.bend])
@@ -78,12 +85,22 @@ class _Problem:
         self._positions, self._headings = len(number), len(places)
         self._size = 2 * self._positions + self._headings + 2
         # The group of each dstate: displacements connect the headings of one group, and of one part of the map the positions.
-        self._group = connected_components(self._graph(self._from, self._to, self._headings), directed=False)[1]
+        self._group = connected_components(
+            self._graph(self._from, self._to, self._headings), directed=False
+        )[1]
 
     def solved(self) -> Fit:
         unknown = self._begun()
         if len(self._moved):
-            found = least_squares(self._residuals, unknown, self._jacobian, method="trf", tr_solver="lsmr", x_scale="jac", max_nfev=50)
+            found = least_squares(
+                self._residuals,
+                unknown,
+                self._jacobian,
+                method="trf",
+                tr_solver="lsmr",
+                x_scale="jac",
+                max_nfev=50,
+            )
             unknown = found.x
         squares = float((self._residuals(unknown) ** 2).sum())
         freedom = self._freedom(unknown)
@@ -94,12 +111,19 @@ class _Problem:
     def _begun(self) -> Array:
         """Unknowns to begin with."""
         unknown = np.zeros(self._size)
-        at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
+        at, heading = (
+            unknown[: 2 * self._positions].reshape(-1, 2),
+            unknown[2 * self._positions : -2],
+        )
         # Headings first, which are linear but for whole turns, and then positions, which are linear where headings are known (Carlone et al. 2014).
         reckoned = self._reckoned()
         off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
         off -= math.tau * np.round(off / math.tau)
-        heading[:] = reckoned + _least(self._differences(self._from, self._to, self._headings), off / self._sigmas(2), 1 / self._sigmas(2))
+        heading[:] = reckoned + _least(
+            self._differences(self._from, self._to, self._headings),
+            off / self._sigmas(2),
+            1 / self._sigmas(2),
+        )
         weights, differences = 1 / self._sigmas(0), self._moves()
         if self._group.max() > 0:
             heading += self._rotations(turned(self._moved[:, :2], heading[self._from]))[self._group]
@@ -112,7 +136,9 @@ class _Problem:
         """For each dstate, the heading as seen from one of its group, by the fewest displacements between."""
         heading = np.zeros(self._headings)
         rotated: dict[tuple[int, int], float] = {}
-        for s, x, angle in zip(self._from.tolist(), self._to.tolist(), self._moved[:, 2].tolist(), strict=True):
+        for s, x, angle in zip(
+            self._from.tolist(), self._to.tolist(), self._moved[:, 2].tolist(), strict=True
+        ):
             rotated[x, s], rotated[s, x] = -angle, angle
         graph = self._graph(self._from, self._to, self._headings)
         for first in np.unique(self._group, return_index=True)[1].tolist():
@@ -131,7 +157,9 @@ class _Problem:
         """
         size = int(self._group.max()) + 1
         inverse = np.linalg.inv(self._misfit(onward) + HELD * np.identity(size))
-        rotation: NDArray[np.complex128] = np.exp(1j * np.random.default_rng(0).uniform(-math.pi, math.pi, size))
+        rotation: NDArray[np.complex128] = np.exp(
+            1j * np.random.default_rng(0).uniform(-math.pi, math.pi, size)
+        )
         for _ in range(SWEEPS):
             look_at_clock()
             rotation = inverse @ rotation
@@ -147,10 +175,14 @@ class _Problem:
         weights = 1 / self._sigmas(0)
         vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
         columns = np.arange(len(vectors)), self._group[self._from]
-        turns = coo_array((vectors, columns), shape=(len(vectors), int(self._group.max()) + 1)).tocsr()
+        turns = coo_array(
+            (vectors, columns), shape=(len(vectors), int(self._group.max()) + 1)
+        ).tocsr()
         moves = csr_array(self._moves().multiply(weights[:, None]))
         mixed = (moves.T @ turns).toarray()
-        solved = splu(((moves.T @ moves) + 1e-9 * _identity(self._positions)).tocsc().astype(complex)).solve(mixed)
+        solved = splu(
+            ((moves.T @ moves) + 1e-9 * _identity(self._positions)).tocsc().astype(complex)
+        ).solve(mixed)
         form: NDArray[np.complex128] = (turns.conj().T @ turns).toarray() - mixed.conj().T @ solved
         return form
 
@@ -166,16 +198,24 @@ class _Problem:
         sigmas: Array = 1 / np.sqrt((self._whitening[:, :, axis] ** 2).sum(1))
         return sigmas
 
-    def _differences(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
+    def _differences(
+        self, first: NDArray[np.int_], second: NDArray[np.int_], size: int
+    ) -> csr_array:
         """The matrix that makes, of values, their differences: second minus first."""
         rows = np.arange(len(first))
         ones = np.ones(len(first))
-        entries = np.concatenate([ones, -ones]), (np.concatenate([rows, rows]), np.concatenate([second, first]))
+        entries = (
+            np.concatenate([ones, -ones]),
+            (np.concatenate([rows, rows]), np.concatenate([second, first])),
+        )
         return coo_array(entries, shape=(len(first), size)).tocsr()
 
     def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
         """What each displacement should be, and the cosine and sine of the heading in its middle."""
-        at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
+        at, heading = (
+            unknown[: 2 * self._positions].reshape(-1, 2),
+            unknown[2 * self._positions : -2],
+        )
         scale, bend = unknown[-2:] * self._sigma
         gone = at[self._place[self._to]] - at[self._place[self._from]]
         facing = heading[self._from] - bend * self._way / 2
@@ -197,7 +237,10 @@ class _Problem:
         m, heading = len(self._moved), 2 * self._positions
         zero, one = np.zeros(m), np.ones(m)
         ahead, left = predicted[:, 0], predicted[:, 1]
-        by_x, by_y = np.stack([scale * cos, -scale * sin, zero], 1), np.stack([scale * sin, scale * cos, zero], 1)
+        by_x, by_y = (
+            np.stack([scale * cos, -scale * sin, zero], 1),
+            np.stack([scale * sin, scale * cos, zero], 1),
+        )
         by_facing = np.stack([left, -ahead, zero], 1)
         columns = [
             (2 * self._place[self._to], by_x),
@@ -206,17 +249,30 @@ class _Problem:
             (2 * self._place[self._from] + 1, -by_y),
             (heading + self._from, by_facing - np.stack([zero, zero, one], 1)),
             (heading + self._to, np.stack([zero, zero, one], 1)),
-            (np.full(m, self._size - 2), np.stack([ahead, left, zero], 1) * (self._sigma[0] / scale)),
-            (np.full(m, self._size - 1), (-by_facing / 2 + np.stack([zero, zero, one], 1)) * self._way[:, None] * self._sigma[1]),
+            (
+                np.full(m, self._size - 2),
+                np.stack([ahead, left, zero], 1) * (self._sigma[0] / scale),
+            ),
+            (
+                np.full(m, self._size - 1),
+                (-by_facing / 2 + np.stack([zero, zero, one], 1))
+                * self._way[:, None]
+                * self._sigma[1],
+            ),
         ]
         rows = np.arange(3 * m)
-        values = [np.einsum("nij,nj->ni", self._whitening, derivative).ravel() for _, derivative in columns]
+        values = [
+            np.einsum("nij,nj->ni", self._whitening, derivative).ravel()
+            for _, derivative in columns
+        ]
         priors = np.arange(2)
         entries = (
             np.concatenate([*values, np.ones(2)]),
             (
                 np.concatenate([np.tile(rows, len(columns)), 3 * m + priors]),
-                np.concatenate([*(np.repeat(column, 3) for column, _ in columns), self._size - 2 + priors]),
+                np.concatenate(
+                    [*(np.repeat(column, 3) for column, _ in columns), self._size - 2 + priors]
+                ),
             ),
         )
         return coo_array(entries, shape=(3 * m + 2, self._size)).tocsr()
@@ -224,7 +280,8 @@ class _Problem:
     def _parts(self) -> NDArray[np.int_]:
         """The part of the map that each position is in: displacements do not connect one part with another."""
         part: NDArray[np.int_] = connected_components(
-            self._graph(self._place[self._from], self._place[self._to], self._positions), directed=False
+            self._graph(self._place[self._from], self._place[self._to], self._positions),
+            directed=False,
         )[1]
         return part
 
@@ -238,8 +295,22 @@ class _Problem:
         used = np.unique(self._place[said])
         parts = len(np.unique(self._parts()[used]))
         exact = (1 / np.sqrt((self._whitening**2).sum(1)) < EXACT).ravel()
-        settled = int(np.linalg.matrix_rank(self._jacobian(unknown)[: len(exact)][exact].toarray())) if exact.any() else 0
-        return int(len(exact) - exact.sum() - (2 * len(used) + len(said) - 2 * parts - self._open_rotations(unknown, said) - settled))
+        settled = (
+            int(np.linalg.matrix_rank(self._jacobian(unknown)[: len(exact)][exact].toarray()))
+            if exact.any()
+            else 0
+        )
+        return int(
+            len(exact)
+            - exact.sum()
+            - (
+                2 * len(used)
+                + len(said)
+                - 2 * parts
+                - self._open_rotations(unknown, said)
+                - settled
+            )
+        )
 
     def _open_rotations(self, unknown: Array, said: NDArray[np.int_]) -> int:
         """In how many ways groups of headings can be turned while all displacements stay what they are.
@@ -250,12 +321,17 @@ class _Problem:
         if len(groups) == len(np.unique(self._parts()[self._place[said]])):
             return len(groups)
         at = unknown[: 2 * self._positions].reshape(-1, 2)
-        form = self._misfit(at[self._place[self._to]] - at[self._place[self._from]]).real[groups][:, groups]
+        form = self._misfit(at[self._place[self._to]] - at[self._place[self._from]]).real[groups][
+            :, groups
+        ]
         return int((np.linalg.eigvalsh(form) < 1e-6 * max(float(form.diagonal().max()), 1.0)).sum())
 
     def _poses(self, unknown: Array) -> tuple[Pose, ...]:
         """The poses, each part of the map seen from the first dstate there; and how uncertain the positions are as seen from it."""
-        at, heading = unknown[: 2 * self._positions].reshape(-1, 2), unknown[2 * self._positions : -2]
+        at, heading = (
+            unknown[: 2 * self._positions].reshape(-1, 2),
+            unknown[2 * self._positions : -2],
+        )
         part = self._parts()
         first = {int(part[self._place[s]]): s for s in range(self._headings - 1, -1, -1)}
         poses: list[Pose] = []
@@ -267,13 +343,24 @@ class _Problem:
             facing = math.remainder(float(heading[s] - heading[origin]), math.tau)
             back = np.array([[cos, sin], [-sin, cos]])
             (xx, xy), (_, yy) = back @ spreads[s] @ back.T
-            poses.append(Pose(float(cos * dx + sin * dy), float(cos * dy - sin * dx), facing, (float(xx), float(xy), float(yy))))
+            poses.append(
+                Pose(
+                    float(cos * dx + sin * dy),
+                    float(cos * dy - sin * dx),
+                    facing,
+                    (float(xx), float(xy), float(yy)),
+                )
+            )
         return tuple(poses)
 
     def _spreads(self, unknown: Array, origins: Sequence[int]) -> Array:
         """The covariance of the position of each dstate, m x 2 x 2, in square metres, where the poses of the origins are known."""
         jacobian = self._jacobian(unknown)
-        fixed = [k for s in origins for k in (2 * self._place[s], 2 * self._place[s] + 1, 2 * self._positions + s)]
+        fixed = [
+            k
+            for s in origins
+            for k in (2 * self._place[s], 2 * self._place[s] + 1, 2 * self._positions + s)
+        ]
         free = np.setdiff1d(np.arange(self._size), fixed)
         information: Any = (jacobian.T @ jacobian)[free][:, free]
         information = (information + 1e-12 * _identity(len(free))).tocsc()
@@ -300,5 +387,7 @@ def _identity(size: int) -> csr_array:
 def _least(differences: csr_array, values: Array, weights: Array) -> Array:
     """Values whose differences come nearest to these, which are weighted already."""
     weighted = csr_array(differences.multiply(weights[:, None]))
-    solved: Array = lsqr(weighted, values, atol=1e-10, btol=1e-10, iter_lim=4 * differences.shape[1] + 100)[0]
+    solved: Array = lsqr(
+        weighted, values, atol=1e-10, btol=1e-10, iter_lim=4 * differences.shape[1] + 100
+    )[0]
     return solved

@@ -58,7 +58,11 @@ class Front:
     def knee(self) -> int | None:
         """The number of faults at which the number of dstates stops falling fast: where it fell most more than it falls next. None where it never does, or where nothing is proven."""
         counts = self._proven
-        bends = {k: (counts[k - 1] - counts[k]) - (counts[k] - counts[k + 1]) for k in counts if k - 1 in counts and k + 1 in counts}
+        bends = {
+            k: (counts[k - 1] - counts[k]) - (counts[k] - counts[k + 1])
+            for k in counts
+            if k - 1 in counts and k + 1 in counts
+        }
         knee = max(bends, key=lambda k: bends[k], default=None)
         return knee if knee is not None and bends[knee] > 0 else None
 
@@ -69,7 +73,9 @@ class Front:
             return None
         counts = self._proven
         here = counts[self.knee]
-        least = max((here - count) / (k - self.knee) for k, count in counts.items() if k > self.knee)
+        least = max(
+            (here - count) / (k - self.knee) for k, count in counts.items() if k > self.knee
+        )
         most = min((count - here) / (self.knee - k) for k, count in counts.items() if k < self.knee)
         return (least, most) if least < most else None
 
@@ -79,7 +85,9 @@ class Front:
         return {point.faults: point.dstates for point in self.points if point.proven}
 
 
-def fault_front(trace: Trace, theory: Theory | None = None, most: int = 5, limit: float | None = None) -> Front:
+def fault_front(
+    trace: Trace, theory: Theory | None = None, most: int = 5, limit: float | None = None
+) -> Front:
     """The fewest dstates for at most 0, 1, …, `most` faults.
 
     theory  Theory.causal() by default; its prices say which kinds of faults there are, both where it has none
@@ -90,11 +98,17 @@ def fault_front(trace: Trace, theory: Theory | None = None, most: int = 5, limit
     theory = Theory.causal() if theory is None else checked_theory(theory)
     check_limit("limit", "seconds", limit)
     if theory.jumped:
-        raise TheoryError("jumped: expected no wrong displacements where faults are counted; leave it out (--jumped)")
+        raise TheoryError(
+            "jumped: expected no wrong displacements where faults are counted; leave it out (--jumped)"
+        )
     if theory.level != "causal":
-        raise TheoryError("front: expected a causal theory, got a topological one; take Theory.causal() (--theory causal)")
+        raise TheoryError(
+            "front: expected a causal theory, got a topological one; take Theory.causal() (--theory causal)"
+        )
     if theory.rules or theory.without or theory.prefer not in (("dstates",), ("auto",)):
-        raise TheoryError("front: expected the causal axioms alone, fewest dstates first; leave out --rules, --without and --prefer")
+        raise TheoryError(
+            "front: expected the causal axioms alone, fewest dstates first; leave out --rules, --without and --prefer"
+        )
     if not is_whole(most) or not 0 <= most <= 1000:
         raise TheoryError(f"front: expected a number of faults from 0 to 1000, got {brief(most)}")
     theory.check_steps(checked_trace(trace))
@@ -117,7 +131,12 @@ def _points(task: Task, most: int) -> Iterator[Point]:
             for found in engine.improving_maps():
                 best = found
         except (LimitError, KeyboardInterrupt):
-            yield Point(faults, -(-(engine.bound or 10) // 10), None if best is None else best.map, proven=False)
+            yield Point(
+                faults,
+                -(-(engine.bound or 10) // 10),
+                None if best is None else best.map,
+                proven=False,
+            )
             return
         if best is None:  # what somebody asserts leaves no map with so few faults
             continue

@@ -46,7 +46,9 @@ class Judging:
         self._trace = trace
         self._theory = theory
         self._evidence = evidence_of(theory)
-        self._accepted: SSHMap | None = None  # the last map that passed the checker before it was kept
+        self._accepted: SSHMap | None = (
+            None  # the last map that passed the checker before it was kept
+        )
         self._judged = 0
         self._seconds = 0.0  # spent so far
         self._a_step = A_STEP  # seconds that a step takes, by the last check
@@ -80,7 +82,9 @@ class Judging:
     @cached_property
     def can_accept(self) -> bool:
         """Whether all that the theory asks for can be judged of a map: by the checker, and for own rules by clingo, which grounds them with the map."""
-        own = {axiom.name for rules in self._theory.rules for axiom in rules.axioms} | {rules.name for rules in self._theory.rules}
+        own = {axiom.name for rules in self._theory.rules for axiom in rules.axioms} | {
+            rules.name for rules in self._theory.rules
+        }
         others = unchecked(self._theory.replace(rules=()))
         return not others and own.isdisjoint(AXIOMS) and can_be_asked(self._theory)
 
@@ -142,7 +146,11 @@ class Judging:
                 or (here, action.name, there) not in links
                 or self._trace.steps[t].view not in (None, ssh_map.dstates[there].view)
             ):
-                self._fail(Violation("map_explains_trace", (t - 1, t), f"Step {t} is not where the map says."))
+                self._fail(
+                    Violation(
+                        "map_explains_trace", (t - 1, t), f"Step {t} is not where the map says."
+                    )
+                )
 
     def _fail(self, violation: Violation) -> None:
         where = f" at step {violation.steps[-1]}" if violation.steps else ""
@@ -154,4 +162,11 @@ class Judging:
 
 def _of_first_steps(ssh_map: SSHMap, steps: int) -> SSHMap:
     """A map of the whole trace whose dstates and links the first steps show all, as a map of these."""
-    return SSHMap(ssh_map.labels[:steps], ssh_map.dstates, ssh_map.links, ssh_map.places, ssh_map.paths, ssh_map.excused)
+    return SSHMap(
+        ssh_map.labels[:steps],
+        ssh_map.dstates,
+        ssh_map.links,
+        ssh_map.places,
+        ssh_map.paths,
+        ssh_map.excused,
+    )

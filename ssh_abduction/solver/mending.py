@@ -56,7 +56,9 @@ class Mending:
         self._solved: dict[Trace, tuple[Found | None, bool]] = {}
         self._best: Found | None = None
         self._best_mended: Trace | None = None
-        self._cheapest: list[Trace] = []  # what all causal maps mend that cost the least, once these are known
+        self._cheapest: list[
+            Trace
+        ] = []  # what all causal maps mend that cost the least, once these are known
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
         self._causal_labels: tuple[int, ...] = ()  # of the last causal map
         # The log is that of the theory: so stars tell dstates apart, and so do pairs of steps that are not at one place.
@@ -74,7 +76,9 @@ class Mending:
     def maps(self) -> Iterator[Found]:
         """Maps of the whole trace, each better than the one before."""
         if self._task.theory.jumped and self._task.theory.star == "frame":
-            merging = Merging(self._task.trace, self._task.theory, self._task.log.pairs, self._task.watch.check)
+            merging = Merging(
+                self._task.trace, self._task.theory, self._task.log.pairs, self._task.watch.check
+            )
             merging.merge()
             yield from self._by_missing_displacements(merging.labels(), merging.places())
         yield from self._by_merging(self._task.trace)
@@ -100,7 +104,11 @@ class Mending:
         costs = {mended: found.cost for mended, (found, _) in solved.items() if found is not None}
         least = min(costs.values())
         minimal = [mended for mended, cost in costs.items() if cost == least]
-        listed = (self._as_found(ssh_map, mended).map for mended in minimal for ssh_map in self._maps_of(mended, most)[0])
+        listed = (
+            self._as_found(ssh_map, mended).map
+            for mended in minimal
+            for ssh_map in self._maps_of(mended, most)[0]
+        )
         return tuple(dict.fromkeys(listed))
 
     def _improving(self, better: Found | None, mended: Trace) -> Iterator[Found]:
@@ -128,7 +136,9 @@ class Mending:
             merging.merge()
             mended = merging.mended()
             task = Task.of(mended, self._without_faults, self._task.watch, self._task.speedups)
-            near = FramedEngine(task).map_mended_from(merging.labels()) if _has_frames(task) else None
+            near = (
+                FramedEngine(task).map_mended_from(merging.labels()) if _has_frames(task) else None
+            )
             if near is not None and not Judging(mended, self._without_faults).why_refused(near.map):
                 yield from self._improving(self._as_found(near.map, mended), mended)
             yield from self._improving(self._minimal(mended, MERGED)[0], mended)
@@ -136,7 +146,9 @@ class Mending:
                 return
             before = self._best
 
-    def _by_missing_displacements(self, labels: Sequence[int], places: Sequence[int | None]) -> Iterator[Found]:
+    def _by_missing_displacements(
+        self, labels: Sequence[int], places: Sequence[int | None]
+    ) -> Iterator[Found]:
         """Maps in which displacements are disbelieved, at first those that do not fit the given labels; then once more by those of the best map, while that gets better."""
         trace, tried = self._task.trace, set()
         for _ in range(ROUNDS):
@@ -149,7 +161,10 @@ class Mending:
             yield from self._improving(self._minimal(without, MERGED)[0], without)
             if self._best is None or self._best is before:
                 return
-            labels, places = self._best.map.labels, [self._best.map.dstates[label].place for label in self._best.map.labels]
+            labels, places = (
+                self._best.map.labels,
+                [self._best.map.dstates[label].place for label in self._best.map.labels],
+            )
 
     def _by_causal_maps(self) -> Iterator[Trace]:
         """What causal maps mend, each cheaper than the one before."""
@@ -182,7 +197,9 @@ class Mending:
                 return
             visits = Counter(before.map.labels)
             rare = [t for t, label in enumerate(before.map.labels) if visits[label] <= RARE]
-            suspected = dict.fromkeys(k for t in rare for k in range(t - 1, t - 1 - BEFORE, -1) if k >= 0)
+            suspected = dict.fromkeys(
+                k for t in rare for k in range(t - 1, t - 1 - BEFORE, -1) if k >= 0
+            )
             for k in list(suspected)[:SUSPECTED]:
                 steps = list(mended.steps)
                 steps[k] = replace(steps[k], action=Action.that_slipped(k))
@@ -191,7 +208,10 @@ class Mending:
 
     def _mended(self, causal: SSHMap) -> Trace:
         """The trace with what a causal map disbelieves replaced: by what was seen at another step at the same dstate, or by an action of which nothing is known."""
-        wrong = {kind: {fault.step for fault in causal.faults if fault.kind == kind} for kind in ("misread", "slipped")}
+        wrong = {
+            kind: {fault.step for fault in causal.faults if fault.kind == kind}
+            for kind in ("misread", "slipped")
+        }
         steps = list(self._task.trace.steps)
         right: dict[int, Step] = {}
         for t, label in enumerate(causal.labels):
@@ -215,9 +235,13 @@ class Mending:
             self._solved[mended] = self._as_found(maps[0], mended) if maps else None, proven
         return self._solved[mended]
 
-    def _maps_of(self, mended: Trace, most: int, seconds: float = math.inf) -> tuple[list[SSHMap], bool]:
+    def _maps_of(
+        self, mended: Trace, most: int, seconds: float = math.inf
+    ) -> tuple[list[SSHMap], bool]:
         """Minimal maps of a mended trace, and whether they are known to be minimal."""
-        maps, proven = self._solver(mended, self._without_faults, most, min(seconds, SHARE * self._task.watch.left()))
+        maps, proven = self._solver(
+            mended, self._without_faults, most, min(seconds, SHARE * self._task.watch.left())
+        )
         return list(maps), proven
 
     def _believed_again(self, ssh_map: SSHMap, mended: Trace) -> Trace:
@@ -231,7 +255,9 @@ class Mending:
             pairs = pairs_of(again, self._without_faults)
             place_of = [s.place for s in ssh_map.dstates]
             fits = all(pairs.allow(k, ssh_map.labels, place_of) for k in range(len(again)))
-            if fits and not Judging(again, self._without_faults).why_refused(replace(ssh_map, faults=())):
+            if fits and not Judging(again, self._without_faults).why_refused(
+                replace(ssh_map, faults=())
+            ):
                 mended = again
         return mended
 
@@ -239,7 +265,9 @@ class Mending:
         """A map of a mended trace as one of the trace itself."""
         if self._task.theory.jumped:
             mended = self._believed_again(ssh_map, mended)
-        return Found.of(with_faults(ssh_map, self._task.trace, mended, self._task.theory), self._task.theory)
+        return Found.of(
+            with_faults(ssh_map, self._task.trace, mended, self._task.theory), self._task.theory
+        )
 
 
 def _has_frames(task: Task) -> bool:
@@ -249,7 +277,10 @@ def _has_frames(task: Task) -> bool:
 
 def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
     """The place of each step, and the slot of the place that it faces."""
-    at = [None if s.place is None or s.heading is None else (s.place, s.heading) for s in ssh_map.dstates]
+    at = [
+        None if s.place is None or s.heading is None else (s.place, s.heading)
+        for s in ssh_map.dstates
+    ]
     return [at[label] for label in ssh_map.labels]
 
 
@@ -272,4 +303,6 @@ def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) ->
             faults.append((t, "jumped"))
     told = facts.faults_of(faults, dict(enumerate(ssh_map.labels)), shows, trace, theory)
     dstates = tuple(replace(s, view=shows[s.id]) for s in ssh_map.dstates)
-    return replace(ssh_map, dstates=dstates, links=facts.links_of(ssh_map.labels, trace, faults), faults=told)
+    return replace(
+        ssh_map, dstates=dstates, links=facts.links_of(ssh_map.labels, trace, faults), faults=told
+    )

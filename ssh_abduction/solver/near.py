@@ -31,7 +31,9 @@ class NearMinimal:
     engine  holds the axioms for the whole trace
     """
 
-    def __init__(self, task: Task, judging: Judging, most: int, report: Callable[[], None], before: Asker) -> None:
+    def __init__(
+        self, task: Task, judging: Judging, most: int, report: Callable[[], None], before: Asker
+    ) -> None:
         """Nothing is asked yet.
 
         task    of the search for the minimal maps
@@ -42,10 +44,17 @@ class NearMinimal:
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report
         names = facts.most_paths(task.trace, task.theory, len(task.trace))
-        self.engine = StepEngine(self._task, min(prefixes.FIRST_PATHS, names) if task.speedups.path_names else names)
-        self.engine.asker.ground_seconds, self.engine.asker.solve_seconds = before.ground_seconds, before.solve_seconds
+        self.engine = StepEngine(
+            self._task, min(prefixes.FIRST_PATHS, names) if task.speedups.path_names else names
+        )
+        self.engine.asker.ground_seconds, self.engine.asker.solve_seconds = (
+            before.ground_seconds,
+            before.solve_seconds,
+        )
 
-    def maps(self, minimal: tuple[int, ...], within: int) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
+    def maps(
+        self, minimal: tuple[int, ...], within: int
+    ) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
         """The maps, and what they cost: the preferred counts, first to last.
 
         minimal  what minimal maps cost
@@ -60,7 +69,9 @@ class NearMinimal:
         ):  # there are no more of anything than there are steps
             self.engine.ask_for(number, count)
             known = Known(self._task.theory)
-            found = Prefixes(self._task, known, self._judging, self.engine, self._most, self._report)
+            found = Prefixes(
+                self._task, known, self._judging, self.engine, self._most, self._report
+            )
             found.find_minimum()
             if known.status is Status.OPTIMAL:
                 yield from ((ssh_map, known.cost) for ssh_map in found.minimal_maps())

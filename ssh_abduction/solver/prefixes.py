@@ -29,9 +29,7 @@ HELD_BACK = 1000  # So many maps are kept until a prefix proves long enough; fro
 # Where all maps are asked for and evidence may refuse some, so many are remembered. Until then what is refused is forbidden, and maps are listed anew;
 # from there on refused maps are left out one by one.
 REMEMBERED = 10_000
-FIRST_PATHS = (
-    8  # So many names for paths there are to begin with: few traces need more, and grounding grows with the square of their number.
-)
+FIRST_PATHS = 8  # So many names for paths there are to begin with: few traces need more, and grounding grows with the square of their number.
 
 
 class Prefixes:
@@ -41,14 +39,28 @@ class Prefixes:
     start   the first prefix that is solved
     """
 
-    def __init__(self, task: Task, known: Known, judging: Judging, engine: Engine, most: int, report: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        task: Task,
+        known: Known,
+        judging: Judging,
+        engine: Engine,
+        most: int,
+        report: Callable[[], None],
+    ) -> None:
         """Nothing is solved yet.
 
         most    maps that are asked for; 0 for all
         report  is called now and then
         """
         self.engine = engine
-        self._task, self._known, self._judging, self._most, self._report = task, known, judging, most, report
+        self._task, self._known, self._judging, self._most, self._report = (
+            task,
+            known,
+            judging,
+            most,
+            report,
+        )
         self._at_once = not task.speedups.prefixes
         self._in_tolerance = task.theory.star == "gateways"
         self.start = len(task.trace) if self._at_once else FIRST_PREFIX
@@ -71,10 +83,18 @@ class Prefixes:
                 return
             self._known.raise_lower(minimal.cost)
             replayed = self._replay(minimal.map)
-            _log.debug("its minimal cost is %s; its map explains %d steps", minimal.cost, len(replayed.labels))
+            _log.debug(
+                "its minimal cost is %s; its map explains %d steps",
+                minimal.cost,
+                len(replayed.labels),
+            )
             if self._predicts_all(minimal, replayed):
-                self._known.keep(replace(minimal, map=self._whole(minimal.map, replayed)), replayed.labels)
-            if self._known.best is not None and self._known.cost <= minimal.cost:  # a map of the whole trace, as cheap as any of the prefix
+                self._known.keep(
+                    replace(minimal, map=self._whole(minimal.map, replayed)), replayed.labels
+                )
+            if (
+                self._known.best is not None and self._known.cost <= minimal.cost
+            ):  # a map of the whole trace, as cheap as any of the prefix
                 self._known.status = Status.OPTIMAL
                 return
             size = self.engine.next_size(len(replayed.labels))
@@ -100,28 +120,40 @@ class Prefixes:
         _log.debug("%s cannot be told so: the readable encodings go on", type(self.engine).__name__)
         self.engine.settle()
         size, theory = self.engine.size, self._task.theory
-        self.engine = StepEngine(self._task, facts.most_paths(self._task.trace, theory, len(self._task.trace)))
+        self.engine = StepEngine(
+            self._task, facts.most_paths(self._task.trace, theory, len(self._task.trace))
+        )
         self.engine.grow(size)
         self.engine.forbid(equalities)
 
     def _tell(self, equalities: frozenset[Equality]) -> bool:
         """Tell the engine that no map has all of these equalities. False where it cannot be told so."""
-        can_be_told = isinstance(self.engine, StepEngine) or all(equality.holds for equality in equalities)
+        can_be_told = isinstance(self.engine, StepEngine) or all(
+            equality.holds for equality in equalities
+        )
         return can_be_told and self.engine.forbid(equalities)
 
     def _minimise_as_told(self) -> Found | None:
         """A minimal map of the prefix by what clingo was told, or None. Better maps of the whole trace are kept on the way."""
         while True:
             minimal = None
-            for found in self.engine.improving_maps(self._known.cost if self._known.best and not self._at_once else ()):
+            for found in self.engine.improving_maps(
+                self._known.cost if self._known.best and not self._at_once else ()
+            ):
                 minimal = found
                 self._known.partial = found.map
                 replayed = self._replay(found.map)
                 if self._known.is_better(found) and self._predicts_all(found, replayed):
-                    self._known.keep(replace(found, map=self._whole(found.map, replayed)), replayed.labels)
+                    self._known.keep(
+                        replace(found, map=self._whole(found.map, replayed)), replayed.labels
+                    )
                     self._task.watch.use_reserve()
                 self._report()
-                if not self._at_once and self._known.lower is not None and found.cost <= self._known.lower:
+                if (
+                    not self._at_once
+                    and self._known.lower is not None
+                    and found.cost <= self._known.lower
+                ):
                     break
             if not self._name_more_paths(minimal.cost if minimal else None):
                 return minimal
@@ -159,7 +191,9 @@ class Prefixes:
             raise
         yield from held
 
-    def _maps_of_prefix(self, held: list[SSHMap], streamed: list[int]) -> Generator[SSHMap, None, int]:
+    def _maps_of_prefix(
+        self, held: list[SSHMap], streamed: list[int]
+    ) -> Generator[SSHMap, None, int]:
         """Hold back the minimal maps of this prefix that replay to the end, or give them where they are many or the prefix is the whole trace.
 
         Returns the farthest step that some map fails at; 0 where all replay, so that there are no others.
@@ -180,11 +214,15 @@ class Prefixes:
                         break
                     continue
                 whole = self._whole(found.map, replayed)
-                if whole in given or any(self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed):
+                if whole in given or any(
+                    self._replay(found.map, size).outcome is Outcome.PREDICTED for size in streamed
+                ):
                     continue
                 remembers = self._judging.may_refuse and (asked or len(given) < REMEMBERED)
                 if self._judging.why_refused(whole):
-                    refusal = self._judging.why_refused(found.map) if telling and remembers else None
+                    refusal = (
+                        self._judging.why_refused(found.map) if telling and remembers else None
+                    )
                     if refusal:
                         break
                     continue
@@ -211,9 +249,20 @@ class Prefixes:
     def _replay(self, ssh_map: SSHMap, known: int | None = None) -> Replay:
         """The trace replayed over a map of a prefix, of which so many steps make links. Where stars agree in tolerance, those of all steps have to."""
         log = self._task.log
-        replayed = log.replay(ssh_map.labels, known, [s.place for s in ssh_map.dstates] if log.pairs else None)
-        replays = replayed.outcome is Outcome.PREDICTED and len(ssh_map.labels) < len(replayed.labels)
-        if self._in_tolerance and replays and turned(self._task.trace, replace(ssh_map, labels=replayed.labels), self._task.theory) is None:
+        replayed = log.replay(
+            ssh_map.labels, known, [s.place for s in ssh_map.dstates] if log.pairs else None
+        )
+        replays = replayed.outcome is Outcome.PREDICTED and len(ssh_map.labels) < len(
+            replayed.labels
+        )
+        if (
+            self._in_tolerance
+            and replays
+            and turned(
+                self._task.trace, replace(ssh_map, labels=replayed.labels), self._task.theory
+            )
+            is None
+        ):
             return Replay(replayed.labels[: len(ssh_map.labels)], Outcome.CONTRADICTED)
         return replayed
 

@@ -95,10 +95,18 @@ def in_order(maps: Sequence[SSHMap], counts: Iterable[int]) -> tuple[SSHMap, ...
 def _order(ssh_map: SSHMap) -> tuple[object, ...]:
     dstates = ssh_map.dstates
     places, paths = (
-        [-1 if number is None else number for number in numbers] for numbers in zip(*((s.place, s.path) for s in dstates), strict=True)
+        [-1 if number is None else number for number in numbers]
+        for numbers in zip(*((s.place, s.path) for s in dstates), strict=True)
     )
     faults = [(f.step, f.kind, str(f.seen), str(f.expected)) for f in ssh_map.faults]
-    return ssh_map.fit.chi2 if ssh_map.fit else math.inf, ssh_map.labels, places, paths, [s.direction or 0 for s in dstates], faults
+    return (
+        ssh_map.fit.chi2 if ssh_map.fit else math.inf,
+        ssh_map.labels,
+        places,
+        paths,
+        [s.direction or 0 for s in dstates],
+        faults,
+    )
 
 
 def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
@@ -137,7 +145,9 @@ def units_warning(trace: Trace) -> str | None:
         dx, dy, _ = step.displacement
         way = math.hypot(dx, dy)
         x, y = (dx / way, dy / way) if way else (1.0, 0.0)
-        sigma = math.sqrt(x * x * covariance[0][0] + 2 * x * y * covariance[0][1] + y * y * covariance[1][1])
+        sigma = math.sqrt(
+            x * x * covariance[0][0] + 2 * x * y * covariance[0][1] + y * y * covariance[1][1]
+        )
         if way > STANDING * sigma:
             return None
         ways.append(way)

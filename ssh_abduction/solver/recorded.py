@@ -37,7 +37,11 @@ class Recorded:
     @classmethod
     def of(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Recorded:
         """What a record, of a solution for so many steps, says. Raises MapError."""
-        written = None if record.get("certificate") is None else read.mapping(record["certificate"], "certificate")
+        written = (
+            None
+            if record.get("certificate") is None
+            else read.mapping(record["certificate"], "certificate")
+        )
         warnings = read.list(record, "warnings", optional=True)
         for i, warning in enumerate(warnings):
             if not isinstance(warning, str):
@@ -45,21 +49,32 @@ class Recorded:
         return cls(
             certificate=None if written is None else _certificate(read, written, steps),
             written_certificate=written,
-            backbone=None if record.get("backbone") is None else Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone"),
+            backbone=None
+            if record.get("backbone") is None
+            else Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone"),
             listed=record.get("minimal_listed", record.get("complete")) is True,
             warnings=tuple(warnings),
-            explanation=None if record.get("explanation") is None else read.mapping(record["explanation"], "explanation"),
+            explanation=None
+            if record.get("explanation") is None
+            else read.mapping(record["explanation"], "explanation"),
         )
 
 
 def _certificate(read: FieldReader, written: Mapping[str, Any], steps: int) -> Certificate:
     clique, refuted = (
-        tuple(_whole(read, x, f"certificate.{k}[{i}]") for i, x in enumerate(_list(read, written, k))) for k in ("clique", "refuted")
+        tuple(
+            _whole(read, x, f"certificate.{k}[{i}]") for i, x in enumerate(_list(read, written, k))
+        )
+        for k in ("clique", "refuted")
     )
     if len(set(clique)) < len(clique) or any(step >= steps for step in clique):
-        raise read.wrong("certificate.clique", f"different steps from 0 to {steps - 1}", list(clique))
+        raise read.wrong(
+            "certificate.clique", f"different steps from 0 to {steps - 1}", list(clique)
+        )
     if refuted != tuple(range(len(clique), len(clique) + len(refuted))):
-        raise read.wrong("certificate.refuted", f"the numbers of dstates from {len(clique)} on", list(refuted))
+        raise read.wrong(
+            "certificate.refuted", f"the numbers of dstates from {len(clique)} on", list(refuted)
+        )
     return Certificate(clique, refuted)
 
 
@@ -100,26 +115,37 @@ def bound_in(read: FieldReader, value: Any) -> dict[str, int]:
     counts = {str(k): _whole(read, v, f"bound.{k}") for k, v in record.items() if k in COUNTS}
     if unknown := set(record) - {*counts, "cost"}:
         raise read.wrong("bound", f"numbers of {', '.join(COUNTS)}, or a cost", sorted(unknown))
-    return counts | ({"tenths": round(10 * _positive(read, record["cost"], "bound.cost"))} if "cost" in record else {})
+    return counts | (
+        {"tenths": round(10 * _positive(read, record["cost"], "bound.cost"))}
+        if "cost" in record
+        else {}
+    )
 
 
 def seconds_in(read: FieldReader, value: Any) -> tuple[float, float, float]:
     """The seconds in all, for grounding and for solving. Raises MapError."""
     record = read.mapping(value, "seconds")
-    total, ground, solve = (_positive(read, record.get(k, 0.0), f"seconds.{k}") for k in ("total", "ground", "solve"))
+    total, ground, solve = (
+        _positive(read, record.get(k, 0.0), f"seconds.{k}") for k in ("total", "ground", "solve")
+    )
     return total, ground, solve
 
 
 def grounding_in(read: FieldReader, value: Any) -> Grounding:
     """How large the ground program was. Raises MapError."""
     record = read.mapping(value, "grounding")
-    return Grounding(*(_whole(read, record.get(k, 0), f"grounding.{k}") for k in ("rules", "atoms")))
+    return Grounding(
+        *(_whole(read, record.get(k, 0), f"grounding.{k}") for k in ("rules", "atoms"))
+    )
 
 
 def evidence_in(read: FieldReader, value: Any) -> dict[str, dict[str, int]]:
     """For each kind of evidence what it excluded. Raises MapError."""
     return {
-        kind: {k: _whole(read, v, f"evidence.{kind}.{k}") for k, v in read.mapping(said, f"evidence.{kind}").items()}
+        kind: {
+            k: _whole(read, v, f"evidence.{kind}.{k}")
+            for k, v in read.mapping(said, f"evidence.{kind}").items()
+        }
         for kind, said in read.mapping(value, "evidence").items()
     }
 
@@ -127,14 +153,25 @@ def evidence_in(read: FieldReader, value: Any) -> dict[str, dict[str, int]]:
 def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> list[tuple[Cost, int]]:
     """What maps of each level cost, and how many there are: one level of all maps, where the file names none. Raises MapError."""
     if "levels" not in record:
-        return [(cost_in(read, record["cost"], "cost"), maps)] if maps and record.get("cost") is not None else []
-    levels = [read.mapping(level, f"levels[{i}]") for i, level in enumerate(read.list(record, "levels"))]
+        return (
+            [(cost_in(read, record["cost"], "cost"), maps)]
+            if maps and record.get("cost") is not None
+            else []
+        )
+    levels = [
+        read.mapping(level, f"levels[{i}]") for i, level in enumerate(read.list(record, "levels"))
+    ]
     found = [
-        (cost_in(read, level.get("cost"), f"levels[{i}].cost"), _whole(read, level.get("count"), f"levels[{i}].count"))
+        (
+            cost_in(read, level.get("cost"), f"levels[{i}].cost"),
+            _whole(read, level.get("count"), f"levels[{i}].count"),
+        )
         for i, level in enumerate(levels)
     ]
     if sum(count for _, count in found) != maps:
-        raise read.wrong("levels", f"{maps} maps in all, as so many are listed", [count for _, count in found])
+        raise read.wrong(
+            "levels", f"{maps} maps in all, as so many are listed", [count for _, count in found]
+        )
     return found
 
 

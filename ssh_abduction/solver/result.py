@@ -75,7 +75,12 @@ class Bound:
         return shortly(self)
 
     def to_dict(self) -> dict[str, float]:
-        counts: dict[str, float | None] = {"dstates": self.dstates, "places": self.places, "paths": self.paths, "excuses": self.excuses}
+        counts: dict[str, float | None] = {
+            "dstates": self.dstates,
+            "places": self.places,
+            "paths": self.paths,
+            "excuses": self.excuses,
+        }
         counts["cost"] = None if self.tenths is None else self.tenths / 10
         return {k: v for k, v in counts.items() if v is not None}
 
@@ -103,7 +108,11 @@ class Progress:
     @property
     def sentence(self) -> str:
         """All of it on one line."""
-        best = f"best {self.cost.dstates} dstates, {self.cost.places} places, {self.cost.paths} paths" if self.cost else "no map yet"
+        best = (
+            f"best {self.cost.dstates} dstates, {self.cost.places} places, {self.cost.paths} paths"
+            if self.cost
+            else "no map yet"
+        )
         bound = ", ".join(f"{k} ≥ {v}" for k, v in self.bound.to_dict().items()) or "no bound yet"
         return f"prefix {self.prefix} of {self.steps} steps; {best}; {bound}; {self.maps} maps; {self.seconds:.1f} s"
 
@@ -189,7 +198,11 @@ class Solution:
 
     def __getitem__(self, index: int | slice) -> SSHMap | tuple[SSHMap, ...]:
         """A map, counted from 0, or maps. Raises RangeError, which names the range."""
-        return self.maps[index] if isinstance(index, slice) else self.maps[checked_index(index, len(self.maps), "maps")]
+        return (
+            self.maps[index]
+            if isinstance(index, slice)
+            else self.maps[checked_index(index, len(self.maps), "maps")]
+        )
 
     def __repr__(self) -> str:
         return f"<Solution {self.headline}>"
@@ -197,25 +210,51 @@ class Solution:
     def _repr_html_(self) -> str:
         """What notebooks show: how the search ended, what the minimal maps share as far as that is known, and the first map; of an unknown answer what is known."""
         known = self.rivals.backbone if self.rivals is not None else self.backbone
-        parts = [] if self.status is Status.UNSATISFIABLE else [cards.paragraph(summary_of(self, self.count, known))]
-        parts += [cards.paragraph(f"warning: {warning}") for warning in (() if self.stopped == "interrupted" else self.warnings)]
+        parts = (
+            []
+            if self.status is Status.UNSATISFIABLE
+            else [cards.paragraph(summary_of(self, self.count, known))]
+        )
+        parts += [
+            cards.paragraph(f"warning: {warning}")
+            for warning in (() if self.stopped == "interrupted" else self.warnings)
+        ]
         if self.count > 1:
-            parts.append(cards.folded(f"{counted(self.count, 'maps')}, of which the first is shown", self._table_of_maps()))
+            parts.append(
+                cards.folded(
+                    f"{counted(self.count, 'maps')}, of which the first is shown",
+                    self._table_of_maps(),
+                )
+            )
         shown = self.maps[0] if self.maps else self.partial
         if shown is not None:
-            first = "" if self.maps else cards.paragraph(f"the best map of the first {counted(len(shown.labels), 'steps')}:")
+            first = (
+                ""
+                if self.maps
+                else cards.paragraph(
+                    f"the best map of the first {counted(len(shown.labels), 'steps')}:"
+                )
+            )
             parts.append(first + shown._repr_html_())
         return cards.card(
             self.headline,
             *parts,
-            cards.paragraph(f"{self.seconds.total:.2f} s, {self.prefix} of {counted(self.steps, 'steps')} given to clingo"),
+            cards.paragraph(
+                f"{self.seconds.total:.2f} s, {self.prefix} of {counted(self.steps, 'steps')} given to clingo"
+            ),
         )
 
     def _table_of_maps(self) -> str:
         """A row a map: what it costs, and how well it closes."""
-        costs, closes = self.costs, [ssh_map.fit.chi2 if ssh_map.fit else None for ssh_map in self.maps]
+        costs, closes = (
+            self.costs,
+            [ssh_map.fit.chi2 if ssh_map.fit else None for ssh_map in self.maps],
+        )
         columns: dict[str, list[object]] = {"map": [*range(1, self.count + 1)]}
-        columns |= {name: [getattr(cost, name) for cost in costs] for name in ("dstates", "places", "paths", "excuses", "faults")}
+        columns |= {
+            name: [getattr(cost, name) for cost in costs]
+            for name in ("dstates", "places", "paths", "excuses", "faults")
+        }
         columns |= {"chi-square": ["" if chi2 is None else f"{chi2:.1f}" for chi2 in closes]}
         shown = {name: column for name, column in columns.items() if any(column)}
         return cards.table([*shown], zip(*shown.values(), strict=True), "maps")
@@ -224,13 +263,26 @@ class Solution:
     def headline(self) -> str:
         """The status, the counts of the best map, and how many maps there are or which bound is proven; in one line."""
         why = f" ({self.stopped})" if self.stopped else ""
-        bound = ", ".join(f"{'cost' if k == 'cost' else k} ≥ {v:g}" for k, v in self.bound.to_dict().items()) or "no bound"
+        bound = (
+            ", ".join(
+                f"{'cost' if k == 'cost' else k} ≥ {v:g}" for k, v in self.bound.to_dict().items()
+            )
+            or "no bound"
+        )
         if self.status is Status.UNSATISFIABLE:
             return f"{self.status.value}: no map of {counted(self.steps, 'steps')} satisfies the axioms"
         if self.cost is None:
-            return f"{self.status.value}{why}: no map of {counted(self.steps, 'steps')} yet; {bound}"
-        shown = {k: v for k, v in self.cost.to_dict().items() if self.theory.level != "causal" or k in ("dstates", "faults")}
-        counts = ", ".join(counted(v, k) if k != "faults" else f"faults that cost {v:g}" for k, v in shown.items())
+            return (
+                f"{self.status.value}{why}: no map of {counted(self.steps, 'steps')} yet; {bound}"
+            )
+        shown = {
+            k: v
+            for k, v in self.cost.to_dict().items()
+            if self.theory.level != "causal" or k in ("dstates", "faults")
+        }
+        counts = ", ".join(
+            counted(v, k) if k != "faults" else f"faults that cost {v:g}" for k, v in shown.items()
+        )
         if self.status is Status.FEASIBLE:
             return f"{self.status.value}{why}: {counts}; {bound}"
         least = self.levels[0].count if self.levels else self.count
@@ -242,7 +294,10 @@ class Solution:
         """The counts of each map, where the maps are the first ones that were given."""
         levels = self.levels or ((Level(self.cost, self.count),) if self.cost else ())
         cost_of = (level.cost for level in levels for _ in range(level.count))
-        return tuple(cost_as_counted(m, cost.preferred_by(self.theory), self.theory) for m, cost in zip(self.maps, cost_of, strict=False))
+        return tuple(
+            cost_as_counted(m, cost.preferred_by(self.theory), self.theory)
+            for m, cost in zip(self.maps, cost_of, strict=False)
+        )
 
     @property
     def minimal_listed(self) -> bool:
@@ -300,7 +355,11 @@ class Solution:
         Worked out when it is first asked for.
         """
         few = self.cost is not None and self.cost.dstates <= LEAST
-        return None if few or self.status is Status.UNSATISFIABLE or self.basis is None else self.basis.noise
+        return (
+            None
+            if few or self.status is Status.UNSATISFIABLE or self.basis is None
+            else self.basis.noise
+        )
 
     @property
     def count(self) -> int:
@@ -314,9 +373,18 @@ class Solution:
         """
         given = sum(level.count for level in self.levels)
         if (self.cost is not None or given) and (not self.maps or given not in (0, len(self.maps))):
-            raise MapError(f"maps: expected the {max(given, 1)} that the search gave, got {len(self.maps)}; give them to Search.solution")
-        maps = [written_map(m, cost if self.within else None) for m, cost in zip(self.maps, self.costs, strict=True)]
-        return {**opening(self.theory, self.steps, self.within), "maps": maps, **ending(self, self.count, self.backbone)}
+            raise MapError(
+                f"maps: expected the {max(given, 1)} that the search gave, got {len(self.maps)}; give them to Search.solution"
+            )
+        maps = [
+            written_map(m, cost if self.within else None)
+            for m, cost in zip(self.maps, self.costs, strict=True)
+        ]
+        return {
+            **opening(self.theory, self.steps, self.within),
+            "maps": maps,
+            **ending(self, self.count, self.backbone),
+        }
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the answer as `solve --json` does, with a line a map, for `load` and for the commands that read maps. Raises MapError."""
@@ -325,7 +393,9 @@ class Solution:
         head = opening(self.theory, self.steps, self.within)
         end = {name: value for name, value in data.items() if name not in head}
         lines = ",\n".join(json_line(m) for m in maps)
-        write_map(path, f'{json_line(head)[:-1]}, "maps": [\n{lines}\n],{json_line(end)[1:]}', "solution")
+        write_map(
+            path, f'{json_line(head)[:-1]}, "maps": [\n{lines}\n],{json_line(end)[1:]}', "solution"
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], trace: Trace | None = None) -> Solution:
@@ -345,12 +415,20 @@ class Solution:
         if "maps" not in record and "labels" in record:
             raise MapError(f"{where}: maps: expected a solution, got one map; take SSHMap.load")
         if record.get("status") == "error":
-            raise MapError(f"{where}: status: expected a solution, got the error that solve ended with: {brief(record.get('error'))}")
+            raise MapError(
+                f"{where}: status: expected a solution, got the error that solve ended with: {brief(record.get('error'))}"
+            )
         check_format(record, SOLUTION_FORMAT, where)
         for name in ("maps", "theory", "steps", "status", "complete"):
             if name not in record:
-                raise MapError(f"{where}: {name}: expected what solve --json or Solution.save writes, got none; solve again")
-        maps, steps, theory = tuple(maps_of(record, where)), read.integer(record["steps"], "steps"), theory_in(record["theory"], where)
+                raise MapError(
+                    f"{where}: {name}: expected what solve --json or Solution.save writes, got none; solve again"
+                )
+        maps, steps, theory = (
+            tuple(maps_of(record, where)),
+            read.integer(record["steps"], "steps"),
+            theory_in(record["theory"], where),
+        )
         if (false := next(contradictions(record, maps, steps, theory), None)) is not None:
             raise MapError(f"{where}: {false}; it was changed by hand, or cut")
         for i, ssh_map in enumerate(maps):
@@ -359,9 +437,13 @@ class Solution:
                     f"{where}: maps[{i}].labels: expected {steps}, one a step, got {len(ssh_map.labels)}; it was changed by hand"
                 )
         if trace is not None:
-            check_of_trace(maps, checked_trace(trace), where, views="functional_view" in theory.hard)
+            check_of_trace(
+                maps, checked_trace(trace), where, views="functional_view" in theory.hard
+            )
             if steps != len(trace):
-                raise MapError(f"{where}: steps: expected those of a trace of {len(trace)} steps, got {steps}; it is of another trace")
+                raise MapError(
+                    f"{where}: steps: expected those of a trace of {len(trace)} steps, got {steps}; it is of another trace"
+                )
         return cls(
             status=Status(record["status"]),
             maps=maps,
@@ -373,7 +455,9 @@ class Solution:
             prefix=read.integer(record.get("prefix", 0), "prefix"),
             seconds=Seconds(*seconds_in(read, record.get("seconds", {}))),
             stopped=record.get("stopped"),
-            partial=None if record.get("partial") is None else SSHMap.from_dict(record["partial"], f"{where}: partial"),
+            partial=None
+            if record.get("partial") is None
+            else SSHMap.from_dict(record["partial"], f"{where}: partial"),
             evidence=evidence_in(read, record.get("evidence", {})),
             within=read.integer(record.get("within", 0), "within"),
             levels=tuple(Level(*level) for level in levels_in(read, record, len(maps))),
@@ -397,16 +481,27 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
     listed = solution.minimal_listed
     told = f"{'' if listed else 'at least '}{minimal} minimal map{'' if minimal == 1 else 's'}"
     if not listed:
-        told += f" (listing was stopped by the {solution.stopped})" if solution.stopped != "interrupted" else " (listing was interrupted)"
+        told += (
+            f" (listing was stopped by the {solution.stopped})"
+            if solution.stopped != "interrupted"
+            else " (listing was interrupted)"
+        )
     if not (listed and minimal == 1):
-        told += f": {backbone.sentence}" + ("" if backbone.proven else ", as far as was found out: others may differ in more")
+        told += f": {backbone.sentence}" + (
+            "" if backbone.proven else ", as far as was found out: others may differ in more"
+        )
     more = sum(level.count for level in solution.levels[1:])
     return told + (f"; and {more} with up to {solution.within} more" if more else "")
 
 
 def opening(theory: Theory, steps: int, within: int) -> dict[str, Any]:
     """What the JSON of a solution says before its maps."""
-    head = {"format": SOLUTION_FORMAT, "version": VERSION, "theory": theory.to_dict(), "steps": steps}
+    head = {
+        "format": SOLUTION_FORMAT,
+        "version": VERSION,
+        "theory": theory.to_dict(),
+        "steps": steps,
+    }
     return {**head, **({"within": within} if within else {})}
 
 
@@ -429,7 +524,9 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         "bound": solution.bound.to_dict(),
         "prefix": solution.prefix,
         "grounding": asdict(solution.grounding),
-        "seconds": {k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")},
+        "seconds": {
+            k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")
+        },
     }
     end["summary"] = summary_of(solution, count, backbone)
     if backbone and not (solution.minimal_listed and count == 1):

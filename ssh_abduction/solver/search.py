@@ -76,7 +76,9 @@ from ssh_abduction.theory.evidence import evidence_of, said_by
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-FEW_STEPS = 24  # Traces up to this length skip names and greedy maps: solving them directly is faster.
+FEW_STEPS = (
+    24  # Traces up to this length skip names and greedy maps: solving them directly is faster.
+)
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
 ONE_MORE_SHARE = 0.1  # Or for such a share of the time that these took, if that is more, so that it is never a large part of the search.
 SETTLE_AFTER = 0.15  # After so many seconds step by step it is looked whether the dstates are known without a search: to look loads numpy.
@@ -169,10 +171,18 @@ class Search:
         check_limit("time_limit (--time-limit)", "seconds", time_limit)
         check_limit("memory_limit (--memory-limit)", "MiB", memory_limit)
         if on_progress is not None and not callable(on_progress):
-            raise SolverError(f"on_progress: expected a function of one Progress, got {brief(on_progress)}")
+            raise SolverError(
+                f"on_progress: expected a function of one Progress, got {brief(on_progress)}"
+            )
         a_flag("reasons", reasons, SolverError)
         if after is not None:
-            an_instance("after", after, Search, SolverError, mend="give the search of the steps before, or leave it out")
+            an_instance(
+                "after",
+                after,
+                Search,
+                SolverError,
+                mend="give the search of the steps before, or leave it out",
+            )
         if minimal is not None:
             checked_map(minimal, "minimal")
         self.theory = checked_theory(theory).resolve(trace)
@@ -184,16 +194,24 @@ class Search:
         self.trace = trace
         self._begun = False
         self._first: SSHMap | None = None  # of the maps that were given
-        self._basis: Basis | None = None  # of the certificate of the whole trace, where the search was stopped
+        self._basis: Basis | None = (
+            None  # of the certificate of the whole trace, where the search was stopped
+        )
         self._most = most
         self.within = int(within)
         self._mends = False  # whether maps were sought by mending the trace
-        self._mended_maps: tuple[SSHMap, ...] | None = None  # the minimal maps, where these were found by mending the trace
-        self._near: NearMinimal | None = None  # what lists maps that cost more than the least, once these are listed
+        self._mended_maps: tuple[SSHMap, ...] | None = (
+            None  # the minimal maps, where these were found by mending the trace
+        )
+        self._near: NearMinimal | None = (
+            None  # what lists maps that cost more than the least, once these are listed
+        )
         self._levels: list[Level] = []
         self._reasons = reasons
         self._cost: tuple[int, ...] = ()  # of the map that was found last: the preferred counts
-        self._last: tuple[SSHMap, tuple[int, ...]] | None = None  # the map that was given last, and its preferred counts
+        self._last: tuple[SSHMap, tuple[int, ...]] | None = (
+            None  # the map that was given last, and its preferred counts
+        )
         self._goes_on = after is not None
         self._asked_speedups = checked_speedups(speedups)
         self._on_progress = on_progress
@@ -207,7 +225,9 @@ class Search:
         self._rivals = Rivals(self._task, self._judging)
         self._candidates = Candidates(self._task, self._known, self._judging, self._report)
         engine = self._engine_after(after) if after else self._new_engine()
-        self._prefixes = Prefixes(self._task, self._known, self._judging, engine, most, self._report)
+        self._prefixes = Prefixes(
+            self._task, self._known, self._judging, engine, most, self._report
+        )
         if after:
             self._take_over(after, minimal)
         self._watch.stop()
@@ -226,9 +246,15 @@ class Search:
             if row("named dstates with faults").holds_for(self.theory):
                 return FaultyEngine(self._task)
             if not self.theory.has_faults:
-                return CausalEngine(self._task) if self.theory.level == "causal" else FramedEngine(self._task)
+                return (
+                    CausalEngine(self._task)
+                    if self.theory.level == "causal"
+                    else FramedEngine(self._task)
+                )
         most = facts.most_paths(self.trace, self.theory, len(self.trace))
-        return StepEngine(self._task, min(prefixes.FIRST_PATHS, most) if self._task.speedups.path_names else most)
+        return StepEngine(
+            self._task, min(prefixes.FIRST_PATHS, most) if self._task.speedups.path_names else most
+        )
 
     def _may_name(self) -> bool:
         """Whether the theory lets dstates be settled before all else, and the trace is long enough for that to pay."""
@@ -240,7 +266,9 @@ class Search:
         before = after._prefixes.engine
         outgrown = not before.goes_on or (isinstance(before, StepEngine) and self._may_name())
         engine = self._new_engine() if outgrown else before.over(self._task)
-        half_told = after.stopped == "interrupted" or not engine.intact  # perhaps while a step was grounded
+        half_told = (
+            after.stopped == "interrupted" or not engine.intact
+        )  # perhaps while a step was grounded
         return engine.with_paths(engine.paths) if half_told else engine
 
     def _take_over(self, after: Search, minimal: SSHMap | None) -> None:
@@ -249,7 +277,11 @@ class Search:
         if self._task.speedups.prefixes:
             known.bound, known.lower = before.bound, before.lower
             solved = before.status is Status.OPTIMAL
-            self._prefixes.start = len(self.trace) if solved else max(prefixes.FIRST_PREFIX, self._prefixes.engine.size_to_go_on)
+            self._prefixes.start = (
+                len(self.trace)
+                if solved
+                else max(prefixes.FIRST_PREFIX, self._prefixes.engine.size_to_go_on)
+            )
         if minimal is not None:
             known.status, known.best, known.cost = Status.OPTIMAL, minimal, before.cost
             known.raise_bound(known.cost[0] if known.cost else None)
@@ -332,7 +364,9 @@ class Search:
     def _found(self) -> Iterator[SSHMap]:
         """The maps, level by level, in the order in which they are found; or the best one known."""
         if self._begun:
-            raise SolverError("search: expected to be iterated once, got a second time; make another Search")
+            raise SolverError(
+                "search: expected to be iterated once, got a second time; make another Search"
+            )
         self._begun = True
         _log.info("search of %r under %r, with %s", self.trace, self.theory, _name(self._engine))
         self._watch.start()
@@ -380,12 +414,22 @@ class Search:
             if not engine.size:
                 engine.grow(steps if engine.lists_least else min(steps, prefixes.FIRST_PREFIX))
             return
-        takes_all = isinstance(engine, StepEngine) and not self._goes_on and FEW_STEPS < steps <= AT_ONCE
+        takes_all = (
+            isinstance(engine, StepEngine) and not self._goes_on and FEW_STEPS < steps <= AT_ONCE
+        )
         may_frame = takes_all and self._task.speedups.framing
         may_settle = takes_all and self._task.speedups.ways and self._asked_speedups.names
-        if may_settle and not self._find_minimum_soon(min(SETTLE_AFTER, FRAME_AFTER)) and self._candidates.sketch_least():
+        if (
+            may_settle
+            and not self._find_minimum_soon(min(SETTLE_AFTER, FRAME_AFTER))
+            and self._candidates.sketch_least()
+        ):
             self._settle_dstates_first()
-        elif (may_frame or may_settle) and self.status is Status.UNKNOWN and not self._find_minimum_soon(FRAME_AFTER):
+        elif (
+            (may_frame or may_settle)
+            and self.status is Status.UNKNOWN
+            and not self._find_minimum_soon(FRAME_AFTER)
+        ):
             _log.info("no minimum after %.1f s step by step", self._watch.elapsed())
             if may_frame:
                 _log.info("maps in which places have frames are sought as candidates")
@@ -414,11 +458,15 @@ class Search:
             mending.settle()
         if self._mended_maps:
             self._known.status = Status.OPTIMAL
-            self._known.keep(Found.of(self._mended_maps[0], self.theory), self._mended_maps[0].labels)
+            self._known.keep(
+                Found.of(self._mended_maps[0], self.theory), self._mended_maps[0].labels
+            )
             self._rivals.reasons = False  # its engines know nothing of mended traces
         return bool(self._mended_maps)
 
-    def _solve_mended(self, mended: Trace, theory: Theory, most: int, seconds: float) -> tuple[tuple[SSHMap, ...], bool]:
+    def _solve_mended(
+        self, mended: Trace, theory: Theory, most: int, seconds: float
+    ) -> tuple[tuple[SSHMap, ...], bool]:
         """The minimal maps of a mended trace, so many at most, and True; or the best one known after so many seconds, and False."""
 
         def end_with_this_search(_: Progress) -> None:
@@ -440,7 +488,9 @@ class Search:
 
     def _find_minimum_soon(self, seconds: float) -> bool:
         """Find the minimal cost step by step, if that is done within so many seconds from the start, or a share of the time that is left."""
-        self._watch.end_stage_after(self._watch.elapsed() + min(seconds, FRAMING_SHARE * self._watch.left()))
+        self._watch.end_stage_after(
+            self._watch.elapsed() + min(seconds, FRAMING_SHARE * self._watch.left())
+        )
         try:
             self._prefixes.find_minimum()
         except StageTimeError:
@@ -457,7 +507,10 @@ class Search:
         if self.best is not None:
             from ssh_abduction.solver.engines.frameless import FramelessEngine
 
-            _log.info("dstates are settled before places and paths, from a map of %d dstates", len(self.best.dstates))
+            _log.info(
+                "dstates are settled before places and paths, from a map of %d dstates",
+                len(self.best.dstates),
+            )
             self._prefixes.go_on_with(FramelessEngine(self._task, labels), len(self.trace))
 
     def _list_maps(self) -> Iterator[SSHMap]:
@@ -482,7 +535,9 @@ class Search:
                 self._watch.start()
                 if self.count == self._most:
                     spent = self._watch.elapsed()
-                    self._watch.end_stage_after(min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent)))
+                    self._watch.end_stage_after(
+                        min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent))
+                    )
         self._known.complete = True
 
     def _maps_by_cost(self) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
@@ -494,7 +549,9 @@ class Search:
             self._watch.end_stage_after(math.inf)
         if self.within and counted_first(self.theory):
             self._prefixes.engine.settle()
-            self._near = NearMinimal(self._task, self._judging, self._most, self._report, self._prefixes.engine.asker)
+            self._near = NearMinimal(
+                self._task, self._judging, self._most, self._report, self._prefixes.engine.asker
+            )
             yield from self._near.maps(self._known.cost, self.within)
 
     def _note(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
@@ -509,13 +566,22 @@ class Search:
         self._watch.stop()
         self._prefixes.engine.settle()
         self._known.raise_bound(self._prefixes.engine.bound)
-        self._rivals.engine = None if self._rivals.listed or not self._prefixes.engine.intact else self._prefixes.engine
+        self._rivals.engine = (
+            None
+            if self._rivals.listed or not self._prefixes.engine.intact
+            else self._prefixes.engine
+        )
 
     def _fall_back(self) -> None:
         """Where the search was stopped: some map of the whole trace, if there was none, and a bound that takes no search."""
         if not self.stopped or self.status is Status.OPTIMAL:
             return
-        may_salvage = self.best is None and self.stopped == "time limit" and self._watch.has_reserve and not self._mends
+        may_salvage = (
+            self.best is None
+            and self.stopped == "time limit"
+            and self._watch.has_reserve
+            and not self._mends
+        )
         with suppress(KeyboardInterrupt):
             self._candidates.sketch(self._overtime)
         if may_salvage:
@@ -540,7 +606,9 @@ class Search:
         try:
             with heeding(self._watch.check):
                 self._prefixes.engine.grow(len(self.trace))
-                self._known.status = Status.OPTIMAL if self._prefixes.minimise() else Status.UNSATISFIABLE
+                self._known.status = (
+                    Status.OPTIMAL if self._prefixes.minimise() else Status.UNSATISFIABLE
+                )
         except LimitError as limit:
             self._known.stopped = limit.reason
         except KeyboardInterrupt:
@@ -549,7 +617,11 @@ class Search:
 
     def _give_best_map(self) -> Iterator[SSHMap]:
         """Where no minimal map was listed, the best one known is the answer, once it has passed the checker."""
-        if self.status in (Status.FEASIBLE, Status.OPTIMAL) and not self.count and self.best is not None:
+        if (
+            self.status in (Status.FEASIBLE, Status.OPTIMAL)
+            and not self.count
+            and self.best is not None
+        ):
             with suppress(LimitError), heeding(Watch().part(self._overtime).check):
                 self._judging.pass_map(self.best, self.prefix, self._watch.elapsed())
             self._known.count = 1
@@ -561,7 +633,9 @@ class Search:
         self._watch.use_reserve()
         self._watch.start()
         spent = self._watch.elapsed()
-        self._watch.end_stage_after(spent + max(REASONING, spent) if self._watch.left() == math.inf else math.inf)
+        self._watch.end_stage_after(
+            spent + max(REASONING, spent) if self._watch.left() == math.inf else math.inf
+        )
         with heeding(self._watch.check):
             self._rivals.reason()
         self._watch.end_stage_after(math.inf)
@@ -596,7 +670,9 @@ class Search:
         asker = self._engine.asker
         # Perhaps the search ended while the prefix was given to clingo: then what shows the bound is sought in all steps.
         ran_out = self.stopped not in (None, "maps limit")
-        basis = self._basis or self._basis_of(len(self.trace) if ran_out else self._prefixes.engine.size)
+        basis = self._basis or self._basis_of(
+            len(self.trace) if ran_out else self._prefixes.engine.size
+        )
         return Solution(
             status=self.status,
             maps=maps,
@@ -616,7 +692,9 @@ class Search:
             trace=self.trace,
             grounding=grounding,
             evidence=said_by(evidence_of(self.theory), self.trace, self._known.refused),
-            odometry_warning=(units_warning(self.trace) or noise_warning(self._first.fit, self.trace))
+            odometry_warning=(
+                units_warning(self.trace) or noise_warning(self._first.fit, self.trace)
+            )
             if self._first and self._first.fit
             else None,
         )
@@ -629,7 +707,9 @@ class Search:
         begin = 0
         for i, level in enumerate(self._levels):
             cost = level.cost.preferred_by(self.theory)
-            self._levels[i] = replace(level, cost=cost_as_counted(ordered[begin], cost, self.theory))
+            self._levels[i] = replace(
+                level, cost=cost_as_counted(ordered[begin], cost, self.theory)
+            )
             begin += level.count
         return ordered
 
@@ -639,7 +719,9 @@ class Search:
         stopped  why it is to end
         """
         one_of("stopped", stopped, get_args(Stop), SolverError)
-        with suppress(Exception):  # what the other thread changes meanwhile: a bound is a bound, and a map a map, without that
+        with suppress(
+            Exception
+        ):  # what the other thread changes meanwhile: a bound is a bound, and a map a map, without that
             if self.status in (Status.UNKNOWN, Status.FEASIBLE):
                 self._candidates.sketch(OVERTIME)
         self._known.raise_bound(self._prefixes.engine.bound)
@@ -648,15 +730,22 @@ class Search:
             self._known.status = Status.FEASIBLE
         self._known.stopped = stopped
         # Clingo is not asked how large its program is while another thread is in it.
-        return replace(self._solution(() if best is None else (best,), Grounding(0, 0)), complete=self.status is Status.UNSATISFIABLE)
+        return replace(
+            self._solution(() if best is None else (best,), Grounding(0, 0)),
+            complete=self.status is Status.UNSATISFIABLE,
+        )
 
     def _basis_of(self, size: int) -> Basis | None:
         """What shows that no map has fewer dstates: of the first `size` steps."""
         if not row("clique").holds_for(self.theory):
             return None
         number: dict[object, int] = {}
-        views = tuple(number.setdefault(step.view, len(number)) for step in self.trace.steps[: max(size, 1)])
-        return Basis(views, tuple(self._task.log.actions[: len(views) - 1]), self.bound.dstates or 0)
+        views = tuple(
+            number.setdefault(step.view, len(number)) for step in self.trace.steps[: max(size, 1)]
+        )
+        return Basis(
+            views, tuple(self._task.log.actions[: len(views) - 1]), self.bound.dstates or 0
+        )
 
     def _count_apart(self) -> None:
         """Where the search was stopped: the steps of the whole trace that are pairwise apart are a bound, too."""
@@ -668,7 +757,14 @@ class Search:
     def _report(self) -> None:
         if self._on_progress is None and not PROGRESS.isEnabledFor(logging.INFO):
             return
-        progress = Progress(self.prefix, len(self.trace), self._known.best_cost, self.bound, self.count, self._watch.elapsed())
+        progress = Progress(
+            self.prefix,
+            len(self.trace),
+            self._known.best_cost,
+            self.bound,
+            self.count,
+            self._watch.elapsed(),
+        )
         news = (progress.cost, progress.bound)
         PROGRESS.log(logging.DEBUG if news == self._news else logging.INFO, "%s", progress.sentence)
         self._news = news
@@ -678,7 +774,11 @@ class Search:
     @property
     def _told_cost(self) -> str:
         cost = self._known.best_cost
-        return "nothing that is counted" if cost is None else ", ".join(counted(v, k) for k, v in cost.to_dict().items())
+        return (
+            "nothing that is counted"
+            if cost is None
+            else ", ".join(counted(v, k) for k, v in cost.to_dict().items())
+        )
 
     @property
     def _told(self) -> str:

@@ -53,8 +53,12 @@ class Shared:
     untold: tuple[int, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
-        pairs = f"; {counted(len(self.sometimes), 'pairs')} of steps differ" if self.sometimes else ""
-        return f"<Shared: {len(set(self.always))} among {counted(len(self.always), 'steps')}{pairs}>"
+        pairs = (
+            f"; {counted(len(self.sometimes), 'pairs')} of steps differ" if self.sometimes else ""
+        )
+        return (
+            f"<Shared: {len(set(self.always))} among {counted(len(self.always), 'steps')}{pairs}>"
+        )
 
     def one_in(self, i: int, j: int) -> Literal["all", "some", "none"]:
         """Whether two steps are one in all maps, in some, or in none."""
@@ -73,8 +77,16 @@ class Shared:
 
     def to_dict(self, steps: Iterable[int]) -> dict[str, Any]:
         """The numbers of these steps, and the pairs: if there are more than PRINTED, as many of them, their count, and the steps in which the maps differ."""
-        more = {"pairs": len(self.sometimes), "differing": list(self.differing)} if len(self.sometimes) > PRINTED else {}
-        return {"always": [self.always[t] for t in steps], "sometimes": [list(pair) for pair in self.sometimes[:PRINTED]], **more}
+        more = (
+            {"pairs": len(self.sometimes), "differing": list(self.differing)}
+            if len(self.sometimes) > PRINTED
+            else {}
+        )
+        return {
+            "always": [self.always[t] for t in steps],
+            "sometimes": [list(pair) for pair in self.sometimes[:PRINTED]],
+            **more,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +120,9 @@ class Backbone:
             differing.pop("courses", None)
         same = [sort for sort in self.sorts if sort not in differing and sort != "courses"]
         told = [f"the same {_listed(same)}"] if same else []
-        return "; ".join(told + [_told_differing(sort, shared) for sort, shared in differing.items()])
+        return "; ".join(
+            told + [_told_differing(sort, shared) for sort, shared in differing.items()]
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """As `solve --json` prints it (docs/formats.md): the dstates by step, and the rest by dstate, so that it is short for a long trace."""
@@ -116,7 +130,8 @@ class Backbone:
         firsts = {number: t for t, number in reversed(list(enumerate(labels)))}
         by_dstate = [firsts[number] for number in sorted(firsts)]
         told: dict[str, Any] = {
-            sort: shared.to_dict(range(len(labels)) if sort == "dstates" else by_dstate) for sort, shared in self.sorts.items()
+            sort: shared.to_dict(range(len(labels)) if sort == "dstates" else by_dstate)
+            for sort, shared in self.sorts.items()
         }
         return {"proven": self.proven, **told}
 
@@ -125,12 +140,24 @@ class Backbone:
         """What `to_dict` wrote, for a trace of so many steps. Raises MapError with the field that is wrong."""
         a_text("where", where, MapError)
         a_whole_number("steps", steps, MapError, 1)
-        if not isinstance(data, Mapping) or not isinstance(data.get("proven"), bool) or "dstates" not in data:
-            raise MapError(f"{where}: expected an object with proven and dstates, got {brief(data)}; write it with solve --json")
+        if (
+            not isinstance(data, Mapping)
+            or not isinstance(data.get("proven"), bool)
+            or "dstates" not in data
+        ):
+            raise MapError(
+                f"{where}: expected an object with proven and dstates, got {brief(data)}; write it with solve --json"
+            )
         dstates = _read_shared(data["dstates"], None, steps, f"{where}: dstates")
         of_step = dstates.always
-        rest = {sort: _read_shared(data[sort], of_step, steps, f"{where}: {sort}") for sort in SORTS[1:] if sort in data}
-        return cls(dstates, rest.get("places"), rest.get("paths"), rest.get("courses"), data["proven"])
+        rest = {
+            sort: _read_shared(data[sort], of_step, steps, f"{where}: {sort}")
+            for sort in SORTS[1:]
+            if sort in data
+        }
+        return cls(
+            dstates, rest.get("places"), rest.get("paths"), rest.get("courses"), data["proven"]
+        )
 
 
 class Sharing:
@@ -191,7 +218,9 @@ class Sharing:
     def backbone(self, *, proven: bool) -> Backbone:
         """What the maps so far share."""
         found = {sort: self._shared(kept) for sort, kept in self._kept.items()}
-        return Backbone(found["dstates"], found.get("places"), found.get("paths"), found.get("courses"), proven)
+        return Backbone(
+            found["dstates"], found.get("places"), found.get("paths"), found.get("courses"), proven
+        )
 
     def _shared(self, kept: Kept) -> Shared:
         number: dict[int, int] = {}
@@ -238,7 +267,10 @@ class Kept:
         if len(self._seen) == REMEMBERED:
             self._seen.clear()
         self._seen.add(names)
-        both = [(number, ("none", i) if name is None else name) for i, (number, name) in enumerate(zip(self.always, names, strict=True))]
+        both = [
+            (number, ("none", i) if name is None else name)
+            for i, (number, name) in enumerate(zip(self.always, names, strict=True))
+        ]
         numbers = {pair: i for i, pair in enumerate(dict.fromkeys(both))}
         self.always = list(map(numbers.__getitem__, both))
         members: dict[Hashable, list[int]] = {}
@@ -256,13 +288,25 @@ def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: st
     """What a file says of one sort: its numbers are of steps or, where a number of each step is given, of these."""
     expected = steps if of_step is None else len(set(of_step))
     always = data.get("always") if isinstance(data, Mapping) else None
-    if not isinstance(always, list) or len(always) != expected or not all(is_whole(n) and n >= 0 for n in always):
-        raise MapError(f"{where}.always: expected {expected} numbers, got {brief(always)}; write it with solve --json")
+    if (
+        not isinstance(always, list)
+        or len(always) != expected
+        or not all(is_whole(n) and n >= 0 for n in always)
+    ):
+        raise MapError(
+            f"{where}.always: expected {expected} numbers, got {brief(always)}; write it with solve --json"
+        )
     pairs, told = data.get("sometimes"), data.get("differing", [])
-    if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 and _are_steps(pair, steps) for pair in pairs):
-        raise MapError(f"{where}.sometimes: expected pairs of steps, 0 to {steps - 1}, got {brief(pairs)}; write it with solve --json")
+    if not isinstance(pairs, list) or not all(
+        isinstance(pair, list) and len(pair) == 2 and _are_steps(pair, steps) for pair in pairs
+    ):
+        raise MapError(
+            f"{where}.sometimes: expected pairs of steps, 0 to {steps - 1}, got {brief(pairs)}; write it with solve --json"
+        )
     if not isinstance(told, list) or not _are_steps(told, steps):
-        raise MapError(f"{where}.differing: expected steps, 0 to {steps - 1}, got {brief(told)}; write it with solve --json")
+        raise MapError(
+            f"{where}.differing: expected steps, 0 to {steps - 1}, got {brief(told)}; write it with solve --json"
+        )
     by_step = tuple(always if of_step is None else (always[number] for number in of_step))
     return Shared(by_step, tuple((i, j) for i, j in pairs), tuple(told))
 
@@ -290,12 +334,20 @@ def _name(dstate: DState, sort: Sort) -> Hashable:
 
 def _told_differing(sort: Sort, shared: Shared) -> str:
     if len(shared.differing) == len(shared.sometimes) == 1:
-        one = {"dstates": "one dstate", "places": "at one place", "paths": "along one path", "courses": "along one path in one direction"}[
-            sort
-        ]
+        one = {
+            "dstates": "one dstate",
+            "places": "at one place",
+            "paths": "along one path",
+            "courses": "along one path in one direction",
+        }[sort]
         first, later = shared.sometimes[0]
         return f"steps {first} and {later} are {one} in some of them"
-    whose = {"dstates": "dstate", "places": "place", "paths": "path", "courses": "direction along the path"}[sort]
+    whose = {
+        "dstates": "dstate",
+        "places": "place",
+        "paths": "path",
+        "courses": "direction along the path",
+    }[sort]
     if len(shared.differing) == 1:
         return f"the {whose} of step {shared.differing[0]} differs"
     whose = {"courses": "directions along paths"}.get(sort, f"{whose}s")

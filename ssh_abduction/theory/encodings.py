@@ -17,7 +17,9 @@ FIRST = (
     "star",
     "gateways",
 )  # each needs those before it; files that are added come after them, by name
-_AXIOM = re.compile(r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if (?P<when>.+))?|(?P<alone>.+))$")
+_AXIOM = re.compile(
+    r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if (?P<when>.+))?|(?P<alone>.+))$"
+)
 _WHEN = re.compile(r"^% @when (?P<when>.+)$")
 _KEEPS = re.compile(r"^% @keeps (?P<names>.+)$")
 _WITH = re.compile(r"^% @with (?P<names>.+)$")
@@ -75,14 +77,24 @@ def path(name: str) -> str:
 @cache
 def levels() -> tuple[str, ...]:
     """The encodings that hold axioms, in the order to load them. They are found in the folder, so a file that is put there is one of them."""
-    found = [file.stem for file in folder().glob("*.lp") if "\n% @axiom(" in file.read_text(encoding="utf-8")]
-    return tuple(sorted(found, key=lambda name: (FIRST.index(name) if name in FIRST else len(FIRST), name)))
+    found = [
+        file.stem
+        for file in folder().glob("*.lp")
+        if "\n% @axiom(" in file.read_text(encoding="utf-8")
+    ]
+    return tuple(
+        sorted(found, key=lambda name: (FIRST.index(name) if name in FIRST else len(FIRST), name))
+    )
 
 
 @cache
 def axioms() -> tuple[Axiom, ...]:
     """Every axiom of every level, in the order of the files."""
-    return tuple(axiom for level in levels() for axiom in axioms_in((folder() / f"{level}.lp").read_text(encoding="utf-8"), level))
+    return tuple(
+        axiom
+        for level in levels()
+        for axiom in axioms_in((folder() / f"{level}.lp").read_text(encoding="utf-8"), level)
+    )
 
 
 def axioms_in(text: str, level: str) -> list[Axiom]:
@@ -94,13 +106,26 @@ def axioms_in(text: str, level: str) -> list[Axiom]:
             subject += tuple(match["when"].split(" and "))
         elif match := _AXIOM.match(line):
             own = tuple(match["when"].split(" and ")) if match["when"] else ()
-            found.append(Axiom(match["name"], match["sentence"] or match["alone"], match["source"] or "", level, subject, subject + own))
+            found.append(
+                Axiom(
+                    match["name"],
+                    match["sentence"] or match["alone"],
+                    match["source"] or "",
+                    level,
+                    subject,
+                    subject + own,
+                )
+            )
     return found
 
 
 def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
     """The encodings that a theory with these fields needs, in the order to load them: those of its axioms, axioms that it leaves out (`without`) among them."""
-    return tuple(level for level in levels() if any(axiom.holds_in(choices) for axiom in axioms() if axiom.level == level))
+    return tuple(
+        level
+        for level in levels()
+        if any(axiom.holds_in(choices) for axiom in axioms() if axiom.level == level)
+    )
 
 
 @cache
@@ -116,10 +141,14 @@ def paths(name: str) -> tuple[str, ...]:
 @cache
 def keeps(*names: str) -> frozenset[str]:
     """The axioms that these fast encodings say at their heads that they keep, together and with the files that they share."""
-    return frozenset(axiom for name in names for file in paths(name) for axiom in _said(file, _KEEPS))
+    return frozenset(
+        axiom for name in names for file in paths(name) for axiom in _said(file, _KEEPS)
+    )
 
 
 def _said(file: str, head: re.Pattern[str]) -> list[str]:
     """The names in all lines of a file that have such a head."""
     lines = Path(file).read_text(encoding="utf-8").splitlines()
-    return [name for line in lines if (match := head.match(line)) for name in match["names"].split()]
+    return [
+        name for line in lines if (match := head.match(line)) for name in match["names"].split()
+    ]

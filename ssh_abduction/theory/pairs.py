@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
 
-Earlier: TypeAlias = Mapping[int, frozenset[int]]  # for a step, the earlier steps with which it makes a pair
+Earlier: TypeAlias = Mapping[
+    int, frozenset[int]
+]  # for a step, the earlier steps with which it makes a pair
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,11 @@ class Pairs:
     one: Earlier = field(default_factory=dict)
 
     @staticmethod
-    def of(apart: Iterable[tuple[int, int]] = (), elsewhere: Iterable[tuple[int, int]] = (), one: Iterable[tuple[int, int]] = ()) -> Pairs:
+    def of(
+        apart: Iterable[tuple[int, int]] = (),
+        elsewhere: Iterable[tuple[int, int]] = (),
+        one: Iterable[tuple[int, int]] = (),
+    ) -> Pairs:
         """Pairs whose steps may come in any order."""
         away = list(elsewhere)
         return Pairs(_earlier([*apart, *away]), _earlier(away), _earlier(one))
@@ -34,7 +40,12 @@ class Pairs:
         """What several kinds of evidence say together."""
         if len(several) <= 1:
             return several[0] if several else NO_PAIRS
-        return Pairs(*(_united([getattr(pairs, name) for pairs in several]) for name in ("apart", "elsewhere", "one")))
+        return Pairs(
+            *(
+                _united([getattr(pairs, name) for pairs in several])
+                for name in ("apart", "elsewhere", "one")
+            )
+        )
 
     def __bool__(self) -> bool:
         return bool(self.apart or self.one)
@@ -44,7 +55,9 @@ class Pairs:
         """The steps about which something is known once they are there."""
         return frozenset((*self.apart, *self.one))
 
-    def allow(self, step: int, labels: Sequence[int], place_of: Sequence[int | None] | None = None) -> bool:
+    def allow(
+        self, step: int, labels: Sequence[int], place_of: Sequence[int | None] | None = None
+    ) -> bool:
         """Whether a step may be at the dstate that `labels` gives it, by what is known of this step and earlier ones.
 
         place_of  the place of each dstate, where that is known
@@ -58,13 +71,17 @@ class Pairs:
             return False
         if not place_of or place_of[here] is None:
             return True
-        return all(place_of[labels[other]] != place_of[here] for other in self.elsewhere.get(step, ()))
+        return all(
+            place_of[labels[other]] != place_of[here] for other in self.elsewhere.get(step, ())
+        )
 
     def broken_by(self, labels: Sequence[int]) -> list[tuple[int, int]]:
         """The pairs of these first steps whose labels contradict what is known: the same label where they are apart, or different ones where they are one."""
         size = len(labels)
         wrong = [(i, t) for i, t in pairs_in(self.apart) if t < size and labels[i] == labels[t]]
-        return wrong + [(i, t) for i, t in pairs_in(self.one) if t < size and labels[i] != labels[t]]
+        return wrong + [
+            (i, t) for i, t in pairs_in(self.one) if t < size and labels[i] != labels[t]
+        ]
 
 
 def pairs_in(earlier: Earlier) -> list[tuple[int, int]]:

@@ -37,7 +37,9 @@ def is_planar(around: Mapping[Place, Ends]) -> bool:
 
 def _faces(around: Mapping[Place, Ends]) -> int:
     """How many faces a rotation system has, not counting those around places without edges."""
-    following = {end: ends[i - len(ends) + 1] for ends in around.values() for i, end in enumerate(ends)}
+    following = {
+        end: ends[i - len(ends) + 1] for ends in around.values() for i, end in enumerate(ends)
+    }
     faces = 0
     left = set(following)
     while left:
@@ -63,7 +65,9 @@ def _parts(around: Mapping[Place, Ends]) -> int:
     return parts
 
 
-def can_be_drawn(edges: Sequence[tuple[Place, Place]], allows: Callable[[Place, Ends], bool]) -> bool:
+def can_be_drawn(
+    edges: Sequence[tuple[Place, Place]], allows: Callable[[Place, Ends], bool]
+) -> bool:
     """Whether there is an order of the ends around each place in which the edges do not cross.
 
     edges   the two places that each one joins
@@ -78,7 +82,9 @@ def can_be_drawn(edges: Sequence[tuple[Place, Place]], allows: Callable[[Place, 
         ends_at.setdefault(place_of[end], []).append(end)
     orders = {place: _orders(ends, partial(allows, place)) for place, ends in ends_at.items()}
     nothing: dict[Place, Ends] = {}
-    return has_way(nothing, range(len(orders)), lambda drawn, _: _one_place_more(drawn, orders, place_of))
+    return has_way(
+        nothing, range(len(orders)), lambda drawn, _: _one_place_more(drawn, orders, place_of)
+    )
 
 
 def _on_rings(place_of: Sequence[Place]) -> set[int]:
@@ -100,7 +106,11 @@ def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
     """The clockwise orders of some ends that are allowed, the first one first."""
     orders: list[Ends] = [()]
     for end in ends:
-        longer = ((*order[:gap], end, *order[gap:]) for order in orders for gap in range(min(1, len(order)), len(order) + 1))
+        longer = (
+            (*order[:gap], end, *order[gap:])
+            for order in orders
+            for gap in range(min(1, len(order)), len(order) + 1)
+        )
         orders = [order for order in each_looking(longer) if allows(order)]
     return orders
 
@@ -109,11 +119,20 @@ def _one_place_more(
     drawn: dict[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
 ) -> Iterator[dict[Place, Ends]]:
     """The ways to draw one more place, one that is joined to those drawn if there is any: that with the fewest ways, so that what is certain comes first."""
-    near = {place_of[end ^ 1]: None for ends in drawn.values() for end in ends if place_of[end ^ 1] not in drawn}
+    near = {
+        place_of[end ^ 1]: None
+        for ends in drawn.values()
+        for end in ends
+        if place_of[end ^ 1] not in drawn
+    }
     among = near or {place: None for place in orders if place not in drawn}
     fewest: list[dict[Place, Ends]] | None = None
     for place in sorted(among, key=lambda place: len(orders[place])):
-        ways = [more for order in orders[place] if _leaves_room(more := {**drawn, place: order}, orders, place_of)]
+        ways = [
+            more
+            for order in orders[place]
+            if _leaves_room(more := {**drawn, place: order}, orders, place_of)
+        ]
         if fewest is None or len(ways) < len(fewest):
             fewest = ways
         if len(fewest) <= 1 or not near:
@@ -121,13 +140,17 @@ def _one_place_more(
     return iter(fewest or ())
 
 
-def _leaves_room(drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]) -> bool:
+def _leaves_room(
+    drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
+) -> bool:
     """Whether places are drawn so that each connected part of the others can lie in one face.
 
     Such a part is drawn as one place, with the ends that lead to it in the order in which that face meets them.
     """
     part = _parts_of_rest(drawn, orders, place_of)
-    following = {end: ends[i - len(ends) + 1] for ends in drawn.values() for i, end in enumerate(ends)}
+    following = {
+        end: ends[i - len(ends) + 1] for ends in drawn.values() for i, end in enumerate(ends)
+    }
     met: dict[Place, list[int]] = {}  # for each part, the ends in it, as one face meets them
     left = set(following)
     while left:
@@ -147,10 +170,14 @@ def _leaves_room(drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[En
             if number in met:
                 return False
             met[number] = ends
-    return is_planar({**drawn, **{("rest", number): tuple(reversed(ends)) for number, ends in met.items()}})
+    return is_planar(
+        {**drawn, **{("rest", number): tuple(reversed(ends)) for number, ends in met.items()}}
+    )
 
 
-def _parts_of_rest(drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]) -> dict[Place, Place]:
+def _parts_of_rest(
+    drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
+) -> dict[Place, Place]:
     """For each place that is not drawn, one that stands for the connected part that it is in."""
     part: dict[Place, Place] = {}
     for first in orders:
@@ -158,11 +185,21 @@ def _parts_of_rest(drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[
         while queue:
             place = queue.pop()
             part[place] = first
-            queue += [q for end in orders[place][0] if (q := place_of[end ^ 1]) not in drawn and q not in part] if orders[place] else []
+            queue += (
+                [
+                    q
+                    for end in orders[place][0]
+                    if (q := place_of[end ^ 1]) not in drawn and q not in part
+                ]
+                if orders[place]
+                else []
+            )
     return part
 
 
-def has_way(start: State, steps: Sequence[Step], ways: Callable[[State, Step], Iterator[State]]) -> bool:
+def has_way(
+    start: State, steps: Sequence[Step], ways: Callable[[State, Step], Iterator[State]]
+) -> bool:
     """Whether all steps can be gone from a start, each in one of its ways. It is a depth-first search, without recursion as there may be many steps."""
     gone: list[Iterator[State]] = []
     state = start

@@ -39,9 +39,13 @@ class Rules:
     def __post_init__(self) -> None:
         """Raises TheoryError for a text that clingo's lexer cannot take: it aborts the process, or ends without a word where a null character is."""
         if not isinstance(self.name, str) or not isinstance(self.text, str):
-            raise TheoryError(f"rules: expected a name and a text, got {brief(self.name)} and {brief(self.text)}; read them from a file")
+            raise TheoryError(
+                f"rules: expected a name and a text, got {brief(self.name)} and {brief(self.text)}; read them from a file"
+            )
         if not is_writable(self.text):
-            raise TheoryError(f"{self.name}: expected a text, got one with half a character (a surrogate); save it as UTF-8")
+            raise TheoryError(
+                f"{self.name}: expected a text, got one with half a character (a surrogate); save it as UTF-8"
+            )
         text = self.text.removeprefix("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
         object.__setattr__(self, "text", text)
         stray = text.find("\0")
@@ -50,8 +54,14 @@ class Rules:
         if stray >= 0:
             line, column = text.count("\n", 0, stray) + 1, stray - text.rfind("\n", 0, stray)
             if text.startswith("#script", stray):
-                raise TheoryError(f"{self.name}:{line}: expected rules, got #script; say it in rules, as no program runs in them")
-            mend = "save it as UTF-8" if text[stray] == "\0" else 'put it in quotes, as in "é", or write it in ASCII'
+                raise TheoryError(
+                    f"{self.name}:{line}: expected rules, got #script; say it in rules, as no program runs in them"
+                )
+            mend = (
+                "save it as UTF-8"
+                if text[stray] == "\0"
+                else 'put it in quotes, as in "é", or write it in ASCII'
+            )
             raise TheoryError(
                 f"{self.name}:{line}:{column}: expected ASCII outside of quotes and comments, got {text[stray]!r} (U+{ord(text[stray]):04X}); {mend}"
             )
@@ -66,17 +76,25 @@ class Rules:
         """Rules, a path of a file, or what `to_dict` made of rules. Raises TheoryError."""
         if isinstance(value, Rules):
             return value
-        if isinstance(value, Mapping) and isinstance(value.get("name"), str) and isinstance(value.get("text"), str):
+        if (
+            isinstance(value, Mapping)
+            and isinstance(value.get("name"), str)
+            and isinstance(value.get("text"), str)
+        ):
             return cls(value["name"], value["text"])
         if not isinstance(value, str | os.PathLike) or not str(value):
-            raise TheoryError(f"rules: expected files of rules, got {brief(value)}; give their paths, as in rules=['own.lp']")
+            raise TheoryError(
+                f"rules: expected files of rules, got {brief(value)}; give their paths, as in rules=['own.lp']"
+            )
         try:
             text = read_at_most(value, LARGEST).decode("utf-8")
         except (OSError, ValueError) as error:
             is_text = not isinstance(error, UnicodeError)
             reason = (getattr(error, "strerror", None) or error) if is_text else "no text in UTF-8"
             mend = "check the path" if is_text else "save it as UTF-8"
-            raise TheoryError(f"rules: {brief(str(value))} cannot be read: {reason}; {mend} (--rules)") from None
+            raise TheoryError(
+                f"rules: {brief(str(value))} cannot be read: {reason}; {mend} (--rules)"
+            ) from None
         return cls(str(value), text)
 
     @classmethod
@@ -87,7 +105,9 @@ class Rules:
         elif isinstance(value, Rules | os.PathLike | Mapping):
             value = [value]
         if not isinstance(value, Iterable):
-            raise TheoryError(f"rules: expected a list of files of rules, got {brief(value)}; give their paths, as in rules=['own.lp']")
+            raise TheoryError(
+                f"rules: expected a list of files of rules, got {brief(value)}; give their paths, as in rules=['own.lp']"
+            )
         return tuple(map(cls.of, value))
 
 

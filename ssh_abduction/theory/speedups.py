@@ -45,7 +45,9 @@ class Speedups:
     def __post_init__(self) -> None:
         for name in SPEEDUPS:
             if not isinstance(getattr(self, name), bool):
-                raise SolverError(f"speedups: {name}: expected true or false, got {brief(getattr(self, name))}")
+                raise SolverError(
+                    f"speedups: {name}: expected true or false, got {brief(getattr(self, name))}"
+                )
 
     def __repr__(self) -> str:
         return shortly(self)
@@ -54,11 +56,15 @@ class Speedups:
     def without(cls, names: str | Iterable[str]) -> Speedups:
         """All speed-ups but these. Raises SolverError."""
         if not isinstance(names, Iterable):
-            raise SolverError(f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(names)}")
+            raise SolverError(
+                f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(names)}"
+            )
         off = [name for name in (names.split(",") if isinstance(names, str) else names) if name]
         for name in off:
             if name not in SPEEDUPS:
-                raise SolverError(f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(name)}")
+                raise SolverError(
+                    f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(name)}"
+                )
         return cls(**dict.fromkeys(off, False))
 
     def that_hold_for(self, theory: Theory) -> Speedups:
@@ -71,7 +77,9 @@ class Speedups:
 def checked_speedups(value: object) -> Speedups:
     """The speed-ups that a caller gives. Raises SolverError."""
     if not isinstance(value, Speedups):
-        raise SolverError(f"speedups: expected Speedups, got {brief(value)}; take Speedups() or Speedups.without(…)")
+        raise SolverError(
+            f"speedups: expected Speedups, got {brief(value)}; take Speedups() or Speedups.without(…)"
+        )
     return value
 
 
@@ -100,7 +108,11 @@ class Speedup:
 
     def holds_for(self, theory: Theory) -> bool:
         """Whether it changes no answer of a theory whose star is settled."""
-        return self.suits(theory) and not self.rests_on & theory.given_up and (self.keeps is EVERY or theory.demands <= self.keeps())
+        return (
+            self.suits(theory)
+            and not self.rests_on & theory.given_up
+            and (self.keeps is EVERY or theory.demands <= self.keeps())
+        )
 
 
 EVERY: Final = None
@@ -129,11 +141,19 @@ def _has_paths(theory: Theory) -> bool:
 
 
 def _has_frames(theory: Theory) -> bool:
-    return theory.star == "frame" and theory.priorities[:1] == ("dstates",) and theory.path_order == "total"
+    return (
+        theory.star == "frame"
+        and theory.priorities[:1] == ("dstates",)
+        and theory.path_order == "total"
+    )
 
 
 def _has_bare_places(theory: Theory) -> bool:
-    return theory.level == "topological" and theory.star in ("none", "alike") and theory.priorities[:1] == ("dstates",)
+    return (
+        theory.level == "topological"
+        and theory.star in ("none", "alike")
+        and theory.priorities[:1] == ("dstates",)
+    )
 
 
 def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozenset[str]]:
@@ -142,7 +162,10 @@ def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozense
 
 
 CAUSAL = frozenset({"functional_view", "deterministic"})
-ONE_OF_EACH = CAUSAL | {"one_place", "one_course"}  # a dstate has one observation, one place, and one course
+ONE_OF_EACH = CAUSAL | {
+    "one_place",
+    "one_course",
+}  # a dstate has one observation, one place, and one course
 TRAVELS_AND_TURNS = CAUSAL | {
     "one_place",
     "turn_stays",
@@ -169,7 +192,16 @@ FRAMES = PLACES | {
     "one_dstate_per_heading",
     "path_goes_straight",
 }
-GATEWAYS = frozenset({"gateway_frame", "gateway_heading", "gateway_turn", "gateway_dstate", "gateway_path", "gateway_end"})
+GATEWAYS = frozenset(
+    {
+        "gateway_frame",
+        "gateway_heading",
+        "gateway_turn",
+        "gateway_dstate",
+        "gateway_path",
+        "gateway_end",
+    }
+)
 NOTHING: frozenset[str] = frozenset()
 # The axioms that a map of a trace still satisfies when it is cut to some first steps, and that speak of nothing but links, observations and pairs of steps.
 SURVIVE_A_CUT = FRAMES | {
@@ -207,7 +239,14 @@ TABLE = (
         ONE_OF_EACH | {"gateway_heading"},
         lambda: SURVIVE_A_CUT | GATEWAYS,
     ),
-    Speedup("path_names", "path_names", "Begin with few names for paths.", _has_paths, TRAVELS_AND_TURNS, EVERY),
+    Speedup(
+        "path_names",
+        "path_names",
+        "Begin with few names for paths.",
+        _has_paths,
+        TRAVELS_AND_TURNS,
+        EVERY,
+    ),
     Speedup(
         "named dstates",
         "names",
@@ -220,7 +259,9 @@ TABLE = (
         "named dstates with faults",
         "names",
         "Causal theory with faults: give the dstates names, and clingo the steps that a map does not predict.",
-        lambda theory: theory.level == "causal" and theory.has_faults and theory.prefer == ("dstates",),
+        lambda theory: (
+            theory.level == "causal" and theory.has_faults and theory.prefer == ("dstates",)
+        ),
         NOTHING,
         _kept_by(
             "faulty",
@@ -237,9 +278,17 @@ TABLE = (
         "mending",
         "names",
         "Places, or displacements that may be wrong, and faults: guess the faults, mend the trace, and solve it without; causal maps with faults say what is minimal.",
-        lambda theory: (theory.level == "topological" or theory.jumped > 0) and theory.has_faults and not theory.without,
+        lambda theory: (
+            (theory.level == "topological" or theory.jumped > 0)
+            and theory.has_faults
+            and not theory.without
+        ),
         NOTHING,
-        lambda: SURVIVE_A_CUT | {f"{axiom}, excusable" for axiom in SURVIVE_A_CUT} | {f"the field {kind}" for kind in EXCUSED},
+        lambda: (
+            SURVIVE_A_CUT
+            | {f"{axiom}, excusable" for axiom in SURVIVE_A_CUT}
+            | {f"the field {kind}" for kind in EXCUSED}
+        ),
     ),
     Speedup(
         "visits",
@@ -266,11 +315,37 @@ TABLE = (
         EVERY,
     ),
     Speedup(
-        "sides", "sides", "With frames: say what order and sides forbid while dstates are sought, path by path.", _has_frames, FRAMES, EVERY
+        "sides",
+        "sides",
+        "With frames: say what order and sides forbid while dstates are sought, path by path.",
+        _has_frames,
+        FRAMES,
+        EVERY,
     ),
-    Speedup("lazy", "lazy", "Give clingo only the links, or the visits, without which others go wrong.", _any_theory, NOTHING, EVERY),
-    Speedup("core_guided", "core_guided", "Raise the bound from below, rather than better the map.", _any_theory, NOTHING, EVERY),
-    Speedup("threads", "threads", "Two threads, where a trace is hard and there are two processors.", _any_theory, NOTHING, EVERY),
+    Speedup(
+        "lazy",
+        "lazy",
+        "Give clingo only the links, or the visits, without which others go wrong.",
+        _any_theory,
+        NOTHING,
+        EVERY,
+    ),
+    Speedup(
+        "core_guided",
+        "core_guided",
+        "Raise the bound from below, rather than better the map.",
+        _any_theory,
+        NOTHING,
+        EVERY,
+    ),
+    Speedup(
+        "threads",
+        "threads",
+        "Two threads, where a trace is hard and there are two processors.",
+        _any_theory,
+        NOTHING,
+        EVERY,
+    ),
     Speedup(
         "processes",
         "processes",
@@ -279,7 +354,14 @@ TABLE = (
         NOTHING,
         EVERY,
     ),
-    Speedup("annealed", "annealed", "Where clingo takes its time, a map near a guess; it passes the checker.", _any_theory, NOTHING, EVERY),
+    Speedup(
+        "annealed",
+        "annealed",
+        "Where clingo takes its time, a map near a guess; it passes the checker.",
+        _any_theory,
+        NOTHING,
+        EVERY,
+    ),
     Speedup(
         "greedy",
         "greedy",
@@ -300,7 +382,9 @@ TABLE = (
         "framing",
         "framing",
         "Places that need no frames: where clingo takes its time, a map in which they have some; it passes the checker.",
-        lambda theory: (framed := theory.with_frames()) is not None and row("visits").holds_for(framed),
+        lambda theory: (
+            (framed := theory.with_frames()) is not None and row("visits").holds_for(framed)
+        ),
         NOTHING,
         EVERY,
     ),

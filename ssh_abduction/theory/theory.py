@@ -146,10 +146,14 @@ class Theory:
     def __post_init__(self) -> None:
         for name, values in CHOICES.items():
             if not isinstance(getattr(self, name), str) or getattr(self, name) not in values:
-                raise TheoryError(f"{name}: expected one of {', '.join(values)}, got {brief(getattr(self, name))}")
+                raise TheoryError(
+                    f"{name}: expected one of {', '.join(values)}, got {brief(getattr(self, name))}"
+                )
         for field in fields(self):
             if isinstance(field.default, bool) and not isinstance(getattr(self, field.name), bool):
-                raise TheoryError(f"{field.name}: expected true or false, got {brief(getattr(self, field.name))}")
+                raise TheoryError(
+                    f"{field.name}: expected true or false, got {brief(getattr(self, field.name))}"
+                )
         self._check_numbers()
         self._set_names("prefer", (*COUNTS, *AUTO))
         self._set_names("without", [a.name for a in encodings.axioms()])
@@ -160,15 +164,23 @@ class Theory:
         if self.level == "causal":
             for name, values in (("boundary", ("none",)), ("star", ("none", "alike"))):
                 if getattr(self, name) not in values:
-                    raise TheoryError(f"{name}: expected {' or '.join(values)} with level=causal, got {getattr(self, name)}; take {CAUSAL}")
+                    raise TheoryError(
+                        f"{name}: expected {' or '.join(values)} with level=causal, got {getattr(self, name)}; take {CAUSAL}"
+                    )
             if set(self.prefer) - {"dstates", *AUTO}:
-                raise TheoryError(f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; take {CAUSAL}")
+                raise TheoryError(
+                    f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; take {CAUSAL}"
+                )
         if "auto" in self.prefer and self.prefer != AUTO:
-            raise TheoryError(f"prefer: expected auto alone, got {', '.join(self.prefer)}; name the counts, or leave it out")
+            raise TheoryError(
+                f"prefer: expected auto alone, got {', '.join(self.prefer)}; name the counts, or leave it out"
+            )
         if self.has_faults:
             self._check_faults()
         if "excuses" in self.prefer and self.boundary != "defeasible":
-            raise TheoryError(f"prefer: expected no excuses with boundary={self.boundary}; take {_choice('boundary', 'defeasible')}")
+            raise TheoryError(
+                f"prefer: expected no excuses with boundary={self.boundary}; take {_choice('boundary', 'defeasible')}"
+            )
 
     def __repr__(self) -> str:
         return shortly(self)
@@ -191,7 +203,9 @@ class Theory:
                 f"jumped: expected displacements to be used, which may be wrong, got displacement=none; leave it out, or take {_choice('displacement', 'auto')}"
             )
         if self.planar:
-            raise TheoryError("planar: expected no planarity where faults are allowed; leave it out (--no-planar)")
+            raise TheoryError(
+                "planar: expected no planarity where faults are allowed; leave it out (--no-planar)"
+            )
 
     def _check_numbers(self) -> None:
         for name in EXCUSED:
@@ -208,7 +222,9 @@ class Theory:
         for name, least, most in (("joint", 1, MOST_JOINT), ("returns", 0, MOST_STEPS)):
             value = getattr(self, name)
             if not is_whole(value) or not least <= value <= most:
-                raise TheoryError(f"{name}: expected a whole number from {least} to {most}, got {brief(value)}")
+                raise TheoryError(
+                    f"{name}: expected a whole number from {least} to {most}, got {brief(value)}"
+                )
             object.__setattr__(self, name, int(value))
         object.__setattr__(self, "reject", float(self.reject))
 
@@ -226,11 +242,17 @@ class Theory:
         value = getattr(self, field)
         if not isinstance(value, str | list | tuple):
             raise TheoryError(f"{field}: expected a list of names, got {brief(value)}")
-        names = tuple(name.strip() for name in value.split(",")) if isinstance(value, str) else tuple(value)
+        names = (
+            tuple(name.strip() for name in value.split(","))
+            if isinstance(value, str)
+            else tuple(value)
+        )
         known = list(allowed)
         for i, name in enumerate(names):
             if name not in known:
-                raise TheoryError(f"{field}: expected names out of {', '.join(known)}, got {brief(name)}")
+                raise TheoryError(
+                    f"{field}: expected names out of {', '.join(known)}, got {brief(name)}"
+                )
             if name in names[:i]:
                 raise TheoryError(f"{field}: expected each name once, got {brief(name)} twice")
         object.__setattr__(self, field, names)
@@ -254,7 +276,9 @@ class Theory:
         """This theory with other choices. Raises TheoryError."""
         unknown = set(choices) - {f.name for f in fields(self)}
         if unknown:
-            raise TheoryError(f"theory: expected fields out of {', '.join(f.name for f in fields(self))}, got {brief(min(unknown))}")
+            raise TheoryError(
+                f"theory: expected fields out of {', '.join(f.name for f in fields(self))}, got {brief(min(unknown))}"
+            )
         return replace(self, **choices)
 
     @property
@@ -262,9 +286,18 @@ class Theory:
         """What is minimised, first to last, with the excuses of boundary=defeasible in their place. With displacement=auto, that of a trace without displacements."""
         prefer = self.prefer
         if self.has_faults:
-            return ("tenths", *(count for count in self.without_faults().priorities if count != "dstates"))
+            return (
+                "tenths",
+                *(count for count in self.without_faults().priorities if count != "dstates"),
+            )
         if prefer == AUTO:
-            prefer = ("dstates",) if self.level == "causal" else WITH_DISPLACEMENTS if self.displacement == "use" else PREFERRED
+            prefer = (
+                ("dstates",)
+                if self.level == "causal"
+                else WITH_DISPLACEMENTS
+                if self.displacement == "use"
+                else PREFERRED
+            )
         if self.boundary == "defeasible" and "excuses" not in prefer:
             return ("excuses", *prefer)
         return prefer
@@ -299,18 +332,32 @@ class Theory:
     def axioms(self) -> tuple[str, ...]:
         """The names of the axioms that hold, those of the user's own rules last. With star=auto and displacement=auto, those of a trace that has neither."""
         own = [axiom.name for rules in self.rules for axiom in rules.axioms]
-        return (*(a.name for a in encodings.axioms() if a.name not in self.without and a.holds_in(vars(self))), *own)
+        return (
+            *(
+                a.name
+                for a in encodings.axioms()
+                if a.name not in self.without and a.holds_in(vars(self))
+            ),
+            *own,
+        )
 
     @cached_property
     def hard(self) -> frozenset[str]:
         """The axioms that nothing may break: all but the one that boundary=defeasible lets pairs of paths be excused from, and those that faults may break."""
         excused = set().union(*(axioms for name, axioms in EXCUSED.items() if getattr(self, name)))
-        return frozenset(self.axioms) - ({"side_of_branch"} if self.boundary == "defeasible" else set()) - excused
+        return (
+            frozenset(self.axioms)
+            - ({"side_of_branch"} if self.boundary == "defeasible" else set())
+            - excused
+        )
 
     @cached_property
     def given_up(self) -> frozenset[str]:
         """The axioms that are about something that the theory speaks of, but need not hold: they are not chosen, are left out, or may be excused."""
-        return frozenset(a.name for a in encodings.axioms() if a.has_subject_in(vars(self))) - self.hard
+        return (
+            frozenset(a.name for a in encodings.axioms() if a.has_subject_in(vars(self)))
+            - self.hard
+        )
 
     @cached_property
     def demands(self) -> frozenset[str]:
@@ -320,7 +367,11 @@ class Theory:
         excusable = {f"{name}, excusable" for name in set(self.axioms) - self.hard}
         asserted = {"asserted same"} if self.same else set()
         rules = {f"the rules of {rules.name}" for rules in self.rules}
-        others = {f"the field {f.name}" for f in fields(self) if f.name not in SPOKEN_FOR and getattr(self, f.name) != f.default}
+        others = {
+            f"the field {f.name}"
+            for f in fields(self)
+            if f.name not in SPOKEN_FOR and getattr(self, f.name) != f.default
+        }
         return self.hard | excusable | asserted | rules | others
 
     @cached_property
@@ -338,7 +389,9 @@ class Theory:
             return None
         boundary = "none" if self.boundary == "none" else "strict"
         rest = [count for count in self.priorities if count in ("paths", "places")]
-        return self.replace(star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest))
+        return self.replace(
+            star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest)
+        )
 
     def resolve(self, trace: Trace) -> Theory:
         """This theory with `star`, `displacement` and `prefer` settled for a trace, after checking that the trace has what the axioms need.
@@ -354,7 +407,9 @@ class Theory:
             star = "frame" if trace.has_stars else "none"
         if star != "none" and not trace.has_stars:
             mend = f"add them to the steps, or take {_choice('star', 'none')}"
-            raise TheoryError(f"star: expected a trace with stars for star={star}, got none; {mend}")
+            raise TheoryError(
+                f"star: expected a trace with stars for star={star}, got none; {mend}"
+            )
         if star == "frame" and not trace.in_quarters:
             star = "gateways"
         displacement = self.displacement
@@ -364,18 +419,27 @@ class Theory:
             displacement == "use" and not trace.has_displacements and not self.returns
         ):  # once they are counted, this may be a part of a trace
             mend = f"add them to the steps, or take {_choice('displacement', 'none')}"
-            raise TheoryError(f"displacement: expected a trace with displacements for displacement=use, got none; {mend}")
+            raise TheoryError(
+                f"displacement: expected a trace with displacements for displacement=use, got none; {mend}"
+            )
         views = set(trace.views)
         if views == {None}:
             raise TraceError(
                 f"{trace.at(0)}: view: expected one, got only an image; cluster the images into views first (ssh-abduction cluster)"
             )
         theory = replace(self, star=star, displacement=displacement, unknown_views=None in views)
-        counts: list[Count] = ["dstates" if count == "tenths" else count for count in theory.priorities]
-        theory = replace(theory, prefer=tuple(count for count in counts if count in self.prefer or count != "excuses"))
+        counts: list[Count] = [
+            "dstates" if count == "tenths" else count for count in theory.priorities
+        ]
+        theory = replace(
+            theory,
+            prefer=tuple(count for count in counts if count in self.prefer or count != "excuses"),
+        )
         for i, step in enumerate(trace.steps):
             theory.require(step, trace.at(i))
-        return theory._with_returns_of(trace) if displacement == "use" and not self.returns else theory
+        return (
+            theory._with_returns_of(trace) if displacement == "use" and not self.returns else theory
+        )
 
     def _with_returns_of(self, trace: Trace) -> Theory:
         """This theory with the returns counted that may be true in a trace."""
@@ -387,7 +451,12 @@ class Theory:
         """Raises TraceError, which says where, if a step lacks what the axioms need. Star has to be settled."""
         a_text("where", where, TraceError)
         _checked_step(step)
-        if self.level == "topological" and step.action is not None and step.action.kind is None and not step.action.slipped:
+        if (
+            self.level == "topological"
+            and step.action is not None
+            and step.action.kind is None
+            and not step.action.slipped
+        ):
             raise TraceError(
                 f'{where}: action.kind: expected "travel" or "turn" in a topological theory, got none for {brief(step.action.name)}; '
                 f'write {{"name": …, "kind": "travel"}} or {{"name": …, "kind": "turn", "turn": "right"}}, or take {CAUSAL}'
@@ -395,7 +464,9 @@ class Theory:
         if self.star == "none":
             return
         if step.star is None:
-            raise TraceError(f"{where}: star: expected one, as other steps have stars; add it, or take {_choice('star', 'none')}")
+            raise TraceError(
+                f"{where}: star: expected one, as other steps have stars; add it, or take {_choice('star', 'none')}"
+            )
         if self.star == "alike":
             return
         if self.star == "gateways":
@@ -416,20 +487,32 @@ class Theory:
         for name in ASSERTIONS:
             for pair in getattr(self, name):
                 if max(pair) >= len(trace):
-                    raise TheoryError(f"{name} (--{name}): expected steps from 0 to {len(trace) - 1}, got {pair[0]},{pair[1]}")
+                    raise TheoryError(
+                        f"{name} (--{name}): expected steps from 0 to {len(trace) - 1}, got {pair[0]},{pair[1]}"
+                    )
 
     def of_steps(self, first: int, length: int) -> Theory:
         """The theory of so many steps from the first one on, numbered from 0: pairs with other steps are dropped."""
-        first, length = (a_whole_number(name, value, TheoryError) for name, value in (("first", first), ("length", length)))
+        first, length = (
+            a_whole_number(name, value, TheoryError)
+            for name, value in (("first", first), ("length", length))
+        )
         kept = {
-            name: tuple((i - first, j - first) for i, j in getattr(self, name) if first <= min(i, j) and max(i, j) < first + length)
+            name: tuple(
+                (i - first, j - first)
+                for i, j in getattr(self, name)
+                if first <= min(i, j) and max(i, j) < first + length
+            )
             for name in ASSERTIONS
         }
         return replace(self, **kept)  # type: ignore[arg-type]
 
     def to_dict(self) -> dict[str, Any]:
         """The theory as plain data."""
-        return {k: [list(e) if isinstance(e, tuple) else e for e in v] if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+        return {
+            k: [list(e) if isinstance(e, tuple) else e for e in v] if isinstance(v, tuple) else v
+            for k, v in asdict(self).items()
+        }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Theory:
@@ -437,7 +520,9 @@ class Theory:
         if not isinstance(data, Mapping):
             raise TheoryError(f"theory: expected an object, got {brief(data)}")
         preset = cls.causal() if data.get("level") == "causal" else cls()
-        return preset.replace(**{str(k): tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+        return preset.replace(
+            **{str(k): tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+        )
 
 
 def _checked_step(value: object) -> Step:
@@ -464,8 +549,15 @@ def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
             steps = [int(step) if isinstance(step, str) else step.__index__() for step in pair]
         except (AttributeError, TypeError, ValueError):
             steps = []
-        if len(steps) != 2 or min(steps) < 0 or max(steps) >= MOST_STEPS or any(isinstance(step, bool) for step in pair):
-            raise TheoryError(f"{field}: expected pairs of steps, counted from 0, got {brief(given)}; {mend}")
+        if (
+            len(steps) != 2
+            or min(steps) < 0
+            or max(steps) >= MOST_STEPS
+            or any(isinstance(step, bool) for step in pair)
+        ):
+            raise TheoryError(
+                f"{field}: expected pairs of steps, counted from 0, got {brief(given)}; {mend}"
+            )
         if steps[0] == steps[1]:
             raise TheoryError(f"{field}: expected two steps, got {steps[0]} twice; {mend}")
         found[min(steps), max(steps)] = None
@@ -487,5 +579,7 @@ PRESETS: dict[str, Callable[[], Theory]] = {
 def checked_theory(value: object) -> Theory:
     """The theory that a caller gives, or Theory.topological() where that is None. Raises TheoryError."""
     if not isinstance(value, Theory | None):
-        raise TheoryError(f"theory: expected a Theory, got {brief(value)}; take Theory.topological(), Theory.causal() or Theory(…)")
+        raise TheoryError(
+            f"theory: expected a Theory, got {brief(value)}; take Theory.topological(), Theory.causal() or Theory(…)"
+        )
     return value or Theory.topological()

@@ -46,8 +46,12 @@ class Experiment:
 
 
 EXPERIMENTS = {
-    "notched-rectangle": Experiment("notched-rectangle", tours=50, k_max=12, views=4, dstates=8, places=4, paths=4),
-    "taylor-hall": Experiment("taylor-hall", tours=10, k_max=24, views=10, dstates=20, places=7, paths=4),
+    "notched-rectangle": Experiment(
+        "notched-rectangle", tours=50, k_max=12, views=4, dstates=8, places=4, paths=4
+    ),
+    "taylor-hall": Experiment(
+        "taylor-hall", tours=10, k_max=24, views=10, dstates=20, places=7, paths=4
+    ),
 }
 # The paper's robot has no odometry that would tell places apart.
 VIEWS_ALONE = Theory.topological().replace(star="none", displacement="none")
@@ -100,7 +104,9 @@ def measure(name: str, seed: int) -> Run:
     world = World.named(e.world)
     trace = simulate(world, e.tours, seed)
     truth = true_dstates(trace)
-    learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k_max=e.k_max, random_state=seed), time_limit=60).fit(trace)
+    learner = BootstrapLearner(
+        VIEWS_ALONE, ViewClusterer(k_max=e.k_max, random_state=seed), time_limit=60
+    ).fit(trace)
     ranges = images_of(trace)
     quality = learner.clusterer_.quality_
     labelings = learner.clusterer_.labels_by_k_
@@ -109,8 +115,15 @@ def measure(name: str, seed: int) -> Run:
     pairs = _aliased(learner.views_, truth)
     alone = labelings[e.dstates]
     even = simulate(world, e.tours, seed, every=_step(trace))
-    even_clusterer = ViewClusterer(k=learner.clusterer_.k_, random_state=seed).fit(ReciprocalTransformer().fit_transform(images_of(even)))
-    sizes = sorted({max(2, round(len(trace) * share)) for share in (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)})
+    even_clusterer = ViewClusterer(k=learner.clusterer_.k_, random_state=seed).fit(
+        ReciprocalTransformer().fit_transform(images_of(even))
+    )
+    sizes = sorted(
+        {
+            max(2, round(len(trace) * share))
+            for share in (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
+        }
+    )
     return Run(
         seed=seed,
         images=len(trace),
@@ -124,7 +137,10 @@ def measure(name: str, seed: int) -> Run:
         star_maps=starred.count,
         right=one_to_one(learner.labels_, truth),
         aliased=len(pairs),
-        told_apart=sum(not set(learner.labels_[truth == a]) & set(learner.labels_[truth == b]) for a, b in pairs),
+        told_apart=sum(
+            not set(learner.labels_[truth == a]) & set(learner.labels_[truth == b])
+            for a, b in pairs
+        ),
         curve=learning_curve(ranges, learner.labels_, sizes, random_state=seed),
         rates={
             "clustering alone": rate(ranges, alone, truth, seed),
@@ -146,10 +162,14 @@ def true_dstates(trace: Trace) -> NDArray[Any]:
 
 def one_to_one(labels: NDArray[Any], truth: NDArray[Any]) -> bool:
     """Whether labels and true dstates are the same partition of the steps."""
-    return bool((labels >= 0).all()) and len(set(zip(labels, truth, strict=True))) == len(set(labels)) == len(set(truth))
+    return bool((labels >= 0).all()) and len(set(zip(labels, truth, strict=True))) == len(
+        set(labels)
+    ) == len(set(truth))
 
 
-def rate(ranges: NDArray[np.float64], labels: NDArray[Any], truth: NDArray[Any], seed: int) -> float:
+def rate(
+    ranges: NDArray[np.float64], labels: NDArray[Any], truth: NDArray[Any], seed: int
+) -> float:
     """Recognition of the true dstate, 10-fold cross-validated, by a recogniser that learns other labels.
 
     Each label stands for the dstate that it goes with most often in the training part: the best that it can be worth.
@@ -173,7 +193,11 @@ def _aliased(views: NDArray[Any], truth: NDArray[Any]) -> list[tuple[str, str]]:
 
 
 def _counts(cost: Cost | None) -> dict[str, int] | None:
-    return None if cost is None else {"dstates": cost.dstates, "places": cost.places, "paths": cost.paths}
+    return (
+        None
+        if cost is None
+        else {"dstates": cost.dstates, "places": cost.places, "paths": cost.paths}
+    )
 
 
 def _step(trace: Trace) -> float:
@@ -189,7 +213,9 @@ def _spread(trace: Trace, truth: NDArray[Any], tours: int) -> list[list[float]]:
     for name in set(truth):
         here = truth == name
         turned = np.angle(np.exp(1j * (poses[here, 2] - poses[here, 2][0])))
-        off[here] = np.column_stack([poses[here, :2] - poses[here, :2].mean(0), turned - turned.mean()])
+        off[here] = np.column_stack(
+            [poses[here, :2] - poses[here, :2].mean(0), turned - turned.mean()]
+        )
     return [[float(v) for v in np.abs(part).max(0)] for part in np.array_split(off, tours)]
 
 
@@ -213,13 +239,30 @@ def claims(name: str) -> list[Claim]:
     triple = f"{e.dstates}, {e.places}, {e.paths}"
     right = {"dstates": e.dstates, "places": e.places, "paths": e.paths}
     if name == "notched-rectangle":
-        largest = Claim("largest k with U = 1", "the same k", lambda r: str(r.largest_k), lambda r: r.largest_k == r.k)
+        largest = Claim(
+            "largest k with U = 1",
+            "the same k",
+            lambda r: str(r.largest_k),
+            lambda r: r.largest_k == r.k,
+        )
     else:
         higher = "higher k would still have been free of variability: largest k with U = 1"
-        largest = Claim(higher, f"above {e.views}", lambda r: str(r.largest_k), lambda r: r.largest_k > r.k)
+        largest = Claim(
+            higher, f"above {e.views}", lambda r: str(r.largest_k), lambda r: r.largest_k > r.k
+        )
     return [
-        Claim(f"k chosen by M, {'400' if e.views == 4 else '240'} images", str(e.views), lambda r: str(r.k), lambda r: r.k == e.views),
-        Claim("U at that k", "1", lambda r: f"{r.uncertainty[r.k]:.3f}", lambda r: r.uncertainty[r.k] > 1 - 1e-9),
+        Claim(
+            f"k chosen by M, {'400' if e.views == 4 else '240'} images",
+            str(e.views),
+            lambda r: str(r.k),
+            lambda r: r.k == e.views,
+        ),
+        Claim(
+            "U at that k",
+            "1",
+            lambda r: f"{r.uncertainty[r.k]:.3f}",
+            lambda r: r.uncertainty[r.k] > 1 - 1e-9,
+        ),
         largest,
         Claim(
             "dstates, places, paths, from the views alone",
@@ -264,21 +307,35 @@ def claims(name: str) -> list[Claim]:
         Claim(
             "images at even distances, same k: M and U drop",
             "yes",
-            lambda r: f"M {r.quality[r.k]:.1f} to {r.even_quality:.2f}, U to {r.even_uncertainty:.2f}",
-            lambda r: r.even_quality < r.quality[r.k] and r.even_uncertainty < r.uncertainty[r.k] - 1e-9,
+            lambda r: (
+                f"M {r.quality[r.k]:.1f} to {r.even_quality:.2f}, U to {r.even_uncertainty:.2f}"
+            ),
+            lambda r: (
+                r.even_quality < r.quality[r.k] and r.even_uncertainty < r.uncertainty[r.k] - 1e-9
+            ),
             ours=True,
         ),
         Claim(
             "recognition by clusters, by map, by truth: first below, the others equal",
             "yes",
-            lambda r: ", ".join(f"{100 * r.rates[kind]:.1f}" for kind in ("clustering alone", "map", "truth")) + " %",
-            lambda r: r.rates["clustering alone"] < r.rates["map"] - 0.02 and abs(r.rates["map"] - r.rates["truth"]) < 0.01,
+            lambda r: (
+                ", ".join(
+                    f"{100 * r.rates[kind]:.1f}" for kind in ("clustering alone", "map", "truth")
+                )
+                + " %"
+            ),
+            lambda r: (
+                r.rates["clustering alone"] < r.rates["map"] - 0.02
+                and abs(r.rates["map"] - r.rates["truth"]) < 0.01
+            ),
             ours=True,
         ),
         Claim(
             "errors do not add up: largest offset from a dstate, last tour against first",
             "no growth",
-            lambda r: f"{1000 * max(r.spread[-1][:2]):.0f} mm against {1000 * max(r.spread[0][:2]):.0f} mm",
+            lambda r: (
+                f"{1000 * max(r.spread[-1][:2]):.0f} mm against {1000 * max(r.spread[0][:2]):.0f} mm"
+            ),
             lambda r: _trend(r) < 0.5,
             ours=True,
         ),
@@ -288,7 +345,9 @@ def claims(name: str) -> list[Claim]:
 def _triple(cost: dict[str, int] | None, maps: int) -> str:
     if cost is None:
         return "no map"
-    return f"{cost['dstates']}, {cost['places']}, {cost['paths']}{'' if maps == 1 else f' (#{maps})'}"
+    return (
+        f"{cost['dstates']}, {cost['places']}, {cost['paths']}{'' if maps == 1 else f' (#{maps})'}"
+    )
 
 
 def _trend(run: Run) -> float:
@@ -347,14 +406,18 @@ def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
     images = ReciprocalTransformer().fit_transform(ranges)
     clusterer = ViewClusterer(k_max=10, n_init=4, random_state=seed).fit(images)
     actions = [world.route[i % len(world.route)] for i in range(len(means) - 1)]
-    solution = solve(Trace.from_steps(clusterer.labels_.tolist(), actions), VIEWS_ALONE, time_limit=5)
+    solution = solve(
+        Trace.from_steps(clusterer.labels_.tolist(), actions), VIEWS_ALONE, time_limit=5
+    )
     return Outcome(
         notch,
         scale,
         scale * float(np.sqrt((offsets[:, :2] ** 2).sum(1).mean())),
         clusterer.k_,
         uncertainty_coefficient(clusterer.labels_, truth),
-        solution.complete and solution.count == 1 and one_to_one(np.array(solution.maps[0].labels), truth),
+        solution.complete
+        and solution.count == 1
+        and one_to_one(np.array(solution.maps[0].labels), truth),
         rate(ranges, np.unique(truth, return_inverse=True)[1], truth, seed),
     )
 
@@ -368,7 +431,9 @@ def notched(depth: float) -> World:
 
 
 @cache
-def _driven(notch: float, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
+def _driven(
+    notch: float, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
     """For each pose of 50 circuits: the mean pose at its dstate, (n, 3), how far it is off it, (n, 3), and the dstate."""
     trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, seed)
     truth = true_dstates(trace)

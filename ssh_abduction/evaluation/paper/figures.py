@@ -30,9 +30,15 @@ def require_matplotlib() -> None:
     try:
         importlib.import_module("matplotlib")
     except ImportError:
-        raise AbductionError("plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'") from None
-    except Exception as error:  # of its settings, such as MPLBACKEND, which it reads when it is loaded
-        raise AbductionError(f"plot: expected matplotlib to load, got {type(error).__name__}: {error}; mend its settings") from None
+        raise AbductionError(
+            "plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'"
+        ) from None
+    except (
+        Exception
+    ) as error:  # of its settings, such as MPLBACKEND, which it reads when it is loaded
+        raise AbductionError(
+            f"plot: expected matplotlib to load, got {type(error).__name__}: {error}; mend its settings"
+        ) from None
 
 
 def _pyplot() -> Any:
@@ -42,7 +48,9 @@ def _pyplot() -> Any:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    pyplot.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 110})
+    pyplot.rcParams.update(
+        {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 110}
+    )
     return pyplot
 
 
@@ -53,7 +61,9 @@ def _save(figure: Any, path: str | Path) -> None:
     write_file(path, drawn.getvalue())
 
 
-def draw_quality(path: str | Path, quality: Mapping[int, float], uncertainty: Mapping[int, float], chosen: int) -> None:
+def draw_quality(
+    path: str | Path, quality: Mapping[int, float], uncertainty: Mapping[int, float], chosen: int
+) -> None:
     """M, and U where it is known, against the number of clusters k."""
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
     axes.plot(list(quality), list(quality.values()), "o-", color=BLUE, label="M")
@@ -62,8 +72,12 @@ def draw_quality(path: str | Path, quality: Mapping[int, float], uncertainty: Ma
     handles = axes.get_legend_handles_labels()
     if uncertainty:
         right = axes.twinx()
-        right.plot(list(uncertainty), list(uncertainty.values()), "s--", color=ORANGE, label="U(v|x)")
-        right.set(ylabel="U: views determined by dstates", ylim=(min(0.7, *uncertainty.values()), 1.02))
+        right.plot(
+            list(uncertainty), list(uncertainty.values()), "s--", color=ORANGE, label="U(v|x)"
+        )
+        right.set(
+            ylabel="U: views determined by dstates", ylim=(min(0.7, *uncertainty.values()), 1.02)
+        )
         right.spines["right"].set_visible(True)
         more = right.get_legend_handles_labels()
         handles = (handles[0] + more[0], handles[1] + more[1])
@@ -75,7 +89,9 @@ def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None
     """Recognition rate, mean and range over the folds, against the number of images."""
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
     for (name, curve), colour in zip(curves.items(), (BLUE, ORANGE, GREEN), strict=False):
-        axes.fill_between(curve.sizes, curve.lowest, curve.highest, color=colour, alpha=0.2, linewidth=0)
+        axes.fill_between(
+            curve.sizes, curve.lowest, curve.highest, color=colour, alpha=0.2, linewidth=0
+        )
         axes.plot(curve.sizes, curve.mean, "o-", color=colour, label=name)
     axes.set(xlabel="images seen", ylabel="recognition rate", ylim=(0, 1.03))
     axes.legend(frameon=False, loc="lower right")
@@ -88,7 +104,9 @@ def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None
     beliefs  as `Belief.to_dict` gives them
     """
     pyplot = _pyplot()
-    figure, (upper, lower) = pyplot.subplots(2, 1, figsize=(7, 3.8), sharex=True, height_ratios=(2, 1))
+    figure, (upper, lower) = pyplot.subplots(
+        2, 1, figsize=(7, 3.8), sharex=True, height_ratios=(2, 1)
+    )
     steps = np.arange(len(beliefs))
     for verdict, colour in (("lost", ORANGE), ("nowhere", GREY)):
         shaded = np.array([belief["verdict"] == verdict for belief in beliefs])
@@ -104,11 +122,23 @@ def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None
                 transform=axes.get_xaxis_transform(),
                 label=verdict if shaded.any() else None,
             )
-    upper.plot(steps, [belief["entropy"] for belief in beliefs], "o-", color=BLUE, markersize=3, label="entropy")
+    upper.plot(
+        steps,
+        [belief["entropy"] for belief in beliefs],
+        "o-",
+        color=BLUE,
+        markersize=3,
+        label="entropy",
+    )
     collapses = [step for step, belief in enumerate(beliefs) if belief["collapsed"]]
     if collapses:
         upper.plot(
-            collapses, [beliefs[step]["entropy"] for step in collapses], "x", color="black", markersize=7, label="the belief collapsed"
+            collapses,
+            [beliefs[step]["entropy"] for step in collapses],
+            "x",
+            color="black",
+            markersize=7,
+            label="the belief collapsed",
         )
     upper.set(ylabel="entropy, bits", ylim=(0, None))
     upper.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
@@ -131,10 +161,19 @@ def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]])
     for s in world.dstates:
         x, y, heading = s.pose
         axes.annotate(
-            "", (x + size * math.cos(heading), y + size * math.sin(heading)), (x, y), arrowprops={"arrowstyle": "->", "color": GREEN}
+            "",
+            (x + size * math.cos(heading), y + size * math.sin(heading)),
+            (x, y),
+            arrowprops={"arrowstyle": "->", "color": GREEN},
         )
         if len(world.dstates) <= 8:
-            axes.text(x + 1.35 * size * math.cos(heading), y + 1.35 * size * math.sin(heading), s.name, ha="center", va="center")
+            axes.text(
+                x + 1.35 * size * math.cos(heading),
+                y + 1.35 * size * math.sin(heading),
+                s.name,
+                ha="center",
+                va="center",
+            )
     if len(world.dstates) > 8:
         for place in sorted({s.place for s in world.dstates}):
             x, y, _ = next(s.pose for s in world.dstates if s.place == place)
@@ -143,18 +182,28 @@ def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]])
     _save(figure, path)
 
 
-def draw_views(path: str | Path, images: NDArray[np.float64], views: NDArray[Any], truth: NDArray[Any]) -> None:
+def draw_views(
+    path: str | Path, images: NDArray[np.float64], views: NDArray[Any], truth: NDArray[Any]
+) -> None:
     """The images of each view on top of each other, as the robot sees them, and which dstates they are of."""
     names = sorted(set(views.tolist()))
     columns = min(5, len(names))
     rows = math.ceil(len(names) / columns)
-    figure, grid = _pyplot().subplots(rows, columns, figsize=(2.1 * columns, 2.0 * rows), squeeze=False)
+    figure, grid = _pyplot().subplots(
+        rows, columns, figsize=(2.1 * columns, 2.0 * rows), squeeze=False
+    )
     for axes in grid.flat:
         axes.axis("off")
     far = min(8.4, 1.05 * float(np.percentile(images, 98)))
     for axes, name in zip(grid.flat, names, strict=False):
         for image in images[views == name][:60]:
-            axes.plot(-image * np.sin(BEARINGS), image * np.cos(BEARINGS), color=BLUE, linewidth=0.4, alpha=0.3)
+            axes.plot(
+                -image * np.sin(BEARINGS),
+                image * np.cos(BEARINGS),
+                color=BLUE,
+                linewidth=0.4,
+                alpha=0.3,
+            )
         axes.plot(0, 0, "^", color=ORANGE, markersize=5)
         axes.set(aspect="equal", xlim=(-far, far), ylim=(-0.06 * far, far))
         dstates = sorted(set(truth[views == name].tolist()))
@@ -164,7 +213,10 @@ def draw_views(path: str | Path, images: NDArray[np.float64], views: NDArray[Any
 
 
 def draw_telling(
-    path: str | Path, ranges: NDArray[np.float64], labels: NDArray[Any], found: Mapping[tuple[int, int], TellingFeatures]
+    path: str | Path,
+    ranges: NDArray[np.float64],
+    labels: NDArray[Any],
+    found: Mapping[tuple[int, int], TellingFeatures],
 ) -> None:
     """Which beams tell pairs of dstates apart: a row for each pair, a column for each method, over the median scan of each of the two.
 
@@ -172,17 +224,32 @@ def draw_telling(
     labels  (n,) the dstate of each
     """
     methods = list(next(iter(found.values())).methods)
-    figure, grid = _pyplot().subplots(len(found), len(methods), figsize=(3.2 * len(methods), 2.3 * len(found)), squeeze=False)
+    figure, grid = _pyplot().subplots(
+        len(found), len(methods), figsize=(3.2 * len(methods), 2.3 * len(found)), squeeze=False
+    )
     bearings = np.radians((np.arange(ranges.shape[1]) + 0.5) * 180 / ranges.shape[1] - 90)
     for row, ((a, b), telling) in zip(grid, found.items(), strict=True):
         scans = [np.median(ranges[labels == name], axis=0) for name in (a, b)]
         far = 1.05 * min(8.0, max(float(np.max(scan)) for scan in scans))
         for axes, (method, shares) in zip(row, telling.methods.items(), strict=True):
             for scan, colour, dashes in zip(scans, (BLUE, GREEN), ("-", "--"), strict=True):
-                axes.plot(-scan * np.sin(bearings), scan * np.cos(bearings), dashes, color=colour, linewidth=0.8)
+                axes.plot(
+                    -scan * np.sin(bearings),
+                    scan * np.cos(bearings),
+                    dashes,
+                    color=colour,
+                    linewidth=0.8,
+                )
             at = np.flatnonzero(shares > 0)
             x, y = -scans[0][at] * np.sin(bearings[at]), scans[0][at] * np.cos(bearings[at])
-            axes.scatter(x, y, s=300 * shares[at] / max(shares.max(), 0.01) * 0.5, color=ORANGE, alpha=0.6, linewidths=0)
+            axes.scatter(
+                x,
+                y,
+                s=300 * shares[at] / max(shares.max(), 0.01) * 0.5,
+                color=ORANGE,
+                alpha=0.6,
+                linewidths=0,
+            )
             axes.plot(0, 0, "^", color="black", markersize=5)
             axes.set(aspect="equal", xlim=(-far, far), ylim=(-0.08 * far, far))
             axes.set_title(f"{a} or {b}: {method}", fontsize=8)
@@ -201,10 +268,24 @@ def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
     """The largest offset from a dstate, tour by tour."""
     table = np.array(spread)
     figure, axes = _pyplot().subplots(figsize=(5.5, 2.8))
-    axes.plot(np.arange(1, len(table) + 1), 1000 * table[:, :2].max(1), "o-", color=BLUE, markersize=3, label="position")
+    axes.plot(
+        np.arange(1, len(table) + 1),
+        1000 * table[:, :2].max(1),
+        "o-",
+        color=BLUE,
+        markersize=3,
+        label="position",
+    )
     axes.set(xlabel="tour", ylabel="largest offset, mm", ylim=(0, None))
     right = axes.twinx()
-    right.plot(np.arange(1, len(table) + 1), np.degrees(table[:, 2]), "s--", color=ORANGE, markersize=3, label="heading")
+    right.plot(
+        np.arange(1, len(table) + 1),
+        np.degrees(table[:, 2]),
+        "s--",
+        color=ORANGE,
+        markersize=3,
+        label="heading",
+    )
     right.set(ylabel="largest offset, degrees", ylim=(0, None))
     right.spines["right"].set_visible(True)
     figure.legend(frameon=False, loc="upper right", ncols=2)
@@ -225,24 +306,57 @@ def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[flo
         ("map right", lambda o: float(o.right), "Greens"),
         ("recognition rate (true labels)", lambda o: o.rate, "viridis"),
     ]
-    lowest = {"map right": 0.0, "U at that k": 0.7, "recognition rate (true labels)": 0.4, "k chosen by M": 2}
+    lowest = {
+        "map right": 0.0,
+        "U at that k": 0.7,
+        "recognition rate (true labels)": 0.4,
+        "k chosen by M": 2,
+    }
     for axes, (title, value, colours) in zip(grid.flat, panels, strict=True):
         table = np.round([[value(cell[n, t]) for t in scales] for n in notches], 3)
         axes.imshow(table, origin="lower", cmap=colours, aspect="auto", vmin=lowest[title])
         for i, n in enumerate(notches):
             for j, t in enumerate(scales):
                 o = cell[n, t]
-                text = {"k chosen by M": str(o.k), "map right": "yes" if o.right else "no"}.get(title, f"{table[i, j]:.2f}")
+                text = {"k chosen by M": str(o.k), "map right": "yes" if o.right else "no"}.get(
+                    title, f"{table[i, j]:.2f}"
+                )
                 middle = (table.min() + table.max()) / 2
-                dark = table[i, j] < max(middle, lowest[title]) if colours == "viridis" else table[i, j] > middle
-                axes.text(j, i, text, ha="center", va="center", fontsize=8, color="white" if dark else "black")
+                dark = (
+                    table[i, j] < max(middle, lowest[title])
+                    if colours == "viridis"
+                    else table[i, j] > middle
+                )
+                axes.text(
+                    j,
+                    i,
+                    text,
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color="white" if dark else "black",
+                )
                 if as_in_paper(o):
-                    axes.add_patch(pyplot.Rectangle((j - 0.47, i - 0.47), 0.94, 0.94, fill=False, edgecolor=ORANGE, linewidth=2))
-        x, y = np.interp(here[1], scales, range(len(scales))), np.interp(here[0], notches, range(len(notches)))
+                    axes.add_patch(
+                        pyplot.Rectangle(
+                            (j - 0.47, i - 0.47),
+                            0.94,
+                            0.94,
+                            fill=False,
+                            edgecolor=ORANGE,
+                            linewidth=2,
+                        )
+                    )
+        x, y = (
+            np.interp(here[1], scales, range(len(scales))),
+            np.interp(here[0], notches, range(len(notches))),
+        )
         axes.plot(x, y, "x", color="red", markersize=10, markeredgewidth=2.5)
         axes.set_xticks(range(len(scales)), [f"{1000 * s:.1f}" for s in spreads])
         axes.set_yticks(range(len(notches)), [f"{100 * n:g}" for n in notches])
-        axes.set(title=title, xlabel="spread of positions (rms), mm", ylabel="depth of the notch, cm")
+        axes.set(
+            title=title, xlabel="spread of positions (rms), mm", ylabel="depth of the notch, cm"
+        )
     figure.tight_layout()
     _save(figure, path)
 

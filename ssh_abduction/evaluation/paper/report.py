@@ -104,7 +104,9 @@ def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int)
     numbered = [(number, work, task) for number, task in enumerate(tasks)]
     for answer in workers.answers(_done, numbered, processes, lambda: False, None, 0.0):
         if isinstance(answer, workers.Lost):
-            raise AbductionError("process: expected an answer, got killed, as happens when memory runs out; take fewer --jobs")
+            raise AbductionError(
+                "process: expected an answer, got killed, as happens when memory runs out; take fewer --jobs"
+            )
         number, ready[number] = answer
         while turn in ready:
             result = ready.pop(turn)
@@ -114,7 +116,9 @@ def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int)
             turn += 1
 
 
-def _done(number: int, work: Callable[..., Any], task: tuple[Any, ...], _: Callable[[], bool]) -> tuple[int, Any]:
+def _done(
+    number: int, work: Callable[..., Any], task: tuple[Any, ...], _: Callable[[], bool]
+) -> tuple[int, Any]:
     """The result of `work`, or what it raised, in a process that does nothing else."""
     try:
         return number, work(*task)
@@ -124,7 +128,11 @@ def _done(number: int, work: Callable[..., Any], task: tuple[Any, ...], _: Calla
 
 def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:
     """How often `on_done` will be called: for a progress bar."""
-    return len(seeds) + 1 + (len(NOTCHES) * len(SCALES) if outcomes and name == "notched-rectangle" else 0)
+    return (
+        len(seeds)
+        + 1
+        + (len(NOTCHES) * len(SCALES) if outcomes and name == "notched-rectangle" else 0)
+    )
 
 
 def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> None:
@@ -183,25 +191,52 @@ DIFFERENCES = {
 
 FIGURES = {
     "notched-rectangle": [
-        ("world.png", "Figure 2: the notched rectangle. Walls, true dstates (arrows) and where images were taken."),
-        ("views.png", "Ours: the views. Images of each cluster on top of each other, the robot at the triangle, facing up."),
+        (
+            "world.png",
+            "Figure 2: the notched rectangle. Walls, true dstates (arrows) and where images were taken.",
+        ),
+        (
+            "views.png",
+            "Ours: the views. Images of each cluster on top of each other, the robot at the triangle, facing up.",
+        ),
         ("quality.png", "Figure 3: M and U against the number of clusters."),
         ("map.svg", "Ours: the minimal map, from the views alone."),
-        ("learning.png", "Figure 4: recognition rate on the map's labels, mean and range over ten folds."),
-        ("spread.png", "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by tour."),
+        (
+            "learning.png",
+            "Figure 4: recognition rate on the map's labels, mean and range over ten folds.",
+        ),
+        (
+            "spread.png",
+            "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by tour.",
+        ),
         (
             "outcomes.png",
             "Ours: where the method works. Frames: all as in the paper (4 views, U = 1, right map, full recognition). Cross: this robot.",
         ),
     ],
     "taylor-hall": [
-        ("world.png", "Figure 5: the hallway. Walls, clutter (orange), true dstates (arrows) and where images were taken."),
-        ("views.png", "Ours: the views. Images of each cluster on top of each other, the robot at the triangle, facing up."),
+        (
+            "world.png",
+            "Figure 5: the hallway. Walls, clutter (orange), true dstates (arrows) and where images were taken.",
+        ),
+        (
+            "views.png",
+            "Ours: the views. Images of each cluster on top of each other, the robot at the triangle, facing up.",
+        ),
         ("quality.png", "Figure 6, left: M and U against the number of clusters."),
         ("map.svg", "Ours: the minimal map, from the views alone."),
-        ("map-with-openings.svg", "Ours: the minimal map when the openings that the robot saw at each place are used too."),
-        ("learning.png", "Figure 6, right: recognition rate on the map's labels, mean and range over ten folds."),
-        ("spread.png", "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by tour."),
+        (
+            "map-with-openings.svg",
+            "Ours: the minimal map when the openings that the robot saw at each place are used too.",
+        ),
+        (
+            "learning.png",
+            "Figure 6, right: recognition rate on the map's labels, mean and range over ten folds.",
+        ),
+        (
+            "spread.png",
+            "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by tour.",
+        ),
     ],
 }
 
@@ -252,4 +287,6 @@ def spread_of(row: dict[str, Any]) -> str:
     counted = sorted(set(values), key=values.count, reverse=True)
     if len(counted) == 1:
         return str(counted[0])
-    return "; ".join(f"{v} (x{values.count(v)})" for v in counted[:3]) + ("; …" if len(counted) > 3 else "")
+    return "; ".join(f"{v} (x{values.count(v)})" for v in counted[:3]) + (
+        "; …" if len(counted) > 3 else ""
+    )

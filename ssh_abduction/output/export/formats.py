@@ -50,7 +50,9 @@ def export_map(
     checked_map(ssh_map)
     degrees_of(turns)
     if not isinstance(to, str) or to not in FORMATS:
-        raise MapError(f"to: expected {', '.join(FORMATS[:-1])} or {FORMATS[-1]}, got {brief(to)}; take one of these")
+        raise MapError(
+            f"to: expected {', '.join(FORMATS[:-1])} or {FORMATS[-1]}, got {brief(to)}; take one of these"
+        )
     level = _level(ssh_map, to, level)
     if not isinstance(level, str) or level not in LEVELS:
         raise MapError(f"level: expected places or dstates, got {brief(level)}; say what nodes are")
@@ -61,15 +63,23 @@ def export_map(
         return (nav2 if to == "nav2" else tmap2)(Roads.of(ssh_map, level, turns), name, frame)
     if level == "places":
         if not ssh_map.places:
-            raise MapError("level: expected dstates, got places: the map has no places; export its dstates")
+            raise MapError(
+                "level: expected dstates, got places: the map has no places; export its dstates"
+            )
         if to == "dot":
-            raise MapError("level: expected dstates, got places: DOT has a node a dstate, and a cluster a place; leave the level out")
+            raise MapError(
+                "level: expected dstates, got places: DOT has a node a dstate, and a cluster a place; leave the level out"
+            )
         graph = _graph_of_places(ssh_map, turns)
     elif to == "networkx-json":
         graph = ssh_map.to_networkx()
     else:
         return ssh_map.to_dot() if to == "dot" else ssh_map.to_graphml()
-    return json_line(nx.node_link_data(graph, edges="edges")) if to == "networkx-json" else "\n".join(nx.generate_graphml(graph))
+    return (
+        json_line(nx.node_link_data(graph, edges="edges"))
+        if to == "networkx-json"
+        else "\n".join(nx.generate_graphml(graph))
+    )
 
 
 def _graph_of_places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.Graph[Any]:
@@ -81,7 +91,9 @@ def _graph_of_places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.Graph[A
     return graph
 
 
-def doubts(ssh_map: SSHMap, to: str, *, level: str | None = None, turns: Trace | Turns | None = None) -> tuple[str, ...]:
+def doubts(
+    ssh_map: SSHMap, to: str, *, level: str | None = None, turns: Trace | Turns | None = None
+) -> tuple[str, ...]:
     """What a program that navigates by an exported map may stumble over.
 
     Args:
@@ -97,9 +109,15 @@ def doubts(ssh_map: SSHMap, to: str, *, level: str | None = None, turns: Trace |
     roads = Roads.of(ssh_map, level, turns)
     found = []
     if not roads.metric:
-        found.append("the map has no poses: its positions are of a layout, and no metres; solve a trace with displacements")
+        found.append(
+            "the map has no poses: its positions are of a layout, and no metres; solve a trace with displacements"
+        )
     if together := roads.together:
-        mend = "export places (export --level places)" if ssh_map.places else "solve with places (solve --theory topological)"
+        mend = (
+            "export places (export --level places)"
+            if ssh_map.places
+            else "solve with places (solve --theory topological)"
+        )
         found.append(
             f"{together} of {len(roads.stops)} {level} share their position with others: "
             f"programs that look nodes up by position may take a wrong one; {mend}"
@@ -109,4 +127,10 @@ def doubts(ssh_map: SSHMap, to: str, *, level: str | None = None, turns: Trace |
 
 def _level(ssh_map: SSHMap, to: str, level: str | None) -> str:
     """The level that is exported where none is asked for."""
-    return level if level is not None else "places" if to in FOR_NAVIGATION and ssh_map.places else "dstates"
+    return (
+        level
+        if level is not None
+        else "places"
+        if to in FOR_NAVIGATION and ssh_map.places
+        else "dstates"
+    )

@@ -18,12 +18,19 @@ def nav2(roads: Roads, name: str, frame: str) -> str:
     first = max(stop.id for stop in roads.stops) + 1
     at = {stop.id: [round(stop.x, DIGITS), round(stop.y, DIGITS)] for stop in roads.stops}
     nodes = [_feature("Point", at[stop.id], _node(stop, roads, frame)) for stop in roads.stops]
-    edges = [_feature("LineString", [at[r.start], at[r.end]], _edge(r, first + i)) for i, r in enumerate(roads.roads)]
+    edges = [
+        _feature("LineString", [at[r.start], at[r.end]], _edge(r, first + i))
+        for i, r in enumerate(roads.roads)
+    ]
     return json_line({"type": "FeatureCollection", "name": name, "features": nodes + edges})
 
 
 def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "Feature", "properties": properties, "geometry": {"type": kind, "coordinates": coordinates}}
+    return {
+        "type": "Feature",
+        "properties": properties,
+        "geometry": {"type": kind, "coordinates": coordinates},
+    }
 
 
 def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
@@ -38,5 +45,14 @@ def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
 
 def _edge(road: Road, number: int) -> dict[str, Any]:
     known = {"action": road.action, "path": road.path, "direction": road.direction}
-    metadata = {"travelled": road.action is not None, **{field: value for field, value in known.items() if value is not None}}
-    return {"id": number, "startid": road.start, "endid": road.end, "cost": round(road.cost, DIGITS), "metadata": metadata}
+    metadata = {
+        "travelled": road.action is not None,
+        **{field: value for field, value in known.items() if value is not None},
+    }
+    return {
+        "id": number,
+        "startid": road.start,
+        "endid": road.end,
+        "cost": round(road.cost, DIGITS),
+        "metadata": metadata,
+    }

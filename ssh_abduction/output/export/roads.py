@@ -78,7 +78,9 @@ class Roads:
         drawn = layout(ssh_map, turns)
         if level == "places":
             if not ssh_map.places:
-                raise MapError("level: expected dstates, got places: the map has no places; export its dstates")
+                raise MapError(
+                    "level: expected dstates, got places: the map has no places; export its dstates"
+                )
             members = {p: [s for s in ssh_map.dstates if s.place == p] for p in ssh_map.places}
             stops = tuple(
                 Stop(
@@ -96,7 +98,11 @@ class Roads:
                 for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
             )
             ends = {
-                (s, x): (action, here.path if here.path == there.path else None, here.direction if here.path == there.path else None)
+                (s, x): (
+                    action,
+                    here.path if here.path == there.path else None,
+                    here.direction if here.path == there.path else None,
+                )
                 for s, action, x in sorted(ssh_map.links, reverse=True)
                 if s != x
                 for here, there in [(ssh_map.dstates[s], ssh_map.dstates[x])]
@@ -104,11 +110,19 @@ class Roads:
         at = {stop.id: (stop.x, stop.y) for stop in stops}
         place = {s.id: s.place for s in ssh_map.dstates} if level == "dstates" else {}
         roads = tuple(
-            Road(a, b, length := math.dist(at[a], at[b]), *what, turns=_is_turn(place.get(a), place.get(b), length))
+            Road(
+                a,
+                b,
+                length := math.dist(at[a], at[b]),
+                *what,
+                turns=_is_turn(place.get(a), place.get(b), length),
+            )
             for (a, b), what in sorted(ends.items())
         )
         if not roads:
-            raise MapError(f"map: expected roads between its {level}, got none; log a trace that moves on")
+            raise MapError(
+                f"map: expected roads between its {level}, got none; log a trace that moves on"
+            )
         return cls(level, drawn.metric, stops, roads)
 
     @property

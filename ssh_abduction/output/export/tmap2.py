@@ -42,9 +42,17 @@ def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) 
         "metric_map": name,
         "name": name,
         "pointset": name,
-        "transformation": {"rotation": _rotation(0.0), "translation": {"x": 0.0, "y": 0.0, "z": 0.0}, "child": "topo_map", "parent": frame},
+        "transformation": {
+            "rotation": _rotation(0.0),
+            "translation": {"x": 0.0, "y": 0.0, "z": 0.0},
+            "child": "topo_map",
+            "parent": frame,
+        },
         "actions": {ACTION: _action()},
-        "nodes": [_node(stop, leaving[stop.id], names, name, frame, FACING[roads.level]) for stop in roads.stops],
+        "nodes": [
+            _node(stop, leaving[stop.id], names, name, frame, FACING[roads.level])
+            for stop in roads.stops
+        ],
     }
     text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=2**16)
     return text
@@ -56,11 +64,15 @@ def _action() -> dict[str, Any]:
         "action_type": f"nav2_msgs.action.{ACTION}",
         "action_server": "/navigate_to_pose",
         "composable": False,
-        "action_goal_template": {"pose": {"header": {"frame_id": "${node.nav_frame}"}, "pose": "${node.pose}"}},
+        "action_goal_template": {
+            "pose": {"header": {"frame_id": "${node.nav_frame}"}, "pose": "${node.pose}"}
+        },
     }
 
 
-def _node(stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str, frame: str, facing: float) -> dict[str, Any]:
+def _node(
+    stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str, frame: str, facing: float
+) -> dict[str, Any]:
     corners = [math.tau * (i + 0.5) / 8 for i in range(8)]
     return {
         "meta": {"map": pointset, "node": names[stop.id], "pointset": pointset},
@@ -72,10 +84,17 @@ def _node(stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str,
                 "position": {"x": _rounded(stop.x), "y": _rounded(stop.y), "z": 0.0},
                 "orientation": _rotation(stop.heading),
             },
-            "properties": {"xy_goal_tolerance": NEAR, "yaw_goal_tolerance": facing, "views": " ".join(map(str, stop.views))},
+            "properties": {
+                "xy_goal_tolerance": NEAR,
+                "yaw_goal_tolerance": facing,
+                "views": " ".join(map(str, stop.views)),
+            },
             "restrictions_planning": "True",
             "restrictions_runtime": "True",
-            "verts": [{"x": _rounded(RADIUS * math.cos(a)), "y": _rounded(RADIUS * math.sin(a))} for a in corners],
+            "verts": [
+                {"x": _rounded(RADIUS * math.cos(a)), "y": _rounded(RADIUS * math.sin(a))}
+                for a in corners
+            ],
             "edges": [_edge(road, names) for road in leaving],
         },
     }
@@ -90,7 +109,9 @@ def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
         "config": [],
         "fail_policy": "fail",
         "fluid_navigation": True,
-        "goal": {"target_pose": {"header": {"frame_id": "$node.parent_frame"}, "pose": "$node.pose"}},
+        "goal": {
+            "target_pose": {"header": {"frame_id": "$node.parent_frame"}, "pose": "$node.pose"}
+        },
         "recovery_behaviours_config": "",
         "restrictions_planning": "True",
         "restrictions_runtime": "True",
@@ -105,7 +126,12 @@ def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
 
 def _rotation(heading: float) -> dict[str, float]:
     """A turn about the vertical as a quaternion."""
-    return {"w": _rounded(math.cos(heading / 2), 6), "x": 0.0, "y": 0.0, "z": _rounded(math.sin(heading / 2), 6)}
+    return {
+        "w": _rounded(math.cos(heading / 2), 6),
+        "x": 0.0,
+        "y": 0.0,
+        "z": _rounded(math.sin(heading / 2), 6),
+    }
 
 
 def _rounded(number: float, digits: int = DIGITS) -> float:
@@ -118,5 +144,8 @@ class _Dumper(yaml.SafeDumper):
 
 
 _Dumper.add_representer(
-    float, lambda dumper, number: dumper.represent_scalar("tag:yaml.org,2002:float", np.format_float_positional(number, trim="0"))
+    float,
+    lambda dumper, number: dumper.represent_scalar(
+        "tag:yaml.org,2002:float", np.format_float_positional(number, trim="0")
+    ),
 )

@@ -49,7 +49,9 @@ def _held_back_interrupts() -> Iterator[None]:
     """Ctrl-C and SIGTERM take effect when this context ends. Raised while clingo starts a thread, they would leave the thread without an owner."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     held = {number: handler for number, handler in handlers.items() if callable(handler)}
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+    if (
+        threading.current_thread() is not threading.main_thread()
+    ):  # only the main thread may handle signals
         yield
         return
     caught: list[int] = []
@@ -80,7 +82,10 @@ class Control(clingo.Control):
     """
 
     def __init__(
-        self, options: Sequence[str] = (), check: Callable[[], None] = lambda: None, preparing: tuple[float, float] = PREPARING
+        self,
+        options: Sequence[str] = (),
+        check: Callable[[], None] = lambda: None,
+        preparing: tuple[float, float] = PREPARING,
     ) -> None:
         super().__init__(["--warn=none", *options])
         self.preparing = preparing
@@ -111,17 +116,25 @@ class Control(clingo.Control):
         with self._alone():
             super().add(*program)
 
-    def ground(self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]] = (("base", ()),), context: Any = None) -> None:
+    def ground(
+        self,
+        parts: Sequence[tuple[str, Sequence[clingo.Symbol]]] = (("base", ()),),
+        context: Any = None,
+    ) -> None:
         asked = _Asked(self._check)
         with self._alone():
             self._ground_alone(parts, context, asked)
 
-    def _ground_alone(self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]], context: Any, asked: _Asked) -> None:
+    def _ground_alone(
+        self, parts: Sequence[tuple[str, Sequence[clingo.Symbol]]], context: Any, asked: _Asked
+    ) -> None:
         began, before = time.perf_counter(), peak_memory()
         try:
             super().ground(parts, context or asked)
         except BaseException:
-            if asked.raised is not None:  # clingo raises a copy of this exception, which lacks what it holds
+            if (
+                asked.raised is not None
+            ):  # clingo raises a copy of this exception, which lacks what it holds
                 raise asked.raised from None
             raise
         finally:
@@ -130,7 +143,10 @@ class Control(clingo.Control):
             self.mebibytes += mebibytes
             if seconds > SLOW:
                 _log.debug(
-                    "clingo grounded %s in %.2f s, %.0f MiB", ", ".join(dict.fromkeys(name for name, _ in parts)), seconds, mebibytes
+                    "clingo grounded %s in %.2f s, %.0f MiB",
+                    ", ".join(dict.fromkeys(name for name, _ in parts)),
+                    seconds,
+                    mebibytes,
                 )
 
 
@@ -211,7 +227,9 @@ class Asker:
         ahead      let clingo search for the next answer while the caller uses this one
         """
         project = "no" if mode.partition(",")[0] == "opt" else "project"
-        with self._solving(control or self.control, assumptions, mode, models, project, conflicts, on_bound) as handle:
+        with self._solving(
+            control or self.control, assumptions, mode, models, project, conflicts, on_bound
+        ) as handle:
             handle.resume()
             while True:
                 if not self._has_come(handle, until):
@@ -264,12 +282,16 @@ class Asker:
         configuration.opt_mode, configuration.models, configuration.project = mode, models, project
         configuration.solve_limit = f"{conflicts},-1"
         if isinstance(control, Control):
-            self.watch.check(control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes)
+            self.watch.check(
+                control.preparing[0] * control.seconds, control.preparing[1] * control.mebibytes
+            )
             control.seconds = control.mebibytes = 0.0
         began = time.perf_counter()
         with ExitStack() as stack:
             with _held_back_interrupts():
-                handle = stack.enter_context(control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound))
+                handle = stack.enter_context(
+                    control.solve(assumptions, yield_=True, async_=True, on_unsat=on_bound)
+                )
             self.solve_seconds += time.perf_counter() - began
             _under_way.add(handle)
             try:
@@ -292,7 +314,9 @@ class Asker:
             self.solve_seconds += time.perf_counter() - began
 
 
-def mapped(function: Callable[[Answer], Made], answers: Generator[Answer, None, bool]) -> Generator[Made, None, bool]:
+def mapped(
+    function: Callable[[Answer], Made], answers: Generator[Answer, None, bool]
+) -> Generator[Made, None, bool]:
     """The results of a function for each answer. Returns what the generator of the answers returns."""
     with closing(answers):
         while True:

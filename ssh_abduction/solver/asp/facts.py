@@ -27,7 +27,9 @@ from ssh_abduction.theory.theory import EXCUSED, Count, Theory
 
 _COURSE = {"pos": 1, "neg": -1}
 
-_Ahead: TypeAlias = tuple[int, int, int]  # a path, and two places of which the first comes before the second on it
+_Ahead: TypeAlias = tuple[
+    int, int, int
+]  # a path, and two places of which the first comes before the second on it
 
 
 def encoding_names(theory: Theory) -> tuple[str, ...]:
@@ -47,7 +49,10 @@ def theory_facts(theory: Theory, paths: int) -> str:
 
 def _preferred(theory: Theory) -> list[str]:
     """Which counts a theory prefers to be small, the first one at the highest level."""
-    return [f"prefer({count},{len(theory.priorities) - i})." for i, count in enumerate(theory.priorities)]
+    return [
+        f"prefer({count},{len(theory.priorities) - i})."
+        for i, count in enumerate(theory.priorities)
+    ]
 
 
 def own_rules(theory: Theory) -> str:
@@ -64,7 +69,9 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     """The most paths that a map of the first steps can have: a path begins at the start, or where a turn right or left ends."""
     if TRAVELS_AND_TURNS & theory.given_up:
         return steps
-    return 1 + sum(action.turn in ("right", "left") or action.slipped for action in trace.actions[: steps - 1])
+    return 1 + sum(
+        action.turn in ("right", "left") or action.slipped for action in trace.actions[: steps - 1]
+    )
 
 
 def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
@@ -72,21 +79,35 @@ def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
     facts = []
     for t in range(start, stop):
         step = trace.steps[t]
-        facts.append(f"unknown({t})." if step.view is None else f"view({t},{_constant(step.view)}).")
+        facts.append(
+            f"unknown({t})." if step.view is None else f"view({t},{_constant(step.view)})."
+        )
         if theory.star in ("pattern", "frame"):
-            facts += [f"open({t},{slot})." for slot, is_open in enumerate(step.openings or ()) if is_open]
+            facts += [
+                f"open({t},{slot})." for slot, is_open in enumerate(step.openings or ()) if is_open
+            ]
     done = {t: trace.actions[t] for t in range(max(start - 1, 0), stop - 1)}
     facts += [f"act({t},{_constant(action.name)})." for t, action in done.items()]
     facts += [f"unlinked({t})." for t, action in done.items() if action.slipped]
     if theory.misread:
-        facts += [f"price(misread,{t},{theory.fault_tenths('misread', trace.steps[t])})." for t in range(start, stop)]
+        facts += [
+            f"price(misread,{t},{theory.fault_tenths('misread', trace.steps[t])})."
+            for t in range(start, stop)
+        ]
     if theory.jumped:
         moved = [t for t in range(max(start, 1), stop) if trace.steps[t].displacement is not None]
-        facts += [f"moved({t}). price(jumped,{t},{theory.fault_tenths('jumped', trace.steps[t])})." for t in moved]
+        facts += [
+            f"moved({t}). price(jumped,{t},{theory.fault_tenths('jumped', trace.steps[t])})."
+            for t in moved
+        ]
     if theory.slipped:
-        facts += [f"price(slipped,{t},{theory.fault_tenths('slipped', trace.steps[t])})." for t in done]
+        facts += [
+            f"price(slipped,{t},{theory.fault_tenths('slipped', trace.steps[t])})." for t in done
+        ]
     if theory.level == "topological":
-        facts += [_kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None]
+        facts += [
+            _kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None
+        ]
     if theory.star == "gateways":
         facts += _gateway_facts(trace, start, stop)
     return "\n".join([*facts, *_evidence_facts(trace, theory, start, stop)])
@@ -97,18 +118,42 @@ def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
     found = frames.Frames(trace, stop)
     known = len(frames.Frames(trace, start).frames)
     yield from (f"star({t},{found.stars[t]})." for t in range(start, stop))
-    yield from (f"looks({star},{x})." for star in dict.fromkeys(found.stars[start:]) for x in found.looks[star])
-    yield from (f"slots({x},{max(frame.slots, 1)})." for x, frame in enumerate(found.frames) if x >= known)
-    yield from (f"ends({x},{way})." for x, frame in enumerate(found.frames) if x >= known for way in frames.ends(frame))
+    yield from (
+        f"looks({star},{x})."
+        for star in dict.fromkeys(found.stars[start:])
+        for x in found.looks[star]
+    )
+    yield from (
+        f"slots({x},{max(frame.slots, 1)})." for x, frame in enumerate(found.frames) if x >= known
+    )
+    yield from (
+        f"ends({x},{way})."
+        for x, frame in enumerate(found.frames)
+        if x >= known
+        for way in frames.ends(frame)
+    )
     for x, y in product(range(len(found.frames)), repeat=2):
         for shift in found.fits(x, y) if max(x, y) >= known else ():
             yield f"fits({x},{y},{shift})."
-            yield from (f"may({x},{y},{shift},{way})." for way in frames.may_face(found.frames[x], found.frames[y], shift))
-            yield from (f"must({x},{y},{shift},{way})." for way in frames.must_face(found.frames[x], found.frames[y], shift))
-    turns = {(trace.actions[t - 1], found.stars[t - 1], found.stars[t]): None for t in range(max(start, 1), stop)}
+            yield from (
+                f"may({x},{y},{shift},{way})."
+                for way in frames.may_face(found.frames[x], found.frames[y], shift)
+            )
+            yield from (
+                f"must({x},{y},{shift},{way})."
+                for way in frames.must_face(found.frames[x], found.frames[y], shift)
+            )
+    turns = {
+        (trace.actions[t - 1], found.stars[t - 1], found.stars[t]): None
+        for t in range(max(start, 1), stop)
+    }
     for action, a, b in turns:
         for x, y in product(found.looks[a], found.looks[b]) if action.turn else ():
-            fitting = (c for c in found.fits(x, y) if frames.may_turn(action, found.frames[x], found.frames[y], c))
+            fitting = (
+                c
+                for c in found.fits(x, y)
+                if frames.may_turn(action, found.frames[x], found.frames[y], c)
+            )
             yield from (f"rotates({_constant(action.name)},{x},{y},{shift})." for shift in fitting)
 
 
@@ -119,7 +164,9 @@ def _evidence_facts(trace: Trace, theory: Theory, start: int, stop: int) -> Iter
         for t in range(start, stop) if pairs else ():
             yield from (f"excluded({evidence.axiom},{i},{t})." for i in pairs.apart.get(t, ()))
             if theory.level == "topological":
-                yield from (f"elsewhere({evidence.axiom},{i},{t})." for i in pairs.elsewhere.get(t, ()))
+                yield from (
+                    f"elsewhere({evidence.axiom},{i},{t})." for i in pairs.elsewhere.get(t, ())
+                )
             yield from (f"one({i},{t})." for i in pairs.one.get(t, ()))
         yield evidence.facts(trace, start, stop)
 
@@ -196,7 +243,8 @@ def some_fail() -> Symbol:
 def may_fail(conclusions: Iterable[Symbol]) -> str:
     """The rules that say so."""
     return "\n".join(
-        f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}. #heuristic {c} : {picked(c)}. [1,false]" for c in conclusions
+        f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}. #heuristic {c} : {picked(c)}. [1,false]"
+        for c in conclusions
     )
 
 
@@ -210,13 +258,20 @@ def _constant(value: str | int) -> str:
 
 
 def _kind_fact(action: Action) -> str:
-    return f"kind({_constant(action.name)},travel)." if action.kind == "travel" else f"turns({_constant(action.name)},{action.turn})."
+    return (
+        f"kind({_constant(action.name)},travel)."
+        if action.kind == "travel"
+        else f"turns({_constant(action.name)},{action.turn})."
+    )
 
 
 @lru_cache(maxsize=2**14)
 def _atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
     """The name and the arguments of an atom of a map. They are cached, as maps have most atoms in common and each part takes a call to clingo."""
-    return symbol.name, tuple(arg.number if arg.type is SymbolType.Number else _COURSE[arg.name] for arg in symbol.arguments)
+    return symbol.name, tuple(
+        arg.number if arg.type is SymbolType.Number else _COURSE[arg.name]
+        for arg in symbol.arguments
+    )
 
 
 def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
@@ -248,7 +303,10 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
             faults.append((args[0], name))
     if theory.star == "gateways":
         found = frames.Frames(trace, len(is_at)).frames
-        heading = {t: frames.heading(found[shape[p]], found[shape[t]], heading[t]) for t, p in place.items()}
+        heading = {
+            t: frames.heading(found[shape[p]], found[shape[t]], heading[t])
+            for t, p in place.items()
+        }
     return _map(trace, is_at, place, course, heading, before, excused, faults, theory)
 
 
@@ -278,7 +336,9 @@ def _map(
     names = sorted(set(is_at.values()))
     dstate_of = {name: i for i, name in enumerate(names)}
     place_of = {name: i for i, name in enumerate(sorted({place[s] for s in names if s in place}))}
-    path_of = {name: i for i, name in enumerate(sorted({course[s][0] for s in names if s in course}))}
+    path_of = {
+        name: i for i, name in enumerate(sorted({course[s][0] for s in names if s in course}))
+    }
     dstates = tuple(
         DState(
             id=dstate_of[s],
@@ -291,19 +351,27 @@ def _map(
         for s in names
     )
     labels = tuple(dstate_of[is_at[t]] for t in range(len(is_at)))
-    pairs = [(path_of[h], place_of[p], place_of[q]) for h, p, q in before if h in path_of and p in place_of and q in place_of]
+    pairs = [
+        (path_of[h], place_of[p], place_of[q])
+        for h, p, q in before
+        if h in path_of and p in place_of and q in place_of
+    ]
     return SSHMap(
         labels=labels,
         dstates=dstates,
         links=links_of(labels, trace, faults),
         places=tuple(place_of.values()),
         paths=_paths(len(path_of), dstates, pairs),
-        excused=tuple(sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)),
+        excused=tuple(
+            sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)
+        ),
         faults=() if theory is None else faults_of(faults, is_at, views, trace, theory),
     )
 
 
-def views_of(labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()) -> dict[int, View | None]:
+def views_of(
+    labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
+) -> dict[int, View | None]:
     """The view of each dstate: that of its first step at which it is known and not misread; None where there is no such step.
 
     labels  the dstate of each step
@@ -318,7 +386,11 @@ def views_of(labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int
 
 
 def faults_of(
-    faults: Iterable[tuple[int, str]], labels: Mapping[int, int], views: Mapping[int, View | None], trace: Trace, theory: Theory
+    faults: Iterable[tuple[int, str]],
+    labels: Mapping[int, int],
+    views: Mapping[int, View | None],
+    trace: Trace,
+    theory: Theory,
 ) -> tuple[Fault, ...]:
     """The faults as a map tells them."""
     found = []
@@ -329,7 +401,11 @@ def faults_of(
         elif kind == "slipped":
             found.append(Fault(t, "slipped", trace.actions[t].name, cost=cost))
         elif kind == "jumped":
-            found.append(Fault(t, "jumped", in_words(trace.steps[t].displacement or (0.0, 0.0, 0.0)), cost=cost))
+            found.append(
+                Fault(
+                    t, "jumped", in_words(trace.steps[t].displacement or (0.0, 0.0, 0.0)), cost=cost
+                )
+            )
         else:
             found.append(Fault(t, "misseen", cost=cost))
     return tuple(found)
@@ -352,12 +428,25 @@ def name_facts(
     """
     view_of = dict(names)
     rests = {spare[-1] for spare in spares}
-    leads = {(s, action, x) for t, action, u in links for s in choices[t] if s not in rests for x in choices[u]}
+    leads = {
+        (s, action, x)
+        for t, action, u in links
+        for s in choices[t]
+        if s not in rests
+        for x in choices[u]
+    }
     facts = [f"view({name},{view})." for name, view in view_of.items()]
     for spare in spares:
-        facts += [f"spare({name})." for name in spare] + [f"after({r},{s})." for r, s in pairwise(spare)] + [f"rest({spare[-1]})."]
+        facts += (
+            [f"spare({name})." for name in spare]
+            + [f"after({r},{s})." for r, s in pairwise(spare)]
+            + [f"rest({spare[-1]})."]
+        )
     facts += [f"leads({s},{action},{x})." for s, action, x in leads]
-    facts += [f"shows({s},{action},{view})." for s, action, view in {(s, action, view_of[x]) for s, action, x in leads}]
+    facts += [
+        f"shows({s},{action},{view})."
+        for s, action, view in {(s, action, view_of[x]) for s, action, x in leads}
+    ]
     facts += ["ordered." if ordered else "{ ordered }."]
     return "\n".join(facts)
 
@@ -433,15 +522,25 @@ class NameReader:
         """The name of each step, in an answer that uses no rest."""
         atoms = model.context.symbolic_atoms
         leads: dict[tuple[int, int], int] = {}
-        name = next(s for s in self._choices[0] if (atom := atoms[named(0, s)]) and model.is_true(atom.literal))
+        name = next(
+            s
+            for s in self._choices[0]
+            if (atom := atoms[named(0, s)]) and model.is_true(atom.literal)
+        )
         names = {0: name}
         for t, action in enumerate(self._actions, 1):
             key = name, action
             if key not in leads:
                 there, literal = self._last.get(key, (-1, 0))
                 if not literal or not model.is_true(literal):
-                    asked = ((x, atoms[Function("goes", numbers(*key, x))]) for x in self._choices[t])
-                    there, literal = next((x, atom.literal) for x, atom in asked if atom and model.is_true(atom.literal))
+                    asked = (
+                        (x, atoms[Function("goes", numbers(*key, x))]) for x in self._choices[t]
+                    )
+                    there, literal = next(
+                        (x, atom.literal)
+                        for x, atom in asked
+                        if atom and model.is_true(atom.literal)
+                    )
                     self._last[key] = there, literal
                 leads[key] = there
             names[t] = name = leads[key]
@@ -463,7 +562,11 @@ def visit_facts(
     unfit   such pairs of earlier batches that may no longer be
     """
     new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit}
-    return "\n".join(f"{name}({batch},{','.join(map(str, args))})." for name, rows in new.items() for args in rows)
+    return "\n".join(
+        f"{name}({batch},{','.join(map(str, args))})."
+        for name, rows in new.items()
+        for args in rows
+    )
 
 
 def same(pair: tuple[int, int, int]) -> Symbol:
@@ -494,7 +597,9 @@ def over(core: int, count: int) -> Symbol:
 
 def read_over(member: Symbol) -> tuple[int, int] | None:
     """The core and the count of such an atom; None for another atom."""
-    return (member.arguments[0].number, member.arguments[1].number) if member.name == "over" else None
+    return (
+        (member.arguments[0].number, member.arguments[1].number) if member.name == "over" else None
+    )
 
 
 def core_facts(core: int, members: Iterable[Symbol]) -> str:
@@ -508,13 +613,18 @@ def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
 
 
 def forbidden_pairs(
-    pairs: Iterable[tuple[int, int, int]], different: Iterable[tuple[int, int, int]] = (), listed: int | None = None
+    pairs: Iterable[tuple[int, int, int]],
+    different: Iterable[tuple[int, int, int]] = (),
+    listed: int | None = None,
 ) -> str:
     """The rule that not all of these pairs of visits are at one place while all those `different` ones are not.
 
     listed  the rule holds only while answers up to this batch are listed (default always)
     """
-    body = [*(f"same({i},{j},{r})" for i, j, r in pairs), *(f"not same({i},{j},{r})" for i, j, r in different)]
+    body = [
+        *(f"same({i},{j},{r})" for i, j, r in pairs),
+        *(f"not same({i},{j},{r})" for i, j, r in different),
+    ]
     return f":- {', '.join(['#true', *body] if listed is None else [f'listed({listed})', *body])}."
 
 
@@ -523,7 +633,9 @@ def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> st
     return "\n".join(forbidden_pairs(pairs) for pairs in product(*equalities))
 
 
-def forbidden_equalities(equalities: Iterable[Equality], where: Symbol | None = None, excusable: bool = False) -> str:
+def forbidden_equalities(
+    equalities: Iterable[Equality], where: Symbol | None = None, excusable: bool = False
+) -> str:
     """The rule that these equalities of steps do not all hold; where an atom is given, only if that holds.
 
     excusable  what refuses them are displacements, and says nothing where one of these, between two of the steps, is disbelieved
@@ -546,13 +658,26 @@ def rests_on(axiom: str, t: int, other: str) -> str:
 def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
     """The rules that say: some doubt holds where this one is open, and two things are one (or are not); the condition of that is None where they never are."""
     rules = [f"#external {open_doubt(number)}."]
-    rules += [f"one_in_doubt({number}) :- {condition}."] if condition else [f"#external one_in_doubt({number})."]
-    return "\n".join([*rules, f"{some_doubt(part)} :- {open_doubt(number)}, {'' if one else 'not '}one_in_doubt({number})."])
+    rules += (
+        [f"one_in_doubt({number}) :- {condition}."]
+        if condition
+        else [f"#external one_in_doubt({number})."]
+    )
+    return "\n".join(
+        [
+            *rules,
+            f"{some_doubt(part)} :- {open_doubt(number)}, {'' if one else 'not '}one_in_doubt({number}).",
+        ]
+    )
 
 
 def doubts_before(part: int) -> str:
     """The rule that some doubt holds where some doubt of an earlier part does."""
-    return f"{some_doubt(part)} :- {some_doubt(part - 1)}." if part > 1 else f"#external {some_doubt(0)}."
+    return (
+        f"{some_doubt(part)} :- {some_doubt(part - 1)}."
+        if part > 1
+        else f"#external {some_doubt(0)}."
+    )
 
 
 def steps_are_one(sort: str, i: int, j: int) -> str:
@@ -577,7 +702,11 @@ def some_doubt(part: int) -> Symbol:
 
 def exactly(number: int, count: Count) -> str:
     """The rule that a map has just so many dstates, places or paths, while `of_number` is true."""
-    counted = {"dstates": "T : is(T,T)", "places": "T : at(T,T)", "paths": "(T,H) : first_along(T,H)"}[count]
+    counted = {
+        "dstates": "T : is(T,T)",
+        "places": "T : at(T,T)",
+        "paths": "(T,H) : first_along(T,H)",
+    }[count]
     return f"#external {of_number(number, count)}.\n:- {of_number(number, count)}, #count {{ {counted} }} != {number}."
 
 
@@ -591,8 +720,13 @@ def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
 
     number  another one for each such rule
     """
-    together = [f"together({number},{k}) :- is({i},S), is({j},S), not rest(S)." for k, (i, j) in enumerate(pairs)]
-    return "\n".join([*together, f":- {', '.join(f'together({number},{k})' for k in range(len(pairs)))}."])
+    together = [
+        f"together({number},{k}) :- is({i},S), is({j},S), not rest(S)."
+        for k, (i, j) in enumerate(pairs)
+    ]
+    return "\n".join(
+        [*together, f":- {', '.join(f'together({number},{k})' for k in range(len(pairs)))}."]
+    )
 
 
 _number = cache(Number)  # takes half the time of making a number anew, where there are many
@@ -611,17 +745,28 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
         if number.setdefault(label, len(number)) == len(first):
             first.append(t)
     found = tuple(number[label] for label in labels)
-    return SSHMap(found, tuple(DState(i, _view(trace, t)) for i, t in enumerate(first)), links_of(found, trace))
+    return SSHMap(
+        found,
+        tuple(DState(i, _view(trace, t)) for i, t in enumerate(first)),
+        links_of(found, trace),
+    )
 
 
-def faulty_map(labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]], theory: Theory) -> SSHMap:
+def faulty_map(
+    labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]], theory: Theory
+) -> SSHMap:
     """The map of the causal level that these labels make, where some steps are disbelieved; dstates are numbered by first visit."""
     number: dict[int, int] = {}
     found = tuple(number.setdefault(label, len(number)) for label in labels)
     is_at = dict(enumerate(found))
     views = views_of(is_at, trace, faults)
     dstates = tuple(DState(i, views[i]) for i in range(len(number)))
-    return SSHMap(found, dstates, links_of(found, trace, faults), faults=faults_of(faults, is_at, views, trace, theory))
+    return SSHMap(
+        found,
+        dstates,
+        links_of(found, trace, faults),
+        faults=faults_of(faults, is_at, views, trace, theory),
+    )
 
 
 def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
@@ -646,7 +791,9 @@ def at_most_faults(most: int) -> str:
 
 def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
     """That there are so many dstates at most, and that their faults cost no more than this, as rules for faulty.lp."""
-    faults = "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
+    faults = (
+        "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
+    )
     return f"#program more(b).\n:- #sum {{ {faults} }} > {tenths}.\n:- #count {{ S : used(S) }} > {dstates}."
 
 
@@ -689,10 +836,22 @@ def faulty_batch(
     found += [f"next({batch},{t},{u})." for t, u in pairwise([*known[-1:], *steps])]
     links = sorted({t for step in steps for t in (step - 1, step) if t in given and t + 1 in given})
     found += [f"link({batch},{t},{actions[t]},{t + 1})." for t in links]
-    found += [f"price({kind},{t},{tenths[t]})." for kind, tenths in price.items() for t in (steps if kind == "misread" else links)]
+    found += [
+        f"price({kind},{t},{tenths[t]})."
+        for kind, tenths in price.items()
+        for t in (steps if kind == "misread" else links)
+    ]
     for t in given:
-        found += [f"excluded({batch},{i},{t})." for i in pairs.apart.get(t, ()) if i in given and (i in new or t in new)]
-        found += [f"one({batch},{i},{t})." for i in pairs.one.get(t, ()) if i in given and (i in new or t in new)]
+        found += [
+            f"excluded({batch},{i},{t})."
+            for i in pairs.apart.get(t, ())
+            if i in given and (i in new or t in new)
+        ]
+        found += [
+            f"one({batch},{i},{t})."
+            for i in pairs.one.get(t, ())
+            if i in given and (i in new or t in new)
+        ]
     return "\n".join(found)
 
 
@@ -713,12 +872,18 @@ def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int], frozenset
     return where, frozenset(steps["slips"]), frozenset(steps["lost"])
 
 
-def paths_framed_facts(trace: Trace, theory: Theory, chart: FramedChart, forbidden: Sequence[Collection[Equality]] = ()) -> str:
+def paths_framed_facts(
+    trace: Trace, theory: Theory, chart: FramedChart, forbidden: Sequence[Collection[Equality]] = ()
+) -> str:
     """What happened at the nodes of a chart, as facts for paths_framed.lp.
 
     forbidden  sets of equalities of steps that do not all hold
     """
-    slipped = {chart.node_of[t] for t, action in enumerate(trace.actions[: len(chart.node_of) - 1]) if action.slipped}
+    slipped = {
+        chart.node_of[t]
+        for t, action in enumerate(trace.actions[: len(chart.node_of) - 1])
+        if action.slipped
+    }
     facts = [f"rotated({s},{x},{-action})." for s, action, x in chart.links if action < 0]
     facts += [f"travelled({s},{x})." for s, _, x in chart.travels if s not in slipped]
     facts += [f"turned({s},{turn},{x})." for s, turn, x in chart.turns(trace)]
@@ -728,7 +893,10 @@ def paths_framed_facts(trace: Trace, theory: Theory, chart: FramedChart, forbidd
     steps = len(chart.node_of)
     for number, equalities in enumerate(forbidden):
         if all(max(equality.first, equality.second) < steps for equality in equalities):
-            nodes = [(chart.node_of[equality.first], chart.node_of[equality.second], equality.of) for equality in equalities]
+            nodes = [
+                (chart.node_of[equality.first], chart.node_of[equality.second], equality.of)
+                for equality in equalities
+            ]
             facts += [f"part({number},{k},{s},{x},{of})." for k, (s, x, of) in enumerate(nodes)]
     return "\n".join([*facts, sides_framed_facts(theory)])
 
@@ -742,7 +910,11 @@ def sides_framed_facts(theory: Theory) -> str:
 
 def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
     """Which numbered actions are travels and turns, and which axioms of sides hold, as facts for sides_frameless.lp."""
-    kinds = [f"turns({a},{action.turn})." if action.turn else f"travels({a})." for a, action in actions.items() if action.kind]
+    kinds = [
+        f"turns({a},{action.turn})." if action.turn else f"travels({a})."
+        for a, action in actions.items()
+        if action.kind
+    ]
     return "\n".join([*kinds, sides_framed_facts(theory)])
 
 
@@ -760,16 +932,28 @@ def paths_frameless_facts(
     far     sets of pairs of dstates: evidence says that in each set there is a pair that is not at one place. Most sets are a single pair
     single  ask only for places and paths in which no two places and no two segments are one, unless they have to be
     """
-    facts = [sides_framed_facts(theory), *(["total."] if theory.path_order == "total" else []), *(["single."] if single else [])]
+    facts = [
+        sides_framed_facts(theory),
+        *(["total."] if theory.path_order == "total" else []),
+        *(["single."] if single else []),
+    ]
     facts += [f"is({x})." for x in dstates]
     for number, pairs in enumerate(far):
-        facts += [f"far({x},{y})." if len(pairs) == 1 else f"far({number},{x},{y})." for x, y in pairs]
+        facts += [
+            f"far({x},{y})." if len(pairs) == 1 else f"far({number},{x},{y})." for x, y in pairs
+        ]
     done = [(s, actions[a], x) for s, a, x in links]
-    facts += [f"turn({s},{action.turn},{x})." if action.turn else f"travel({s},{x})." for s, action, x in done if action.kind]
+    facts += [
+        f"turn({s},{action.turn},{x})." if action.turn else f"travel({s},{x})."
+        for s, action, x in done
+        if action.kind
+    ]
     return "\n".join([*facts, *_preferred(theory)])
 
 
-def turn_facts(batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]) -> str:
+def turn_facts(
+    batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]
+) -> str:
     """New visits, and new turns on a visit, from slot to slot, as facts for sides_framed.lp."""
     facts = [f"visit({batch},{visit})." for visit in visits]
     for s, turn, x in turns:
@@ -782,15 +966,27 @@ def read_contrary(model: Model) -> tuple[list[int], list[int]]:
     """Dstates whose segments show that there are no places and paths, those of short segments first; and dstates where paths cross that seem to meet again."""
     atoms = list(map(_atom, model.symbols(shown=True)))
     contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")
-    return [dstate for _, dstate in contrary], sorted(args[0] for name, args in atoms if name == "twice")
+    return [dstate for _, dstate in contrary], sorted(
+        args[0] for name, args in atoms if name == "twice"
+    )
 
 
-def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int], *, single: bool = False) -> str:
+def settled_facts(
+    theory: Theory,
+    chart: FramedChart,
+    labels: Sequence[int],
+    nodes: Iterable[int],
+    *,
+    single: bool = False,
+) -> str:
     """The dstates of these nodes, what is open from each dstate, and what is preferred, as facts for the fewest places and paths (paths_framed.lp).
 
     single  ask only for places and paths in which no two places and no two segments are one, unless they have to be
     """
-    facts = [settled_labels((node, labels[node]) for node in nodes), *(["single."] if single else [])]
+    facts = [
+        settled_labels((node, labels[node]) for node in nodes),
+        *(["single."] if single else []),
+    ]
     for label, node in {
         label: node for node, label in enumerate(labels)
     }.items():  # all nodes of a dstate see one star, so any of them will do
@@ -802,9 +998,15 @@ def settled_facts(theory: Theory, chart: FramedChart, labels: Sequence[int], nod
 
 def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
     """The segments of a control, and the pairs of them that cannot be one path in either direction."""
-    segments = sorted(_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("segment", 1))
-    distinct = {tuple(_atom(atom.symbol)[1]) for atom in control.symbolic_atoms.by_signature("distinct", 3)}
-    return segments, [(g, h) for g, h, direction in distinct if direction == 1 and (g, h, -1) in distinct]
+    segments = sorted(
+        _atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("segment", 1)
+    )
+    distinct = {
+        tuple(_atom(atom.symbol)[1]) for atom in control.symbolic_atoms.by_signature("distinct", 3)
+    }
+    return segments, [
+        (g, h) for g, h, direction in distinct if direction == 1 and (g, h, -1) in distinct
+    ]
 
 
 @dataclass(frozen=True)
@@ -834,13 +1036,18 @@ class Segments:
             return [tuple(_atom(atom.symbol)[1]) for atom in symbols.by_signature(name, arity)]
 
         places = sorted(place for (place,) in atoms("visited", 1))
-        elsewhere, travels = [(c, p) for c, p in atoms("elsewhere", 2)], [(g, c, b) for g, c, b in atoms("travel_on", 3)]
+        elsewhere, travels = (
+            [(c, p) for c, p in atoms("elsewhere", 2)],
+            [(g, c, b) for g, c, b in atoms("travel_on", 3)],
+        )
         return cls(places, elsewhere, travels, *read_rivals(control))
 
 
 def tight_facts(homes: Mapping[int, Iterable[int]]) -> str:
     """For each place the fixed places that it may be, as facts for paths_frameless.lp."""
-    return "tight.\n" + "\n".join(f"fixed({place},{home})." for place, found in homes.items() for home in found)
+    return "tight.\n" + "\n".join(
+        f"fixed({place},{home})." for place, found in homes.items() for home in found
+    )
 
 
 def pinned_facts(segments: Iterable[int]) -> str:
@@ -875,15 +1082,25 @@ def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
 
 def open_labels(labels: Sequence[int]) -> str:
     """The dstate of each node, for clingo to take or to leave out, so that what it takes has no places and paths."""
-    return "\n".join([*(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)), ":- not violated.", "#show is/2."])
+    return "\n".join(
+        [
+            *(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)),
+            ":- not violated.",
+            "#show is/2.",
+        ]
+    )
 
 
 def read_contraries(model: Model) -> list[int]:
     """Dstates whose paths show that there are no places and paths for them."""
-    return sorted(args[0] for name, args in map(_atom, model.symbols(shown=True)) if name == "contrary")
+    return sorted(
+        args[0] for name, args in map(_atom, model.symbols(shown=True)) if name == "contrary"
+    )
 
 
-def forbidden_links(links: Iterable[tuple[int, int, int]], placed: Iterable[tuple[int, int]] = ()) -> str:
+def forbidden_links(
+    links: Iterable[tuple[int, int, int]], placed: Iterable[tuple[int, int]] = ()
+) -> str:
     """The rule that these links of named dstates do not all hold while these steps are at these dstates."""
     return f":- {', '.join([*(f'goes({s},{a},{x})' for s, a, x in links), *(f'is({t},{s})' for t, s in placed)])}."
 
@@ -909,8 +1126,12 @@ class PathReader:
     the time.
     """
 
-    def __init__(self, control: Control, trace: Trace, theory: Theory, chart: Chart, labels: Sequence[int]) -> None:
-        stands, runs = ({a: (b, c) for a, b, c in _literals(control, name)} for name in ("stands", "runs"))
+    def __init__(
+        self, control: Control, trace: Trace, theory: Theory, chart: Chart, labels: Sequence[int]
+    ) -> None:
+        stands, runs = (
+            {a: (b, c) for a, b, c in _literals(control, name)} for name in ("stands", "runs")
+        )
         first: dict[int, int] = {}  # for each label, the first step at its dstate
         for t, node in enumerate(chart.node_of):
             first.setdefault(labels[node], t)
@@ -918,24 +1139,40 @@ class PathReader:
         self._labels = tuple(number[labels[node]] for node in chart.node_of)
         self._links = links_of(self._labels, trace)
         self._dstates = [(_view(trace, t), *stands[label]) for label, t in first.items()]
-        self._runs: dict[int, list[tuple[int, int]]] = {}  # for each segment, the dstates on it, and whether they face its direction
+        self._runs: dict[
+            int, list[tuple[int, int]]
+        ] = {}  # for each segment, the dstates on it, and whether they face its direction
         for i, label in enumerate(first):
             if label in runs:
                 segment, direction = runs[label]
                 self._runs.setdefault(segment, []).append((i, direction))
-        self._passes = {(segment, self._dstates[i][1]): None for segment, members in self._runs.items() for i, _ in members}
+        self._passes = {
+            (segment, self._dstates[i][1]): None
+            for segment, members in self._runs.items()
+            for i, _ in members
+        }
         self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
         self._total = theory.path_order == "total"
         self._before: dict[_Ahead, int] = {}  # the literal that says so, 0 for what is never so
-        self._order: dict[int, list[int]] = {}  # for each path, its places in the answer that was read last
-        self._placed: _Placed | None = None  # what the places of the last map tell, as they are mostly the same in the next
-        self._made: dict[tuple[object, ...], DState] = {}  # dstates made so far, as most of them are in most maps
+        self._order: dict[
+            int, list[int]
+        ] = {}  # for each path, its places in the answer that was read last
+        self._placed: _Placed | None = (
+            None  # what the places of the last map tell, as they are mostly the same in the next
+        )
+        self._made: dict[
+            tuple[object, ...], DState
+        ] = {}  # dstates made so far, as most of them are in most maps
 
     def condition(self, sort: str, i: int, j: int) -> str | None:
         """The condition that two dstates of a map are one in the answer: as to place, path or course. None where they never are."""
         if sort == "places":
             return f"at({self._dstates[i][1]},P,_), at({self._dstates[j][1]},P,_)"
-        runs = {dstate: (segment, direction) for segment, members in self._runs.items() for dstate, direction in members}
+        runs = {
+            dstate: (segment, direction)
+            for segment, members in self._runs.items()
+            for dstate, direction in members
+        }
         if i not in runs or j not in runs:
             return None
         (g, d), (h, e) = runs[i], runs[j]
@@ -948,19 +1185,28 @@ class PathReader:
         on: dict[int, dict[int, None]] = {}  # for each path, the places on it
         for segment, component in self._passes:
             on.setdefault(part[segment][0], {})[at[component][0]] = None
-        return PathAnswer(at, part, {path: self._ordered(model, path, places) for path, places in on.items()})
+        return PathAnswer(
+            at, part, {path: self._ordered(model, path, places) for path, places in on.items()}
+        )
 
     def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
         """The places of a path in order. This begins with their order in the last answer, which is mostly nearly the same."""
-        order = list(dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places]))
+        order = list(
+            dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places])
+        )
         if self._total:
-            for i, place in enumerate(order):  # insertion sort takes few questions where places are nearly in order
+            for i, place in enumerate(
+                order
+            ):  # insertion sort takes few questions where places are nearly in order
                 to = i
                 while to and not self._is_before(model, (path, order[to - 1], place)):
                     to -= 1
                 order.insert(to, order.pop(i))
         else:
-            order = _in_order(places, (pair for pair in permutations(places, 2) if self._is_before(model, (path, *pair))))
+            order = _in_order(
+                places,
+                (pair for pair in permutations(places, 2) if self._is_before(model, (path, *pair))),
+            )
         self._order[path] = order
         return order
 
@@ -976,7 +1222,9 @@ class PathReader:
         placed = self._placed
         if placed is None or placed.at != answer.at:
             placed = self._placed = self._placed_at(answer.at)
-        faced: dict[int, tuple[int, int]] = {}  # for each path, its number in the map, and the direction that is faced first
+        faced: dict[
+            int, tuple[int, int]
+        ] = {}  # for each path, its number in the map, and the direction that is faced first
         dstates = list(placed.dstates)
         for segment, members in self._runs.items():
             h, ahead = answer.part[segment]
@@ -984,16 +1232,26 @@ class PathReader:
             key = segment, path, ahead * first
             along = placed.along.get(key)
             if along is None:
-                along = placed.along[key] = [(i, self._dstate(dstates[i], path, key[2] * direction)) for i, direction in members]
+                along = placed.along[key] = [
+                    (i, self._dstate(dstates[i], path, key[2] * direction))
+                    for i, direction in members
+                ]
             for i, dstate in along:
                 dstates[i] = dstate
-        orders = ((path, [placed.number[p] for p in answer.order[h][::first]]) for h, (path, first) in faced.items())
+        orders = (
+            (path, [placed.number[p] for p in answer.order[h][::first]])
+            for h, (path, first) in faced.items()
+        )
         paths = tuple(MapPath(path, tuple(order)) for path, order in orders)
-        return SSHMap(self._labels, tuple(dstates), self._links, tuple(range(len(placed.number))), paths)
+        return SSHMap(
+            self._labels, tuple(dstates), self._links, tuple(range(len(placed.number))), paths
+        )
 
     def _placed_at(self, at: dict[int, tuple[int, int]]) -> _Placed:
         """What the places of an answer tell of a map."""
-        arrived: dict[int, tuple[int, int]] = {}  # for each place, its number in the map, and the slot that is faced first
+        arrived: dict[
+            int, tuple[int, int]
+        ] = {}  # for each place, its number in the map, and the slot that is faced first
         dstates: list[DState] = []
         for view, component, slot in self._dstates:
             p, turned = at[component]
@@ -1055,7 +1313,9 @@ def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
     return found
 
 
-def links_of(labels: Sequence[int], trace: Trace, faults: Iterable[tuple[int, str]] = ()) -> tuple[tuple[int, str, int], ...]:
+def links_of(
+    labels: Sequence[int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
+) -> tuple[tuple[int, str, int], ...]:
     """The distinct links that a labelling of the trace's first steps makes, sorted; without those of actions that slipped."""
     slipped = {t for t, kind in faults if kind == "slipped"}
     links = enumerate(zip(pairwise(labels), trace.actions, strict=False))
@@ -1068,7 +1328,9 @@ def _view(trace: Trace, step: int) -> str | int:
     return view
 
 
-def _paths(count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]) -> tuple[MapPath, ...]:
+def _paths(
+    count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]
+) -> tuple[MapPath, ...]:
     """Paths with their places in order."""
     on: list[set[int]] = [set() for _ in range(count)]
     for s in dstates:
@@ -1078,7 +1340,9 @@ def _paths(count: int, dstates: Iterable[DState], before: Iterable[tuple[int, in
     for path, p, q in before:
         if p in on[path] and q in on[path]:
             pairs[path].append((p, q))
-    return tuple(MapPath(path, tuple(_in_order(found, pairs[path]))) for path, found in enumerate(on))
+    return tuple(
+        MapPath(path, tuple(_in_order(found, pairs[path]))) for path, found in enumerate(on)
+    )
 
 
 def _in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:

@@ -27,8 +27,14 @@ Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps lim
 
 def check_limit(name: str, unit: str, limit: object) -> None:
     """Raises SolverError where a limit that a caller gives is neither None nor a number above 0."""
-    if limit is not None and not (is_finite(limit) and limit > 0) and not (isinstance(limit, float) and limit == math.inf):
-        raise SolverError(f"{name}: expected a number of {unit} above 0, got {brief(limit)}; leave it out for none")
+    if (
+        limit is not None
+        and not (is_finite(limit) and limit > 0)
+        and not (isinstance(limit, float) and limit == math.inf)
+    ):
+        raise SolverError(
+            f"{name}: expected a number of {unit} above 0, got {brief(limit)}; leave it out for none"
+        )
 
 
 class LimitError(Exception):
@@ -76,7 +82,12 @@ class Watch:
 
     def begin_anew(self) -> None:
         """Count time from now, as if none were spent, up to the whole limit."""
-        self._spent, self._next_tick, self._stage_ends, self.interrupted = 0.0, TICK, math.inf, False
+        self._spent, self._next_tick, self._stage_ends, self.interrupted = (
+            0.0,
+            TICK,
+            math.inf,
+            False,
+        )
         self.use_reserve()
         self.start()
 

@@ -27,7 +27,21 @@ from ssh_abduction.solver.asp.rules import read_by
 from ssh_abduction.theory.theory import Theory
 
 # What rules may read of a map and of a trace, if a map alone is to say whether they hold.
-SHOWN = frozenset({"is", "same", "at", "same_place", "along", "same_course", "on_some_path", "on", "before", "travel", "turn"})
+SHOWN = frozenset(
+    {
+        "is",
+        "same",
+        "at",
+        "same_place",
+        "along",
+        "same_course",
+        "on_some_path",
+        "on",
+        "before",
+        "travel",
+        "turn",
+    }
+)
 OF_TRACE = frozenset({"view", "act", "kind", "turns", "open", "axiom", "path", "prefer", "query"})
 FRAME = """
 #defined query/1. #defined violation/2. #defined is/2. #defined same/2. #defined at/2. #defined same_place/2. #defined along/3. #defined same_course/2.
@@ -45,7 +59,9 @@ def can_be_asked(theory: Theory) -> bool:
     if not theory.rules:
         return True
     settled = not theory.has_faults and (theory.level == "causal" or theory.path_order == "total")
-    return settled and all(read_by(rules, theory.rules) <= SHOWN | OF_TRACE for rules in theory.rules)
+    return settled and all(
+        read_by(rules, theory.rules) <= SHOWN | OF_TRACE for rules in theory.rules
+    )
 
 
 def keeps_own_rules(trace: Trace, ssh_map: SSHMap, theory: Theory) -> bool:
@@ -80,7 +96,9 @@ def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
     """What the encodings say of each step where they have this map. Dstates and places have the names of their first steps, and paths are numbered from 1."""
     first: dict[int, int] = {}
     place: dict[int, int] = {}
-    path: dict[int, tuple[int, int]] = {}  # for each path, its number, and the direction that is faced first
+    path: dict[
+        int, tuple[int, int]
+    ] = {}  # for each path, its number, and the direction that is faced first
     before: dict[int, list[int]] = {}  # for each dstate, and place, and course, its steps so far
     here: dict[int, list[int]] = {}
     along: dict[tuple[int, int], list[int]] = {}
@@ -97,13 +115,17 @@ def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
             number, faced = path.setdefault(s.path, (len(path) + 1, s.direction))
             yield f"along({t},{number},{'pos' if s.direction == faced else 'neg'})"
             yield f"on_some_path({t})"
-            yield from (f"same_course({i},{t})" for i in along.setdefault((s.path, s.direction), []))
+            yield from (
+                f"same_course({i},{t})" for i in along.setdefault((s.path, s.direction), [])
+            )
             along[s.path, s.direction].append(t)
     for h in ssh_map.paths:
         number, faced = path[h.id]
         order = [place[p] for p in h.order[::faced]]
         yield from (f"on({number},{p})" for p in order)
-        yield from (f"before({number},{p},{q})" for i, p in enumerate(order) for q in order[i + 1 :])
+        yield from (
+            f"before({number},{p},{q})" for i, p in enumerate(order) for q in order[i + 1 :]
+        )
     for t, action in enumerate(trace.actions):
         if action.kind == "travel" and not action.slipped:
             yield f"travel({t})"

@@ -41,18 +41,26 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
             raise error
         return result
     if code < 0:
-        raise LimitError("memory limit")  # a signal ended it, as the system does where memory is short
+        raise LimitError(
+            "memory limit"
+        )  # a signal ended it, as the system does where memory is short
     return work(*arguments, watch)
 
 
-def _run(work: Callable[..., object], arguments: tuple[object, ...], watch: Watch) -> tuple[int, bytes]:
+def _run(
+    work: Callable[..., object], arguments: tuple[object, ...], watch: Watch
+) -> tuple[int, bytes]:
     """The exit code of a process that does this work, and what it wrote. Should this process end first, the other one's input ends, and it ends with that."""
-    if "python" not in os.path.basename(sys.executable or "").lower():  # this is a program that embeds Python, and cannot be run as Python
+    if (
+        "python" not in os.path.basename(sys.executable or "").lower()
+    ):  # this is a program that embeds Python, and cannot be run as Python
         return 1, b""
     with (
         suppress(OSError),
         tempfile.TemporaryFile() as answer,
-        subprocess.Popen(command(__name__), stdin=subprocess.PIPE, stdout=answer, stderr=subprocess.DEVNULL) as process,
+        subprocess.Popen(
+            command(__name__), stdin=subprocess.PIPE, stdout=answer, stderr=subprocess.DEVNULL
+        ) as process,
     ):
         assert process.stdin
         _under_way.add(process)
@@ -81,7 +89,9 @@ def end_all() -> None:
 
 def serve() -> None:
     """Do the work that comes in, and write its result, or what it raised, to the output."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is meant for the process that waits for this one
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C is meant for the process that waits for this one
     work, arguments, memory = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_end_with_input, daemon=True).start()
     watch = Watch(memory=memory)

@@ -23,9 +23,19 @@ from ssh_abduction.theory.theory import Theory
 # The predicates of a trace's facts, which come step by step.
 OF_STEPS = {"view", "act", "kind", "turns", "open", "excluded", "elsewhere", "one"}
 READABLE = {"axiom", "path", "prefer", "defeasible"}  # the predicates of a theory's facts
-PARTS = {"base": 0, "step": 1, "check": 1}  # the program parts that are grounded, with the number of their parameters
+PARTS = {
+    "base": 0,
+    "step": 1,
+    "check": 1,
+}  # the program parts that are grounded, with the number of their parameters
 TEXT = "<string>"  # what clingo calls a text that is no file
-ALLOWED = {ast.ASTType.Rule, ast.ASTType.Program, ast.ASTType.Definition, ast.ASTType.Defined, ast.ASTType.Comment}
+ALLOWED = {
+    ast.ASTType.Rule,
+    ast.ASTType.Program,
+    ast.ASTType.Definition,
+    ast.ASTType.Defined,
+    ast.ASTType.Comment,
+}
 EXAMPLE = "% @axiom(brief) No dstate is seen again later.\n#program step(t).\nviolation(brief,t) :- same(I,t), t-I > 10."
 
 
@@ -43,9 +53,18 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
     """Check one file of rules, which may use what the others and these encodings define."""
     of_steps, known, numbers = _predicates(files)
     statements = _statements(rules)
-    own = {name for other in others for statement, _, _ in _statements(other) for name in _heads(statement)}
+    own = {
+        name
+        for other in others
+        for statement, _, _ in _statements(other)
+        for name in _heads(statement)
+    }
     own |= {name for statement, _, _ in statements for name in _heads(statement)}
-    defined = {str(statement.name) for statement, _, _ in statements if statement.ast_type is ast.ASTType.Defined}
+    defined = {
+        str(statement.name)
+        for statement, _, _ in statements
+        if statement.ast_type is ast.ASTType.Defined
+    }
     named = {axiom.name for axiom in rules.axioms}
     for statement, part, parameter in statements:
         begin = statement.location.begin
@@ -55,9 +74,13 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
                 f"{rules.name}: expected rules, got #include of {begin.filename}; give that file, too (--rules may be given again)"
             )
         if statement.ast_type not in ALLOWED:
-            raise TheoryError(f"{where}: expected rules, got {_short(statement)}; what is minimised and shown is chosen by the theory")
+            raise TheoryError(
+                f"{where}: expected rules, got {_short(statement)}; what is minimised and shown is chosen by the theory"
+            )
         for function in _functions_of_python(statement):
-            raise TheoryError(f"{where}: expected what clingo works out by itself, got {function}, a function of Python's; say it in rules")
+            raise TheoryError(
+                f"{where}: expected what clingo works out by itself, got {function}, a function of Python's; say it in rules"
+            )
         if statement.ast_type is not ast.ASTType.Rule:
             continue
         for name in _heads(statement):
@@ -85,8 +108,12 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
                 raise TheoryError(
                     f"{where}: {name}: expected an atom that this theory has, got one that nothing defines; there are {', '.join(sorted(of_steps))}"
                 )
-            if name not in own | defined and len(atom.arguments) not in numbers.get(name, {len(atom.arguments)}):
-                raise TheoryError(f"{where}: {atom}: expected {_counted(numbers[name])}, got {len(atom.arguments)}")
+            if name not in own | defined and len(atom.arguments) not in numbers.get(
+                name, {len(atom.arguments)}
+            ):
+                raise TheoryError(
+                    f"{where}: {atom}: expected {_counted(numbers[name])}, got {len(atom.arguments)}"
+                )
             if (
                 name in of_steps
                 and not positive
@@ -108,9 +135,20 @@ def read_by(rules: Rules, every: Iterable[Rules]) -> frozenset[str]:
         rules: The rules, which `check_rules` found to be in order.
         every: All files of rules.
     """
-    own = {name for other in every for statement, _, _ in _statements(other) for name in _heads(statement)}
-    of_rules = [statement for statement, _, _ in _statements(rules) if statement.ast_type is ast.ASTType.Rule]
-    return frozenset(atom.name for statement in of_rules for atom, _ in _atoms(statement) if atom.name not in own)
+    own = {
+        name
+        for other in every
+        for statement, _, _ in _statements(other)
+        for name in _heads(statement)
+    }
+    of_rules = [
+        statement
+        for statement, _, _ in _statements(rules)
+        if statement.ast_type is ast.ASTType.Rule
+    ]
+    return frozenset(
+        atom.name for statement in of_rules for atom, _ in _atoms(statement) if atom.name not in own
+    )
 
 
 def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
@@ -122,7 +160,10 @@ def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
     def take(statement: ast.AST) -> None:
         nonlocal part, parameter
         if statement.ast_type is ast.ASTType.Program:
-            part, parameter = str(statement.name), ",".join(str(p.name) for p in statement.parameters)
+            part, parameter = (
+                str(statement.name),
+                ",".join(str(p.name) for p in statement.parameters),
+            )
             if PARTS.get(part) != len(statement.parameters):
                 where = f"{rules.name}:{statement.location.begin.line}"
                 raise TheoryError(
@@ -134,16 +175,16 @@ def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
         ast.parse_string(rules.text, take, logger=lambda _, message: messages.append(message))
     except RuntimeError:
         raise TheoryError(_said(rules, messages)) from None
-    return [entry for entry in found[1:] if entry[0].ast_type is not ast.ASTType.Comment]  # the first one opens base
+    return [
+        entry for entry in found[1:] if entry[0].ast_type is not ast.ASTType.Comment
+    ]  # the first one opens base
 
 
 def _said(rules: Rules, messages: list[str]) -> str:
     """What clingo said of rules, on one line."""
     said = " ".join(messages[0].split()) if messages else "clingo cannot read them"
     said = re.sub(r"^<[^>]*>", lambda _: rules.name, said)
-    return (
-        f"{said if said.startswith(rules.name) else f'{rules.name}: {said}'}; rules are written as in: {' '.join(EXAMPLE.split(chr(10)))}"
-    )
+    return f"{said if said.startswith(rules.name) else f'{rules.name}: {said}'}; rules are written as in: {' '.join(EXAMPLE.split(chr(10)))}"
 
 
 def _check_safety(*files: Rules) -> None:
@@ -155,11 +196,15 @@ def _check_safety(*files: Rules) -> None:
             control.add("base", [], rules.text)
         control.ground([])
     except RuntimeError:
-        raise TheoryError(_said(files[-1], [m for m in messages if "error" in m] or messages)) from None
+        raise TheoryError(
+            _said(files[-1], [m for m in messages if "error" in m] or messages)
+        ) from None
 
 
 @lru_cache(maxsize=8)
-def _predicates(files: tuple[str, ...]) -> tuple[frozenset[str], frozenset[str], dict[str, frozenset[int]]]:
+def _predicates(
+    files: tuple[str, ...],
+) -> tuple[frozenset[str], frozenset[str], dict[str, frozenset[int]]]:
     """The predicates of these encodings that are about steps; all that they define; and how many arguments each may have that they define or read."""
     of_steps = set(OF_STEPS)
     defined, numbers = set[str](), dict[str, set[int]]()
@@ -171,7 +216,11 @@ def _predicates(files: tuple[str, ...]) -> tuple[frozenset[str], frozenset[str],
                 of_steps |= heads if part != "base" else set()
                 for atom, _ in _atoms_in(statement):
                     numbers.setdefault(atom.name, set()).add(len(atom.arguments))
-    return frozenset(of_steps - {"violation"}), frozenset(defined), {name: frozenset(found) for name, found in numbers.items()}
+    return (
+        frozenset(of_steps - {"violation"}),
+        frozenset(defined),
+        {name: frozenset(found) for name, found in numbers.items()},
+    )
 
 
 def _heads(statement: ast.AST) -> Iterator[str]:
@@ -185,7 +234,11 @@ def _heads(statement: ast.AST) -> Iterator[str]:
 def _violations(statement: ast.AST) -> Iterator[str]:
     """The axioms of which a rule derives violations."""
     for atom in _derived(statement.head):
-        if atom.name == "violation" and atom.arguments and atom.arguments[0].ast_type is ast.ASTType.SymbolicTerm:
+        if (
+            atom.name == "violation"
+            and atom.arguments
+            and atom.arguments[0].ast_type is ast.ASTType.SymbolicTerm
+        ):
             yield str(atom.arguments[0])
 
 
@@ -204,7 +257,11 @@ def _atoms(statement: ast.AST) -> Iterator[tuple[ast.AST, bool]]:
     derived = list(_derived(statement.head))
     for literal in statement.body:
         yield from _atoms_in(literal)
-    yield from ((atom, positive) for atom, positive in _atoms_in(statement.head) if not any(atom is other for other in derived))
+    yield from (
+        (atom, positive)
+        for atom, positive in _atoms_in(statement.head)
+        if not any(atom is other for other in derived)
+    )
 
 
 def _atoms_in(node: ast.AST, positive: bool = True) -> Iterator[tuple[ast.AST, bool]]:
@@ -224,7 +281,11 @@ def _atoms_in(node: ast.AST, positive: bool = True) -> Iterator[tuple[ast.AST, b
 def _children(node: ast.AST) -> Iterator[ast.AST]:
     for key in node.child_keys:
         child = getattr(node, key)
-        yield from [child] if isinstance(child, ast.AST) else [part for part in child or () if isinstance(part, ast.AST)]
+        yield from (
+            [child]
+            if isinstance(child, ast.AST)
+            else [part for part in child or () if isinstance(part, ast.AST)]
+        )
 
 
 def _functions_of_python(node: ast.AST) -> Iterator[ast.AST]:

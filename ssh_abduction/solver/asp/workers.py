@@ -47,7 +47,12 @@ class Worker:
     def __init__(self, folder: str) -> None:
         self.deadline: float | None = None
         self._late = False
-        self._process = subprocess.Popen(command(__name__), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        self._process = subprocess.Popen(
+            command(__name__),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
         self._send(search_path())
         self._send(folder)
         self._begun = False
@@ -139,7 +144,9 @@ def answers(
                     worker.end()
                     break
                 if seconds is not None:
-                    worker.deadline = time.monotonic() + seconds + (0.0 if worker is before else STARTING)
+                    worker.deadline = (
+                        time.monotonic() + seconds + (0.0 if worker is before else STARTING)
+                    )
                 ready.put(worker.done(task[0], work, task))
         except queue.Empty:
             pass
@@ -148,7 +155,9 @@ def answers(
         finally:
             ready.put(None)
 
-    threads = [threading.Thread(target=run, args=(place,), daemon=True) for place in range(processes)]
+    threads = [
+        threading.Thread(target=run, args=(place,), daemon=True) for place in range(processes)
+    ]
     for thread in threads:
         thread.start()
     running, told = processes, set[Worker]()
@@ -238,7 +247,9 @@ def serves() -> bool:
 def serve() -> None:
     """Do the work that comes in, and send what comes of it, until the input ends."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # they are meant for the process that waits for this one, which says what is to end
+        signal.signal(
+            number, signal.SIG_IGN
+        )  # they are meant for the process that waits for this one, which says what is to end
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # nothing else is written there
     output.write(_BEGIN)

@@ -36,7 +36,13 @@ class Cost:
     def of(ssh_map: SSHMap) -> Cost:
         checked_map(ssh_map)
         faults = sum(round(10 * fault.cost) for fault in ssh_map.faults) / 10
-        return Cost(len(ssh_map.dstates), len(ssh_map.places), len(ssh_map.paths), len(ssh_map.excused), faults)
+        return Cost(
+            len(ssh_map.dstates),
+            len(ssh_map.places),
+            len(ssh_map.paths),
+            len(ssh_map.excused),
+            faults,
+        )
 
     @property
     def tenths(self) -> int:
@@ -48,14 +54,20 @@ class Cost:
         return tuple(getattr(self, name) for name in checked_theory(theory).priorities)
 
     def to_dict(self) -> dict[str, float]:
-        counts: dict[str, float] = {"dstates": self.dstates, "places": self.places, "paths": self.paths}
+        counts: dict[str, float] = {
+            "dstates": self.dstates,
+            "places": self.places,
+            "paths": self.paths,
+        }
         counts |= {"excuses": self.excuses} if self.excuses else {}
         return {**counts, "faults": self.faults} if self.faults else counts
 
 
 def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> Cost:
     """The counts of a map: those that the theory prefers as clingo counted them, since it may count more than the map can show where axioms are left out."""
-    counted = {name: count for name, count in zip(theory.priorities, cost, strict=True) if name != "tenths"}
+    counted = {
+        name: count for name, count in zip(theory.priorities, cost, strict=True) if name != "tenths"
+    }
     return replace(Cost.of(ssh_map), **counted)
 
 
@@ -90,10 +102,14 @@ class Task:
     speedups: Speedups
 
     @staticmethod
-    def of(trace: Trace, theory: Theory, watch: Watch | None = None, speedups: Speedups | None = None) -> Task:
+    def of(
+        trace: Trace, theory: Theory, watch: Watch | None = None, speedups: Speedups | None = None
+    ) -> Task:
         """A task for all speed-ups that hold for a theory, or for these of them."""
         speedups = (speedups or Speedups()).that_hold_for(theory)
-        if speedups.sides and any(action.slipped for action in trace.actions):  # `sides` takes all that links two visits for a travel
+        if speedups.sides and any(
+            action.slipped for action in trace.actions
+        ):  # `sides` takes all that links two visits for a travel
             speedups = replace(speedups, sides=False)
         return Task(trace, theory, Log(trace, theory), watch or Watch(), speedups)
 

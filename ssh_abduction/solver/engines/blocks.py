@@ -23,9 +23,7 @@ from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.theory.evidence import Pairs
 
 MARGIN = 3  # Such a block begins and ends so many times as many steps from the faults as there may be dstates, if there is room.
-COARSE = (
-    5  # The shortest block is sought to a step, and to one more for each so many dstates that are asked for beyond those of the known map.
-)
+COARSE = 5  # The shortest block is sought to a step, and to one more for each so many dstates that are asked for beyond those of the known map.
 MOST_STEPS = 200  # Clingo is asked of blocks up to this length,
 MOST_NAMES = 80  # and only with so few names for dstates, those of all views together.
 CONFLICTS = 20_000  # After so many conflicts a question is left open.
@@ -47,7 +45,9 @@ class Blocks:
     faults: Mapping[str, Sequence[int]]
     dstates: int
     watch: Watch
-    _proven: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)  # of blocks, with how many dstates which cost is proven
+    _proven: dict[tuple[int, int], tuple[int, int]] = field(
+        default_factory=dict
+    )  # of blocks, with how many dstates which cost is proven
 
     @property
     def cost(self) -> int:
@@ -61,13 +61,18 @@ class Blocks:
         while most > 0:
             least = self.least_faults(most)
             bound = min(bound, 10 * most + least)
-            most = min(most, -(-(bound - least) // 10)) - 1  # the same blocks do for all numbers in between
+            most = (
+                min(most, -(-(bound - least) // 10)) - 1
+            )  # the same blocks do for all numbers in between
         return bound
 
     def least_faults(self, most: int) -> int:
         """What faults cost, at least, in maps of so many dstates at most: the sum of blocks, from the left, each as short as it takes."""
         total = begin = 0
-        steps, places = len(self.seen), sorted(step for found in self.faults.values() for step in found)
+        steps, places = (
+            len(self.seen),
+            sorted(step for found in self.faults.values() for step in found),
+        )
         reach = 0  # how far behind a fault the last block ended
         while begin < steps:
             following = begin
@@ -114,20 +119,34 @@ class Blocks:
     def _takes_fault(self, begin: int, end: int, most: int) -> bool:
         """Whether without a fault these steps take more dstates than so many."""
         self.watch.check()
-        return end - begin > most and len(Continuations(self.seen[begin:end], self.actions[begin : end - 1]).clique()) > most
+        return (
+            end - begin > most
+            and len(Continuations(self.seen[begin:end], self.actions[begin : end - 1]).clique())
+            > most
+        )
 
-    def _wider(self, begin: int, end: int, places: Sequence[int], most: int) -> tuple[int, int] | None:
+    def _wider(
+        self, begin: int, end: int, places: Sequence[int], most: int
+    ) -> tuple[int, int] | None:
         """The end of a wider block, where faults of the known map are too near to each other for blocks of their own, and what these cost; None where that is not proven."""
         first = behind = bisect_left(places, begin)
-        while behind < len(places) and places[behind] < max(end, places[behind - 1] + most + 1 if behind > first else 0):
+        while behind < len(places) and places[behind] < max(
+            end, places[behind - 1] + most + 1 if behind > first else 0
+        ):
             behind += 1
         if behind - first < 2:
             return None
         after = places[behind] if behind < len(places) else len(self.seen)
-        end = max(end, min((places[behind - 1] + after + 1) // 2, places[behind - 1] + MARGIN * most))
+        end = max(
+            end, min((places[behind - 1] + after + 1) // 2, places[behind - 1] + MARGIN * most)
+        )
         begin = max(begin, places[first] - MARGIN * most)
         known = self._known_cost(begin, end)
-        if end - begin > MOST_STEPS or most * len(set(self.seen[begin:end])) > MOST_NAMES or not self._refuted(begin, end, most, known - 1):
+        if (
+            end - begin > MOST_STEPS
+            or most * len(set(self.seen[begin:end])) > MOST_NAMES
+            or not self._refuted(begin, end, most, known - 1)
+        ):
             return None
         return end, known
 
@@ -140,10 +159,17 @@ class Blocks:
             asker.control = Control((), self.watch.check)
             asker.control.load_encodings("faulty")
             price = {kind: found[begin:end] for kind, found in self.price.items()}
-            full = {t + near - begin for found in self.faults.values() for t in found for near in (-1, 0, 1)}
+            full = {
+                t + near - begin
+                for found in self.faults.values()
+                for t in found
+                for near in (-1, 0, 1)
+            }
             told = facts.faulty_batch(0, seen, actions, range(len(seen)), (), Pairs(), price, full)
             base = facts.faulty_base(actions, dict.fromkeys(sorted(set(seen)), most), self.price)
-            asker.control.add("base", [], "\n".join([base, told, facts.dstates_and_faults_up_to(most, tenths)]))
+            asker.control.add(
+                "base", [], "\n".join([base, told, facts.dstates_and_faults_up_to(most, tenths)])
+            )
             asker.control.ground([("base", [])])
             asker.control.ground([("more", facts.numbers(0))])
             answer, core = asker.verdict(lambda _: True, [], CONFLICTS)
@@ -156,9 +182,14 @@ class Blocks:
         """What the known map's faults cost among these steps, and the links between them."""
         last = {"misread": end, "slipped": end - 1}
         return sum(
-            sum(self.price[kind][t] for t in found[bisect_left(found, begin) : bisect_right(found, last[kind] - 1)])
+            sum(
+                self.price[kind][t]
+                for t in found[bisect_left(found, begin) : bisect_right(found, last[kind] - 1)]
+            )
             for kind, found in self.faults.items()
         )
 
     def _least_price(self, begin: int, end: int) -> int:
-        return min(min(found[begin : end - (kind == "slipped")]) for kind, found in self.price.items())
+        return min(
+            min(found[begin : end - (kind == "slipped")]) for kind, found in self.price.items()
+        )

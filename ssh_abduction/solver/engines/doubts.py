@@ -28,13 +28,20 @@ class Doubts:
     condition  what it takes for two steps, or two dstates, to be one: the body of a rule; None where they never are
     """
 
-    def __init__(self, asker: Asker, control: clingo.Control, condition: Callable[[Sort, int, int], str | None]) -> None:
+    def __init__(
+        self,
+        asker: Asker,
+        control: clingo.Control,
+        condition: Callable[[Sort, int, int], str | None],
+    ) -> None:
         self._asker, self._control, self._condition = asker, control, condition
         self._told: dict[Doubt, int] = {}  # all that clingo knows, by their numbers
         self._open: set[Doubt] = set()
         self._parts = 0
 
-    def answer(self, doubts: Collection[Doubt], read: Callable[[clingo.Model], Answer], mode: str) -> Answer | None:
+    def answer(
+        self, doubts: Collection[Doubt], read: Callable[[clingo.Model], Answer], mode: str
+    ) -> Answer | None:
         """An answer in which any of these doubts holds; None where there is none."""
         doubts = set(doubts)
         if not doubts:
@@ -44,7 +51,9 @@ class Doubts:
             self._control.assign_external(facts.open_doubt(self._told[doubt]), doubt in doubts)
         self._open = doubts
         assumed = [(facts.some_doubt(self._parts), True)]
-        with closing(self._asker.answers(read, mode, 1, assumptions=assumed, control=self._control)) as answers:
+        with closing(
+            self._asker.answers(read, mode, 1, assumptions=assumed, control=self._control)
+        ) as answers:
             return next(answers, None)
 
     def _tell(self, doubts: Sequence[Doubt]) -> None:
@@ -70,9 +79,20 @@ class Settled:
     """
 
     def __init__(
-        self, asker: Asker, control: clingo.Control, mode: str, reader: facts.PathReader, map_of: Callable[[facts.PathAnswer], SSHMap]
+        self,
+        asker: Asker,
+        control: clingo.Control,
+        mode: str,
+        reader: facts.PathReader,
+        map_of: Callable[[facts.PathAnswer], SSHMap],
     ) -> None:
-        self._asker, self._control, self._mode, self._reader, self._map_of = asker, control, mode, reader, map_of
+        self._asker, self._control, self._mode, self._reader, self._map_of = (
+            asker,
+            control,
+            mode,
+            reader,
+            map_of,
+        )
         self._doubts = Doubts(asker, control, reader.condition)
         self._any: SSHMap | None = None
 
@@ -83,7 +103,9 @@ class Settled:
     def any_map(self) -> SSHMap | None:
         """Some map, if there is one."""
         if self._any is None:
-            with closing(self._asker.answers(self._reader.read, self._mode, 1, control=self._control)) as answers:
+            with closing(
+                self._asker.answers(self._reader.read, self._mode, 1, control=self._control)
+            ) as answers:
                 self._any = next(map(self._map_of, answers), None)
         return self._any
 

@@ -39,9 +39,7 @@ PLACES = 12  # Steps around so many of those that the Viterbi pass disbelieves a
 NAMES = 3  # So many names a view has at first.
 MORE_NAMES = 2  # So many more it is given where its rest is used.
 OPTIONS = ("--opt-strategy=usc,stratify",)
-SPARE = (
-    3  # So many names a view has at first beside those of the best map that is guessed. With one the rests are used, and all begins anew.
-)
+SPARE = 3  # So many names a view has at first beside those of the best map that is guessed. With one the rests are used, and all begins anew.
 GUESSING = 5.0  # No start of EM begins after so many seconds,
 GUESSING_SHARE = 0.1  # or after such a share of the time that is left.
 
@@ -152,8 +150,18 @@ class FaultyEngine:
     def _bound_by_blocks(self) -> None:
         """Raise the bound of a long trace by disjoint blocks of it."""
         if self.size >= LONG and self._known is not None and self._most_faults is None:
-            faults = {kind: [fault.step for fault in self._known.faults if fault.kind == kind] for kind in self._price}
-            blocks = Blocks(self._seen, self._actions, self._price, faults, len(self._known.dstates), self._task.watch)
+            faults = {
+                kind: [fault.step for fault in self._known.faults if fault.kind == kind]
+                for kind in self._price
+            }
+            blocks = Blocks(
+                self._seen,
+                self._actions,
+                self._price,
+                faults,
+                len(self._known.dstates),
+                self._task.watch,
+            )
             self._raise_bound([blocks.bound()])
 
     def _asked(self) -> Iterator[Found]:
@@ -190,7 +198,9 @@ class FaultyEngine:
         while True:
             found: list[Found] = []
             for answer in self._answers_of_cost(cost[0], enough):
-                labels, failed = (None, -1) if answer.rests or answer.lost else self._followed(answer)
+                labels, failed = (
+                    (None, -1) if answer.rests or answer.lost else self._followed(answer)
+                )
                 if labels is None:
                     break
                 found.append(self._found(labels, answer.slips, self._machine(answer)[0]))
@@ -221,9 +231,15 @@ class FaultyEngine:
 
     def _name_more(self, answer: _Answer) -> None:
         """Give the views more names whose rest is used, and also those all of whose names are."""
-        used = Counter(view for name, view in facts.faulty_names(self._names) if name in set(answer.where.values()))
+        used = Counter(
+            view
+            for name, view in facts.faulty_names(self._names)
+            if name in set(answer.where.values())
+        )
         for view in self._names:
-            self._names[view] += MORE_NAMES if view in answer.rests else used[view] == self._names[view]
+            self._names[view] += (
+                MORE_NAMES if view in answer.rests else used[view] == self._names[view]
+            )
 
     def _prepare(self) -> None:
         """Tell clingo of the given steps that it does not know yet; a new control where views have more names than it knows."""
@@ -233,13 +249,28 @@ class FaultyEngine:
                 self._batches = self._ruled = 0
                 self.asker.control = Control(OPTIONS, self.asker.watch.check)
                 self.asker.control.load_encodings("faulty")
-                self.asker.control.add("base", [], facts.faulty_base(self._actions, self._names, self._price))
+                self.asker.control.add(
+                    "base", [], facts.faulty_base(self._actions, self._names, self._price)
+                )
                 self.asker.control.ground([("base", [])])
             control = self.asker.control
             if new := sorted(self._given.difference(self._told)):
                 batch = self._batches
-                price = self._price if self._most_faults is None else {kind: [0] * len(self._seen) for kind in self._price}
-                told = facts.faulty_batch(batch, self._seen, self._actions, new, self._told, self._task.log.pairs, price, self._full)
+                price = (
+                    self._price
+                    if self._most_faults is None
+                    else {kind: [0] * len(self._seen) for kind in self._price}
+                )
+                told = facts.faulty_batch(
+                    batch,
+                    self._seen,
+                    self._actions,
+                    new,
+                    self._told,
+                    self._task.log.pairs,
+                    price,
+                    self._full,
+                )
                 control.add(f"batch_{batch}", [], told)
                 control.ground([(f"batch_{batch}", []), ("more", facts.numbers(batch))])
                 if self._most_faults is not None:
@@ -268,7 +299,9 @@ class FaultyEngine:
         seen: set[tuple[frozenset[tuple[int, int]], frozenset[int]]] = set()
         # Of a long trace the bound is proven by blocks, and not of the steps that clingo was given.
         mode = f"optN,{cost}" if self.size < LONG else f"enum,{cost}"
-        for answer in (answer for answer in self.asker.answers(self._read, mode, 0) if answer.cost == cost):
+        for answer in (
+            answer for answer in self.asker.answers(self._read, mode, 0) if answer.cost == cost
+        ):
             told = frozenset(answer.where.items()), answer.slips
             if told not in seen:
                 seen.add(told)
@@ -303,7 +336,9 @@ class FaultyEngine:
             here = answer.where.get(t)
             if t and (t - 1 not in answer.where or here is None):
                 there = machine.goes.get((labels[-1], self._actions[t - 1]))
-                known = there is not None and (machine.shows[there] == self._seen[t] if here is None else there == number[here])
+                known = there is not None and (
+                    machine.shows[there] == self._seen[t] if here is None else there == number[here]
+                )
                 if not known and t - 1 not in answer.slips:
                     return None, t if here is None else t - 1
                 if here is None:
@@ -323,33 +358,54 @@ class FaultyEngine:
         if not machine.shows:  # all given steps are lost
             return None, []
         explained = self._explainer.explained(machine)
-        doubted = [t for t in sorted({*explained.unknown, *explained.faults}) if t not in self._given]
+        doubted = [
+            t for t in sorted({*explained.unknown, *explained.faults}) if t not in self._given
+        ]
         return self._map_of(self._explainer.completed(machine)), doubted[:PLACES]
 
     def _map_of(self, explained: Explained) -> Found | None:
         """The map of an explanation of the trace; None where its faults are not allowed."""
         labels, shows = explained.labels, explained.machine.shows
-        if (explained.misread and "misread" not in self._price) or (explained.slips and "slipped" not in self._price):
+        if (explained.misread and "misread" not in self._price) or (
+            explained.slips and "slipped" not in self._price
+        ):
             return None
-        if set(labels) - {s for t, s in enumerate(labels) if shows[s] == self._seen[t]}:  # a dstate whose view is never read right
+        if set(labels) - {
+            s for t, s in enumerate(labels) if shows[s] == self._seen[t]
+        }:  # a dstate whose view is never read right
             return None
-        if any(all(labels[one.first] == labels[one.second] for one in together) for together in self._forbidden):
+        if any(
+            all(labels[one.first] == labels[one.second] for one in together)
+            for together in self._forbidden
+        ):
             return None
-        if self._task.log.pairs.broken_by(labels) or (self._most_faults is not None and len(explained.faults) > self._most_faults):
+        if self._task.log.pairs.broken_by(labels) or (
+            self._most_faults is not None and len(explained.faults) > self._most_faults
+        ):
             return None
         return self._found(labels, explained.slips, {}, shows)
 
-    def _found(self, labels: Sequence[int], slips: Collection[int], number: Mapping[int, int], shows: Sequence[int] | None = None) -> Found:
+    def _found(
+        self,
+        labels: Sequence[int],
+        slips: Collection[int],
+        number: Mapping[int, int],
+        shows: Sequence[int] | None = None,
+    ) -> Found:
         """A map of the whole trace, and what it costs."""
         view_of = dict(facts.faulty_names(self._names))
         shown = self._shown_somewhere(labels, shows or [view_of[name] for name in number])
         misread = [t for t in range(self.size) if shown[labels[t]] != self._seen[t]]
         faults = [*((t, "misread") for t in misread), *((t, "slipped") for t in slips)]
-        return Found.of(facts.faulty_map(labels, self._task.trace, faults, self._task.theory), self._task.theory)
+        return Found.of(
+            facts.faulty_map(labels, self._task.trace, faults, self._task.theory), self._task.theory
+        )
 
     def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
         """The views of dstates, so that each is read right at some step: of one that never is, any other view is as good, and the one seen most often needs fewer faults."""
         views = list(shown)
         for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:
-            views[s] = Counter(self._seen[t] for t, label in enumerate(labels) if label == s).most_common(1)[0][0]
+            views[s] = Counter(
+                self._seen[t] for t, label in enumerate(labels) if label == s
+            ).most_common(1)[0][0]
         return views

@@ -100,7 +100,9 @@ class FramedEngine:
     lists_least = True
     goes_on = True
 
-    def __init__(self, task: Task, around: Mapping[int, Sequence[int]] | None = None, soon: float = SOON) -> None:
+    def __init__(
+        self, task: Task, around: Mapping[int, Sequence[int]] | None = None, soon: float = SOON
+    ) -> None:
         """An engine for no steps yet.
 
         around  as in `Chart.framed`, where steps have no stars
@@ -121,12 +123,20 @@ class FramedEngine:
         """Nothing is known of maps of this prefix yet."""
         self._guess: list[int] | None = None  # labels of a map of the causal axioms
         self._guessed = False  # whether maps near the guess were sought
-        self._known_cost: tuple[int, ...] = ()  # of the known map, until better paths were looked for
+        self._known_cost: tuple[
+            int, ...
+        ] = ()  # of the known map, until better paths were looked for
         self._beside: Beside | None = None  # a search that begins with the guess, in another thread
-        self._tried: list[int] | None = None  # labels found there, the last of which it is known whether they have paths
+        self._tried: list[int] | None = (
+            None  # labels found there, the last of which it is known whether they have paths
+        )
         self._named: NearbySearch | None = None  # what searches there
-        self._path_seconds = 0.0  # what the last control for paths took, which cannot be stopped meanwhile
-        self._best: tuple[tuple[int, ...], list[_Naming]] | None = None  # the minimal cost, and all namings that have it
+        self._path_seconds = (
+            0.0  # what the last control for paths took, which cannot be stopped meanwhile
+        )
+        self._best: tuple[tuple[int, ...], list[_Naming]] | None = (
+            None  # the minimal cost, and all namings that have it
+        )
 
     @property
     def size(self) -> int:
@@ -139,7 +149,13 @@ class FramedEngine:
     @property
     def _paths(self) -> Paths:
         pinned, check = self._task.speedups.clique, self.asker.watch.check
-        return Paths(self._task.trace, self._task.theory, pinned=pinned, check=check, forbidden=tuple(self._forbidden))
+        return Paths(
+            self._task.trace,
+            self._task.theory,
+            pinned=pinned,
+            check=check,
+            forbidden=tuple(self._forbidden),
+        )
 
     def with_paths(self, paths: int) -> FramedEngine:
         return FramedEngine(self._task, self._around, self._soon)
@@ -174,8 +190,12 @@ class FramedEngine:
         best = first.found
         yield best
         namings: list[_Naming] = []
-        for other in chain([first.naming], self._all_with_paths(best.cost[0], besides=first.naming.labels)):
-            naming = other if other.control else replace(other, control=self._path_control(other.labels))
+        for other in chain(
+            [first.naming], self._all_with_paths(best.cost[0], besides=first.naming.labels)
+        ):
+            naming = (
+                other if other.control else replace(other, control=self._path_control(other.labels))
+            )
             for found in self._better_paths(naming):
                 if found.cost < best.cost:
                     best, namings = found, []
@@ -205,7 +225,9 @@ class FramedEngine:
         """Maps near a guess, once; and then what came of the search beside this one."""
         if not self._guessed:
             self._guessed = True
-            yield from self._near_guess(self._guess or self._paths.guessed_labels(self._chart, self.asker.watch))
+            yield from self._near_guess(
+                self._guess or self._paths.guessed_labels(self._chart, self.asker.watch)
+            )
         else:
             yield from self._maps_found_beside()
             yield from self._improve_known_map()
@@ -216,7 +238,9 @@ class FramedEngine:
             self._absorb(self._beside)
         if self._guessed:
             known = self._visits.known
-            return self._labels_beside() is not None or (known is not None and self.bound == len(set(known)))
+            return self._labels_beside() is not None or (
+                known is not None and self.bound == len(set(known))
+            )
         if not self._task.speedups.annealed or self._visits.has_forbidden:
             return False
         waited = self.asker.watch.elapsed()
@@ -224,7 +248,9 @@ class FramedEngine:
         soon = min(self._soon, SOON_SHARE * limit) if limit > self._soon else self._soon
         if not self._beside and waited > soon and self._task.has_processors:
             self._search_beside(self._chart)
-        later = self._soon if self._visits.knows_all else min(LATER * self._soon, LATER_SHARE * limit)
+        later = (
+            self._soon if self._visits.knows_all else min(LATER * self._soon, LATER_SHARE * limit)
+        )
         return self._guess is not None or (not self._beside and waited > max(later, GUESS_FIRST))
 
     def _search_beside(self, chart: FramedChart) -> None:
@@ -242,16 +268,26 @@ class FramedEngine:
 
         self._beside = Beside(self._named, watch, self._fewer_labels(self._named, chart, watch))
 
-    def _fewer_labels(self, named: NearbySearch, chart: FramedChart, watch: Watch) -> Iterator[list[int]]:
+    def _fewer_labels(
+        self, named: NearbySearch, chart: FramedChart, watch: Watch
+    ) -> Iterator[list[int]]:
         """Labels, each time fewer, of maps of the causal axioms near a guess."""
         guessed_labels = self._paths.guessed_labels
-        self._guess = in_process(guessed_labels, chart, watch=watch) if self._task.speedups.processes else guessed_labels(chart, watch)
+        self._guess = (
+            in_process(guessed_labels, chart, watch=watch)
+            if self._task.speedups.processes
+            else guessed_labels(chart, watch)
+        )
         yield from named.fewer(self._guess)
 
     def map_of_guess(self) -> Found | None:
         """A map of the whole trace made of a guess, without a search: None where none is found soon."""
         chart = self._charted(len(self._task.trace), None)
-        return None if chart is None else self._separate_paths(self._paths.guessed_labels(chart, self.asker.watch), chart)
+        return (
+            None
+            if chart is None
+            else self._separate_paths(self._paths.guessed_labels(chart, self.asker.watch), chart)
+        )
 
     def map_mended_from(self, known: Sequence[int]) -> Found | None:
         """A map of the whole trace in which the first steps keep these dstates, as far as can be, and all else is new, if that has paths."""
@@ -284,7 +320,11 @@ class FramedEngine:
 
     def _named_at(self, dstates: int) -> NearbySearch | None:
         """What searched beside, if that alone showed that there are no fewer dstates."""
-        return self._named if self._named and self._named.bound == dstates > self._visits.least else None
+        return (
+            self._named
+            if self._named and self._named.bound == dstates > self._visits.least
+            else None
+        )
 
     def _near_guess(self, guess: Sequence[int]) -> Iterator[Found]:
         """Maps near a guess, if it leads to any, each with fewer dstates than the one before; and better paths for each."""
@@ -305,9 +345,18 @@ class FramedEngine:
     def _improve_known_map(self) -> Iterator[Found]:
         """The known map with better paths, unless these were looked for already, or there is no time for that."""
         known = self._visits.known
-        if known and self._known_cost and len(self._task.theory.priorities) > 1 and self.asker.watch.allows(self._preparing):
+        if (
+            known
+            and self._known_cost
+            and len(self._task.theory.priorities) > 1
+            and self.asker.watch.allows(self._preparing)
+        ):
             cost, self._known_cost = self._known_cost, ()
-            yield from (found for found in self._maps(_Naming(list(known), None), "opt", GUESSING) if found.cost < cost)
+            yield from (
+                found
+                for found in self._maps(_Naming(list(known), None), "opt", GUESSING)
+                if found.cost < cost
+            )
 
     def _maps_found_beside(self) -> Iterator[Found]:
         """A map of the labels last found beside, if they are new and have paths."""
@@ -338,17 +387,25 @@ class FramedEngine:
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
         if not self._framed:
             return
-        namings = self._best[1] if self._best and self._best[0] == cost else self._all_with_paths(cost[0])
+        namings = (
+            self._best[1] if self._best and self._best[0] == cost else self._all_with_paths(cost[0])
+        )
         mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
-        yield from islice((found for naming in namings for found in self._maps(naming, mode)), enough or None)
+        yield from islice(
+            (found for naming in namings for found in self._maps(naming, mode)), enough or None
+        )
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
         if not self._framed:
             return
         mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
-        for naming in self._best[1] if self._best and self._best[0] == cost else self._all_with_paths(cost[0]):
+        for naming in (
+            self._best[1] if self._best and self._best[0] == cost else self._all_with_paths(cost[0])
+        ):
             control = naming.control or self._path_control(naming.labels)
-            reader = facts.PathReader(control, self._task.trace, self._task.theory, self._chart, naming.labels)
+            reader = facts.PathReader(
+                control, self._task.trace, self._task.theory, self._chart, naming.labels
+            )
             settled = Settled(self.asker, control, mode, reader, reader.map_of)
             if settled.has_map():
                 yield settled
@@ -363,14 +420,22 @@ class FramedEngine:
             fitted[tuple(labels)] = found
             return None
 
-        if self._named_at(dstates):  # what searches beside is not told why labels have no paths; it lists each anyway
+        if self._named_at(
+            dstates
+        ):  # what searches beside is not told why labels have no paths; it lists each anyway
             known = {tuple(besides)}
             for labels in self._all_labels(dstates):
                 if tuple(labels) not in known and (found := self._some_paths(labels)) is not None:
                     yield found.naming
                 known.add(tuple(labels))
             return
-        for labels in all_accepted(lambda: self._all_labels(dstates), why_not, self._forbid, key=tuple, known={tuple(besides)}):
+        for labels in all_accepted(
+            lambda: self._all_labels(dstates),
+            why_not,
+            self._forbid,
+            key=tuple,
+            known={tuple(besides)},
+        ):
             yield fitted.pop(tuple(labels)).naming
 
     def _some_paths(self, labels: Sequence[int]) -> _Fitted | None:
@@ -379,7 +444,9 @@ class FramedEngine:
 
     def _paths_found_soon(self, labels: Sequence[int]) -> _Fitted | None:
         """A map with these dstates, where they are many and there is one in which no two places or segments are taken for one."""
-        found = self._separate_paths(labels, self._chart) if len(set(labels)) > MANY_DSTATES else None
+        found = (
+            self._separate_paths(labels, self._chart) if len(set(labels)) > MANY_DSTATES else None
+        )
         return _Fitted(found, _Naming(list(labels), None)) if found else None
 
     def _any_paths(self, labels: Sequence[int]) -> _Fitted | None:
@@ -406,14 +473,34 @@ class FramedEngine:
             control = self._path_control(naming.labels, ["--opt-strategy=usc"])
             yield from self._maps(replace(naming, control=control), "opt")
 
-    def _maps(self, naming: _Naming, mode: str, conflicts: int = -1, chart: FramedChart | None = None) -> Generator[Found, None, bool]:
+    def _maps(
+        self, naming: _Naming, mode: str, conflicts: int = -1, chart: FramedChart | None = None
+    ) -> Generator[Found, None, bool]:
         """Maps with these dstates. Returns whether clingo came to an end, and not to the limit of conflicts."""
         control = naming.control or self._path_control(naming.labels)
-        alone = mode == "opt" and len(set(naming.labels)) > MANY_DSTATES and not self._beside and self._task.has_processors
+        alone = (
+            mode == "opt"
+            and len(set(naming.labels)) > MANY_DSTATES
+            and not self._beside
+            and self._task.has_processors
+        )
         give_threads(control, two=alone)  # which keep all that they list
-        reader = facts.PathReader(control, self._task.trace, self._task.theory, chart or self._chart, naming.labels)
-        answers = self.asker.answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
-        return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), self._task.theory), answers))
+        reader = facts.PathReader(
+            control, self._task.trace, self._task.theory, chart or self._chart, naming.labels
+        )
+        answers = self.asker.answers(
+            reader.read,
+            mode,
+            int(mode == "ignore"),
+            control=control,
+            conflicts=conflicts,
+            ahead=True,
+        )
+        return (
+            yield from mapped(
+                lambda answer: Found.of(reader.map_of(answer), self._task.theory), answers
+            )
+        )
 
     @property
     def _preparing(self) -> float:
@@ -433,10 +520,16 @@ class FramedEngine:
         self.asker.watch.check(0.0 if single else self._preparing)
         worked = time.thread_time()
         with self.asker.grounding_timed():
-            control = self._paths.settled(chart or self._chart, labels, options, nodes, single=single)
+            control = self._paths.settled(
+                chart or self._chart, labels, options, nodes, single=single
+            )
         self.asker.watch.check()
-        seconds = time.thread_time() - worked  # of this thread: the one beside may have made it wait
-        self._path_seconds = (self._path_seconds or ALL_PATHS * len(set(labels)) * seconds) if single else seconds
+        seconds = (
+            time.thread_time() - worked
+        )  # of this thread: the one beside may have made it wait
+        self._path_seconds = (
+            (self._path_seconds or ALL_PATHS * len(set(labels)) * seconds) if single else seconds
+        )
         return control
 
     def _forbid(self, labels: Sequence[int]) -> None:
@@ -445,7 +538,9 @@ class FramedEngine:
         told = (
             self._task.speedups.sides
             and self._visits.pairs <= MANY_PAIRS
-            and self._sides.say_of_path(self._paths, self._chart, labels, self._visits.standing(labels))
+            and self._sides.say_of_path(
+                self._paths, self._chart, labels, self._visits.standing(labels)
+            )
         )
         if not told:
             self._visits.forbid(labels, self._clashing(labels))
@@ -454,14 +549,24 @@ class FramedEngine:
         self._end_beside()
         self._best, self._named, self._tried = None, None, None
         self._forbidden.append(equalities)
-        nodes = [(self._chart.node_of[equality.first], self._chart.node_of[equality.second], equality.of) for equality in equalities]
-        self._visits.forbid_together([(a, b) for a, b, of in nodes if of == "dstate"], [(a, b) for a, b, of in nodes if of == "place"])
+        nodes = [
+            (self._chart.node_of[equality.first], self._chart.node_of[equality.second], equality.of)
+            for equality in equalities
+        ]
+        self._visits.forbid_together(
+            [(a, b) for a, b, of in nodes if of == "dstate"],
+            [(a, b) for a, b, of in nodes if of == "place"],
+        )
         return True
 
     def _clashing(self, labels: Sequence[int]) -> list[list[int]]:
         """Minimal conflicting sets of nodes: no paths fit the labels of any of these sets. At most CLASHES of them."""
         control = self._paths.clashing(self._chart, labels)
-        clashes = list(self.asker.answers(lambda model: sorted(facts.read_names(model)), "ignore", CLASHES, control=control))
+        clashes = list(
+            self.asker.answers(
+                lambda model: sorted(facts.read_names(model)), "ignore", CLASHES, control=control
+            )
+        )
         return clashes or [self._clash(labels)]
 
     def _clash(self, labels: Sequence[int]) -> list[int]:

@@ -72,8 +72,12 @@ class _Far:
     @classmethod
     def of(cls, labels: Sequence[int], equalities: Collection[Equality]) -> _Far | None:
         """What follows for these labels if equalities do not all hold; None where nothing follows, as some steps that were to be one dstate are not."""
-        steps = dict.fromkeys(step for equality in equalities for step in (equality.first, equality.second))
-        if max(steps) >= len(labels) or any(e.of == "dstate" and labels[e.first] != labels[e.second] for e in equalities):
+        steps = dict.fromkeys(
+            step for equality in equalities for step in (equality.first, equality.second)
+        )
+        if max(steps) >= len(labels) or any(
+            e.of == "dstate" and labels[e.first] != labels[e.second] for e in equalities
+        ):
             return None
         pairs = {(labels[e.first], labels[e.second]): None for e in equalities if e.of == "place"}
         return cls(tuple(pairs), tuple((step, labels[step]) for step in steps))
@@ -118,7 +122,9 @@ class FramelessEngine:
         self._fitting = PlacesAndPaths(task, self.asker)
         self._named = NamedLabels(task, self.asker, known, self._fitting)
         self._fitting.named = self._named
-        self._best: tuple[tuple[int, ...], list[list[int]]] | None = None  # the minimal cost, and all labels that have it
+        self._best: tuple[tuple[int, ...], list[list[int]]] | None = (
+            None  # the minimal cost, and all labels that have it
+        )
 
     @property
     def size(self) -> int:
@@ -165,23 +171,36 @@ class FramelessEngine:
         self._best = best.cost, as_good
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        every = self._best[1] if self._best and self._best[0] == cost else self._all_that_fit(cost[0])
+        every = (
+            self._best[1] if self._best and self._best[0] == cost else self._all_that_fit(cost[0])
+        )
         mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
         yield from islice(self._listed(every, mode), enough or None)
 
     def _listed(self, every: Iterable[list[int]], mode: str) -> Iterator[Found]:
         """The maps with these labels. Where displacements are used, maps whose places differ come first: how well maps close depends on dstates and places alone."""
         left, sooner, first = iter(every), list[list[int]](), set[SSHMap]()
-        while self._task.theory.displacement == "use" and len(first) < SOONER and (labels := next(left, None)):
+        while (
+            self._task.theory.displacement == "use"
+            and len(first) < SOONER
+            and (labels := next(left, None))
+        ):
             sooner.append(labels)
             for found in self._fitting.maps(labels, mode, parts=PARTS):
                 first.add(found.map)
                 yield found
-        yield from (found for labels in chain(sooner, left) for found in self._fitting.maps(labels, mode) if found.map not in first)
+        yield from (
+            found
+            for labels in chain(sooner, left)
+            for found in self._fitting.maps(labels, mode)
+            if found.map not in first
+        )
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
         mode = f"enum,{','.join(map(str, (0, *cost[1:])))}"
-        for labels in self._best[1] if self._best and self._best[0] == cost else self._all_that_fit(cost[0]):
+        for labels in (
+            self._best[1] if self._best and self._best[0] == cost else self._all_that_fit(cost[0])
+        ):
             settled = self._fitting.settled(labels, mode)
             if settled.has_map():
                 yield settled
@@ -198,9 +217,14 @@ class FramelessEngine:
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._fitting.forbid_together(equalities)
-        self._named.forbid_together([(equality.first, equality.second) for equality in equalities])  # as one dstate is at one place
+        self._named.forbid_together(
+            [(equality.first, equality.second) for equality in equalities]
+        )  # as one dstate is at one place
         if self._best:  # maps of that cost that are left have some of these labels
-            self._best = self._best[0], [labels for labels in self._best[1] if self._named.is_allowed(labels)]
+            self._best = (
+                self._best[0],
+                [labels for labels in self._best[1] if self._named.is_allowed(labels)],
+            )
         return True
 
     def settle(self) -> None:
@@ -218,10 +242,16 @@ class PlacesAndPaths:
     def __init__(self, task: Task, asker: Asker) -> None:
         self._task, self._asker = task, asker
         self._actions = dict(zip(task.log.actions, task.trace.actions, strict=True))
-        self._refused: list[Collection[Equality]] = []  # sets of which not all hold, and some of which are of places
+        self._refused: list[
+            Collection[Equality]
+        ] = []  # sets of which not all hold, and some of which are of places
         self._forbidden = 0  # sets of links, so far
-        self._told: set[tuple[int, int]] = set()  # dstates of whose paths clingo was told, as `NamedLabels.names` has them
-        self._asked: tuple[_Question, clingo.Control] | None = None  # the last labels, and the control for their places and paths
+        self._told: set[tuple[int, int]] = (
+            set()
+        )  # dstates of whose paths clingo was told, as `NamedLabels.names` has them
+        self._asked: tuple[_Question, clingo.Control] | None = (
+            None  # the last labels, and the control for their places and paths
+        )
         self._tight: dict[
             tuple[int, ...], tuple[Mapping[int, list[int]], Found]
         ] = {}  # labels of which the fewest places are known, with homes and a best map
@@ -253,7 +283,9 @@ class PlacesAndPaths:
             parts: list[tuple[str, list[clingo.Symbol]]] = []
             if not self._told:
                 control.load(encodings.path("sides_frameless"))
-                control.add("sides", [], facts.sides_frameless_facts(self._task.theory, self._actions))
+                control.add(
+                    "sides", [], facts.sides_frameless_facts(self._task.theory, self._actions)
+                )
                 parts.append(("sides", []))
             parts += [("path", facts.numbers(names[dstate])) for dstate in dstates]
             control.ground(parts)  # in one go: that takes half as long, and searching, too
@@ -267,10 +299,16 @@ class PlacesAndPaths:
         key = tuple(labels)
         if key in self._tight:
             return self._tight[key][1]
-        if "places" not in self._task.theory.priorities or key in self._failed or len(self._failed) >= TIGHT:
+        if (
+            "places" not in self._task.theory.priorities
+            or key in self._failed
+            or len(self._failed) >= TIGHT
+        ):
             return None
         with self._asker.grounding_timed():
-            control = self._control_for(self._links_of(labels), labels, far=self._far_away(labels), parts=TOLD)
+            control = self._control_for(
+                self._links_of(labels), labels, far=self._far_away(labels), parts=TOLD
+            )
             told = facts.Segments.read(control)
             homes = homes_of(told)
             if homes is not None:
@@ -288,9 +326,17 @@ class PlacesAndPaths:
 
         fewest  a lower bound on the number of paths
         """
-        places_first = next(count for count in self._task.theory.priorities if count in ("places", "paths")) == "places"
-        reader = facts.PathReader(control, self._task.trace, self._task.theory, self.named.chart, labels)
-        answers = mapped(reader.map_of, self._asker.answers(reader.read, "opt", 0, control=control, conflicts=TIGHTLY))
+        places_first = (
+            next(count for count in self._task.theory.priorities if count in ("places", "paths"))
+            == "places"
+        )
+        reader = facts.PathReader(
+            control, self._task.trace, self._task.theory, self.named.chart, labels
+        )
+        answers = mapped(
+            reader.map_of,
+            self._asker.answers(reader.read, "opt", 0, control=control, conflicts=TIGHTLY),
+        )
         best: Found | None = None
         with closing(answers):
             while True:
@@ -314,44 +360,68 @@ class PlacesAndPaths:
         control = self._control_for(links, parts=("base",))
         contrary = next(self._asker.answers(facts.read_contraries, "ignore", 1, control=control))
         dstate_of = {name: dstate for dstate, name in self.named.names().items()}
-        new = [dstate for name in contrary if (dstate := dstate_of.get(name)) is not None and dstate not in self._told][:CONTRARY]
+        new = [
+            dstate
+            for name in contrary
+            if (dstate := dstate_of.get(name)) is not None and dstate not in self._told
+        ][:CONTRARY]
         if new:
             self._tell_of(new)
             return
         far = self._far_away(labels)
-        for members in self._turned_together(links, far) or [_Members.of(smaller(_Members([*links], far).all(), self._clashing))]:
+        for members in self._turned_together(links, far) or [
+            _Members.of(smaller(_Members([*links], far).all(), self._clashing))
+        ]:
             placed = {at for apart in members.far for at in apart.placed}
             self.named.add_links_at({step for step, _ in placed})
             self._forbidden += 1
-            self.named.tell(f"forbidden_{self._forbidden}", facts.forbidden_links(members.links, placed))
+            self.named.tell(
+                f"forbidden_{self._forbidden}", facts.forbidden_links(members.links, placed)
+            )
 
     def _turned_together(self, links: Iterable[Link], far: Iterable[_Far]) -> list[_Members]:
         """Dstates that are far from each other though turns lead from one to the other, with as few links as lead there; the fewest links first."""
-        turns = nx.Graph((s, x, {"link": (s, action, x)}) for s, action, x in links if self._actions[action].turn)
+        turns = nx.Graph(
+            (s, x, {"link": (s, action, x)}) for s, action, x in links if self._actions[action].turn
+        )
         turns.add_nodes_from(dstate for apart in far for dstate in chain(*apart.pairs))
         found = []
         for apart in far:
             if all(nx.has_path(turns, x, y) for x, y in apart.pairs):
                 ways = (nx.shortest_path(turns, x, y) for x, y in apart.pairs)
-                found.append(_Members([turns.edges[pair]["link"] for way in ways for pair in pairwise(way)], [apart]))
+                found.append(
+                    _Members(
+                        [turns.edges[pair]["link"] for way in ways for pair in pairwise(way)],
+                        [apart],
+                    )
+                )
         return sorted(found, key=lambda members: len(members.links))[:CONTRARY]
 
     def _clashing(self, members: list[Link | _Far]) -> list[Link | _Far] | None:
         """These links, and dstates that are far from each other, if no places and paths fit them."""
         some = _Members.of(members)
-        found = any(self._has_paths(self._control_for(some.links, far=some.far, single=single)) for single in (True, False))
+        found = any(
+            self._has_paths(self._control_for(some.links, far=some.far, single=single))
+            for single in (True, False)
+        )
         return None if found else members
 
     def _far_away(self, labels: Sequence[int]) -> list[_Far]:
         """The dstates that are not at one place, as evidence says of steps at them; each pair once, and what is said of several pairs together."""
         away = self._task.log.pairs.elsewhere.items()
-        found = {(labels[i], labels[t]): (i, t) for t, others in away if t < len(labels) for i in others}
-        alone = [_Far((pair,), tuple(zip(steps, pair, strict=True))) for pair, steps in found.items()]
+        found = {
+            (labels[i], labels[t]): (i, t) for t, others in away if t < len(labels) for i in others
+        }
+        alone = [
+            _Far((pair,), tuple(zip(steps, pair, strict=True))) for pair, steps in found.items()
+        ]
         return alone + [far for equalities in self._refused if (far := _Far.of(labels, equalities))]
 
     def _links_of(self, labels: Sequence[int]) -> list[Link]:
         """The links that these labels of all steps make, each once."""
-        return list(dict.fromkeys((labels[t], action, labels[u]) for t, action, u in self.named.chart.links))
+        return list(
+            dict.fromkeys((labels[t], action, labels[u]) for t, action, u in self.named.chart.links)
+        )
 
     def _control_for(
         self,
@@ -368,18 +438,33 @@ class PlacesAndPaths:
         control.load_encodings("paths_frameless", "preference")
         apart = [member.pairs for member in far]
         dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links), *chain(*apart)))
-        control.add("base", [], facts.paths_frameless_facts(self._task.theory, dstates, links, self._actions, apart, single=single))
+        control.add(
+            "base",
+            [],
+            facts.paths_frameless_facts(
+                self._task.theory, dstates, links, self._actions, apart, single=single
+            ),
+        )
         control.ground([(part, []) for part in parts])
         return control
 
-    def _path_control(self, labels: Sequence[int], options: Sequence[str] = (), parts: Sequence[str] = (*PARTS, *EACH)) -> clingo.Control:
+    def _path_control(
+        self,
+        labels: Sequence[int],
+        options: Sequence[str] = (),
+        parts: Sequence[str] = (*PARTS, *EACH),
+    ) -> clingo.Control:
         """A control for the places and paths that fit these labels of all steps. The last one is kept, as the next question is often to it."""
         key = tuple(labels), tuple(options), tuple(parts)
         if self._asked is None or self._asked[0] != key:
             with self._asker.grounding_timed():
                 at_home = key[0] in self._tight
                 control = self._control_for(
-                    self._links_of(labels), labels, options, far=self._far_away(labels), parts=TOLD if at_home else parts
+                    self._links_of(labels),
+                    labels,
+                    options,
+                    far=self._far_away(labels),
+                    parts=TOLD if at_home else parts,
                 )
                 if at_home:
                     _go_on_at_home(control, self._tight[key[0]][0], parts)
@@ -390,8 +475,16 @@ class PlacesAndPaths:
     def settled(self, labels: Sequence[int], mode: str) -> Settled:
         """The maps with these dstates."""
         control = self._path_control(labels)
-        reader = facts.PathReader(control, self._task.trace, self._task.theory, self.named.chart, labels)
-        return Settled(self._asker, control, mode, reader, lambda answer: reader.map_of(answer).without_headings())
+        reader = facts.PathReader(
+            control, self._task.trace, self._task.theory, self.named.chart, labels
+        )
+        return Settled(
+            self._asker,
+            control,
+            mode,
+            reader,
+            lambda answer: reader.map_of(answer).without_headings(),
+        )
 
     def improving_maps(self, labels: Sequence[int]) -> Iterator[Found]:
         """Maps with these dstates, each as good as the one before or better, the last one best; none if no places and paths fit them."""
@@ -403,16 +496,39 @@ class PlacesAndPaths:
             yield from self.maps(labels, "opt", options=["--opt-strategy=usc"])
 
     def maps(
-        self, labels: Sequence[int], mode: str, conflicts: int = -1, options: Sequence[str] = (), parts: Sequence[str] = (*PARTS, *EACH)
+        self,
+        labels: Sequence[int],
+        mode: str,
+        conflicts: int = -1,
+        options: Sequence[str] = (),
+        parts: Sequence[str] = (*PARTS, *EACH),
     ) -> Generator[Found, None, bool]:
         """Maps with these dstates: without EACH one for each choice of places. Returns whether clingo came to an end, and not to the limit of conflicts."""
         control = self._path_control(labels, options, parts)
-        reader = facts.PathReader(control, self._task.trace, self._task.theory, self.named.chart, labels)
-        answers = self._asker.answers(reader.read, mode, int(mode == "ignore"), control=control, conflicts=conflicts, ahead=True)
-        return (yield from mapped(lambda answer: Found.of(reader.map_of(answer).without_headings(), self._task.theory), answers))
+        reader = facts.PathReader(
+            control, self._task.trace, self._task.theory, self.named.chart, labels
+        )
+        answers = self._asker.answers(
+            reader.read,
+            mode,
+            int(mode == "ignore"),
+            control=control,
+            conflicts=conflicts,
+            ahead=True,
+        )
+        return (
+            yield from mapped(
+                lambda answer: Found.of(
+                    reader.map_of(answer).without_headings(), self._task.theory
+                ),
+                answers,
+            )
+        )
 
 
 def _go_on_at_home(control: Control, homes: Mapping[int, list[int]], parts: Iterable[str]) -> None:
     """Ground the other parts of a control that has what segments tell, where each place is at one of its homes."""
     control.add("homes", [], facts.tight_facts(homes))
-    control.ground([(part, []) for part in ("homes", *(part for part in parts if part not in TOLD))])
+    control.ground(
+        [(part, []) for part in ("homes", *(part for part in parts if part not in TOLD))]
+    )

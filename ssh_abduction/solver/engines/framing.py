@@ -23,7 +23,9 @@ from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
 
-def maps_with_frames(trace: Trace, theory: Theory, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
+def maps_with_frames(
+    trace: Trace, theory: Theory, watch: Watch, speedups: Speedups
+) -> Iterator[SSHMap]:
     """Maps of a trace, each with fewer dstates than the one before, or as many and better paths, and the last one the best in which places have frames.
 
     theory  what it asks for, with star settled; none where it has no theory with frames

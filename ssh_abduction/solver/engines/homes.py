@@ -29,7 +29,9 @@ def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
     Args:
         told: What the segments say of places.
     """
-    if any(c == p for c, p in told.elsewhere):  # the segments contradict each other: no places fit these dstates
+    if any(
+        c == p for c, p in told.elsewhere
+    ):  # the segments contradict each other: no places fit these dstates
         return None
     places = told.places
     number = {place: i for i, place in enumerate(places)}
@@ -41,7 +43,9 @@ def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
     may_be = ~different[:, columns]
     may_be[columns] = np.eye(len(fixed), dtype=bool)
     steps = [(segment, number[c], number[b]) for segment, c, b in told.travels]
-    follows = {segment: _may_follow(pairs, columns) for segment, pairs in _by_segment(steps).items()}
+    follows = {
+        segment: _may_follow(pairs, columns) for segment, pairs in _by_segment(steps).items()
+    }
     before = -1
     while before != (before := int(may_be.sum())):
         for segment, c, b in [*steps, *reversed(steps)]:
@@ -50,7 +54,10 @@ def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
             may_be[b] &= (follows[segment] & may_be[c][:, None]).any(axis=0)
     if not may_be.any(axis=1).all():
         return None
-    return {place: [fixed[k] for k in np.flatnonzero(row)] for place, row in zip(places, may_be, strict=True)}
+    return {
+        place: [fixed[k] for k in np.flatnonzero(row)]
+        for place, row in zip(places, may_be, strict=True)
+    }
 
 
 def fewest_paths(told: Segments) -> int:

@@ -49,7 +49,13 @@ from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, give_threads, new_control
 from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch
 from ssh_abduction.solver.engines.base import AT_ONCE, Task
-from ssh_abduction.solver.engines.nearby import AT_A_TIME, SECONDS_A_CHARACTER, Beside, NearbySearch, mended
+from ssh_abduction.solver.engines.nearby import (
+    AT_A_TIME,
+    SECONDS_A_CHARACTER,
+    Beside,
+    NearbySearch,
+    mended,
+)
 from ssh_abduction.solver.engines.refusing import first_accepted_of
 from ssh_abduction.solver.guesses.annealing import annealed, annealed_steps
 from ssh_abduction.solver.guesses.continuing import followed
@@ -138,7 +144,13 @@ class NamedLabels:
     fitting  what asks more of labels; None in the causal theory
     """
 
-    def __init__(self, task: Task, asker: Asker, given_map: Sequence[int] = (), fitting: Fitting | None = None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        asker: Asker,
+        given_map: Sequence[int] = (),
+        fitting: Fitting | None = None,
+    ) -> None:
         """Labels of no steps yet.
 
         given_map  labels of all steps of a map with few dstates, if one is known
@@ -149,10 +161,14 @@ class NamedLabels:
         self.size = 0
         self._task, self._asker, self._given_map, self._fitting = task, asker, given_map, fitting
         self._hard = False  # whether few conflicts were not enough
-        self._had_all_help = False  # whether all links were given, and small maps were sought by other means, too
+        self._had_all_help = (
+            False  # whether all links were given, and small maps were sought by other means, too
+        )
         self._seeking = False  # whether the fewest dstates are being sought
         self._beside: Beside | None = None  # a search for a map near a guess, in another thread
-        self._forbidden: list[list[tuple[int, int]]] = []  # sets of pairs of steps, of each of which some pair is not one dstate
+        self._forbidden: list[
+            list[tuple[int, int]]
+        ] = []  # sets of pairs of steps, of each of which some pair is not one dstate
 
     def large_enough(self, size: int) -> int:
         """Of a long trace, so many steps that more of them would not have a larger clique; at least these."""
@@ -204,7 +220,10 @@ class NamedLabels:
         seen = self.chart.seen
         found = Counter(dict(zip(self._given_map, seen, strict=False)).values())
         pinned = Counter(seen[node] for node in self.clique)
-        return {view: max(SPARES, found[view] - pinned[view] + 1) if self._given_map else SPARES for view in dict.fromkeys(seen)}
+        return {
+            view: max(SPARES, found[view] - pinned[view] + 1) if self._given_map else SPARES
+            for view in dict.fromkeys(seen)
+        }
 
     def improving(self) -> Iterator[list[int]]:
         """Labels of all nodes, the last ones with the fewest dstates; before, if that takes its time, some that have few."""
@@ -254,7 +273,11 @@ class NamedLabels:
         answer.labels, failed = self._follow(answer.names)
         if failed:
             return _Lacking(links=failed)
-        return None if self._fitting is None or self._fitting.fits(answer.labels) else _Lacking(labels=answer.labels)
+        return (
+            None
+            if self._fitting is None or self._fitting.fits(answer.labels)
+            else _Lacking(labels=answer.labels)
+        )
 
     def _tell_why(self, lacking: _Lacking) -> None:
         if lacking.views:
@@ -284,7 +307,14 @@ class NamedLabels:
     def _cheapest(self, conflicts: int) -> tuple[dict[int, int] | None, bool]:
         """The best answer that clingo finds with so many conflicts, and whether it is proven to be the best."""
         answer = None
-        answers = self._asker.answers(facts.read_names, "opt", 0, conflicts=conflicts, on_bound=self._raise_bound, until=self._may_end)
+        answers = self._asker.answers(
+            facts.read_names,
+            "opt",
+            0,
+            conflicts=conflicts,
+            on_bound=self._raise_bound,
+            until=self._may_end,
+        )
         while True:
             try:
                 answer = next(answers)
@@ -317,7 +347,11 @@ class NamedLabels:
 
     def add_links_at(self, steps: Collection[int]) -> None:
         """Give clingo the links to and from these steps, and so the steps, where it does not know them."""
-        self.add(link for link in self.chart.links if link not in self._links and not {link[0], link[2]}.isdisjoint(steps))
+        self.add(
+            link
+            for link in self.chart.links
+            if link not in self._links and not {link[0], link[2]}.isdisjoint(steps)
+        )
 
     def tell(self, part: str, rules: str) -> None:
         """Give clingo rules in a program part of this name."""
@@ -327,7 +361,9 @@ class NamedLabels:
     @property
     def _may_search_nearby(self) -> bool:
         """Whether small maps may be sought by other means than clingo: what fits the causal theory need not fit one that asks for more."""
-        return self._fitting is None and (self._task.speedups.greedy or self._task.speedups.annealed)
+        return self._fitting is None and (
+            self._task.speedups.greedy or self._task.speedups.annealed
+        )
 
     def _search_nearby(self) -> Iterator[list[int]]:
         """Begin to search for small maps in another thread; where there is but one processor, give a map merged by evidence."""
@@ -335,7 +371,11 @@ class NamedLabels:
             watch = Watch(beside=self._asker.watch)
             search = self._nearby(watch)
             near = chain(self._merged(watch.check), self._near_guess(search, watch.check))
-            self._beside = Beside(search, watch, _ever_fewer(self._from_beginning(watch.check) if self._is_long else near))
+            self._beside = Beside(
+                search,
+                watch,
+                _ever_fewer(self._from_beginning(watch.check) if self._is_long else near),
+            )
         elif not self._is_long:
             yield from self._merged(self._asker.watch.check)
 
@@ -371,7 +411,10 @@ class NamedLabels:
 
     def _from_beginning(self, check: Callable[[], None]) -> Iterator[list[int]]:
         """Labels of maps of a long trace that guesses at its beginning lead to, ever longer ones, until one needs no dstates beyond those that the guess has."""
-        steps, most = AT_ONCE, len(self.chart.seen) if len(self.chart.seen) <= GUESSED else 2 * AT_ONCE
+        steps, most = (
+            AT_ONCE,
+            len(self.chart.seen) if len(self.chart.seen) <= GUESSED else 2 * AT_ONCE,
+        )
         while self._task.speedups.annealed:
             beginning = Chart.of_steps(self._task.log, steps)
             clique = beginning.continuations.clique()
@@ -386,24 +429,42 @@ class NamedLabels:
                 return
             steps = min(2 * steps, most)
 
-    def _near_guess(self, search: NearbySearch, check: Callable[[], None], tries: int | None = None) -> Iterator[list[int]]:
+    def _near_guess(
+        self, search: NearbySearch, check: Callable[[], None], tries: int | None = None
+    ) -> Iterator[list[int]]:
         """Labels of a map that is guessed, and of those near that."""
-        near = self._map_of_guess(self.chart, self.clique, self._may_be, check) if self._task.speedups.annealed else None
+        near = (
+            self._map_of_guess(self.chart, self.clique, self._may_be, check)
+            if self._task.speedups.annealed
+            else None
+        )
         if near is not None:
             yield from search.fewer(thinned(self.chart, near, check), tries)
 
     def _map_of_guess(
-        self, steps: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None]
+        self,
+        steps: Chart,
+        clique: Sequence[int],
+        may_be: Sequence[Sequence[int]],
+        check: Callable[[], None],
     ) -> list[int] | None:
         """Labels of a map of these first steps near a guess; None where none is made."""
         guess = self._guessed(steps, clique, may_be, check)
         return None if guess is None else merged_near(steps.apart(), steps.links, guess, check)
 
-    def _guessed(self, steps: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None]) -> list[int] | None:
+    def _guessed(
+        self,
+        steps: Chart,
+        clique: Sequence[int],
+        may_be: Sequence[Sequence[int]],
+        check: Callable[[], None],
+    ) -> list[int] | None:
         """A guess at the dstates of these first steps, -1 where it is not sure; None where that would take too much memory."""
         chart = Chart.turned(self._task.trace, self._task.log, len(steps.seen))
         if chart is None:
-            guesses: Iterable[list[int]] = islice(annealed_steps(steps, clique, may_be, check), GUESSES)
+            guesses: Iterable[list[int]] = islice(
+                annealed_steps(steps, clique, may_be, check), GUESSES
+            )
         else:
             labels = annealed(chart, check).labels(chart)
             guesses = [[labels[node] for node in chart.node_of]]
@@ -437,7 +498,9 @@ class NamedLabels:
 
     def _absorb(self, labels: list[int] | None, bound: int) -> None:
         """Take what a search near a guess knows, which knows nothing of pairs of steps that evidence speaks of."""
-        fewer = labels is not None and (self.known is None or len(set(labels)) < len(set(self.known)))
+        fewer = labels is not None and (
+            self.known is None or len(set(labels)) < len(set(self.known))
+        )
         if labels is not None and fewer and self.is_allowed(labels):
             self.known = labels
         self.bound = max(self.bound or 0, bound)
@@ -445,7 +508,11 @@ class NamedLabels:
     def names(self) -> dict[tuple[int, int], int]:
         """The names of dstates, but for rests, by what stays the same when there are more spare names: the view, and a number."""
         pinned = {(-1, name): name for name in range(len(self.clique))}
-        return pinned | {(view, i): name for view, spare in self._spare.items() for i, name in enumerate(spare[:-1])}
+        return pinned | {
+            (view, i): name
+            for view, spare in self._spare.items()
+            for i, name in enumerate(spare[:-1])
+        }
 
     def _configure(self) -> None:
         """Let clasp search as suits what is asked, and how hard it turned out to be."""
@@ -455,7 +522,9 @@ class NamedLabels:
     def _answers_of(self, spares: int) -> Iterator[dict[int, int]]:
         """All answers that cost so many spare names and use no rest."""
         read = self._reader().read if self.has_all_links else facts.read_names
-        return self._asker.answers(read, f"enum,{spares},0", 0, assumptions=[self._resting(False)], ahead=True)
+        return self._asker.answers(
+            read, f"enum,{spares},0", 0, assumptions=[self._resting(False)], ahead=True
+        )
 
     def _reader(self) -> facts.NameReader:
         return facts.NameReader(self._task.log.actions[: self.size - 1], self._choices)
@@ -476,7 +545,9 @@ class NamedLabels:
             yield known
         if not known or enough != 1:
             first = numbered(known or ())
-            yield from (labels for labels in self._listed(dstates, enough) if numbered(labels) != first)
+            yield from (
+                labels for labels in self._listed(dstates, enough) if numbered(labels) != first
+            )
 
     def _listed(self, dstates: int, enough: int) -> Iterator[list[int]]:
         """The same, as clingo lists them."""
@@ -487,7 +558,9 @@ class NamedLabels:
             yield [0]
             return
         while True:
-            while not enough and self._needs_rest(spares):  # asked again when nodes were added, as these may be at a rest
+            while not enough and self._needs_rest(
+                spares
+            ):  # asked again when nodes were added, as these may be at a rest
                 pass
             held: list[list[int]] = []
             failed: Iterable[Link] = ()
@@ -518,7 +591,12 @@ class NamedLabels:
 
     def _needs_rest(self, spares: int) -> bool:
         """Take more spare names, if some answer of this cost uses a rest. Says whether it was so."""
-        answer = next(self._asker.answers(facts.read_names, f"enum,{spares},{spares}", 1, assumptions=[self._resting(True)]), None)
+        answer = next(
+            self._asker.answers(
+                facts.read_names, f"enum,{spares},{spares}", 1, assumptions=[self._resting(True)]
+            ),
+            None,
+        )
         views = self._rests(answer) if answer else set()
         if views:
             self._name_more(views)
@@ -553,7 +631,9 @@ class NamedLabels:
             names += [(name, view) for name in spares[view]]
         self._rest = {found[-1]: view for view, found in spares.items()}
         self._choices = [
-            options if len(options) == 1 and t == self.clique[options[0]] else options + spares[seen[t]]
+            options
+            if len(options) == 1 and t == self.clique[options[0]]
+            else options + spares[seen[t]]
             for t, options in enumerate(self._may_be)
         ]
         cores = ["--opt-strategy=usc"] if self._task.speedups.core_guided else []
@@ -562,7 +642,9 @@ class NamedLabels:
         self._asker.control = new_control("names", base, ["--eq=1", *cores])
         self._configure()
         self._given: set[int] = set()  # nodes
-        self._open = np.zeros(len(seen), dtype=bool)  # whether a node is one of them, and not pinned
+        self._open = np.zeros(
+            len(seen), dtype=bool
+        )  # whether a node is one of them, and not pinned
         self._last: dict[int, int] = {}  # by view, the step given last
         self._batches = 0
 
@@ -580,7 +662,9 @@ class NamedLabels:
         left = [link for link in self.chart.links if link not in self._links]
         if not self._is_long:
             return left
-        return sorted(left, key=lambda link: len(self._choices[link[0]]) * len(self._choices[link[2]]))[:MORE_LINKS]
+        return sorted(
+            left, key=lambda link: len(self._choices[link[0]]) * len(self._choices[link[2]])
+        )[:MORE_LINKS]
 
     def _give(self, links: Iterable[Link]) -> None:
         added = [link for link in links if link not in self._links]
@@ -594,7 +678,12 @@ class NamedLabels:
                 if len(self._choices[t]) > 1:
                     self._last[view] = t
                     if self.chart.excluded:
-                        far += [(t, int(u)) for u in np.flatnonzero(self.chart.continuations.excluded_from(t) & self._open)]
+                        far += [
+                            (t, int(u))
+                            for u in np.flatnonzero(
+                                self.chart.continuations.excluded_from(t) & self._open
+                            )
+                        ]
                     self._open[t] = True
         self._links.update(dict.fromkeys(added))
         part, batch = f"batch_{self._batches}", self._batches
@@ -617,7 +706,9 @@ class NamedLabels:
         """The name of every node, following the answer's links from node to node, and the links that it does not explain."""
         if self.has_all_links and not self._rests(answer):
             return [answer[node] for node in range(len(answer))], []
-        goes: dict[tuple[int, int], int] = {(answer[t], action): answer[u] for t, action, u in self._links}
+        goes: dict[tuple[int, int], int] = {
+            (answer[t], action): answer[u] for t, action, u in self._links
+        }
         labels = [-1] * len(self.chart.seen)  # -1: not known
         followed: list[_Trail] = [None] * len(labels)  # links since the last node that clingo named
         failed: dict[Link, None] = {}
@@ -642,9 +733,18 @@ class NamedLabels:
             elif here >= 0 and labels[u] >= 0 and goes.setdefault(key, labels[u]) != labels[u]:
                 failed.update(self._not_given((link, followed[t])))
                 failed.update(self._not_given(followed[u]))
-        excluded = {node for pair in self.chart.excluded if labels[pair[0]] == labels[pair[1]] >= 0 for node in pair}
+        excluded = {
+            node
+            for pair in self.chart.excluded
+            if labels[pair[0]] == labels[pair[1]] >= 0
+            for node in pair
+        }
         if excluded:
-            failed.update((link, None) for link in self.chart.links if link not in self._links and not excluded.isdisjoint(link[::2]))
+            failed.update(
+                (link, None)
+                for link in self.chart.links
+                if link not in self._links and not excluded.isdisjoint(link[::2])
+            )
         return labels, list(failed)
 
     def _not_given(self, trail: _Trail) -> Iterator[tuple[Link, None]]:

@@ -93,8 +93,12 @@ class NearbySearch:
         self._configuration = configuration  # of clasp, if not its default
         self._labels: Labels = []
         self._needed: set[int] = set()  # names that cannot be spared
-        self._fewest: dict[int, int] = {}  # by view, spare names that are not taken back, as once they were not enough
-        self._allowed: list[int] | None = None  # names that do not help, though all are allowed; None before they were tried one by one
+        self._fewest: dict[
+            int, int
+        ] = {}  # by view, spare names that are not taken back, as once they were not enough
+        self._allowed: list[int] | None = (
+            None  # names that do not help, though all are allowed; None before they were tried one by one
+        )
         self._waiting: list[int] = []  # names yet to be allowed
         self._region = FIRST_REGION
         self._random = random.Random(0)
@@ -109,7 +113,9 @@ class NearbySearch:
             yield list(guess)
         guessed = _keys(guess, self._chart)
         name_of = {guessed[node]: name for name, node in reversed(list(enumerate(self.clique)))}
-        extra = dict.fromkeys(key for key in guessed if key is not None and key not in name_of)  # of no step of the clique
+        extra = dict.fromkeys(
+            key for key in guessed if key is not None and key not in name_of
+        )  # of no step of the clique
         counts = Counter(view for view, _ in extra)
         self._take({view: counts[view] for view in dict.fromkeys(self._chart.seen)})
         left = {view: iter(spare) for view, spare in self._spare.items()}
@@ -117,7 +123,9 @@ class NearbySearch:
         self._labels = [-1 if key is None else name_of[key] for key in guessed]
         # Even where the guess is a map: clasp goes on choosing as in its last answer, and so stays near.
         for allowed in ((), [name for spare in self._spare.values() for name in spare[:-1]]):
-            verdict = self._moved(self._not_allowed(allowed), (), WIDE * CONFLICTS, step_by_step=True)
+            verdict = self._moved(
+                self._not_allowed(allowed), (), WIDE * CONFLICTS, step_by_step=True
+            )
             if verdict == "moved":
                 break
         else:
@@ -143,7 +151,11 @@ class NearbySearch:
         spares = self.bound - len(self.clique)
         while True:
             give_threads(self._asker.control, two=has_processors(self._speedups))
-            with closing(self._asker.answers(facts.read_names, f"enum,{spares},{spares}", 0, assumptions=[self._ordered])) as answers:
+            with closing(
+                self._asker.answers(
+                    facts.read_names, f"enum,{spares},{spares}", 0, assumptions=[self._ordered]
+                )
+            ) as answers:
                 for answer in answers:
                     if resting := self._rests.intersection(answer.values()):
                         break
@@ -163,7 +175,10 @@ class NearbySearch:
             names += [(name, view) for name in self._spare[view]]
         self._rests = {spare[-1] for spare in self._spare.values()}
         pinned = set(self.clique)
-        self._choices = [options if t in pinned else [*options, *self._spare[seen[t]]] for t, options in enumerate(map(list, self._may_be))]
+        self._choices = [
+            options if t in pinned else [*options, *self._spare[seen[t]]]
+            for t, options in enumerate(map(list, self._may_be))
+        ]
         links = self._chart.links
         base = facts.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
         self._asker.watch.check(SECONDS_A_CHARACTER * len(base))
@@ -171,7 +186,11 @@ class NearbySearch:
         if self._configuration:
             configuration: Any = self._asker.control.configuration
             configuration.configuration, configuration.sat_prepro = self._configuration, "no"
-        self._used = {name: self._literal(facts.used(name)) for spare in self._spare.values() for name in spare}
+        self._used = {
+            name: self._literal(facts.used(name))
+            for spare in self._spare.values()
+            for name in spare
+        }
         given: set[int] = set()
         last: dict[int, int] = {}  # by view, the last step that has a choice
         self._ordered = self._literal(facts.ordered())
@@ -185,7 +204,11 @@ class NearbySearch:
                 nodes.append((t, seen[t], self._choices[t], last.get(seen[t])))
                 if t not in pinned:
                     last[seen[t]] = t
-            far = [(t, int(u)) for t in new for u in np.flatnonzero(self._far(t)[:t])] if self._far is not None else []
+            far = (
+                [(t, int(u)) for t in new for u in np.flatnonzero(self._far(t)[:t])]
+                if self._far is not None
+                else []
+            )
             self._asker.control.add(part, [], facts.batch_facts(batch, nodes, added, far))
             self._asker.control.ground([(part, []), ("more", facts.numbers(batch))])
         self._asker.watch.check(PREPARING * (time.perf_counter() - began))
@@ -200,13 +223,26 @@ class NearbySearch:
         taken = {*self._labels, *allowed}
         return [-literal for name, literal in self._used.items() if name not in taken]
 
-    def _moved(self, assumed: Sequence[int], free: Iterable[int], conflicts: int, *, step_by_step: bool = False) -> _Verdict:
+    def _moved(
+        self,
+        assumed: Sequence[int],
+        free: Iterable[int],
+        conflicts: int,
+        *,
+        step_by_step: bool = False,
+    ) -> _Verdict:
         """Move steps so that this holds; those at names that are not free stay, unless they, or others at their names, are in the way."""
         free = {-1, *free}
         literals = self._literals()
         while True:
-            stay = {literal: name for literal, name in zip(literals, self._labels, strict=True) if literal and name not in free}
-            answer, core = self._asker.verdict(facts.read_names, [-self._ordered, *assumed, *stay], conflicts)
+            stay = {
+                literal: name
+                for literal, name in zip(literals, self._labels, strict=True)
+                if literal and name not in free
+            }
+            answer, core = self._asker.verdict(
+                facts.read_names, [-self._ordered, *assumed, *stay], conflicts
+            )
             if answer is not None:
                 self._keep(answer)
                 return "moved"
@@ -223,7 +259,9 @@ class NearbySearch:
     def _literals(self) -> list[int]:
         """Of each step, that it is where its label says; 0 where there is no choice."""
         return [
-            0 if name < 0 or len(self._choices[t]) == 1 or name not in self._choices[t] else self._literal(facts.named(t, name))
+            0
+            if name < 0 or len(self._choices[t]) == 1 or name not in self._choices[t]
+            else self._literal(facts.named(t, name))
             for t, name in enumerate(self._labels)
         ]
 
@@ -243,7 +281,11 @@ class NearbySearch:
         tried: set[int] = set()
         while True:
             count = Counter(self._labels)
-            last = [max(used) for spare in self._spare.values() if (used := [name for name in spare if name in count])]
+            last = [
+                max(used)
+                for spare in self._spare.values()
+                if (used := [name for name in spare if name in count])
+            ]
             left = [name for name in last if name not in tried and name not in self._needed]
             if not left:
                 return
@@ -273,11 +315,19 @@ class NearbySearch:
             edge = [self._random.choice(begin)]
             free = set(edge)
             while edge and len(free) < self._region:
-                for name in sorted(near[edge.pop(self._random.randrange(len(edge)))] - free)[: self._region - len(free)]:
+                for name in sorted(near[edge.pop(self._random.randrange(len(edge)))] - free)[
+                    : self._region - len(free)
+                ]:
                     free.add(name)
                     edge.append(name)
-            stay = [literal for literal, name in zip(self._literals(), self._labels, strict=True) if literal and name not in free]
-            answer, core = self._with_fewer([-self._ordered, *self._not_allowed(()), *stay], conflicts)
+            stay = [
+                literal
+                for literal, name in zip(self._literals(), self._labels, strict=True)
+                if literal and name not in free
+            ]
+            answer, core = self._with_fewer(
+                [-self._ordered, *self._not_allowed(()), *stay], conflicts
+            )
             if answer is not None:
                 self._keep(answer)
                 yield self._labels
@@ -291,12 +341,17 @@ class NearbySearch:
         """Labels with fewer dstates, if allowing more names leads to some; "needed" if there are none whatever is allowed."""
         if self._allowed is None:  # first no more names, then each of them alone
             taken = set(self._labels)
-            more = [name for spare in self._spare.values() for name in spare[:-1] if name not in taken]
+            more = [
+                name for spare in self._spare.values() for name in spare[:-1] if name not in taken
+            ]
             for names in ((), *((name,) for name in more)):
                 verdict = yield from self._asked(names, conflicts)
                 if verdict == "moved" or (verdict == "open" and not names):
                     return verdict
-            self._allowed, self._waiting = [], [*more, *(spare[-1] for spare in self._spare.values())]
+            self._allowed, self._waiting = (
+                [],
+                [*more, *(spare[-1] for spare in self._spare.values())],
+            )
         at_once = 1  # names that are allowed in one go
         left: list[int] | None = None
         while self._waiting and left != self._waiting:
@@ -330,7 +385,9 @@ class NearbySearch:
             yield self._labels
         return "moved"
 
-    def _with_fewer(self, assumed: Sequence[int], conflicts: int) -> tuple[dict[int, int] | None, list[int] | None]:
+    def _with_fewer(
+        self, assumed: Sequence[int], conflicts: int
+    ) -> tuple[dict[int, int] | None, list[int] | None]:
         """An answer of fewer dstates where this holds, or a core of it."""
         cost = len(set(self._labels)) - 1 - len(self.clique)
         if cost < 0:
@@ -341,9 +398,17 @@ class NearbySearch:
         """Take a control with more names for the views of these rests."""
         before, taken = self._spare, set(self._labels)
         used = {view: [name for name in spare if name in taken] for view, spare in before.items()}
-        self._fewest |= {view: len(spare) - 1 for view, spare in before.items() if spare[-1] in resting}
-        self._take({view: max(len(names), self._fewest.get(view, 0)) for view, names in used.items()})
-        renamed = {old: new for view, names in used.items() for old, new in zip(names, self._spare[view], strict=False)}
+        self._fewest |= {
+            view: len(spare) - 1 for view, spare in before.items() if spare[-1] in resting
+        }
+        self._take(
+            {view: max(len(names), self._fewest.get(view, 0)) for view, names in used.items()}
+        )
+        renamed = {
+            old: new
+            for view, names in used.items()
+            for old, new in zip(names, self._spare[view], strict=False)
+        }
         self._label([renamed.get(name, name) for name in self._labels])
 
 
@@ -359,14 +424,20 @@ def mended(guess: Sequence[int], chart: Chart) -> list[int]:
             leads.setdefault((here, action), Counter())[there] += 1
     most = {key: counts.most_common(1)[0][0] for key, counts in leads.items()}
     for t, action, u in chart.links:
-        if (here := keys[t]) is not None and (likely := most.get((here, action))) is not None and likely[0] == chart.seen[u]:
+        if (
+            (here := keys[t]) is not None
+            and (likely := most.get((here, action))) is not None
+            and likely[0] == chart.seen[u]
+        ):
             keys[u] = likely
     return [-1 if key is None else key[1] for key in keys]
 
 
 def _keys(guess: Sequence[int], chart: Chart) -> list[_Key | None]:
     """What is seen at each node, and its label, where it has one: steps that show different things are not at one dstate."""
-    return [None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)]
+    return [
+        None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)
+    ]
 
 
 class Beside:
@@ -397,7 +468,9 @@ class Beside:
     def end(self) -> None:
         self._watch.interrupted = True
         self._thread.join()
-        threading.Thread(target=self._held.clear).start()  # to free clingo's control may take seconds, for which nobody has to wait
+        threading.Thread(
+            target=self._held.clear
+        ).start()  # to free clingo's control may take seconds, for which nobody has to wait
 
     def _run(self, search: NearbySearch, found: Iterator[Labels]) -> None:
         try:

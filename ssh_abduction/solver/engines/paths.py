@@ -35,7 +35,13 @@ from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.guesses.annealing import MORE, SECONDS, attempts
-from ssh_abduction.solver.guesses.merging import Told, first_failing, kept, merged_as_told, merged_near
+from ssh_abduction.solver.guesses.merging import (
+    Told,
+    first_failing,
+    kept,
+    merged_as_told,
+    merged_near,
+)
 from ssh_abduction.solver.steps.apart import Matrix, large_clique
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.solver.steps.localising import faced, states_of, tracked
@@ -82,17 +88,24 @@ class Paths:
         self._check = check
 
     def __reduce__(self) -> tuple[Callable[..., Paths], tuple[Trace, Theory]]:
-        return partial(Paths, pinned=self._pinned, forbidden=self._forbidden), (self._trace, self._theory)
+        return partial(Paths, pinned=self._pinned, forbidden=self._forbidden), (
+            self._trace,
+            self._theory,
+        )
 
     def _under(self, check: Callable[[], None]) -> Paths:
         """The same questions, which these limits end."""
-        return Paths(self._trace, self._theory, pinned=self._pinned, check=check, forbidden=self._forbidden)
+        return Paths(
+            self._trace, self._theory, pinned=self._pinned, check=check, forbidden=self._forbidden
+        )
 
     def control(self, chart: FramedChart, options: Sequence[str] = ()) -> Control:
         """A control with these axioms, and what happened; nothing is grounded yet."""
         control = Control(options, self._check, PREPARING)
         control.load_encodings("paths_framed")
-        control.add("base", [], facts.paths_framed_facts(self._trace, self._theory, chart, self._forbidden))
+        control.add(
+            "base", [], facts.paths_framed_facts(self._trace, self._theory, chart, self._forbidden)
+        )
         return control
 
     def contrary(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
@@ -110,20 +123,34 @@ class Paths:
         return control
 
     def settled(
-        self, chart: FramedChart, labels: Sequence[int], options: Sequence[str] = (), nodes: Iterable[int] | None = None, *, single: bool
+        self,
+        chart: FramedChart,
+        labels: Sequence[int],
+        options: Sequence[str] = (),
+        nodes: Iterable[int] | None = None,
+        *,
+        single: bool,
     ) -> clingo.Control:
         """A control for the paths that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
         control = self.control(chart, options)
         control.load_encodings("preference")
         nodes = range(len(labels)) if nodes is None else nodes
-        control.add("base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single))
-        control.ground([("base", []), *([("again", [])] if single else []), ("segments", []), ("least", [])])
+        control.add(
+            "base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single)
+        )
+        control.ground(
+            [("base", []), *([("again", [])] if single else []), ("segments", []), ("least", [])]
+        )
         if self._pinned and not single:
-            control.add("pinned", [], facts.pinned_facts(pairwise_distinct(*facts.read_rivals(control))))
+            control.add(
+                "pinned", [], facts.pinned_facts(pairwise_distinct(*facts.read_rivals(control)))
+            )
         control.ground([("pinned", []), ("paths", []), ("each", [])])
         return control
 
-    def telling(self, chart: FramedChart, labels: Sequence[int], loose: Iterable[int]) -> clingo.Control:
+    def telling(
+        self, chart: FramedChart, labels: Sequence[int], loose: Iterable[int]
+    ) -> clingo.Control:
         """A control for what holds wherever the nodes are at these dstates, though loose ones may turn out to be others."""
         control = self.control(chart)
         control.add("base", [], f"{facts.settled_labels(enumerate(labels))}\n{facts.loose(loose)}")
@@ -149,13 +176,19 @@ class Paths:
         control.ground([("base", [])])
         return not facts.is_violated(control) and self._may_have_separate(chart, labels, loose)
 
-    def has_separate(self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None) -> bool | None:
+    def has_separate(
+        self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None
+    ) -> bool | None:
         """Whether the labels of all nodes, or of these, have paths, as far as separate ones tell. None where that is not soon known."""
         options = [f"--solve-limit={TRYING}"]
         return self.settled(chart, labels, options, nodes, single=True).solve().satisfiable
 
-    def _may_have_separate(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
-        return self.has_separate(chart, labels, set(range(len(labels))).difference(loose)) is not False
+    def _may_have_separate(
+        self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]
+    ) -> bool:
+        return (
+            self.has_separate(chart, labels, set(range(len(labels))).difference(loose)) is not False
+        )
 
     def guessed_labels(self, chart: FramedChart, watch: Watch) -> list[int]:
         """Labels of a map of the causal axioms: one that has paths, as far as separate ones tell, or where that is not soon found one of few dstates.
@@ -166,7 +199,9 @@ class Paths:
         visits = chart.visits_with(FIRST_PAIRS)
         while visits < len(chart.stars) and chart.fitting[-1] > 2 * chart.fitting[visits]:
             part = chart.beginning(visits)
-            if labels := asked._continued(chart, part, asked._guessed(part, watch.check), watch.check):
+            if labels := asked._continued(
+                chart, part, asked._guessed(part, watch.check), watch.check
+            ):
                 return labels
             visits *= 2
         return asked._guessed(chart, watch.check)
@@ -188,16 +223,24 @@ class Paths:
                 return min(found, key=lambda labels: len(set(labels)))
         raise AssertionError
 
-    def _continued(self, chart: FramedChart, part: FramedChart, known: Sequence[int], check: Callable[[], None]) -> list[int] | None:
+    def _continued(
+        self, chart: FramedChart, part: FramedChart, known: Sequence[int], check: Callable[[], None]
+    ) -> list[int] | None:
         """Such labels of all visits near those of a beginning, if these say where most visits are."""
         states = tracked(chart, dict(enumerate(states_of(part, known))))
         if states.count(-1) > LOST * len(states):
             return None
-        start = [faced(states[visit], slot) if states[visit] >= 0 else -1 for visit, slot in chart.facing]
+        start = [
+            faced(states[visit], slot) if states[visit] >= 0 else -1 for visit, slot in chart.facing
+        ]
         return self.labels_near(chart, chart.apart(), start, check)
 
     def labels_near(
-        self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None] = lambda: None
+        self,
+        chart: FramedChart,
+        apart: Matrix,
+        start: Sequence[int],
+        check: Callable[[], None] = lambda: None,
     ) -> list[int] | None:
         """Labels near these, which are -1 where they are not known, of a map that has paths, as far as separate ones tell; None if none is soon found.
 
@@ -206,15 +249,23 @@ class Paths:
         """
         tell = partial(self._told_if_separate, chart)
         likely = self._likely(chart, apart, start, check)
-        labels = merged_as_told(apart, chart.links, likely, tell, partial(self.may_fit, chart), check) if likely else None
+        labels = (
+            merged_as_told(apart, chart.links, likely, tell, partial(self.may_fit, chart), check)
+            if likely
+            else None
+        )
         return labels if labels and self.has_separate(chart, labels) else None
 
-    def _told_if_separate(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
+    def _told_if_separate(
+        self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]
+    ) -> Told | None:
         """As `told`; None where the others have no paths either, as far as separate ones tell."""
         told = self.told(chart, labels, loose)
         return told if told and self._may_have_separate(chart, labels, loose) else None
 
-    def _likely(self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]) -> list[int] | None:
+    def _likely(
+        self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]
+    ) -> list[int] | None:
         """A guess without those of its places with which it has no paths, if they are few: -1 there."""
         states = states_of(chart, kept(apart, chart.links, start))
         visits = Counter(state // 4 for state in states)
@@ -224,7 +275,10 @@ class Paths:
 
         def of_first(number: int) -> list[int]:
             some = set(places[:number]) - left_out
-            return [label if states[visit] // 4 in some else -1 for label, (visit, _) in zip(start, chart.facing, strict=True)]
+            return [
+                label if states[visit] // 4 in some else -1
+                for label, (visit, _) in zip(start, chart.facing, strict=True)
+            ]
 
         def agrees(number: int) -> bool:
             check()
@@ -250,12 +304,16 @@ def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) 
     return [members[i] for i in large_clique(rivals)]
 
 
-def _apart(chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]) -> Matrix:
+def _apart(
+    chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]
+) -> Matrix:
     """Nodes x nodes: they are of visits some nodes of which have labels that are at different places."""
     pairs = np.array(list(elsewhere), dtype=int).reshape(-1, 2)
     different = np.zeros((max(labels) + 1,) * 2, dtype=bool)
     different[pairs[:, 0], pairs[:, 1]] = different[pairs[:, 1], pairs[:, 0]] = True
-    visits = np.array([visit for visit, _ in chart.facing])  # in order, as nodes are numbered by the first step at them
+    visits = np.array(
+        [visit for visit, _ in chart.facing]
+    )  # in order, as nodes are numbered by the first step at them
     starts = np.flatnonzero(np.diff(visits, prepend=-1))
     rows = np.logical_or.reduceat(different[list(labels)], starts, axis=0)
     apart = np.logical_or.reduceat(rows[:, list(labels)], starts, axis=1)

@@ -16,7 +16,9 @@ Meanwhile = TypeVar("Meanwhile")
 
 
 def first_accepted(
-    ask: Callable[[], Answer | None], refuse: Callable[[Answer], Reason | None], forbid: Callable[[Reason], None]
+    ask: Callable[[], Answer | None],
+    refuse: Callable[[Answer], Reason | None],
+    forbid: Callable[[Reason], None],
 ) -> Answer | None:
     """The first answer that nothing refuses; None where there is no answer left.
 

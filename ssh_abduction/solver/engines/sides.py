@@ -25,26 +25,46 @@ class FramedSides:
 
     def begin(self) -> None:
         """The control is a new one, which knows nothing."""
-        self._said: dict[tuple[str, tuple[int, ...]], None] = {}  # program parts of sides_framed.lp, and their arguments
+        self._said: dict[
+            tuple[str, tuple[int, ...]], None
+        ] = {}  # program parts of sides_framed.lp, and their arguments
         self._batch = -1
 
     def extend(self, batch: int) -> None:
         """Clingo was told of more visits, in this batch: what was said of paths is said of these, too."""
         self._batch = batch
         if self._said:
-            paths = [(part, facts.numbers(*arguments, batch)) for part, arguments in self._said if part == "path"]
+            paths = [
+                (part, facts.numbers(*arguments, batch))
+                for part, arguments in self._said
+                if part == "path"
+            ]
             self._asker.control.ground([("paths", facts.numbers(batch)), *paths])
 
-    def say_of_path(self, paths: Paths, chart: FramedChart, labels: Sequence[int], standing: Mapping[int, tuple[int, int]]) -> bool:
+    def say_of_path(
+        self,
+        paths: Paths,
+        chart: FramedChart,
+        labels: Sequence[int],
+        standing: Mapping[int, tuple[int, int]],
+    ) -> bool:
         """Say what order and sides demand of a path that these labels contradict. False if all such paths have been told of.
 
         standing  the visit and slot of some node at each dstate, as far as clingo knows of any
         """
-        contrary, twice = next(self._asker.answers(facts.read_contrary, "ignore", 1, control=paths.contrary(chart, labels)))
+        contrary, twice = next(
+            self._asker.answers(
+                facts.read_contrary, "ignore", 1, control=paths.contrary(chart, labels)
+            )
+        )
         if any(self._say_once("path", *standing[dstate]) for dstate in contrary):
             return True
         for visit in (standing[dstate][0] for dstate in twice):
-            said = [self._say_once("path", visit, 0), self._say_once("path", visit, 1), self._say_once("crossing", visit, self._batch)]
+            said = [
+                self._say_once("path", visit, 0),
+                self._say_once("path", visit, 1),
+                self._say_once("crossing", visit, self._batch),
+            ]
             if any(said):
                 return True
         return False
@@ -58,7 +78,9 @@ class FramedSides:
             if not self._said:
                 control.load(encodings.path("sides_framed"))
                 control.add("sides", [], facts.sides_framed_facts(self._theory))
-                control.ground([("sides", []), *(("paths", facts.numbers(batch)) for batch in batches)])
+                control.ground(
+                    [("sides", []), *(("paths", facts.numbers(batch)) for batch in batches)]
+                )
             self._said[part, arguments] = None
             if part == "path":
                 control.ground([(part, facts.numbers(*arguments, batch)) for batch in batches])

@@ -37,7 +37,9 @@ class StepEngine:
         self._task = task
         self._asked: int | None = None  # the step that is the last one, as far as clingo knows
         self._forbidden: list[Collection[Equality]] = []
-        self._number: tuple[int, Count] | None = None  # how many dstates, places or paths maps have, where somebody asked for just so many
+        self._number: tuple[int, Count] | None = (
+            None  # how many dstates, places or paths maps have, where somebody asked for just so many
+        )
         # Seconds and MiB that it took to ground the last step: the next one takes about as much, and cannot be stopped.
         self._last_step = 0.0, 0.0
         control = self.asker.control
@@ -49,7 +51,10 @@ class StepEngine:
 
     def with_paths(self, paths: int) -> StepEngine:
         engine = StepEngine(self._task, paths)
-        engine.asker.ground_seconds, engine.asker.solve_seconds = self.asker.ground_seconds, self.asker.solve_seconds
+        engine.asker.ground_seconds, engine.asker.solve_seconds = (
+            self.asker.ground_seconds,
+            self.asker.solve_seconds,
+        )
         engine._forbidden, engine._number = list(self._forbidden), self._number
         return engine
 
@@ -69,7 +74,9 @@ class StepEngine:
         is_new = not self.size
         with self.asker.grounding_timed():
             while self.size < size:
-                self._ground_steps(min(size, self.size + (AT_FIRST if self.size < FIRST_STEPS else 1)))
+                self._ground_steps(
+                    min(size, self.size + (AT_FIRST if self.size < FIRST_STEPS else 1))
+                )
             self._let_end_with(size - 1)
             if is_new:
                 for number in range(len(self._forbidden)):
@@ -84,7 +91,9 @@ class StepEngine:
         control.add(part, [], facts.trace_facts(self._task.trace, self._task.theory, start, stop))
         before = control.seconds, control.mebibytes
         base: list[tuple[str, list[clingo.Symbol]]] = [] if start else [("base", [])]
-        control.ground([*base, (part, []), *(("step", facts.numbers(t)) for t in range(start, stop))])
+        control.ground(
+            [*base, (part, []), *(("step", facts.numbers(t)) for t in range(start, stop))]
+        )
         if base:
             control.assign_external(facts.run_by_steps(), True)
         self._last_step = control.seconds - before[0], control.mebibytes - before[1]
@@ -104,7 +113,9 @@ class StepEngine:
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         if most:
             configuration: Any = self.asker.control.configuration
-            configuration.solver.opt_strategy = "usc"  # as a good map is known, what is missing is a bound
+            configuration.solver.opt_strategy = (
+                "usc"  # as a good map is known, what is missing is a bound
+            )
         if self._task.theory.priorities:
             return self.asker.answers(self._read, ",".join(["opt", *map(str, most)]), 0)
         return self.asker.answers(self._read, "ignore", 1)
@@ -115,7 +126,9 @@ class StepEngine:
 
     def map_with(self, doubts: Collection[Doubt], cost: tuple[int, ...]) -> SSHMap | None:
         """A map of the prefix that costs at most this, in which any of these doubts about steps holds; None where there is none."""
-        found = self._doubts.answer(doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore")
+        found = self._doubts.answer(
+            doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore"
+        )
         return None if found is None else found.map
 
     def labellings(self, cost: tuple[int, ...]) -> None:
@@ -146,7 +159,13 @@ class StepEngine:
 
     def _tell_forbidden(self, number: int) -> None:
         part = f"forbidden_{number}"
-        self.asker.control.add(part, [], facts.forbidden_equalities(self._forbidden[number], excusable=self._task.theory.jumped > 0))
+        self.asker.control.add(
+            part,
+            [],
+            facts.forbidden_equalities(
+                self._forbidden[number], excusable=self._task.theory.jumped > 0
+            ),
+        )
         self.asker.control.ground([(part, [])])
 
     def _read(self, model: clingo.Model) -> Found:

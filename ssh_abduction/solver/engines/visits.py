@@ -62,9 +62,13 @@ MANY = 5
 FAR = 200
 
 Pair: TypeAlias = tuple[int, int, int]  # visits I < J, R: slot 0 of I is slot R of J
-Three: TypeAlias = tuple[int, int, int, int, int]  # visits I < J < K, and how I is turned to J, and J to K
+Three: TypeAlias = tuple[
+    int, int, int, int, int
+]  # visits I < J < K, and how I is turned to J, and J to K
 Member = TypeVar("Member")
-_Turned: TypeAlias = dict[int, dict[int, int]]  # of visits that are the same: which slot of the other slot 0 is
+_Turned: TypeAlias = dict[
+    int, dict[int, int]
+]  # of visits that are the same: which slot of the other slot 0 is
 
 
 class Open(Enum):
@@ -119,7 +123,13 @@ class VisitLabels:
 
     chart: FramedChart
 
-    def __init__(self, task: Task, asker: Asker, charted: Callable[[int, FramedChart | None], FramedChart | None], sides: Sides) -> None:
+    def __init__(
+        self,
+        task: Task,
+        asker: Asker,
+        charted: Callable[[int, FramedChart | None], FramedChart | None],
+        sides: Sides,
+    ) -> None:
         """Labels of no steps yet.
 
         charted  makes the chart of so many first steps, from one of fewer steps if there is one; None where they fit no frame
@@ -151,7 +161,9 @@ class VisitLabels:
                 chart = self._charted(size, None)
                 if chart is None:
                     return False
-                order = self._order_of_choice(chart)  # which finds the clique, whose visits are among the first
+                order = self._order_of_choice(
+                    chart
+                )  # which finds the clique, whose visits are among the first
                 self._give(chart, self._first_visits(chart), order, anew=True)
             self.size = size
             self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
@@ -163,7 +175,13 @@ class VisitLabels:
         apart = chart.apart()
         self._asker.watch.check()
         self.clique = clique(apart, chart.seen) if self._task.speedups.clique else []
-        return [*self.clique, *sorted(set(range(len(apart))) - set(self.clique), key=lambda node: (-int(apart[node].sum()), node))]
+        return [
+            *self.clique,
+            *sorted(
+                set(range(len(apart))) - set(self.clique),
+                key=lambda node: (-int(apart[node].sum()), node),
+            ),
+        ]
 
     def _first_visits(self, chart: FramedChart) -> set[int]:
         """The visits that clingo is told of first: all, unless too many may be one."""
@@ -191,7 +209,9 @@ class VisitLabels:
         self._turns: set[tuple[int, str, int]] = set()
         self._fits: frozenset[Pair] = frozenset()
         self.least = 0
-        self._avoided: dict[int, clingo.Symbol] = {}  # what is assumed not to be there, by the literal of that
+        self._avoided: dict[
+            int, clingo.Symbol
+        ] = {}  # what is assumed not to be there, by the literal of that
         self._pair_of = _PairOf()
         self._unread: list[Pair] = []  # whose literals were not asked for yet
         self._transitive = _Transitive()
@@ -200,11 +220,17 @@ class VisitLabels:
         self._parts = 0
         self._sides.begin()
 
-    def _give(self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False) -> None:
+    def _give(
+        self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False
+    ) -> None:
         """Tell clingo what it does not know yet of these visits of a chart. New nodes come after the others in the order of choice."""
         told = sorted(visits)
         known = 0 if anew else len(self._fits)
-        self._asker.watch.check(SECONDS_A_PAIR * (int(chart.fitting[-1]) - known) if len(told) == len(chart.stars) else 0.0)
+        self._asker.watch.check(
+            SECONDS_A_PAIR * (int(chart.fitting[-1]) - known)
+            if len(told) == len(chart.stars)
+            else 0.0
+        )
         fits = frozenset(chart.fits(told))
         self._asker.watch.check(SECONDS_A_PAIR * (len(fits) - known))
         size, self.size = self.size, 0  # until clingo was told all of it
@@ -222,10 +248,16 @@ class VisitLabels:
                 self._place_of[node] = len(self._place_of)
                 nodes.append((self._place_of[node], *chart.facing[node]))
         leaves = [
-            (visit, *how) for visit, how in chart.leaves.items() if visit in visits and visit + 1 in visits and visit not in self._ends
+            (visit, *how)
+            for visit, how in chart.leaves.items()
+            if visit in visits and visit + 1 in visits and visit not in self._ends
         ]
         self._ends.update(visit for visit, *_ in leaves)
-        turns = [turn for turn in chart.turns(self._task.trace) if turn not in self._turns and chart.facing[turn[0]][0] in visits]
+        turns = [
+            turn
+            for turn in chart.turns(self._task.trace)
+            if turn not in self._turns and chart.facing[turn[0]][0] in visits
+        ]
         self._turns.update(turns)
         new, unfit = sorted(fits - self._fits), sorted(self._fits - fits)
         self._fits = fits
@@ -263,7 +295,9 @@ class VisitLabels:
             if self.known and self.bound == len(set(self.known)):
                 self._found.append(self.known)
                 break
-            answer = first_accepted(partial(self._best_answer, until), self._why_not, self._tell_why)
+            answer = first_accepted(
+                partial(self._best_answer, until), self._why_not, self._tell_why
+            )
             if answer is None:
                 return None
             if answer.is_open:
@@ -296,7 +330,9 @@ class VisitLabels:
     def _best_answer(self, until: Callable[[], bool]) -> _Answer | None:
         """An answer with the fewest lone nodes."""
         if not self._task.speedups.core_guided:
-            better = list(self._asker.answers(lambda model: (self._pairs(model), model.cost[0]), "opt", 0))
+            better = list(
+                self._asker.answers(lambda model: (self._pairs(model), model.cost[0]), "opt", 0)
+            )
             if not better:
                 return None
             pairs, self.least = better[-1]
@@ -390,8 +426,14 @@ class VisitLabels:
                 if fewer := [literal for literal in core if literal in avoided]:
                     avoided.difference_update(fewer[-1:] if patient else fewer)
                 elif core:
-                    freed.update(self._together_impossible(sorted({place_of[literal] for literal in core}), place_of))
-                    place_of = {literal: place for literal, place in place_of.items() if place not in freed}
+                    freed.update(
+                        self._together_impossible(
+                            sorted({place_of[literal] for literal in core}), place_of
+                        )
+                    )
+                    place_of = {
+                        literal: place for literal, place in place_of.items() if place not in freed
+                    }
                 else:
                     return
             elif (reason := self._why_not(answer := _Answer(pairs_found or []))) is not None:
@@ -403,7 +445,11 @@ class VisitLabels:
         """Of places that cannot all be as guessed, few that cannot."""
 
         def impossible(some: list[int]) -> list[int] | None:
-            core = self._asker.verdict(lambda _: None, [literal for literal, place in place_of.items() if place in some], TRY_CONFLICTS)[1]
+            core = self._asker.verdict(
+                lambda _: None,
+                [literal for literal, place in place_of.items() if place in some],
+                TRY_CONFLICTS,
+            )[1]
             return None if core is None else sorted({place_of[literal] for literal in core})
 
         return smaller(places, impossible, FAILED_TRIES)
@@ -419,8 +465,12 @@ class VisitLabels:
         yield from map(list, self._found)
         asked = 0
         while True:
-            known = [self._spanning(found, self._place_of) for found in self._found[self._excluded :]]
-            self._tell("\n".join(facts.forbidden_pairs(pairs, listed=self.batch) for pairs in known))
+            known = [
+                self._spanning(found, self._place_of) for found in self._found[self._excluded :]
+            ]
+            self._tell(
+                "\n".join(facts.forbidden_pairs(pairs, listed=self.batch) for pairs in known)
+            )
             self._excluded = len(self._found)
             labels = self._other(dstates)
             if labels is None:
@@ -444,7 +494,9 @@ class VisitLabels:
         self._read_literals()
         self._transitive.asked, self._transitive.failed = True, 0
         mode, assumed = self._asking_for(dstates)
-        answers = self._asker.answers(read, mode, 0, assumptions=assumed, until=lambda: self._transitive.failed > FAR)
+        answers = self._asker.answers(
+            read, mode, 0, assumptions=assumed, until=lambda: self._transitive.failed > FAR
+        )
         try:
             while True:
                 try:
@@ -488,17 +540,28 @@ class VisitLabels:
 
     def forbid(self, labels: Sequence[int], clashes: Collection[Collection[int]]) -> None:
         """From now on the nodes of none of these sets are at the dstates that these labels give them, those of one label at one and the others not."""
-        if unknown := {self.chart.facing[node][0] for clash in clashes for node in clash} - self._visits:
+        if (
+            unknown := {self.chart.facing[node][0] for clash in clashes for node in clash}
+            - self._visits
+        ):
             self._give_more(unknown)
         rules = []
         for clash in clashes:
             first = {labels[node]: node for node in clash}
-            different = [pair for a, b in combinations(first.values(), 2) if (pair := self._pair(a, b)) in self._fits]
-            if self._fits.issuperset(together := self._spanning(labels, clash)):  # else clingo knows by now
+            different = [
+                pair
+                for a, b in combinations(first.values(), 2)
+                if (pair := self._pair(a, b)) in self._fits
+            ]
+            if self._fits.issuperset(
+                together := self._spanning(labels, clash)
+            ):  # else clingo knows by now
                 rules.append(facts.forbidden_pairs(together, different))
         self._tell("\n".join(rules))
 
-    def forbid_together(self, pairs: Collection[tuple[int, int]], places: Collection[tuple[int, int]] = ()) -> None:
+    def forbid_together(
+        self, pairs: Collection[tuple[int, int]], places: Collection[tuple[int, int]] = ()
+    ) -> None:
         """From now on these pairs of nodes are not all one dstate, while those are at one place.
 
         Labels alone do not tell which nodes are at one place. So where places are given, labels that were found stay, and whoever seeks their paths finds out.
@@ -532,7 +595,11 @@ class VisitLabels:
     def _spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
         """Pairs that are the same if these nodes are at the dstates that they are labelled with."""
         first: dict[int, int] = {}
-        return [self._pair(other, node) for node in nodes if (other := first.setdefault(labels[node], node)) != node]
+        return [
+            self._pair(other, node)
+            for node in nodes
+            if (other := first.setdefault(labels[node], node)) != node
+        ]
 
     def _pair(self, a: int, b: int) -> Pair:
         """How the visits of two nodes are turned where these are at one dstate."""
@@ -550,7 +617,11 @@ class VisitLabels:
         for pair in pairs:
             _take(turned, pair)
         for i, j, r in work:
-            follows = [(i + 1, j + 1, 0)] if i in leaves and leaves.get(j) == ((leaves[i][0] + r) % 4, leaves[i][1]) else []
+            follows = (
+                [(i + 1, j + 1, 0)]
+                if i in leaves and leaves.get(j) == ((leaves[i][0] + r) % 4, leaves[i][1])
+                else []
+            )
             for first, (middle, half), (last, turn) in _apart_yet_joined((i, j, r), turned):
                 found[_in_order((first, 0), (middle, half), (last, turn))] = None
                 follows.append(_pair(first, last, turn))
@@ -576,10 +647,16 @@ class VisitLabels:
 
     def _labels(self, everywhere: Located) -> tuple[int, ...]:
         """The dstate of each node, numbered by the first node there."""
-        return tuple(numbered(faced(everywhere.states[visit], slot) for visit, slot in self.chart.facing))
+        return tuple(
+            numbered(faced(everywhere.states[visit], slot) for visit, slot in self.chart.facing)
+        )
 
 
-def smaller(members: list[Member], shrunk: Callable[[list[Member]], list[Member] | None], tries: int | None = None) -> list[Member]:
+def smaller(
+    members: list[Member],
+    shrunk: Callable[[list[Member]], list[Member] | None],
+    tries: int | None = None,
+) -> list[Member]:
     """Fewer members that still have what all of them have: parts are left out, half of them first, single members last.
 
     shrunk  of some members those that have it, if they do
@@ -640,7 +717,10 @@ class _Transitive(clingo.Propagator):
         for pair in pairs:
             for first, (middle, half), (last, turn) in _apart_yet_joined(pair, self._turned):
                 self.failed += 1
-                clause = [-self._literals[pair], -self._literals[_pair(middle, last, (turn - half) % 4)]]
+                clause = [
+                    -self._literals[pair],
+                    -self._literals[_pair(middle, last, (turn - half) % 4)],
+                ]
                 if (third := self._literals.get(_pair(first, last, turn))) is not None:
                     clause.append(third)
                 if not control.add_clause(clause, lock=True) or not control.propagate():
@@ -661,11 +741,18 @@ def _scattered(pairs: Sequence[Pair], visits: int) -> list[Pair]:
     turned = np.zeros(visits, dtype=int)  # the slot that slot 0 of that visit is
     at_first = group[second] == first
     turned[second[at_first]] = turns[at_first]
-    members, joined = np.bincount(group, minlength=visits), np.bincount(group[first], minlength=visits)
+    members, joined = (
+        np.bincount(group, minlength=visits),
+        np.bincount(group[first], minlength=visits),
+    )
     wrong = (group[first] != group[second]) | ((turned[second] - turned[first]) % 4 != turns)
     scattered = joined != members * (members - 1) // 2
     scattered[group[first[wrong]]] = scattered[group[second[wrong]]] = True
-    return [pair for pair, bad in zip(pairs, scattered[group[first]] | scattered[group[second]], strict=True) if bad]
+    return [
+        pair
+        for pair, bad in zip(pairs, scattered[group[first]] | scattered[group[second]], strict=True)
+        if bad
+    ]
 
 
 def _take(turned: _Turned, pair: Pair) -> None:
@@ -674,13 +761,23 @@ def _take(turned: _Turned, pair: Pair) -> None:
     turned.setdefault(j, {})[i] = -r % 4
 
 
-def _apart_yet_joined(pair: Pair, turned: _Turned) -> list[tuple[int, tuple[int, int], tuple[int, int]]]:
+def _apart_yet_joined(
+    pair: Pair, turned: _Turned
+) -> list[tuple[int, tuple[int, int], tuple[int, int]]]:
     """Visits that are not the same though each is the same as a third, by this pair and another: the first one, the third
     and the last, these two with the slot that slot 0 of the first one would be."""
     i, j, r = pair
     of_i, of_j = turned[i], turned[j]
-    joined = [(i, (j, r), (k, (r + q) % 4)) for k, q in of_j.items() if k != i and of_i.get(k) != (r + q) % 4]
-    return joined + [(j, (i, -r % 4), (k, (q - r) % 4)) for k, q in of_i.items() if k != j and of_j.get(k) != (q - r) % 4]
+    joined = [
+        (i, (j, r), (k, (r + q) % 4))
+        for k, q in of_j.items()
+        if k != i and of_i.get(k) != (r + q) % 4
+    ]
+    return joined + [
+        (j, (i, -r % 4), (k, (q - r) % 4))
+        for k, q in of_i.items()
+        if k != j and of_j.get(k) != (q - r) % 4
+    ]
 
 
 def _pair(i: int, j: int, r: int) -> Pair:

@@ -95,7 +95,10 @@ class Guess:
     def labels(self, chart: FramedChart) -> list[int]:
         """A number for the dstate of each node of the chart; -1 where the guess is not sure."""
         states, sure = self.states.tolist(), self.sure.tolist()
-        return [states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 if sure[visit] else -1 for visit, slot in chart.facing]
+        return [
+            states[visit] - states[visit] % 4 + (states[visit] + slot) % 4 if sure[visit] else -1
+            for visit, slot in chart.facing
+        ]
 
     def loosened(self, chart: FramedChart, travels: int) -> Guess:
         """The same guess, sure of fewer visits: of none to a place from which the same travel leads to several places, to one of these places, or to a
@@ -106,7 +109,12 @@ class Guess:
         for visit, (slot, action) in chart.leaves.items():
             here = states[visit]
             leads.setdefault((here // 4, (here + slot) % 4, action), set()).add(states[visit + 1])
-        loose = {place for (here, *_), there in leads.items() if len(there) > 1 for place in (here, *(state // 4 for state in there))}
+        loose = {
+            place
+            for (here, *_), there in leads.items()
+            if len(there) > 1
+            for place in (here, *(state // 4 for state in there))
+        }
         joined = [(here // 4, there // 4) for here, there in pairwise(states)]
         for _ in range(travels):
             loose |= {place for pair in joined if loose.intersection(pair) for place in pair}
@@ -127,7 +135,9 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Gu
     raise AssertionError
 
 
-def attempts(chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False) -> Iterator[tuple[int, Guess]]:
+def attempts(
+    chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False
+) -> Iterator[tuple[int, Guess]]:
     """Guesses without end, each with how many travels do not lead where most such travels do.
 
     check  called now and then, and may raise
@@ -143,7 +153,10 @@ def attempts(chart: FramedChart, check: Callable[[], None] = lambda: None, *, ro
 
 
 def annealed_steps(
-    chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence[int]], check: Callable[[], None] = lambda: None
+    chart: Chart,
+    clique: Sequence[int],
+    may_be: Sequence[Sequence[int]],
+    check: Callable[[], None] = lambda: None,
 ) -> Iterator[list[int]]:
     """Guesses at the dstates of all steps, as labels, -1 where they are not sure. They become better, and there is no end to them; where they would take too much
     memory, there are none.
@@ -166,7 +179,13 @@ def annealed_steps(
 class _Drawn:
     """The states of all visits, which are drawn again and again."""
 
-    def __init__(self, options: States, leaves: Sequence[tuple[int, int]], ways: int, random: np.random.Generator) -> None:
+    def __init__(
+        self,
+        options: States,
+        leaves: Sequence[tuple[int, int]],
+        ways: int,
+        random: np.random.Generator,
+    ) -> None:
         """
         options  visits x the states that are possible for each; padded with -1
         leaves   the slot that each visit but the last ends at, and the action there
@@ -175,7 +194,10 @@ class _Drawn:
         self._random = random
         self._options = options
         self._visits = np.arange(len(options))
-        actions = {action: number for number, action in enumerate(dict.fromkeys(action for _, action in leaves))}
+        actions = {
+            action: number
+            for number, action in enumerate(dict.fromkeys(action for _, action in leaves))
+        }
         self._actions = max(1, len(actions))
         self._slot = np.array([slot for slot, _ in leaves], dtype=int)
         self._action = np.array([actions[action] for _, action in leaves], dtype=int)
@@ -211,7 +233,9 @@ class _Drawn:
     def _rows(self, states: States, visits: States) -> States:
         """The rows of the table of transitions, numbered by state and action, for visits that are in these states and end as these visits end."""
         turned = (states + self._slot[visits]) % self._ways
-        rows: States = (states - states % self._ways + turned) * self._actions + self._action[visits]
+        rows: States = (states - states % self._ways + turned) * self._actions + self._action[
+            visits
+        ]
         return rows
 
     def _count(self) -> None:
@@ -221,10 +245,14 @@ class _Drawn:
         entries = rows * self._states + there
         if self._ways > 1:
             back = self._back[there] * self._actions + self._action
-            entries = np.concatenate([entries, back * self._states + self._back[rows // self._actions]])
+            entries = np.concatenate(
+                [entries, back * self._states + self._back[rows // self._actions]]
+            )
         self._counted = entries
         shape = self._states * self._actions, self._states
-        self._counts = np.bincount(entries, minlength=shape[0] * shape[1]).reshape(shape).astype(np.float32)
+        self._counts = (
+            np.bincount(entries, minlength=shape[0] * shape[1]).reshape(shape).astype(np.float32)
+        )
         self._totals = self._counts.sum(axis=1)
 
     def _entries(self, states: States) -> States:
@@ -244,7 +272,9 @@ class _Drawn:
         table = np.zeros(shape, dtype=np.float32)
         table[:-1, :-1] = np.power(np.float32(WEIGHT) / totals, np.float32(power))[:, None]
         row, column = np.divmod(self._counted, self._states)
-        table[row, column] = np.power((self._counts[row, column] + np.float32(WEIGHT)) / totals[row], np.float32(power))
+        table[row, column] = np.power(
+            (self._counts[row, column] + np.float32(WEIGHT)) / totals[row], np.float32(power)
+        )
         return table.ravel()[entries]
 
     def _choose(self, power: float) -> None:
@@ -295,7 +325,14 @@ class _Drawn:
         starts = np.unique(np.append(0, np.arange(first, len(self._visits), STRETCH)))
         return starts, np.diff(np.append(starts, len(self._visits)))
 
-    def _filtered(self, states: States, likely: NDArray[np.float32], place: States, starts: States, lengths: States) -> NDArray[np.float32]:
+    def _filtered(
+        self,
+        states: States,
+        likely: NDArray[np.float32],
+        place: States,
+        starts: States,
+        lengths: States,
+    ) -> NDArray[np.float32]:
         """Visits x states: how likely a visit is in a state, given the visits before it in its stretch, and the last draw of the visit before the stretch."""
         ahead = (states >= 0).astype(np.float32)
         for i in range(int(lengths.max())):
@@ -312,16 +349,25 @@ def _options(chart: FramedChart, spares: int, visits_each: int) -> States:
     """The states that each visit may be in: visits x states, padded with -1."""
     misfits = chart.misfits
     # The star of each visit in a frame whose slot r is slot 0 of the visit; and its kind, which is the least of these four stars.
-    turned = [[tuple(star[(slot - r) % 4] for slot in range(4)) for r in range(4)] for star in chart.stars]
+    turned = [
+        [tuple(star[(slot - r) % 4] for slot in range(4)) for r in range(4)] for star in chart.stars
+    ]
     kinds = [min(stars) for stars in turned]
     pinned = clique(np.logical_and.reduce(misfits), numbered(kinds))
     spare = _spare(kinds, pinned, spares, visits_each)
-    known = ~misfits[:, :, pinned].transpose(1, 2, 0).reshape(len(kinds), -1)  # visits x states of pinned places
+    known = ~misfits[:, :, pinned].transpose(1, 2, 0).reshape(
+        len(kinds), -1
+    )  # visits x states of pinned places
     known[pinned] = False
     known[pinned, 4 * np.arange(len(pinned))] = True
     options: list[list[int]] = [np.flatnonzero(row).tolist() for row in known]
     for visit in set(range(len(kinds))).difference(pinned):
-        options[visit] += [4 * place + r for place in spare[kinds[visit]] for r in range(4) if turned[visit][r] == kinds[visit]]
+        options[visit] += [
+            4 * place + r
+            for place in spare[kinds[visit]]
+            for r in range(4)
+            if turned[visit][r] == kinds[visit]
+        ]
     return _padded(options)
 
 
@@ -329,10 +375,17 @@ def _step_options(chart: Chart, clique: Sequence[int], may_be: Sequence[Sequence
     """The states that each step may be in: those of the clique, and the spare ones of its view. Steps x states, padded with -1."""
     pinned = set(clique)
     spare = _spare(chart.seen, clique, SPARES, ROUGH_VISITS)
-    return _padded([[*options, *(() if step in pinned else spare[chart.seen[step]])] for step, options in enumerate(may_be)])
+    return _padded(
+        [
+            [*options, *(() if step in pinned else spare[chart.seen[step]])]
+            for step, options in enumerate(may_be)
+        ]
+    )
 
 
-def _spare(kinds: Sequence[_Kind], pinned: Sequence[int], spares: int, visits_each: int) -> dict[_Kind, range]:
+def _spare(
+    kinds: Sequence[_Kind], pinned: Sequence[int], spares: int, visits_each: int
+) -> dict[_Kind, range]:
     """Spare names for each kind of place. The first names, which come before them, are those of the pinned visits."""
     named = Counter(kinds[visit] for visit in pinned)
     spare: dict[_Kind, range] = {}

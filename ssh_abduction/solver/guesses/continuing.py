@@ -39,7 +39,9 @@ MANY = 10
 _Link: TypeAlias = tuple[int, int]  # dstate, action
 
 
-def followed(log: Log, labels: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int] | None:
+def followed(
+    log: Log, labels: Sequence[int], check: Callable[[], None] = lambda: None
+) -> list[int] | None:
     """Labels of all steps of a trace, which make a map near the given one; None where too much of that one is contradicted.
 
     labels  of a map of the first steps, numbered from 0
@@ -110,7 +112,11 @@ class _Map:
         forgotten = {dstate for dstate in dstates if dstate >= 0}
         for dstate in forgotten:
             self._like[self._shows[dstate]].remove(dstate)
-        self.leads = {link: there for link, there in self.leads.items() if forgotten.isdisjoint((link[0], there))}
+        self.leads = {
+            link: there
+            for link, there in self.leads.items()
+            if forgotten.isdisjoint((link[0], there))
+        }
         if self._start in forgotten:
             self._start = None
 
@@ -138,7 +144,11 @@ class _Map:
                 next_most = max(next_most, steps)
         if link:
             self.leads.pop(link, None)
-        return best if most >= min(least, len(self._seen) - step) and most >= next_most + AHEAD else None
+        return (
+            best
+            if most >= min(least, len(self._seen) - step) and most >= next_most + AHEAD
+            else None
+        )
 
     def _predicted(self, dstate: int, step: int) -> tuple[int, bool]:
         """How many steps are predicted if this one is at that dstate, this step counted, and whether the next one contradicts the map."""

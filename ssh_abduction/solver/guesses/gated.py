@@ -37,7 +37,9 @@ from ssh_abduction.theory.theory import Theory
 _Seen = tuple[int, Star]  # a dstate, and a star that is seen there
 
 
-def gated_map(trace: Trace, theory: Theory, *, homing: bool, pairs: Pairs = NO_PAIRS) -> SSHMap | None:
+def gated_map(
+    trace: Trace, theory: Theory, *, homing: bool, pairs: Pairs = NO_PAIRS
+) -> SSHMap | None:
     """A map of a trace in which stars agree in tolerance, or None if the first choices lead to none. The caller has to check it.
 
     Args:
@@ -108,7 +110,9 @@ class _Growing:
             turns={**self.turns},
         )
 
-    def options(self, action: Action, step: Step, homing: bool) -> Iterator[Callable[[_Growing], int]]:
+    def options(
+        self, action: Action, step: Step, homing: bool
+    ) -> Iterator[Callable[[_Growing], int]]:
         """The ways to go on: each changes a copy, and says which dstate the action leads to."""
         here = self.labels[-1]
         known = self.links.get((here, action.name))
@@ -121,7 +125,9 @@ class _Growing:
             for course in self._courses(here):
                 yield from self._travelling(here, course, step, homing)
 
-    def _turning(self, here: int, action: Action, step: Step) -> Iterator[Callable[[_Growing], int]]:
+    def _turning(
+        self, here: int, action: Action, step: Step
+    ) -> Iterator[Callable[[_Growing], int]]:
         s = self.dstates[here]
         around = action.turn == "around"
         for x in self.dstates:
@@ -142,12 +148,22 @@ class _Growing:
         if s.path is not None and s.direction is not None:
             yield s.path, s.direction
             return
-        there = [x for x in self.dstates if x.place == s.place and x.path is not None and x.direction is not None]
+        there = [
+            x
+            for x in self.dstates
+            if x.place == s.place and x.path is not None and x.direction is not None
+        ]
         taken = {(x.path, x.direction) for x in there}
-        yield from ((x.path, -x.direction) for x in there if x.path is not None and x.direction and (x.path, -x.direction) not in taken)
+        yield from (
+            (x.path, -x.direction)
+            for x in there
+            if x.path is not None and x.direction and (x.path, -x.direction) not in taken
+        )
         yield len(self.orders), 1
 
-    def _travelling(self, here: int, course: tuple[int, int], step: Step, homing: bool) -> Iterator[Callable[[_Growing], int]]:
+    def _travelling(
+        self, here: int, course: tuple[int, int], step: Step, homing: bool
+    ) -> Iterator[Callable[[_Growing], int]]:
         path, direction = course
         place = self.dstates[here].place
         assert place is not None
@@ -159,17 +175,25 @@ class _Growing:
             for options in [*known, *new] if homing else [*new, *known]:
                 yield from options
 
-    def _homing(self, here: int, course: tuple[int, int], place: int, step: Step) -> Iterator[Callable[[_Growing], int]]:
+    def _homing(
+        self, here: int, course: tuple[int, int], place: int, step: Step
+    ) -> Iterator[Callable[[_Growing], int]]:
         """To a known place ahead: to the dstate that goes on there, or to one that shows the view and has no course, or to a new one."""
         there = [x for x in self.dstates if x.place == place]
         onward = [x.id for x in there if (x.path, x.direction) == course]
-        shown = [x.id for x in there if x.view == step.view and (x.id in onward or (not onward and x.path is None))]
+        shown = [
+            x.id
+            for x in there
+            if x.view == step.view and (x.id in onward or (not onward and x.path is None))
+        ]
         for x in shown:
             yield partial(_Growing.travelled, here=here, there=x, course=course)
         if not onward:
             yield lambda other: other.travelled(here, other.add(step, place), course)
 
-    def _leaving(self, here: int, course: tuple[int, int], number: int, step: Step) -> Iterator[Callable[[_Growing], int]]:
+    def _leaving(
+        self, here: int, course: tuple[int, int], number: int, step: Step
+    ) -> Iterator[Callable[[_Growing], int]]:
         """To a new place, behind so many places ahead."""
 
         def leave(other: _Growing) -> int:
@@ -240,7 +264,11 @@ class _Growing:
 
     def fits(self, place: int, axioms: frozenset[str]) -> bool:
         """Whether the courses at a place are different and agree with the turns there, and the stars can be read as those of one place."""
-        course = {s.id: None if s.path is None or s.direction is None else (s.path, s.direction) for s in self.dstates if s.place == place}
+        course = {
+            s.id: None if s.path is None or s.direction is None else (s.path, s.direction)
+            for s in self.dstates
+            if s.place == place
+        }
         known = [found for found in course.values() if found is not None]
         if len(set(known)) < len(known):
             return False
@@ -254,13 +282,26 @@ class _Growing:
                 return False
         return headings(*self._seen_at(place), axioms).keys() >= course.keys()
 
-    def _seen_at(self, place: int) -> tuple[list[Sight], dict[tuple[Sight, Sight], tuple[Action, ...]]]:
+    def _seen_at(
+        self, place: int
+    ) -> tuple[list[Sight], dict[tuple[Sight, Sight], tuple[Action, ...]]]:
         sights: dict[_Seen, Sight] = {}
         shown: set[int] = set()
         for (s, star), step in self.sights[place].items():
-            sights[s, star] = Sight(self.dstates[s], star, step, s not in shown, not sights, self._onward(self.dstates[s]))
+            sights[s, star] = Sight(
+                self.dstates[s],
+                star,
+                step,
+                s not in shown,
+                not sights,
+                self._onward(self.dstates[s]),
+            )
             shown.add(s)
-        turns = {(sights[a], sights[b]): actions for (a, b), actions in self.turns.items() if a in sights and b in sights}
+        turns = {
+            (sights[a], sights[b]): actions
+            for (a, b), actions in self.turns.items()
+            if a in sights and b in sights
+        }
         return list(sights.values()), turns
 
     def _onward(self, s: DState) -> tuple[int, ...]:
@@ -269,7 +310,11 @@ class _Growing:
             return ()
         order = self.orders[s.path][:: s.direction]
         position = order.index(s.place)
-        return tuple(towards for towards, goes_on in ((0, position + 1 < len(order)), (180, position > 0)) if goes_on)
+        return tuple(
+            towards
+            for towards, goes_on in ((0, position + 1 < len(order)), (180, position > 0))
+            if goes_on
+        )
 
     def map(self, axioms: frozenset[str]) -> SSHMap | None:
         """The map, numbered by first visit, with headings that all stars allow."""
@@ -283,14 +328,34 @@ class _Growing:
         for old, new in first.items():
             s = self.dstates[old]
             assert s.place is not None
-            path, faced = paths.setdefault(s.path, (len(paths), s.direction or 1)) if s.path is not None else (None, 1)
+            path, faced = (
+                paths.setdefault(s.path, (len(paths), s.direction or 1))
+                if s.path is not None
+                else (None, 1)
+            )
             direction = None if s.direction is None else s.direction * faced
             dstates.append(
-                replace(s, id=new, place=places.setdefault(s.place, len(places)), path=path, direction=direction, heading=facing.get(old))
+                replace(
+                    s,
+                    id=new,
+                    place=places.setdefault(s.place, len(places)),
+                    path=path,
+                    direction=direction,
+                    heading=facing.get(old),
+                )
             )
-        made = tuple(MapPath(number, tuple(places[p] for p in self.orders[path][::faced])) for path, (number, faced) in paths.items())
+        made = tuple(
+            MapPath(number, tuple(places[p] for p in self.orders[path][::faced]))
+            for path, (number, faced) in paths.items()
+        )
         links = tuple(sorted((first[s], action, first[x]) for (s, action), x in self.links.items()))
-        return SSHMap(tuple(first[label] for label in self.labels), tuple(dstates), links, tuple(places.values()), made)
+        return SSHMap(
+            tuple(first[label] for label in self.labels),
+            tuple(dstates),
+            links,
+            tuple(places.values()),
+            made,
+        )
 
 
 def _stay(known: int, _: _Growing) -> int:

@@ -26,7 +26,9 @@ MOST_VOTES = 15.0
 FEWEST_VOTES = 3.0
 
 
-def wrong_displacements(trace: Trace, labels: Sequence[int], places: Sequence[int | None]) -> tuple[int, ...]:
+def wrong_displacements(
+    trace: Trace, labels: Sequence[int], places: Sequence[int | None]
+) -> tuple[int, ...]:
     """The steps to which displacements lead that are wrong, those first that have most votes.
 
     labels  the dstate of each step, nearly right
@@ -35,8 +37,15 @@ def wrong_displacements(trace: Trace, labels: Sequence[int], places: Sequence[in
     loops = Reckoning(trace).loops_of_unknown_drift()
     voters: list[tuple[int, int, float]] = []
     for with_heading, pairs in ((True, _returns(labels)), (False, _returns(places))):
-        known = [(i, j) for i, j in pairs if loops.part[i] == loops.part[j] and (with_heading or labels[i] != labels[j])]
-        voters += [(i, j, votes) for (i, j), votes in zip(known, _votes(loops, known, with_heading), strict=True)]
+        known = [
+            (i, j)
+            for i, j in pairs
+            if loops.part[i] == loops.part[j] and (with_heading or labels[i] != labels[j])
+        ]
+        voters += [
+            (i, j, votes)
+            for (i, j), votes in zip(known, _votes(loops, known, with_heading), strict=True)
+        ]
     found: list[int] = []
     while True:
         votes = np.zeros(len(trace) + 1)
@@ -71,7 +80,8 @@ def _votes(loops: Loops, pairs: Sequence[tuple[int, int]], with_heading: bool) -
     size = 3 if with_heading else 2
     wrong = np.diag([FAR**2, FAR**2, ANYHOW**2])
     likely = [
-        chi_squares(closing, spread)[int(with_heading)] + np.linalg.slogdet(spread[:, :size, :size])[1]
+        chi_squares(closing, spread)[int(with_heading)]
+        + np.linalg.slogdet(spread[:, :size, :size])[1]
         for spread in (covariance, covariance + wrong)
     ]
     votes: list[float] = np.minimum((likely[0] - likely[1]) / 2, MOST_VOTES).tolist()

@@ -28,7 +28,9 @@ from ssh_abduction.theory.theory import Theory
 MOST_PAIRS = 60_000
 DSTATE = 10  # What a dstate costs, in tenths.
 
-_Turned = tuple[int, int]  # a visit or group, and a quarter: slot K of the visit is slot K + quarter of the place
+_Turned = tuple[
+    int, int
+]  # a visit or group, and a quarter: slot K of the visit is slot K + quarter of the place
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,12 @@ class _Group:
     stars    what it costs to disbelieve all steps that show a star, by star as seen from slot 0
     """
 
-    def __init__(self, members: Mapping[int, int], views: Mapping[int, Counter[View]], stars: Counter[Openings]) -> None:
+    def __init__(
+        self,
+        members: Mapping[int, int],
+        views: Mapping[int, Counter[View]],
+        stars: Counter[Openings],
+    ) -> None:
         self.members, self.views, self.stars = members, views, stars
         self.cost = sum(DSTATE + _outvoted(votes) for votes in views.values()) + _outvoted(stars)
 
@@ -77,7 +84,9 @@ class Merging:
     check   called now and then, and may raise
     """
 
-    def __init__(self, trace: Trace, theory: Theory, pairs: Pairs, check: Callable[[], None]) -> None:
+    def __init__(
+        self, trace: Trace, theory: Theory, pairs: Pairs, check: Callable[[], None]
+    ) -> None:
         self._trace, self._theory, self._check = trace, theory, check
         self.visits = list(_visits(trace))
         self._groups = {number: self._of_visit(number) for number in range(len(self.visits))}
@@ -98,12 +107,16 @@ class Merging:
             place, faced = here
             other, turn = first.setdefault(place, (number, faced))
             if other != number:
-                self._merge([(self._group_of[other], 0), *self._beside(other, number, (turn - faced) % 4)])
+                self._merge(
+                    [(self._group_of[other], 0), *self._beside(other, number, (turn - faced) % 4)]
+                )
 
     def merge(self) -> None:
         """Merge groups as long as that makes them cheaper."""
         while True:
-            waiting = [(-gain, pair) for pair in self._candidates() if (gain := self._gain(*pair)[0]) > 0]
+            waiting = [
+                (-gain, pair) for pair in self._candidates() if (gain := self._gain(*pair)[0]) > 0
+            ]
             heapq.heapify(waiting)
             if not waiting:
                 return
@@ -168,11 +181,15 @@ class Merging:
         """R x I x J: whether groups I and J cannot be one place so that slot K of I is slot K + R of J."""
         count = len(self.visits)
         misfits = np.zeros((4, count, count), dtype=bool)
-        at = {t: (number, slot) for number, visit in enumerate(self.visits) for t, slot in visit.steps}
+        at = {
+            t: (number, slot) for number, visit in enumerate(self.visits) for t, slot in visit.steps
+        }
         for number in range(count):
             misfits[1:, number, number] = True
             if self.visits[number].leaves is not None:
-                misfits[:, number, number + 1] = misfits[:, number + 1, number] = True  # a travel leads to another place
+                misfits[:, number, number + 1] = misfits[:, number + 1, number] = (
+                    True  # a travel leads to another place
+                )
         for i, t in pairs_in(pairs.elsewhere):
             a, b = at[i][0], at[t][0]
             misfits[:, a, b] = misfits[:, b, a] = True
@@ -184,7 +201,10 @@ class Merging:
     def _candidates(self) -> list[tuple[int, int, int]]:
         """Pairs of groups that may be one place, as (I, J, R)."""
         some = np.array(sorted(self._groups))
-        turns, first, second = np.nonzero(~self._misfits[:, some[:, None], some] & np.triu(np.ones((len(some),) * 2, dtype=bool), 1))
+        turns, first, second = np.nonzero(
+            ~self._misfits[:, some[:, None], some]
+            & np.triu(np.ones((len(some),) * 2, dtype=bool), 1)
+        )
         if len(turns) > MOST_PAIRS:
             near = np.argsort(second - first, kind="stable")[:MOST_PAIRS]
             turns, first, second = turns[near], first[near], second[near]
@@ -201,7 +221,9 @@ class Merging:
 
     def _gain(self, first: int, second: int, turn: int) -> tuple[int, list[list[_Turned]]]:
         """What is gained where two visits, and so their groups, are one place, with all that follows from it; and the groups that are then one. Nothing where they cannot be."""
-        together: dict[int, dict[int, int]] = {}  # for a group: all groups that are one place with it, each with its turn
+        together: dict[
+            int, dict[int, int]
+        ] = {}  # for a group: all groups that are one place with it, each with its turn
         work = [(first, second, turn)]
         while work:
             i, j, r = work.pop()
@@ -226,9 +248,13 @@ class Merging:
                 self._check()
         joined = list({id(parts): list(parts.items()) for parts in together.values()}.values())
         before = sum(self._groups[x].cost for parts in joined for x, _ in parts)
-        return before - sum(_Group.joined((self._groups[x], t) for x, t in parts).cost for parts in joined), joined
+        return before - sum(
+            _Group.joined((self._groups[x], t) for x, t in parts).cost for parts in joined
+        ), joined
 
-    def _follow(self, mine: Mapping[int, int], its: Mapping[int, int], shift: int) -> list[tuple[int, int, int]]:
+    def _follow(
+        self, mine: Mapping[int, int], its: Mapping[int, int], shift: int
+    ) -> list[tuple[int, int, int]]:
         """The next visits that are one, too, where two groups are: those to which the same action leads from the same slot."""
         leads = dict(self._leads(mine, 0))
         return [(leads[key], there, 0) for key, there in self._leads(its, shift) if key in leads]

@@ -34,7 +34,20 @@ from ssh_abduction.solver.steps.chart import Chart, Link, numbered
 
 # What is demanded of a merge, ever less: by how much its evidence is ahead of the next best merge of the same step, and how many known dstates may fit that
 # step. What is demanded last lets every step be merged that fits some known dstate.
-DEMANDS = ((10, 1), (5, 1), (5, 2), (3, 1), (3, 3), (2, 2), (2, 10), (1, 3), (1, 100), (0, 1), (0, 2), (0, 1000))
+DEMANDS = (
+    (10, 1),
+    (5, 1),
+    (5, 2),
+    (3, 1),
+    (3, 3),
+    (2, 2),
+    (2, 10),
+    (1, 3),
+    (1, 100),
+    (0, 1),
+    (0, 2),
+    (0, 1000),
+)
 # The same for merges of two known dstates, when a map is thinned.
 THINNED = 10, 5, 3, 0
 # When this many merges contradicted what the caller told, there is no map near the guess.
@@ -42,12 +55,23 @@ TAKEN_BACK = 20
 # When this many merges did while a map was thinned, the map is thin enough: with 40 of them it came to have at most 1 % fewer dstates, and took twice as long.
 THIN_ENOUGH = 5
 
-Told: TypeAlias = tuple[Matrix, Sequence[tuple[int, int]]]  # which nodes are apart, and pairs that are one
-_Snapshot: TypeAlias = tuple[NDArray[np.int_], NDArray[np.bool_], Matrix, list[NDArray[np.int_]], list[dict[int, int]]]  # of a _Classes
-_Merge: TypeAlias = tuple[int, int]  # two steps whose classes become one. Where these are one class already, that becomes a known dstate
+Told: TypeAlias = tuple[
+    Matrix, Sequence[tuple[int, int]]
+]  # which nodes are apart, and pairs that are one
+_Snapshot: TypeAlias = tuple[
+    NDArray[np.int_], NDArray[np.bool_], Matrix, list[NDArray[np.int_]], list[dict[int, int]]
+]  # of a _Classes
+_Merge: TypeAlias = tuple[
+    int, int
+]  # two steps whose classes become one. Where these are one class already, that becomes a known dstate
 
 
-def merged(apart: Matrix, links: Iterable[Link], clique: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
+def merged(
+    apart: Matrix,
+    links: Iterable[Link],
+    clique: Sequence[int],
+    check: Callable[[], None] = lambda: None,
+) -> list[int]:
     """The dstate of each node of a chart in a small map, numbered by first node.
 
     apart   which nodes are apart, nodes x nodes
@@ -61,7 +85,12 @@ def merged(apart: Matrix, links: Iterable[Link], clique: Sequence[int], check: C
     return classes.labels()
 
 
-def merged_near(apart: Matrix, links: Iterable[Link], guess: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
+def merged_near(
+    apart: Matrix,
+    links: Iterable[Link],
+    guess: Sequence[int],
+    check: Callable[[], None] = lambda: None,
+) -> list[int]:
     """The dstate of each node of a chart in a small map near a guess.
 
     guess  a label for each node; -1 where it is not known. A node that cannot be one dstate with the nodes before it of the same label is free, too
@@ -105,7 +134,9 @@ def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int
     return _from_guess(apart, links, guess).labels()
 
 
-def thinned(chart: Chart, labels: Sequence[int], check: Callable[[], None] = lambda: None) -> list[int]:
+def thinned(
+    chart: Chart, labels: Sequence[int], check: Callable[[], None] = lambda: None
+) -> list[int]:
     """The dstate of each node in a smaller map: dstates of the given map are merged until no two of them can be one.
 
     Dstates seen at the fewest nodes are merged first, each with the dstate for which there is most evidence.
@@ -116,7 +147,15 @@ def thinned(chart: Chart, labels: Sequence[int], check: Callable[[], None] = lam
     first = np.unique(dstates, return_index=True)[1]
     links = list(dict.fromkeys((dstates[t], action, dstates[u]) for t, action, u in chart.links))
     excluded = [(dstates[i], dstates[j]) for i, j in chart.excluded]
-    root = np.array(thinned_map(np.asarray(chart.seen)[first].tolist(), links, np.bincount(dstates).tolist(), check, excluded))
+    root = np.array(
+        thinned_map(
+            np.asarray(chart.seen)[first].tolist(),
+            links,
+            np.bincount(dstates).tolist(),
+            check,
+            excluded,
+        )
+    )
     return numbered(root[dstates].tolist())
 
 
@@ -133,14 +172,21 @@ def thinned_map(
     visits    how many nodes are at each
     excluded  pairs of dstates that are not one
     """
-    classes = _Classes(_apart_in_map(np.asarray(shows), links, excluded, check), links, check, np.asarray(visits))
+    classes = _Classes(
+        _apart_in_map(np.asarray(shows), links, excluded, check), links, check, np.asarray(visits)
+    )
     classes.known[:] = True
     classes.thin_all()
     root: list[int] = classes.root.tolist()
     return root
 
 
-def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link], excluded: Sequence[tuple[int, int]], check: Callable[[], None]) -> Matrix:
+def _apart_in_map(
+    seen: NDArray[np.int_],
+    links: Sequence[Link],
+    excluded: Sequence[tuple[int, int]],
+    check: Callable[[], None],
+) -> Matrix:
     """Which pairs of dstates of a map are apart: those that show different views, that evidence excludes, or from which one action leads to dstates that are apart."""
     leads: dict[int, NDArray[np.int_]] = {}
     for dstate, action, leads_to in links:
@@ -158,7 +204,12 @@ def _apart_in_map(seen: NDArray[np.int_], links: Sequence[Link], excluded: Seque
             return apart
 
 
-def _from_guess(apart: Matrix, links: Iterable[Link], guess: Sequence[int], check: Callable[[], None] = lambda: None) -> _Classes:
+def _from_guess(
+    apart: Matrix,
+    links: Iterable[Link],
+    guess: Sequence[int],
+    check: Callable[[], None] = lambda: None,
+) -> _Classes:
     """Classes in which the nodes that a guess gives one label are merged, as far as they can be one, with all that follows from that."""
     classes = _Classes(apart, links, check)
     classes.take(guess)
@@ -173,7 +224,11 @@ class _Classes:
     """
 
     def __init__(
-        self, apart: Matrix, links: Iterable[Link], check: Callable[[], None] = lambda: None, nodes: NDArray[np.int_] | None = None
+        self,
+        apart: Matrix,
+        links: Iterable[Link],
+        check: Callable[[], None] = lambda: None,
+        nodes: NDArray[np.int_] | None = None,
     ) -> None:
         """
         nodes  how many nodes each step stands for (default one)
@@ -182,12 +237,18 @@ class _Classes:
         self._nodes = nodes
         self.root = np.arange(steps)
         self.known = np.zeros(steps, dtype=bool)
-        self._apart = apart.copy()  # the row of each root: which steps are apart from some step of its class
+        self._apart = (
+            apart.copy()
+        )  # the row of each root: which steps are apart from some step of its class
         self._members: list[NDArray[np.int_]] = [np.array([t]) for t in range(steps)]
-        self._leads: list[dict[int, int]] = [{} for _ in range(steps)]  # for each root, a step that each action leads to
+        self._leads: list[dict[int, int]] = [
+            {} for _ in range(steps)
+        ]  # for each root, a step that each action leads to
         for t, action, u in links:
             self._leads[t][action] = u
-        self._undo: list[tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]] = []
+        self._undo: list[
+            tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]
+        ] = []
         self._made: list[_Merge] = []
         self._check = check
 
@@ -275,17 +336,23 @@ class _Classes:
         for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: nodes[root]):
             self._check()
             if self.known[root]:  # it may have been merged since
-                ranked = self._ranked(root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True)
+                ranked = self._ranked(
+                    root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True
+                )
                 if ranked and _is_ahead(ranked, evidence):
                     self.make((ranked[0][1], root))
 
     def _fitting(self, root: int) -> list[int]:
         """The known dstates that no step of the class is apart from."""
         known = np.flatnonzero(self.known)
-        fits: list[int] = known[~self._apart[np.ix_(known, self._members[root])].any(axis=1)].tolist()
+        fits: list[int] = known[
+            ~self._apart[np.ix_(known, self._members[root])].any(axis=1)
+        ].tolist()
         return fits
 
-    def _ranked(self, root: int, fits: Sequence[int], *, forced: bool = False) -> list[tuple[int, int]]:
+    def _ranked(
+        self, root: int, fits: Sequence[int], *, forced: bool = False
+    ) -> list[tuple[int, int]]:
         """Those of these dstates that the class can be merged with, as (evidence, dstate), the one with most evidence first."""
         found = []
         for dstate in fits:
@@ -309,13 +376,19 @@ class _Classes:
             if a == b:
                 confirmed += 1
                 continue
-            if (self.known[a] and self.known[b] and not forced) or self._apart[a, self._members[b]].any():
+            if (self.known[a] and self.known[b] and not forced) or self._apart[
+                a, self._members[b]
+            ].any():
                 self._take_back()
                 return None
-            if self.known[b] or (not self.known[a] and len(self._members[a]) < len(self._members[b])):
+            if self.known[b] or (
+                not self.known[a] and len(self._members[a]) < len(self._members[b])
+            ):
                 a, b = b, a
             leads, more = self._leads[a], self._leads[b]
-            self._undo.append((a, b, bool(self.known[b]), self._apart[a].copy(), leads, self._members[a]))
+            self._undo.append(
+                (a, b, bool(self.known[b]), self._apart[a].copy(), leads, self._members[a])
+            )
             self.known[b] = False
             work += [(leads[action], t) for action, t in more.items() if action in leads]
             self._leads[a] = more | leads
@@ -327,7 +400,12 @@ class _Classes:
     def _take_back(self) -> None:
         """Undo the last merge."""
         for a, b, known, apart, leads, members in reversed(self._undo):
-            self._apart[a], self._leads[a], self._members[a], self.known[b] = apart, leads, members, known
+            self._apart[a], self._leads[a], self._members[a], self.known[b] = (
+                apart,
+                leads,
+                members,
+                known,
+            )
             self.root[self._members[b]] = b
         self._undo = []
 
@@ -384,13 +462,25 @@ class _ToldClasses(_Classes):
     def _make_anew(self, before: _Snapshot, merges: Iterable[_Merge]) -> None:
         """Go back to a snapshot, and make these merges."""
         root, known, apart, members, leads = before
-        self.root, self.known, self._apart, self._members, self._leads = root.copy(), known.copy(), apart.copy(), list(members), list(leads)
+        self.root, self.known, self._apart, self._members, self._leads = (
+            root.copy(),
+            known.copy(),
+            apart.copy(),
+            list(members),
+            list(leads),
+        )
         for merge in merges:
             self.make(merge)
 
     def _snapshot(self) -> _Snapshot:
         """What `_make_anew` needs to come back to the classes as they are now."""
-        return self.root.copy(), self.known.copy(), self._apart.copy(), list(self._members), list(self._leads)
+        return (
+            self.root.copy(),
+            self.known.copy(),
+            self._apart.copy(),
+            list(self._members),
+            list(self._leads),
+        )
 
     def _keeps_what_is_told(self) -> bool:
         """Ask the caller, note which steps are apart, and merge those that are one, as far as they can be. Returns False where the classes contradict what the caller

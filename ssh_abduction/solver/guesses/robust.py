@@ -39,11 +39,15 @@ CLONES = (
 )  # So many states each view has, from one start of EM to the next: with more than are needed it finds better optima.
 AGREE = 2  # So many starts that end at the cheapest map known are enough.
 ROUNDS = 100  # Steps of EM from each start, at most.
-ENOUGH = 1e-4  # EM ends where a round gains less than this in log-likelihood, per step of the trace.
+ENOUGH = (
+    1e-4  # EM ends where a round gains less than this in log-likelihood, per step of the trace.
+)
 PSEUDOCOUNT = 2e-3  # Added to all counts, as George et al. do.
 MISREAD, SLIPPED = 0.01, 0.01  # The chances that the model is given.
 RARE = 4  # A dstate that is visited so many times at most may be dropped.
-TRIED = 20  # So many of these are tried in a round, and so many pairs of dstates that are nearly one.
+TRIED = (
+    20  # So many of these are tried in a round, and so many pairs of dstates that are nearly one.
+)
 DEARER = (
     4 / 3
 )  # So many times as much as one that may be, a fault of a kind that may not be costs while a map is refined: few of them can be mended in the end.
@@ -93,7 +97,11 @@ class Machine:
     def without(self, dropped: int) -> Machine:
         """The machine that lacks a dstate."""
         number = {s: s - (s > dropped) for s in range(len(self.shows)) if s != dropped}
-        goes = {(number[s], a): number[x] for (s, a), x in self.goes.items() if s in number and x in number}
+        goes = {
+            (number[s], a): number[x]
+            for (s, a), x in self.goes.items()
+            if s in number and x in number
+        }
         return Machine([view for s, view in enumerate(self.shows) if s != dropped], goes)
 
 
@@ -130,7 +138,10 @@ class Explainer:
     def explained(self, machine: Machine) -> Explained:
         """The labels with the fewest faults that a machine gives to the trace. Where it does not know where an action leads, that may be anywhere."""
         steps, count = len(self.seen), len(machine.shows)
-        slip, misread = (np.array(self.price.get(kind, [NEVER] * steps), dtype=float) for kind in ("slipped", "misread"))
+        slip, misread = (
+            np.array(self.price.get(kind, [NEVER] * steps), dtype=float)
+            for kind in ("slipped", "misread")
+        )
         known = np.zeros((max(self.actions, default=0) + 1, count), dtype=bool)
         target = np.zeros(known.shape, dtype=int)
         for (s, action), x in machine.goes.items():
@@ -152,7 +163,9 @@ class Explainer:
                 begin = int(free[action][spent[free[action]].argmin()])
                 better = spent[begin] + UNKNOWN < now
                 came[t][better], now[better] = begin, spent[begin] + UNKNOWN
-            order = led[action][np.argsort(-spent[led[action]], kind="stable")]  # the last one written is the cheapest
+            order = led[action][
+                np.argsort(-spent[led[action]], kind="stable")
+            ]  # the last one written is the cheapest
             best = np.full(count, np.inf)
             source = np.zeros(count, dtype=np.int32)
             best[target[action, order]], source[target[action, order]] = spent[order], order
@@ -171,7 +184,9 @@ class Explainer:
         while explained.unknown:
             votes: dict[tuple[int, int], Counter[int]] = {}
             for t in explained.unknown:
-                votes.setdefault((explained.labels[t], self.actions[t]), Counter())[explained.labels[t + 1]] += 1
+                votes.setdefault((explained.labels[t], self.actions[t]), Counter())[
+                    explained.labels[t + 1]
+                ] += 1
             led = {key: counts.most_common(1)[0][0] for key, counts in votes.items()}
             machine = Machine(machine.shows, {**machine.goes, **led})
             explained = self.explained(machine)
@@ -187,7 +202,10 @@ class Explainer:
             views[label][self.seen[t]] += trust[t] if trust else 1
         for t, action in enumerate(self.actions):
             ends.setdefault((labels[t], action), Counter())[labels[t + 1]] += 1
-        return Machine([found.most_common(1)[0][0] for found in views], {key: found.most_common(1)[0][0] for key, found in ends.items()})
+        return Machine(
+            [found.most_common(1)[0][0] for found in views],
+            {key: found.most_common(1)[0][0] for key, found in ends.items()},
+        )
 
     def refined(self, labels: Sequence[int]) -> Explained:
         """The cheapest explanation near these labels: the map is read off, and laid over the trace anew, as long as that gets cheaper; so are those in which dstates are
@@ -205,14 +223,20 @@ class Explainer:
         labels = numbered(best.labels)
         visits = Counter(labels)
         links: list[Link] = [(s, action, x) for (s, action), x in machine.goes.items()]
-        root = thinned_map(machine.shows, links, [visits[s] for s in range(len(machine.shows))], self.check)
+        root = thinned_map(
+            machine.shows, links, [visits[s] for s in range(len(machine.shows))], self.check
+        )
         if len(set(root)) < len(machine.shows):
             yield self._settled([root[label] for label in labels])
         for s, count in sorted(visits.items(), key=lambda item: item[1])[:TRIED]:
             if count <= RARE and len(machine.shows) > 1:
                 self.check()
                 yield self._settled(self.completed(machine.without(s)).labels)
-        folded = (machine.folded(s, x) for s, x in combinations(range(len(machine.shows)), 2) if machine.shows[s] == machine.shows[x])
+        folded = (
+            machine.folded(s, x)
+            for s, x in combinations(range(len(machine.shows)), 2)
+            if machine.shows[s] == machine.shows[x]
+        )
         for _, root in sorted(folded)[:TRIED]:
             self.check()
             yield self._settled([root[label] for label in labels])
@@ -226,11 +250,22 @@ class Explainer:
 
     def _told(self, machine: Machine, labels: Sequence[int]) -> Explained:
         misread = [t for t, s in enumerate(labels) if machine.shows[s] != self.seen[t]]
-        leads = [machine.goes.get((s, action)) for s, action in zip(labels, self.actions, strict=False)]
+        leads = [
+            machine.goes.get((s, action)) for s, action in zip(labels, self.actions, strict=False)
+        ]
         unknown = [t for t, x in enumerate(leads) if x is None]
         slips = [t for t, x in enumerate(leads) if x is not None and x != labels[t + 1]]
-        paid = sum(self._cost("misread", t) for t in misread) + sum(self._cost("slipped", t) for t in slips)
-        return Explained(machine, labels, tuple(misread), tuple(slips), tuple(unknown), 10 * len(set(labels)) + paid)
+        paid = sum(self._cost("misread", t) for t in misread) + sum(
+            self._cost("slipped", t) for t in slips
+        )
+        return Explained(
+            machine,
+            labels,
+            tuple(misread),
+            tuple(slips),
+            tuple(unknown),
+            10 * len(set(labels)) + paid,
+        )
 
     def _cost(self, kind: str, step: int) -> int:
         return self.price[kind][step] if kind in self.price else NEVER
@@ -244,7 +279,11 @@ def robust_maps(explainer: Explainer, seed: int = 0) -> Iterator[Explained | Non
     best, agreed = NEVER, 0
     for clones in CLONES:
         guess = explainer.completed(soft.refined(_Model(soft, clones, rng).labels()).machine)
-        agreed = agreed + 1 if guess.tenths == best else agreed * (guess.tenths > best) + (guess.tenths < best)
+        agreed = (
+            agreed + 1
+            if guess.tenths == best
+            else agreed * (guess.tenths > best) + (guess.tenths < best)
+        )
         yield guess if guess.tenths < best else None
         best = min(best, guess.tenths)
         if agreed == AGREE:
@@ -259,10 +298,14 @@ class _Model:
         seen, views = np.array(explainer.seen), max(explainer.seen) + 1
         self._shows = np.repeat(np.arange(views), clones)
         misread = MISREAD if "misread" in explainer.price else 0.0
-        self._sees = np.where(self._shows == np.arange(views)[:, None], 1 - misread, misread / max(views - 1, 1))[seen]
+        self._sees = np.where(
+            self._shows == np.arange(views)[:, None], 1 - misread, misread / max(views - 1, 1)
+        )[seen]
         self._actions = np.array(explainer.actions, dtype=int)
         self._slip = SLIPPED if "slipped" in explainer.price else 0.0
-        self._chances = self._normal(rng.random((self._actions.max(initial=0) + 1, len(self._shows), len(self._shows))))
+        self._chances = self._normal(
+            rng.random((self._actions.max(initial=0) + 1, len(self._shows), len(self._shows)))
+        )
 
     def labels(self) -> list[int]:
         """The most probable state of each step, once the model is trained."""
@@ -282,17 +325,24 @@ class _Model:
         scale = np.ones(steps)
         matrices = list(self._chances)
         for t in range(steps):
-            message = (ahead[t - 1] @ matrices[self._actions[t - 1]] if t else ahead[0]) * self._sees[t]
+            message = (
+                ahead[t - 1] @ matrices[self._actions[t - 1]] if t else ahead[0]
+            ) * self._sees[t]
             scale[t] = message.sum()
             ahead[t] = message / scale[t]
             if t % 500 == 0:
                 self._explainer.check()
         for t in range(steps - 2, -1, -1):
-            behind[t] = matrices[self._actions[t]] @ (behind[t + 1] * self._sees[t + 1]) / scale[t + 1]
+            behind[t] = (
+                matrices[self._actions[t]] @ (behind[t + 1] * self._sees[t + 1]) / scale[t + 1]
+            )
             if t % 500 == 0:
                 self._explainer.check()
         then = behind[1:] * self._sees[1:] / scale[1:, None]
-        taken = [self._chances[a] * (ahead[:-1][self._actions == a].T @ then[self._actions == a]) for a in range(len(matrices))]
+        taken = [
+            self._chances[a] * (ahead[:-1][self._actions == a].T @ then[self._actions == a])
+            for a in range(len(matrices))
+        ]
         self._chances = self._normal(np.array(taken) + PSEUDOCOUNT)
         return float(np.log(scale).sum())
 

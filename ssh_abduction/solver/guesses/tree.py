@@ -61,7 +61,9 @@ class Sketch:
     certain  whether the map is known to be consistent. If not, the caller has to check it, and may set this then
     """
 
-    def __init__(self, first: Step, theory: Theory, homing: bool = True, framed: bool = False) -> None:
+    def __init__(
+        self, first: Step, theory: Theory, homing: bool = True, framed: bool = False
+    ) -> None:
         self.labels: list[int] = []
         self._theory = theory
         self._homing = homing or theory.next_place
@@ -69,10 +71,16 @@ class Sketch:
         self._states: list[_Known] = []
         self._links: dict[tuple[int, str], int] = {}
         self._stars: list[object] = []  # for each place, its star
-        self._orders: list[list[int]] = []  # for each path, its places in the order in which direction 1 meets them
+        self._orders: list[
+            list[int]
+        ] = []  # for each path, its places in the order in which direction 1 meets them
         self._along: dict[tuple[int, int, int], int] = {}  # place, path, direction: dstate
-        self._facing: dict[tuple[int, int], int] = {}  # place, heading: dstate; only where places have frames
-        self._slots: dict[tuple[int, int], tuple[int, int]] = {}  # place, heading: path, direction; only where places have frames
+        self._facing: dict[
+            tuple[int, int], int
+        ] = {}  # place, heading: dstate; only where places have frames
+        self._slots: dict[
+            tuple[int, int], tuple[int, int]
+        ] = {}  # place, heading: path, direction; only where places have frames
         self._excused: tuple[tuple[int, int], ...] = ()  # pairs of paths
         self._map: SSHMap | None = None
         self._tree = self.certain = True
@@ -83,7 +91,9 @@ class Sketch:
     @classmethod
     def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
         """All kinds of sketches of a trace that begins with this step. Those that become smaller, if they are not given up, come first."""
-        framed = [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
+        framed = (
+            [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
+        )
         return [cls(first, theory, homing, frames) for frames in framed for homing in (True, False)]
 
     @classmethod
@@ -100,7 +110,9 @@ class Sketch:
         for s in ssh_map.dstates:
             place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
             assert s.view is not None
-            sketch._states.append(_Known(s.view, observation(seen[s.id], theory), place, heading, s.path, direction))
+            sketch._states.append(
+                _Known(s.view, observation(seen[s.id], theory), place, heading, s.path, direction)
+            )
             stars.setdefault(place, sketch._star(seen[s.id], heading))
             if s.path is not None:
                 sketch._along[place, s.path, direction] = s.id
@@ -158,7 +170,10 @@ class Sketch:
         elif around and s.path is not None:
             there = self._along.get((s.place, s.path, -s.direction))
         elif around:
-            there = next((x for x in s.reverse if self._states[x].seen == observation(step, self._theory)), None)
+            there = next(
+                (x for x in s.reverse if self._states[x].seen == observation(step, self._theory)),
+                None,
+            )
         if there is None:
             there = self._new(step, s.place, heading)
         if around:
@@ -217,7 +232,9 @@ class Sketch:
         """The path and direction of a dstate. A dstate that has none gets the path that leaves through its slot, or a new path."""
         s = self._states[here]
         if s.path is None:
-            path, direction = self._slots.get((s.place, s.heading), (len(self._orders), 1))  # without frames there are no slots
+            path, direction = self._slots.get(
+                (s.place, s.heading), (len(self._orders), 1)
+            )  # without frames there are no slots
             if path < len(self._orders) or not self._framed:
                 self._doubt_if_grown_from_map()
             if path == len(self._orders):
@@ -275,8 +292,12 @@ class Sketch:
         """The sketch as a map, made anew."""
         links = tuple(sorted((s, action, x) for (s, action), x in self._links.items()))
         if self._theory.level == "causal":
-            return SSHMap(labels, tuple(DState(i, s.view) for i, s in enumerate(self._states)), links)
-        first: dict[int, tuple[int, int]] = {}  # for each path, its number in the map, and the direction that is faced first
+            return SSHMap(
+                labels, tuple(DState(i, s.view) for i, s in enumerate(self._states)), links
+            )
+        first: dict[
+            int, tuple[int, int]
+        ] = {}  # for each path, its number in the map, and the direction that is faced first
         for s in self._states:
             if s.path is not None:
                 first.setdefault(s.path, (len(first), s.direction))
@@ -291,6 +312,16 @@ class Sketch:
             )
             for i, s in enumerate(self._states)
         )
-        paths = tuple(MapPath(number, tuple(self._orders[path][::direction])) for path, (number, direction) in first.items())
+        paths = tuple(
+            MapPath(number, tuple(self._orders[path][::direction]))
+            for path, (number, direction) in first.items()
+        )
         excused = [sorted((first[h][0], first[g][0])) for h, g in self._excused]
-        return SSHMap(labels, dstates, links, tuple(range(len(self._stars))), paths, tuple(sorted((h, g) for h, g in excused)))
+        return SSHMap(
+            labels,
+            dstates,
+            links,
+            tuple(range(len(self._stars))),
+            paths,
+            tuple(sorted((h, g) for h, g in excused)),
+        )

@@ -43,7 +43,12 @@ class Continuations:
     any two neighbours from the one to the other have.
     """
 
-    def __init__(self, seen: Sequence[int], actions: Sequence[int], excluded: Collection[tuple[int, int]] = ()) -> None:
+    def __init__(
+        self,
+        seen: Sequence[int],
+        actions: Sequence[int],
+        excluded: Collection[tuple[int, int]] = (),
+    ) -> None:
         """
         seen      what was seen at each step
         actions   what was done after each step but the last, numbered from 0
@@ -53,11 +58,15 @@ class Continuations:
         steps = len(shown)
         self._seen = seen
         self._excluded = _spread(excluded, done) if excluded and steps <= COMPARED else None
-        self._partners: dict[int, list[int]] = {}  # the excluded steps of each step, where the trace is too long for a matrix
+        self._partners: dict[
+            int, list[int]
+        ] = {}  # the excluded steps of each step, where the trace is too long for a matrix
         for i, j in excluded if self._excluded is None else ():
             self._partners.setdefault(i, []).append(j)
             self._partners.setdefault(j, []).append(i)
-        ranks = [_ranked(shown * (done.max() + 1) + done)]  # the order of the steps by their first 1, 2, 4, … views and actions
+        ranks = [
+            _ranked(shown * (done.max() + 1) + done)
+        ]  # the order of the steps by their first 1, 2, 4, … views and actions
         while ranks[-1].max() < steps - 1:
             then = np.zeros(steps, dtype=int)
             ahead = 1 << (len(ranks) - 1)
@@ -66,10 +75,14 @@ class Continuations:
         self._place = ranks[-1]  # the position of each step in the sorted order
         self._sorted = np.argsort(self._place)
         here, there = self._sorted[:-1], self._sorted[1:]
-        for level in range(len(ranks) - 2, -1, -1):  # both neighbours go on, by halving strides, to where they differ
+        for level in range(
+            len(ranks) - 2, -1, -1
+        ):  # both neighbours go on, by halving strides, to where they differ
             ahead = (ranks[level][here] == ranks[level][there]) * (1 << level)
             here, there = here + ahead, there + ahead
-        self._shared = 2 * (here - self._sorted[:-1]) + (shown[here] == shown[there])  # views and actions that neighbours have in common
+        self._shared = 2 * (here - self._sorted[:-1]) + (
+            shown[here] == shown[there]
+        )  # views and actions that neighbours have in common
 
     def apart_from(self, step: int, actions: int = 0) -> Matrix:
         """Which steps are apart from this one, and show it only after at least this many actions. With 0 it is the step's row of `apart`."""
@@ -146,7 +159,9 @@ class _Clique:
         if apart:
             more = len(self.steps) * other.group + len(other.steps) * self.group
             return _Clique(self.steps + other.steps, self.apart + other.apart + more, group)
-        best = max(self, other, key=lambda clique: (len(clique.steps), clique.apart, -clique.steps[0]))
+        best = max(
+            self, other, key=lambda clique: (len(clique.steps), clique.apart, -clique.steps[0])
+        )
         return _Clique(best.steps, best.apart, group)
 
 
@@ -195,6 +210,8 @@ def _grown(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[
         best = free[int((degree[free] + random.random(len(free))).argmax())]
         found.append(int(left[best]))
         stay = inner[best, free]
-        degree -= inner[free[~stay]].sum(axis=0)  # each node drops out once, so a clique takes no longer than reading the matrix
+        degree -= inner[free[~stay]].sum(
+            axis=0
+        )  # each node drops out once, so a clique takes no longer than reading the matrix
         free = free[stay]
     return found

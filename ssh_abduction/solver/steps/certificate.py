@@ -22,7 +22,9 @@ from ssh_abduction.data.trace import Trace, View, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.solver.steps.noise import Noise, noise_in
 
-RESTS_ON = frozenset({"functional_view", "deterministic"})  # the axioms that make apart steps different dstates
+RESTS_ON = frozenset(
+    {"functional_view", "deterministic"}
+)  # the axioms that make apart steps different dstates
 # A certificate in a file has its words only if they have at most this many actions in all, some megabytes. Where steps look alike for long, words grow with
 # the cube of the trace; and whoever checks the certificate can find them anew.
 WRITTEN = 500_000
@@ -40,7 +42,9 @@ class Certificate:
     refuted: tuple[int, ...] = ()
 
     def __repr__(self) -> str:
-        refuted = f", and clingo refuted {counted(len(self.refuted), 'sizes')}" if self.refuted else ""
+        refuted = (
+            f", and clingo refuted {counted(len(self.refuted), 'sizes')}" if self.refuted else ""
+        )
         return f"<Certificate: at least {counted(self.bound, 'dstates')}; {counted(len(self.clique), 'steps')} are pairwise apart{refuted}>"
 
     @property
@@ -93,7 +97,9 @@ class Basis:
 
     @cached_property
     def certificate(self) -> Certificate:
-        from ssh_abduction.solver.steps.apart import Continuations  # loads numpy, which takes longer than to solve a short trace
+        from ssh_abduction.solver.steps.apart import (
+            Continuations,
+        )  # loads numpy, which takes longer than to solve a short trace
 
         clique = tuple(Continuations(self.views, self.actions).clique())
         return Certificate(clique, tuple(range(len(clique), self.bound)))
@@ -111,5 +117,7 @@ def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
         if here.view != there.view:
             return tuple(word)
         if here.action is None or there.action is None or here.action.name != there.action.name:
-            raise SolverError(f"clique: expected steps that are apart, got {i} and {j}, which may be one dstate")
+            raise SolverError(
+                f"clique: expected steps that are apart, got {i} and {j}, which may be one dstate"
+            )
         word.append(here.action.name)

@@ -55,7 +55,12 @@ class Chart:
     def of_steps(log: Log, size: int) -> Chart:
         """The chart of the first steps, each a node."""
         links = tuple((t, log.actions[t], t + 1) for t in range(size - 1))
-        return Chart(tuple(log.seen[:size]), links, range(size), excluded=frozenset(_pairs_within(log.pairs.apart, size)))
+        return Chart(
+            tuple(log.seen[:size]),
+            links,
+            range(size),
+            excluded=frozenset(_pairs_within(log.pairs.apart, size)),
+        )
 
     def apart(self) -> NDArray[np.bool_]:
         """Which pairs of nodes are apart: nodes x nodes."""
@@ -77,8 +82,14 @@ class Chart:
         leads: dict[tuple[int, int], int] = {}
         return (
             min(labels) >= 0
-            and all(view.setdefault(label, seen) == seen for label, seen in zip(labels, self.seen, strict=True))
-            and all(leads.setdefault((labels[t], action), labels[u]) == labels[u] for t, action, u in self.links)
+            and all(
+                view.setdefault(label, seen) == seen
+                for label, seen in zip(labels, self.seen, strict=True)
+            )
+            and all(
+                leads.setdefault((labels[t], action), labels[u]) == labels[u]
+                for t, action, u in self.links
+            )
             and all(labels[i] != labels[j] for i, j in self.excluded)
         )
 
@@ -95,13 +106,20 @@ class Chart:
     @staticmethod
     def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]] | None:
         """For each observation, what is seen ahead, right, back and left of where it is seen ahead, as turns show. None as `turned` says."""
-        after: dict[tuple[int, int], int] = {}  # what is seen after a turn, by what was seen before it and the quarters to the right
-        for action, before, then in zip(trace.actions[: size - 1], log.seen, log.seen[1:], strict=False):
+        after: dict[
+            tuple[int, int], int
+        ] = {}  # what is seen after a turn, by what was seen before it and the quarters to the right
+        for action, before, then in zip(
+            trace.actions[: size - 1], log.seen, log.seen[1:], strict=False
+        ):
             if action.kind is None:
                 return None
             if action.turn:
                 quarters = QUARTERS[action.turn]
-                if after.setdefault((before, quarters), then) != then or after.setdefault((then, 4 - quarters), before) != before:
+                if (
+                    after.setdefault((before, quarters), then) != then
+                    or after.setdefault((then, 4 - quarters), before) != before
+                ):
                     return None
         found: dict[int, list[int]] = {}
         for seen in dict.fromkeys(log.seen[:size]):
@@ -112,7 +130,12 @@ class Chart:
         return found
 
     @staticmethod
-    def framed(trace: Trace, log: Log, size: int | None = None, around: Mapping[int, Sequence[int]] | None = None) -> FramedChart | None:
+    def framed(
+        trace: Trace,
+        log: Log,
+        size: int | None = None,
+        around: Mapping[int, Sequence[int]] | None = None,
+    ) -> FramedChart | None:
         """The chart of the first steps (default all), where places have frames. None where some visit fits no frame: then there is no map.
 
         around  in the place of stars: for each observation, what is seen ahead, right, back and left of where it is seen ahead
@@ -121,11 +144,15 @@ class Chart:
         node: dict[tuple[int, int], int] = {}
         seen: list[int] = []
         node_of: list[int] = []
-        stars: list[tuple[int, ...]] = []  # of each visit, in a frame whose slot 0 the robot faces as it arrives
+        stars: list[
+            tuple[int, ...]
+        ] = []  # of each visit, in a frame whose slot 0 the robot faces as it arrives
         travels: list[tuple[int, int, int]] = []
         visit = slot = 0
         for t in range(size):
-            if t and (action := trace.actions[t - 1]).kind != "turn":  # a travel, or nothing is known of where it led
+            if (
+                t and (action := trace.actions[t - 1]).kind != "turn"
+            ):  # a travel, or nothing is known of where it led
                 visit, slot = visit + 1, 0
             elif t:
                 slot = (slot + QUARTERS[action.turn]) % 4
@@ -141,12 +168,17 @@ class Chart:
             if t and action.kind != "turn":
                 travels.append((node_of[-2], log.actions[t - 1], here))
         rotations = [
-            (s, -((k - j) % 4), x) for (v, j), s in node.items() for k in range(4) if k != j and (x := node.get((v, k))) is not None
+            (s, -((k - j) % 4), x)
+            for (v, j), s in node.items()
+            for k in range(4)
+            if k != j and (x := node.get((v, k))) is not None
         ]
         links = sorted([*travels, *rotations], key=lambda link: max(link[0], link[2]))
         facing = tuple(node)
         away = {(node_of[i], node_of[j]) for i, j in _pairs_within(log.pairs.elsewhere, size)}
-        excluded = {(node_of[i], node_of[j]) for i, j in _pairs_within(log.pairs.apart, size)} - away
+        excluded = {
+            (node_of[i], node_of[j]) for i, j in _pairs_within(log.pairs.apart, size)
+        } - away
         if any(i == j for i, j in excluded) or any(facing[i][0] == facing[j][0] for i, j in away):
             return None
         return FramedChart(
@@ -187,7 +219,9 @@ class FramedChart(Chart):
         """What is sent to another process: the fields, without the large arrays that are computed from them."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def apart(self, most: int | None = None, others: Sequence[int] | None = None) -> NDArray[np.bool_]:
+    def apart(
+        self, most: int | None = None, others: Sequence[int] | None = None
+    ) -> NDArray[np.bool_]:
         """Which pairs of nodes are apart: nodes x others. Two nodes are apart if their visits misfit when turned so that the two nodes face one slot.
 
         most    only the first so many nodes (default all)
@@ -203,14 +237,19 @@ class FramedChart(Chart):
             rows = np.flatnonzero(slots == slot)
             for other_slot in range(4):
                 columns = np.flatnonzero(other_slots == other_slot)
-                apart[np.ix_(rows, columns)] = self.misfits[(other_slot - slot) % 4][np.ix_(visits[rows], other_visits[columns])]
+                apart[np.ix_(rows, columns)] = self.misfits[(other_slot - slot) % 4][
+                    np.ix_(visits[rows], other_visits[columns])
+                ]
         apart |= (visits[:, None] == other_visits) & (slots[:, None] != other_slots)
         return apart
 
     @cached_property
     def leaves(self) -> dict[int, tuple[int, int]]:
         """For each visit but the last, the slot that it ends at, and the action there, which leads to the next visit."""
-        return {visit: (self.facing[node][1], action) for visit, (node, action, _) in enumerate(self.travels)}
+        return {
+            visit: (self.facing[node][1], action)
+            for visit, (node, action, _) in enumerate(self.travels)
+        }
 
     def turns(self, trace: Trace) -> list[tuple[int, str, int]]:
         """The turns of the trace from node to node, as (node, direction, node), each once, in the order of the trace."""
@@ -219,11 +258,17 @@ class FramedChart(Chart):
 
     def beginning(self, visits: int) -> FramedChart:
         """The chart of the first so many visits."""
-        nodes = next((node for node, (visit, _) in enumerate(self.facing) if visit == visits), len(self.facing))
-        steps = next((step for step, node in enumerate(self.node_of) if node >= nodes), len(self.node_of))
+        nodes = next(
+            (node for node, (visit, _) in enumerate(self.facing) if visit == visits),
+            len(self.facing),
+        )
+        steps = next(
+            (step for step, node in enumerate(self.node_of) if node >= nodes), len(self.node_of)
+        )
         links = tuple(link for link in self.links if max(link[0], link[2]) < nodes)
         elsewhere, away, excluded = (
-            frozenset(pair for pair in pairs if max(pair) < nodes) for pairs in (self.elsewhere, self.away, self.excluded)
+            frozenset(pair for pair in pairs if max(pair) < nodes)
+            for pairs in (self.elsewhere, self.away, self.excluded)
         )
         return FramedChart(
             self.seen[:nodes],
@@ -276,14 +321,19 @@ class FramedChart(Chart):
             views[visit, slot] = seen
         number: dict[tuple[int, ...], int] = {}
         # stars[r] numbers the star of each visit as it looks from slot r of the visit
-        stars = [np.array([number.setdefault(star[r:] + star[:r], len(number)) for star in self.stars]) for r in range(4)]
+        stars = [
+            np.array([number.setdefault(star[r:] + star[:r], len(number)) for star in self.stars])
+            for r in range(4)
+        ]
         leaves = np.full(visits, -1)  # the slot that a visit ends at, none for the last
         action = np.full(visits, -1)
         for visit, (slot, done) in self.leaves.items():
             leaves[visit], action[visit] = slot, done
         misfits = np.zeros((4, visits, visits), dtype=bool)
         for s, x in self.elsewhere:
-            misfits[:, self.facing[s][0], self.facing[x][0]] = misfits[:, self.facing[x][0], self.facing[s][0]] = True
+            misfits[:, self.facing[s][0], self.facing[x][0]] = misfits[
+                :, self.facing[x][0], self.facing[s][0]
+            ] = True
         for s, x in self.excluded:
             (i, faced), (j, other) = self.facing[s], self.facing[x]
             if i != j:

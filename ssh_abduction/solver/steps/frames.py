@@ -39,15 +39,23 @@ class Frames:
     def __init__(self, trace: Trace, stop: int | None = None) -> None:
         numbers: dict[Frame, int] = {}
         number_of: dict[Star, int] = {}
-        self.stars = [number_of.setdefault(step.gateways or Star(()), len(number_of)) for step in trace.steps[:stop]]
-        self.looks = [tuple(numbers.setdefault(frame, len(numbers)) for frame in star.frames) for star in number_of]
+        self.stars = [
+            number_of.setdefault(step.gateways or Star(()), len(number_of))
+            for step in trace.steps[:stop]
+        ]
+        self.looks = [
+            tuple(numbers.setdefault(frame, len(numbers)) for frame in star.frames)
+            for star in number_of
+        ]
         self.frames: tuple[Frame, ...] = tuple(numbers)
 
     def fits(self, x: int, y: int) -> Iterator[int]:
         """The shifts at which frame y, seen later, may be frame x."""
         first, then = self.frames[x], self.frames[y]
         if first.slots == then.slots:
-            yield from (shift for shift in range(max(first.slots, 1)) if rotations(first, then, shift))
+            yield from (
+                shift for shift in range(max(first.slots, 1)) if rotations(first, then, shift)
+            )
 
 
 @lru_cache(maxsize=2**16)
@@ -67,13 +75,21 @@ def rotations(first: Frame, then: Frame, shift: int) -> int:
 def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
     """Whether the robot may face the same way in both (alike), or the opposite way; or leave along the same path so."""
     found = rotations(first, then, shift)
-    return [way for way, towards in WAYS.items() if found >> towards & 1 or way == _declared(first, then, shift)]
+    return [
+        way
+        for way, towards in WAYS.items()
+        if found >> towards & 1 or way == _declared(first, then, shift)
+    ]
 
 
 def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
     """Which of these ways it faces, as far as bearings can tell."""
     found = rotations(first, then, shift)
-    return [way for way, towards in WAYS.items() if _surely(found, towards) or way == _declared(first, then, shift)]
+    return [
+        way
+        for way, towards in WAYS.items()
+        if _surely(found, towards) or way == _declared(first, then, shift)
+    ]
 
 
 def may_turn(action: Action, first: Frame, then: Frame, shift: int) -> bool:
@@ -85,8 +101,14 @@ def ends(frame: Frame) -> list[str]:
     """Where no gateway leads on along the robot's path: ahead, behind. It may be off straight ahead, or straight behind, by twice its spread."""
     if _way(frame) is not None:
         return []
-    near = [(bearing, 2 * spread) for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)]
-    return [way for way, towards in (("ahead", 0), ("behind", 180)) if not any(_about(*gateway) >> towards & 1 for gateway in near)]
+    near = [
+        (bearing, 2 * spread) for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
+    ]
+    return [
+        way
+        for way, towards in (("ahead", 0), ("behind", 180))
+        if not any(_about(*gateway) >> towards & 1 for gateway in near)
+    ]
 
 
 def heading(first: Frame, then: Frame, shift: int) -> int:
@@ -97,7 +119,10 @@ def heading(first: Frame, then: Frame, shift: int) -> int:
 def middle(found: int) -> int:
     """The rotation in the middle of a set of rotations; 0 where it holds all rotations or none."""
     starts = [r for r in members(found) if not found >> (r - 1) % 360 & 1]
-    lengths = {start: next(length for length in range(1, 361) if not found >> (start + length) % 360 & 1) for start in starts}
+    lengths = {
+        start: next(length for length in range(1, 361) if not found >> (start + length) % 360 & 1)
+        for start in starts
+    }
     longest = max(starts, key=lambda start: lengths[start], default=0)
     return (longest + (lengths.get(longest, 1) - 1) // 2) % 360
 
@@ -117,8 +142,14 @@ def _turned_by(action: Action, first: Frame) -> int:
     if action.turn == "around":
         faced = next((k for k in range(first.slots) if first.faces(k)), None)
         behind = None if faced is None else first.opposite[faced]
-        return 1 << 180 | (0 if behind is None else _about(first.bearings[behind], first.spreads[behind]))
-    return _between(LEAST_TURN + 1, 179 - LEAST_TURN) if action.turn == "right" else _between(181 + LEAST_TURN, 359 - LEAST_TURN)
+        return 1 << 180 | (
+            0 if behind is None else _about(first.bearings[behind], first.spreads[behind])
+        )
+    return (
+        _between(LEAST_TURN + 1, 179 - LEAST_TURN)
+        if action.turn == "right"
+        else _between(181 + LEAST_TURN, 359 - LEAST_TURN)
+    )
 
 
 def _declared(first: Frame, then: Frame, shift: int) -> str | None:

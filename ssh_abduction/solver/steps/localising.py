@@ -79,7 +79,9 @@ class _Localiser:
         self._slots: list[list[int]] = [[] for _ in chart.stars]  # the slots that each visit faces
         for visit, slot in chart.facing:
             self._slots[visit].append(slot)
-        self._faced = {faced(state, slot) for visit, state in states.items() for slot in self._slots[visit]}
+        self._faced = {
+            faced(state, slot) for visit, state in states.items() for slot in self._slots[visit]
+        }
         self._leads = {
             (faced(state, slot), action): states[visit + 1]
             for visit, state in states.items()
@@ -110,7 +112,11 @@ class _Localiser:
                     break
                 possible = possible or self._anywhere(visit)
             found.append(possible)
-        return Located((), tuple(sorted(missed))) if missed else Located(tuple(state for (state,) in found))
+        return (
+            Located((), tuple(sorted(missed)))
+            if missed
+            else Located(tuple(state for (state,) in found))
+        )
 
     def _stretch_up_to(self, visit: int) -> Iterable[int]:
         """A stretch of visits, up to this one, that is long enough to show that the map does not explain it, whatever came before."""
@@ -141,11 +147,17 @@ class _Localiser:
     def _is_unknown(self, possible: set[State], visit: int) -> bool:
         """Whether it is known where a visit is, but not where its action leads."""
         slot, action = self._leaves[visit]
-        return len(possible) == 1 and not any((faced(state, slot), action) in self._leads for state in possible)
+        return len(possible) == 1 and not any(
+            (faced(state, slot), action) in self._leads for state in possible
+        )
 
     def _is_new(self, possible: set[State], visit: int) -> bool:
         """Whether it is known where a visit is, and it faces a slot there that no visit of the map faced."""
-        return len(possible) == 1 and any(faced(state, slot) not in self._faced for state in possible for slot in self._slots[visit])
+        return len(possible) == 1 and any(
+            faced(state, slot) not in self._faced
+            for state in possible
+            for slot in self._slots[visit]
+        )
 
 
 def faced(state: State, slot: int) -> State:

@@ -69,7 +69,12 @@ class Log:
         self.actions = [actions.setdefault(a.name, len(actions)) for a in trace.actions]
         self.seen = [seen.setdefault(observation(step, theory), len(seen)) for step in trace.steps]
 
-    def replay(self, labels: Sequence[int], known: int | None = None, place_of: Sequence[int | None] | None = None) -> Replay:
+    def replay(
+        self,
+        labels: Sequence[int],
+        known: int | None = None,
+        place_of: Sequence[int | None] | None = None,
+    ) -> Replay:
         """Replay the trace over the map that `labels` make of its first steps.
 
         known     how many of these steps make the links of the map (default all)
@@ -121,7 +126,9 @@ class Log:
             for label in alike if left > 0 else ():
                 links[key] = label
                 found = [label]
-                while (end := t + len(found)) < len(seen) and (following := links.get((found[-1], actions[end - 1]))) is not None:
+                while (end := t + len(found)) < len(seen) and (
+                    following := links.get((found[-1], actions[end - 1]))
+                ) is not None:
                     if shows[following] != seen[end]:
                         break
                     found.append(following)

@@ -78,7 +78,9 @@ def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
 
 def _clique(views: Sequence[int], actions: Sequence[int], steps: int) -> list[int]:
     """A largest clique of the first steps that are apart."""
-    from ssh_abduction.solver.steps.apart import Continuations  # loads numpy, which takes longer than to solve a short trace
+    from ssh_abduction.solver.steps.apart import (
+        Continuations,
+    )  # loads numpy, which takes longer than to solve a short trace
 
     return Continuations(views[:steps], actions[: steps - 1]).clique()
 

@@ -49,14 +49,24 @@ def evidence_of(theory: Theory) -> tuple[Evidence, ...]:
     return tuple(kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms)
 
 
-def said_by(kinds: Iterable[Evidence], trace: Trace, refused: Mapping[str, int]) -> dict[str, dict[str, int]]:
+def said_by(
+    kinds: Iterable[Evidence], trace: Trace, refused: Mapping[str, int]
+) -> dict[str, dict[str, int]]:
     """For each kind of evidence that takes part, how many pairs of steps of a trace it excludes, and how many sets of equalities it refused.
 
     refused  how many sets, by the name of the kind; 0 for those that are not there
     """
-    return {kind.name: {"pairs": sum(map(len, kind.pairs(trace).apart.values())), "refused": refused.get(kind.name, 0)} for kind in kinds}
+    return {
+        kind.name: {
+            "pairs": sum(map(len, kind.pairs(trace).apart.values())),
+            "refused": refused.get(kind.name, 0),
+        }
+        for kind in kinds
+    }
 
 
 def pairs_of(trace: Trace, theory: Theory) -> Pairs:
     """What all evidence says of pairs of steps of a trace that nothing excuses."""
-    return Pairs.joined([evidence.pairs(trace) for evidence in evidence_of(theory) if evidence.axiom in theory.hard])
+    return Pairs.joined(
+        [evidence.pairs(trace) for evidence in evidence_of(theory) if evidence.axiom in theory.hard]
+    )

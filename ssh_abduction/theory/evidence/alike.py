@@ -31,7 +31,12 @@ class Alike:
         return cls("functional_view" in theory.hard and not theory.unknown_views)
 
     def pairs(self, trace: Trace) -> Pairs:
-        return _pairs(tuple((step.view if self.has_one_view else None, step.gateways or Star(())) for step in trace.steps))
+        return _pairs(
+            tuple(
+                (step.view if self.has_one_view else None, step.gateways or Star(()))
+                for step in trace.steps
+            )
+        )
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
         return ""
@@ -47,7 +52,9 @@ def _pairs(seen: tuple[_Seen, ...]) -> Pairs:
     apart: dict[int, frozenset[int]] = {}
     for t, (view, star) in enumerate(seen):
         others = steps.setdefault(view, {})
-        if unlike := [i for other, there in others.items() if not are_alike(other, star) for i in there]:
+        if unlike := [
+            i for other, there in others.items() if not are_alike(other, star) for i in there
+        ]:
             apart[t] = frozenset(unlike)
         others.setdefault(star, []).append(t)
     return Pairs(apart)
@@ -70,7 +77,11 @@ def _pairable(one: Star, other: Star) -> bool:
         """Find a partner for gateway k, and others for those whose partners it takes."""
         here = one.gateways[k]
         for j, there in enumerate(other.gateways):
-            if j not in tried and abs((here.bearing - there.bearing + 180) % 360 - 180) <= here.spread + there.spread:
+            if (
+                j not in tried
+                and abs((here.bearing - there.bearing + 180) % 360 - 180)
+                <= here.spread + there.spread
+            ):
                 tried.add(j)
                 if j not in partner or pair(partner[j], tried):
                     partner[j] = k

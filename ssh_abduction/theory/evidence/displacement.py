@@ -67,7 +67,12 @@ class Displacement:
         # Where displacements may be wrong, each pair of steps is excused by what lies between its own steps: so it does not stand for others of its visits.
         turns_stay = "turn_stays" in hard and not theory.jumped
         return cls(
-            theory.reject, theory.joint, theory.returns, topological, turns_stay, "functional_view" in hard and not theory.unknown_views
+            theory.reject,
+            theory.joint,
+            theory.returns,
+            topological,
+            turns_stay,
+            "functional_view" in hard and not theory.unknown_views,
         )
 
     def pairs(self, trace: Trace) -> Pairs:
@@ -79,7 +84,9 @@ class Displacement:
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         if self.joint <= 1:
             return None
-        return self.returns_of(trace.without_displacements_at(jumped(ssh_map))).refused_together(ssh_map, since)
+        return self.returns_of(trace.without_displacements_at(jumped(ssh_map))).refused_together(
+            ssh_map, since
+        )
 
     def returns_of(self, trace: Trace) -> Returns:
         """The returns that a trace may have."""
@@ -101,7 +108,14 @@ def _returns(evidence: Displacement, trace: Trace) -> Returns:
     for known in kept:
         if known.trace is trace and known.evidence == evidence:
             return known
-    before = next((known for known in reversed(kept) if known.evidence == evidence and _has_grown(known.trace, trace)), None)
+    before = next(
+        (
+            known
+            for known in reversed(kept)
+            if known.evidence == evidence and _has_grown(known.trace, trace)
+        ),
+        None,
+    )
     reckoning = next((known.reckoning for known in kept if known.trace is trace), None)
     found = Returns(evidence, trace, before, reckoning)
     if before:
@@ -130,7 +144,13 @@ def count_returns(trace: Trace, theory: Theory) -> int:
 class Returns:
     """The returns that a trace may have, and which of them are refused."""
 
-    def __init__(self, evidence: Displacement, trace: Trace, before: Returns | None = None, reckoning: Reckoning | None = None) -> None:
+    def __init__(
+        self,
+        evidence: Displacement,
+        trace: Trace,
+        before: Returns | None = None,
+        reckoning: Reckoning | None = None,
+    ) -> None:
         """Nothing is tested yet, but what was tested before.
 
         before     the returns of the first steps, if these are known
@@ -139,9 +159,15 @@ class Returns:
         from ssh_abduction.theory.evidence.loops import Reckoning  # loads numpy
 
         self.evidence, self.trace = evidence, trace
-        self.reckoning: Reckoning = reckoning or Reckoning(trace, before.reckoning if before else None)
-        self._accepted: dict[_Course, Together] = dict(before._accepted) if before else {}  # the last one last
-        self._refused: list[frozenset[Equality]] = list(before._refused) if before else []  # sets of two returns, the last one last
+        self.reckoning: Reckoning = reckoning or Reckoning(
+            trace, before.reckoning if before else None
+        )
+        self._accepted: dict[_Course, Together] = (
+            dict(before._accepted) if before else {}
+        )  # the last one last
+        self._refused: list[frozenset[Equality]] = (
+            list(before._refused) if before else []
+        )  # sets of two returns, the last one last
         self._pairs: Pairs | None = before._pairs if before else None
         self._likely: int | None = before._likely if before else None
         if before and (self._pairs is not None or self._likely is not None):
@@ -176,7 +202,10 @@ class Returns:
         for t, step in enumerate(self.trace.steps):
             views[step.view if self.evidence.has_one_view else None].append(t)
         places = [self.arrivals] if self.evidence.has_places else []
-        return {True: self._loops_within(places, since), False: self._loops_within(list(views.values()), since)}
+        return {
+            True: self._loops_within(places, since),
+            False: self._loops_within(list(views.values()), since),
+        }
 
     def _loops_within(self, groups: Sequence[Sequence[int]], since: int = 0) -> tuple[Steps, Steps]:
         """All loops between two steps of one group about which displacements say something, and which end at a step from `since` on."""
@@ -192,10 +221,16 @@ class Returns:
             starts = np.searchsorted(steps, begins[steps[new]])
             counts = new - starts
             last = np.repeat(new, counts)
-            first = np.arange(len(last)) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(starts, counts)
+            first = (
+                np.arange(len(last))
+                - np.repeat(np.cumsum(counts) - counts, counts)
+                + np.repeat(starts, counts)
+            )
             found.append((steps[first], steps[last]))
         empty = np.zeros(0, dtype=int)
-        return np.concatenate([empty, *(i for i, _ in found)]), np.concatenate([empty, *(j for _, j in found)])
+        return np.concatenate([empty, *(i for i, _ in found)]), np.concatenate(
+            [empty, *(j for _, j in found)]
+        )
 
     def _pairs_of(self, tested: _Tested, since: int = 0) -> Pairs:
         """The pairs of steps that are told apart by these returns, as they are refused alone. They are all, or those that end at the steps which are new."""
@@ -237,12 +272,18 @@ class Returns:
         from ssh_abduction.theory.evidence.loops import chi_squares
 
         most, which = self.threshold(2 if places else 3, together=False), 0 if places else 1
-        drifts = [number for number, unlikely in enumerate(self.reckoning.unlikely) if unlikely <= most]
-        for numbers in filter(None, (drifts[:1], drifts[1:])):  # most true returns close without a drift, and most false ones with none
+        drifts = [
+            number for number, unlikely in enumerate(self.reckoning.unlikely) if unlikely <= most
+        ]
+        for numbers in filter(
+            None, (drifts[:1], drifts[1:])
+        ):  # most true returns close without a drift, and most false ones with none
             refused = np.ones(len(first), dtype=bool)
             for part in _parts(len(first), AT_A_TIME // max(len(numbers), 1)):
                 i, j = first[part], last[part]
-                closings = self.reckoning.closings(np.repeat(numbers, len(i)), np.tile(i, len(numbers)), np.tile(j, len(numbers)))
+                closings = self.reckoning.closings(
+                    np.repeat(numbers, len(i)), np.tile(i, len(numbers)), np.tile(j, len(numbers))
+                )
                 squares = chi_squares(*closings)[which].reshape(len(numbers), len(i))
                 unlikely = np.array([self.reckoning.unlikely[number] for number in numbers])
                 refused[part] = (squares + unlikely[:, None] > most).all(0)
@@ -261,9 +302,13 @@ class Returns:
         views = self.trace.views
         for j, others in elsewhere.items():
             for t in range(max(j, since), end[j]):
-                yield from ((s, t) for i in others for s in range(i, end[i]) if views[s] == views[t])
+                yield from (
+                    (s, t) for i in others for s in range(i, end[i]) if views[s] == views[t]
+                )
 
-    def _returns_of(self, labels: tuple[int, ...], places: tuple[int | None, ...], since: int = 0) -> Steps:
+    def _returns_of(
+        self, labels: tuple[int, ...], places: tuple[int | None, ...], since: int = 0
+    ) -> Steps:
         """The returns of a map about which displacements say something and that end at a step from `since` on, as rows by last step: pairs of visits that
         begin at one place, or at one dstate.
 
@@ -272,7 +317,9 @@ class Returns:
         """
         return self._returns_among(labels, [places[label] for label in labels], since)
 
-    def _returns_among(self, labels: Sequence[int], places: Sequence[int | None], since: int = 0) -> Steps:
+    def _returns_among(
+        self, labels: Sequence[int], places: Sequence[int | None], since: int = 0
+    ) -> Steps:
         """The same, where `places` has the place of each step."""
         import numpy as np
 
@@ -302,7 +349,11 @@ class Returns:
         course = _Course.of(labels, places)
         if course in self._accepted:
             return None
-        if (known := next((found for found in reversed(self._refused) if _hold(found, labels, places)), None)) is not None:
+        if (
+            known := next(
+                (found for found in reversed(self._refused) if _hold(found, labels, places)), None
+            )
+        ) is not None:
             return known
         before = self._accepted.pop(_Course.of(labels[:since], places), None)
         rows = self._returns_of(labels, places, since if before else 0)
@@ -311,7 +362,10 @@ class Returns:
         together = self._together(rows, before)
         worst = together.worst(rows[:, 1] >= since if since else self._is_new(rows))
         if worst is not None:
-            refused = frozenset(Equality(int(i), int(j), "dstate" if one_dstate else "place") for i, j, one_dstate in worst)
+            refused = frozenset(
+                Equality(int(i), int(j), "dstate" if one_dstate else "place")
+                for i, j, one_dstate in worst
+            )
             self._refused = [*self._refused[-REMEMBERED:], refused]
             return refused
         self._accepted[course] = together
@@ -319,24 +373,40 @@ class Returns:
             del self._accepted[next(iter(self._accepted))]
         return None
 
-    def refused_at(self, labels: Sequence[int], places: Sequence[int | None], step: int) -> frozenset[Equality] | None:
+    def refused_at(
+        self, labels: Sequence[int], places: Sequence[int | None], step: int
+    ) -> frozenset[Equality] | None:
         """The two returns that are refused together most clearly, though none is alone, and the later of which ends at this step; None where no two are.
 
         labels, places  the dstate and the place of each step, which need not be those of a map
         """
         alone = self.pairs
         rows = self._returns_among(labels[: step + 1], places)
-        refused = [i in (alone.apart if one_dstate else alone.elsewhere).get(j, ()) for i, j, one_dstate in rows.tolist()]
+        refused = [
+            i in (alone.apart if one_dstate else alone.elsewhere).get(j, ())
+            for i, j, one_dstate in rows.tolist()
+        ]
         rows = rows[[not is_refused for is_refused in refused]]
         worst = self._together(rows).worst(rows[:, 1] == step)
         if worst is None:
             return None
-        return frozenset(Equality(int(i), int(j), "dstate" if one_dstate else "place") for i, j, one_dstate in worst)
+        return frozenset(
+            Equality(int(i), int(j), "dstate" if one_dstate else "place")
+            for i, j, one_dstate in worst
+        )
 
-    def refused_alone_at(self, labels: Sequence[int], places: Sequence[int | None], step: int) -> list[Equality]:
+    def refused_alone_at(
+        self, labels: Sequence[int], places: Sequence[int | None], step: int
+    ) -> list[Equality]:
         """The returns that are refused alone and end at this step, where `labels` and `places` have the dstate and the place of each step."""
-        elsewhere = [Equality(i, step, "place") for i in self.pairs.elsewhere.get(step, ()) if places[i] == places[step] is not None]
-        return elsewhere + [Equality(i, step) for i in self.pairs.apart.get(step, ()) if labels[i] == labels[step]]
+        elsewhere = [
+            Equality(i, step, "place")
+            for i in self.pairs.elsewhere.get(step, ())
+            if places[i] == places[step] is not None
+        ]
+        return elsewhere + [
+            Equality(i, step) for i in self.pairs.apart.get(step, ()) if labels[i] == labels[step]
+        ]
 
     def excess(self, refused: Equality) -> float:
         """How clearly a return is refused alone: its chi-square, less the threshold."""
@@ -345,7 +415,9 @@ class Returns:
         from ssh_abduction.theory.evidence.loops import chi_squares
 
         first, last, which = refused.first, refused.second, int(refused.of == "dstate")
-        squares = chi_squares(*self.reckoning.loops_of_unknown_drift().closings(np.array([first]), np.array([last])))
+        squares = chi_squares(
+            *self.reckoning.loops_of_unknown_drift().closings(np.array([first]), np.array([last]))
+        )
         return float(squares[which][0]) - self.threshold(2 + which, together=False)
 
     def why_apart(self, first: int, last: int, number_from: int = 0) -> str | None:
@@ -356,12 +428,19 @@ class Returns:
         named = f"steps {first + number_from} and {last + number_from}"
         i, j = self._begin_of_visit(first), self._begin_of_visit(last)
         if i in self.pairs.elsewhere.get(j, ()):
-            they = "they" if (i, j) == (first, last) else f"steps {i + number_from} and {j + number_from}, where their visits begin,"
+            they = (
+                "they"
+                if (i, j) == (first, last)
+                else f"steps {i + number_from} and {j + number_from}, where their visits begin,"
+            )
             return f"{named} are not at one place: by the odometry {they} are {self.closing(i, j).metres} apart"
         if first not in self.pairs.apart.get(last, ()):
             return None
         closing = self.closing(first, last)
-        far, turned = closing.square_of_position > self.threshold(2, False), closing.square_of_heading > self.threshold(1, False)
+        far, turned = (
+            closing.square_of_position > self.threshold(2, False),
+            closing.square_of_heading > self.threshold(1, False),
+        )
         if turned and not far:
             return f"{named} are not one dstate: by the odometry their headings are {closing.degrees} apart"
         off = closing.metres if far else f"{closing.metres} and {closing.degrees}"
@@ -371,11 +450,21 @@ class Returns:
         """What keeps two returns, which are refused together, from being true, in words."""
         ordered = sorted(returns, key=lambda e: (e.second, e.first, e.of))
         closings = [self.closing(e.first, e.second) for e in ordered]
-        named = ", and ".join(f"steps {e.first + number_from} and {e.second + number_from}" for e in ordered)
+        named = ", and ".join(
+            f"steps {e.first + number_from} and {e.second + number_from}" for e in ordered
+        )
         ways = " and ".join(f"{closing.way:.0f} m" for closing in closings)
         sizes = " and ".join(f"{closing.size:.1f} m" for closing in closings)
-        turned = [abs(math.degrees(closing.turned)) for e, closing in zip(ordered, closings, strict=True) if e.of == "dstate"]
-        headings = f", and {' and '.join(f'{angle:.0f}' for angle in turned)} degrees in heading" if any(map(round, turned)) else ""
+        turned = [
+            abs(math.degrees(closing.turned))
+            for e, closing in zip(ordered, closings, strict=True)
+            if e.of == "dstate"
+        ]
+        headings = (
+            f", and {' and '.join(f'{angle:.0f}' for angle in turned)} degrees in heading"
+            if any(map(round, turned))
+            else ""
+        )
         return f"{named} cannot both be returns: the loops of {ways} close {sizes} off{headings}"
 
     def closing(self, first: int, last: int) -> Closing:
@@ -415,7 +504,9 @@ class Returns:
             return np.ones(len(rows), dtype=bool)
         known = next(reversed(self._accepted.values())).rows
         size = len(self.trace)
-        codes, known_codes = ((found[:, 0] * size + found[:, 1]) * 2 + found[:, 2] for found in (rows, known))
+        codes, known_codes = (
+            (found[:, 0] * size + found[:, 1]) * 2 + found[:, 2] for found in (rows, known)
+        )
         new: Mask = np.isin(codes, known_codes, invert=True)
         return new
 
@@ -449,7 +540,9 @@ class Closing:
     @property
     def degrees(self) -> str:
         """90 ± 3 degrees"""
-        return f"{abs(math.degrees(self.turned)):.0f} ± {math.degrees(self.turned_sigma):.0f} degrees"
+        return (
+            f"{abs(math.degrees(self.turned)):.0f} ± {math.degrees(self.turned_sigma):.0f} degrees"
+        )
 
 
 class _Course(NamedTuple):
@@ -464,7 +557,9 @@ class _Course(NamedTuple):
         return _Course(labels, places[: max(labels, default=-1) + 1])
 
 
-def _hold(equalities: Collection[Equality], labels: Sequence[int], places: Sequence[int | None]) -> bool:
+def _hold(
+    equalities: Collection[Equality], labels: Sequence[int], places: Sequence[int | None]
+) -> bool:
     """Whether all of these equalities hold, of two steps each, the first of which comes first.
 
     labels  the dstate of each step

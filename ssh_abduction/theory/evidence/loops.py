@@ -84,7 +84,9 @@ class Loops:
         """
         odometry = trace.odometry or Odometry()
         sums = _sums(trace, 0, len(trace), np.array([bend]), np.zeros((1, COLUMNS)))[0]
-        return Loops._of(sums, _parts(trace), odometry, bend, odometry.bend if drift is None else drift)
+        return Loops._of(
+            sums, _parts(trace), odometry, bend, odometry.bend if drift is None else drift
+        )
 
     @staticmethod
     def _of(sums: Array, part: Steps, odometry: Odometry, bend: float, drift: float) -> Loops:
@@ -100,15 +102,21 @@ class Loops:
         covariance = self.noise(i, j) + self.repeated(i, j)
         lost = self._heading_variance(i, j)
         moved_by_heading = self._moved_by_heading(i, j)
-        bent = (SIGMAS / 2) ** 2 * lost * moved_by_heading + ROUNDED**2 + 2 * self.odometry.offset**2
+        bent = (
+            (SIGMAS / 2) ** 2 * lost * moved_by_heading + ROUNDED**2 + 2 * self.odometry.offset**2
+        )
         covariance[:, 0, 0] += bent
         covariance[:, 1, 1] += bent
         covariance[:, 2, 2] += ROUNDED**2 + 2 * self.odometry.facing**2
         return closing, covariance
 
-    def shared(self, loops: tuple[ArrayLike, ArrayLike], others: tuple[ArrayLike, ArrayLike]) -> Array:
+    def shared(
+        self, loops: tuple[ArrayLike, ArrayLike], others: tuple[ArrayLike, ArrayLike]
+    ) -> Array:
         """The covariance between how far off loops close and how far off others do, m x 3 x 3: by the displacements that both have, and what is wrong with all."""
-        (i, j), (k, m) = (tuple(np.asarray(steps, dtype=int) for steps in pair) for pair in (loops, others))
+        (i, j), (k, m) = (
+            tuple(np.asarray(steps, dtype=int) for steps in pair) for pair in (loops, others)
+        )
         begin, end = np.maximum(i, k), np.minimum(j, m)
         covariance = self._white(begin, np.maximum(begin, end), j, m)
         return covariance + self._repeated((i, j), (k, m))
@@ -116,8 +124,16 @@ class Loops:
     def _white(self, i: Steps, j: Steps, end: Steps, other_end: Steps) -> Array:
         """What the noise of the displacements after step i, up to j, contributes to the covariance between loops that end at two steps."""
         sums = self.moments[j] - self.moments[i]
-        position, mixed, mixed_across = sums[:, :4].reshape(-1, 2, 2), sums[:, 4:6], sums[:, 6:10].reshape(-1, 2, 2)
-        angle, angle_across, angle_square = sums[:, 10], sums[:, 11:13], sums[:, 13:17].reshape(-1, 2, 2)
+        position, mixed, mixed_across = (
+            sums[:, :4].reshape(-1, 2, 2),
+            sums[:, 4:6],
+            sums[:, 6:10].reshape(-1, 2, 2),
+        )
+        angle, angle_across, angle_square = (
+            sums[:, 10],
+            sums[:, 11:13],
+            sums[:, 13:17].reshape(-1, 2, 2),
+        )
         a, b = _quarter_turned(self.poses[end, :2]), _quarter_turned(self.poses[other_end, :2])
         covariance = np.empty((len(sums), 3, 3))
         covariance[:, :2, :2] = (
@@ -155,18 +171,31 @@ class Loops:
     def _by_bend(self, i: Steps, j: Steps) -> Array:
         """How a drift of 1 radian a metre moves the end of each loop."""
         sums = self.ways[j] - self.ways[i]
-        return np.hstack([sums[:, :1] * _quarter_turned(self.poses[j, :2]) - sums[:, 1:], sums[:, :1]])
+        return np.hstack(
+            [sums[:, :1] * _quarter_turned(self.poses[j, :2]) - sums[:, 1:], sums[:, :1]]
+        )
 
     def _heading_variance(self, i: Steps, j: Steps) -> Array:
-        variance: Array = self.moments[j, 10] - self.moments[i, 10] + (self.drift * (self.ways[j, 0] - self.ways[i, 0])) ** 2
+        variance: Array = (
+            self.moments[j, 10]
+            - self.moments[i, 10]
+            + (self.drift * (self.ways[j, 0] - self.ways[i, 0])) ** 2
+        )
         return variance
 
     def _moved_by_heading(self, i: Steps, j: Steps) -> Array:
         """The variance of the end of each loop, in both directions together, that comes of errors of heading."""
         sums = self.moments[j] - self.moments[i]
         end = _quarter_turned(self.poses[j, :2])
-        white = sums[:, 10] * (end**2).sum(1) - 2 * (end * sums[:, 11:13]).sum(1) + sums[:, 13] + sums[:, 16]
-        moved: Array = np.maximum(white, 0.0) + self.drift**2 * (self._by_bend(i, j)[:, :2] ** 2).sum(1)
+        white = (
+            sums[:, 10] * (end**2).sum(1)
+            - 2 * (end * sums[:, 11:13]).sum(1)
+            + sums[:, 13]
+            + sums[:, 16]
+        )
+        moved: Array = np.maximum(white, 0.0) + self.drift**2 * (
+            self._by_bend(i, j)[:, :2] ** 2
+        ).sum(1)
         return moved
 
     def of_ends(self, end: int) -> Array:
@@ -201,7 +230,11 @@ class Reckoning:
         self.odometry = trace.odometry or Odometry()
         sigma = self.odometry.bend
         step = sigma / BENDS_A_SIGMA
-        numbers = sorted(range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1), key=abs) if sigma else [0]
+        numbers = (
+            sorted(range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1), key=abs)
+            if sigma
+            else [0]
+        )
         self.bends = [number * step for number in numbers]
         # Each drift stands for those around it, and counts as the nearest of them.
         self.unlikely = [(max(abs(number) - 0.5, 0.0) / BENDS_A_SIGMA) ** 2 for number in numbers]
@@ -215,16 +248,28 @@ class Reckoning:
             new[:, at - start : stop - start] = _sums(trace, at, stop, np.array(self.bends), last)
             last = new[:, stop - start - 1]
         self._rows: _Rows = before._rows.extended(start, new) if before else _Rows(new)
-        self._part: Steps = np.concatenate([before._part, _parts(trace, start, int(before._part[-1]))]) if before else _parts(trace)
+        self._part: Steps = (
+            np.concatenate([before._part, _parts(trace, start, int(before._part[-1]))])
+            if before
+            else _parts(trace)
+        )
         self.begins: Steps = self._begins(before.begins if before else np.zeros(0, dtype=int))
 
     def loops(self, number: int) -> Loops:
         """The loops for one of the drifts."""
-        return Loops._of(self._rows.array[number, : self._size], self._part, self.odometry, self.bends[number], self._drift)
+        return Loops._of(
+            self._rows.array[number, : self._size],
+            self._part,
+            self.odometry,
+            self.bends[number],
+            self._drift,
+        )
 
     def loops_of_unknown_drift(self) -> Loops:
         """The loops without a drift, where any that the odometry allows is left."""
-        return Loops._of(self._rows.array[0, : self._size], self._part, self.odometry, 0.0, self.odometry.bend)
+        return Loops._of(
+            self._rows.array[0, : self._size], self._part, self.odometry, 0.0, self.odometry.bend
+        )
 
     def closings(self, numbers: Steps, first: Steps, last: Steps) -> tuple[Array, Array]:
         """As `Loops.closings`, but for loops each of which has a drift of its own."""
@@ -238,11 +283,20 @@ class Reckoning:
         start = len(known)
         begin = int(known[-1]) if start else 0
         since = slice(begin, None)
-        angle, way, part = loops.moments[since, 10].tolist(), loops.ways[since, 0].tolist(), loops.part[since].tolist()
+        angle, way, part = (
+            loops.moments[since, 10].tolist(),
+            loops.ways[since, 0].tolist(),
+            loops.part[since].tolist(),
+        )
         found, shift = [], begin
-        for t in range(start - shift, len(part)):  # the beginning never goes back, as the heading gets no better
+        for t in range(
+            start - shift, len(part)
+        ):  # the beginning never goes back, as the heading gets no better
             here = begin - shift
-            while part[here] < part[t] or angle[t] - angle[here] + (self._drift * (way[t] - way[here])) ** 2 > LOST**2:
+            while (
+                part[here] < part[t]
+                or angle[t] - angle[here] + (self._drift * (way[t] - way[here])) ** 2 > LOST**2
+            ):
                 here += 1
             begin = here + shift
             found.append(begin)
@@ -296,7 +350,11 @@ def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Arr
     position = _summed(last[:, :2], onward)
     rotation = np.zeros((*before.shape, 3, 3))
     rotation[..., 0, 0] = rotation[..., 1, 1] = np.cos(before)
-    rotation[..., 1, 0], rotation[..., 0, 1], rotation[..., 2, 2] = np.sin(before), -np.sin(before), 1.0
+    rotation[..., 1, 0], rotation[..., 0, 1], rotation[..., 2, 2] = (
+        np.sin(before),
+        -np.sin(before),
+        1.0,
+    )
     noise = rotation @ noise @ rotation.swapaxes(-1, -2)
     across = _quarter_turned(position)
     angle, mixed = noise[..., 2, 2], noise[..., :2, 2]
@@ -308,7 +366,9 @@ def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Arr
         (mixed[..., :, None] * across[..., None, :]).reshape(*before.shape, 4),
         angle[..., None],
         angle[..., None] * across,
-        (angle[..., None, None] * across[..., :, None] * across[..., None, :]).reshape(*before.shape, 4),
+        (angle[..., None, None] * across[..., :, None] * across[..., None, :]).reshape(
+            *before.shape, 4
+        ),
         ways,
         ways * _quarter_turned(middle),
     ]
@@ -337,7 +397,13 @@ def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
 def turned(vectors: Array, angles: Array) -> Array:
     """Vectors, ... x 2, turned counterclockwise by angles."""
     cos, sin = np.cos(angles), np.sin(angles)
-    return np.stack([cos * vectors[..., 0] - sin * vectors[..., 1], sin * vectors[..., 0] + cos * vectors[..., 1]], axis=-1)
+    return np.stack(
+        [
+            cos * vectors[..., 0] - sin * vectors[..., 1],
+            sin * vectors[..., 0] + cos * vectors[..., 1],
+        ],
+        axis=-1,
+    )
 
 
 def _quarter_turned(vectors: Array) -> Array:

@@ -97,10 +97,19 @@ class Planar:
         moves = _fewest(moves, lambda fewer: self._cross(trace, fewer, labels, at, distinct))
         steps = sorted({step for t in moves for step in (t, t + 1)})
         if not distinct:
-            labels = _split(labels, steps, lambda finer: self._cross(trace, moves, finer, at, False))
+            labels = _split(
+                labels, steps, lambda finer: self._cross(trace, moves, finer, at, False)
+            )
         return frozenset(_description(labels, at, steps, distinct))
 
-    def _cross(self, trace: Trace, moves: Sequence[int], labels: Mapping[int, int], at: Mapping[int, int], distinct: bool) -> bool:
+    def _cross(
+        self,
+        trace: Trace,
+        moves: Sequence[int],
+        labels: Mapping[int, int],
+        at: Mapping[int, int],
+        distinct: bool,
+    ) -> bool:
         """Whether these travels and turns alone cannot be drawn.
 
         moves     the steps at which they begin
@@ -109,7 +118,11 @@ class Planar:
         distinct  no two dstates face one slot
         """
         shown = _Shown(trace, moves, labels, at, stars=self.stars)
-        return not (_can_draw_framed(shown, self.turns, distinct) if self.frames else _can_draw_sided(shown, self.crossing))
+        return not (
+            _can_draw_framed(shown, self.turns, distinct)
+            if self.frames
+            else _can_draw_sided(shown, self.crossing)
+        )
 
 
 def _first_moves(trace: Trace, labels: Sequence[int]) -> list[int]:
@@ -131,7 +144,15 @@ class _Shown:
     stars    the openings seen at each dstate, from ahead on clockwise
     """
 
-    def __init__(self, trace: Trace, moves: Sequence[int], labels: Mapping[int, int], at: Mapping[int, int], *, stars: bool) -> None:
+    def __init__(
+        self,
+        trace: Trace,
+        moves: Sequence[int],
+        labels: Mapping[int, int],
+        at: Mapping[int, int],
+        *,
+        stars: bool,
+    ) -> None:
         self.travels: dict[tuple[int, int], None] = {}
         self.turns: dict[tuple[int, str, int], None] = {}
         self.places: dict[int, int] = {}
@@ -171,11 +192,18 @@ def _can_draw_framed(shown: _Shown, turns: bool, distinct: bool) -> bool:
     def ways(chosen: dict[End, int], place: int) -> Iterator[dict[End, int]]:
         return (more for slots in choices[place] if _is_drawing(edges, more := chosen | slots))
 
-    return _is_drawing(edges, fixed) and has_way(fixed, sorted(left, key=lambda place: len(choices[place])), ways)
+    return _is_drawing(edges, fixed) and has_way(
+        fixed, sorted(left, key=lambda place: len(choices[place])), ways
+    )
 
 
 def _slots_of(
-    shown: _Shown, group: Mapping[int, int], slot: Mapping[int, int], place: int, ends: Sequence[End], distinct: bool
+    shown: _Shown,
+    group: Mapping[int, int],
+    slot: Mapping[int, int],
+    place: int,
+    ends: Sequence[End],
+    distinct: bool,
 ) -> list[dict[End, int]]:
     """The slots that the ends of edges at a place may have, up to turning the place."""
     here = [s for s in shown.places if shown.places[s] == place]
@@ -185,23 +213,35 @@ def _slots_of(
         look_at_clock()
         quarters = dict(zip(groups, turned, strict=True))
         faced = {s: (slot[s] + quarters[group[s]]) % SLOTS for s in here}
-        seen = {tuple(star[(k - faced[s]) % SLOTS] for k in range(SLOTS)) for s in here for star in shown.stars[s]}
+        seen = {
+            tuple(star[(k - faced[s]) % SLOTS] for k in range(SLOTS))
+            for s in here
+            for star in shown.stars[s]
+        }
         if len(seen) <= 1 and not (distinct and len(set(faced.values())) < len(faced)):
             slots = [(k + quarters[g]) % SLOTS for _, g, k in ends]
-            found.setdefault(tuple((k - slots[0]) % SLOTS for k in slots), dict(zip(ends, slots, strict=True)))
+            found.setdefault(
+                tuple((k - slots[0]) % SLOTS for k in slots), dict(zip(ends, slots, strict=True))
+            )
     return list(found.values())
 
 
 def _is_drawing(edges: Iterable[tuple[End, End]], slots: Mapping[End, int]) -> bool:
     """Whether the edges both ends of which have slots join each gateway to one other, and do not cross."""
-    joined = {frozenset((end[0], slots[end]) for end in edge) for edge in edges if edge[0] in slots and edge[1] in slots}
+    joined = {
+        frozenset((end[0], slots[end]) for end in edge)
+        for edge in edges
+        if edge[0] in slots and edge[1] in slots
+    }
     if not _are_paired(joined):
         return False
     around: dict[int, list[tuple[int, int]]] = {}
     for number, edge in enumerate(joined):
         for side, (place, k) in enumerate(tuple(edge) * (3 - len(edge))):
             around.setdefault(place, []).append((k, 2 * number + side))
-    return is_planar({place: tuple(end for _, end in sorted(ends)) for place, ends in around.items()})
+    return is_planar(
+        {place: tuple(end for _, end in sorted(ends)) for place, ends in around.items()}
+    )
 
 
 def _are_paired(edges: Collection[frozenset[Side]]) -> bool:
@@ -227,7 +267,15 @@ def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int],
                 if y not in group:
                     group[y], slot[y] = first, (slot[x] + quarters) % SLOTS
                     queue.append(y)
-    return group, slot, all((slot[y] - slot[x] - quarters) % SLOTS == 0 for x, ys in links.items() for y, quarters in ys)
+    return (
+        group,
+        slot,
+        all(
+            (slot[y] - slot[x] - quarters) % SLOTS == 0
+            for x, ys in links.items()
+            for y, quarters in ys
+        ),
+    )
 
 
 def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
@@ -249,7 +297,9 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
         if turn != "around" and x in at_edge and y in at_edge:
             right, left = ((y, AHEAD), (y, BACK)) if turn == "right" else ((y, BACK), (y, AHEAD))
             told = [(x, AHEAD), right, (x, BACK), left]
-            clockwise[shown.places[x]].append([same.of(arm) for arm in told if crossing or arm != (y, BACK)])
+            clockwise[shown.places[x]].append(
+                [same.of(arm) for arm in told if crossing or arm != (y, BACK)]
+            )
     ends = [end for edge in edges for end in tuple(edge) * (3 - len(edge))]
 
     @cache
@@ -258,16 +308,22 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
         others = dict.fromkeys(arm for told in clockwise[place] for arm in told if arm not in arms)
         return _can_complete(arms, list(others), clockwise[place])
 
-    return can_be_drawn([(p, q) for (p, _), (q, _) in zip(ends[::2], ends[1::2], strict=True)], allows)
+    return can_be_drawn(
+        [(p, q) for (p, _), (q, _) in zip(ends[::2], ends[1::2], strict=True)], allows
+    )
 
 
 def _paired(shown: _Shown, same: _Classes) -> list[frozenset[Gateway]] | None:
     """The edges, each of which joins one gateway to one other, once gateways at one place to which one gateway leads are said to be one; None where it leads to
     gateways at different places.
     """
-    joined = [((shown.places[x], (x, AHEAD)), (shown.places[y], (y, BACK))) for x, y in shown.travels]
+    joined = [
+        ((shown.places[x], (x, AHEAD)), (shown.places[y], (y, BACK))) for x, y in shown.travels
+    ]
     while True:
-        edges = list(dict.fromkeys(frozenset((p, same.of(arm)) for p, arm in edge) for edge in joined))
+        edges = list(
+            dict.fromkeys(frozenset((p, same.of(arm)) for p, arm in edge) for edge in joined)
+        )
         beyond: dict[Gateway, Gateway] = {}
         for edge in edges:
             ends = tuple(edge) * (3 - len(edge))
@@ -296,7 +352,10 @@ def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Seque
     if not others:
         return True
     first, *rest = others
-    return any(_can_complete([*order[:gap], first, *order[gap:]], rest, clockwise) for gap in range(1 if order else 0, len(order) + 1))
+    return any(
+        _can_complete([*order[:gap], first, *order[gap:]], rest, clockwise)
+        for gap in range(1 if order else 0, len(order) + 1)
+    )
 
 
 def _is_clockwise(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
@@ -343,7 +402,9 @@ def _fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
         size //= 2
 
 
-def _split(labels: Mapping[int, int], steps: Sequence[int], cross: Callable[[Mapping[int, int]], bool]) -> Mapping[int, int]:
+def _split(
+    labels: Mapping[int, int], steps: Sequence[int], cross: Callable[[Mapping[int, int]], bool]
+) -> Mapping[int, int]:
     """Labels of these steps by which as few of them are one dstate as let the edges cross still."""
     new = max(labels.values()) + 1
     for step in steps:
@@ -354,7 +415,9 @@ def _split(labels: Mapping[int, int], steps: Sequence[int], cross: Callable[[Map
     return labels
 
 
-def _description(labels: Mapping[int, int], at: Mapping[int, int], steps: Sequence[int], distinct: bool) -> Iterator[Equality]:
+def _description(
+    labels: Mapping[int, int], at: Mapping[int, int], steps: Sequence[int], distinct: bool
+) -> Iterator[Equality]:
     """Which of these steps are one dstate, and which are at one place, and which are not."""
     first: dict[int, int] = {}  # step of each dstate
     for step in steps:
@@ -366,4 +429,6 @@ def _description(labels: Mapping[int, int], at: Mapping[int, int], steps: Sequen
     for here in visits.values():
         yield from (Equality(here[0], step, "place") for step in here[1:])
         yield from (Equality(i, j, holds=False) for i, j in combinations(here, 2) if distinct)
-    yield from (Equality(i[0], j[0], "place", holds=False) for i, j in combinations(visits.values(), 2))
+    yield from (
+        Equality(i[0], j[0], "place", holds=False) for i, j in combinations(visits.values(), 2)
+    )

@@ -47,7 +47,11 @@ class _Alone:
     repeated: Array
 
     def followed_by(self, other: _Alone) -> _Alone:
-        pairs = ((self.inverse, other.inverse), (self.square, other.square), (self.repeated, other.repeated))
+        pairs = (
+            (self.inverse, other.inverse),
+            (self.square, other.square),
+            (self.repeated, other.repeated),
+        )
         return _Alone(*(np.concatenate(pair) for pair in pairs))
 
 
@@ -57,7 +61,13 @@ class Together:
     rows  one row for each return, by last step: its first step, its last step, and whether it is one dstate rather than one place
     """
 
-    def __init__(self, reckoning: Reckoning, thresholds: Mapping[int, float], rows: Steps, before: Together | None = None) -> None:
+    def __init__(
+        self,
+        reckoning: Reckoning,
+        thresholds: Mapping[int, float],
+        rows: Steps,
+        before: Together | None = None,
+    ) -> None:
         """Nothing is tested yet.
 
         thresholds  the chi-square above which a set is refused, by its degrees of freedom
@@ -83,7 +93,9 @@ class Together:
         if not new.any():
             return None
         ends, starts = np.unique(rows[:, 1], return_index=True)
-        for end, start, stop in zip(ends.tolist(), starts.tolist(), [*starts[1:].tolist(), len(rows)], strict=True):
+        for end, start, stop in zip(
+            ends.tolist(), starts.tolist(), [*starts[1:].tolist(), len(rows)], strict=True
+        ):
             look_at_clock()
             if not new[:stop].any():
                 continue
@@ -114,9 +126,17 @@ class Together:
         inverse = alone.inverse[later]
         gathered = self._loops(self._number).of_ends(end) @ inverse.T
         before = np.arange(end + 1)[:, None] < first
-        gathered = np.where(before, gathered[first, np.arange(len(later))], gathered)  # what comes before a loop is no part of it
-        share = gathered[rows[earlier, 1]] - gathered[rows[earlier, 0]] + (inverse * alone.repeated[later]).sum(1)
-        unsafe = ~self._is_safe(share, alone.square[earlier, None] + alone.square[later], self._number)
+        gathered = np.where(
+            before, gathered[first, np.arange(len(later))], gathered
+        )  # what comes before a loop is no part of it
+        share = (
+            gathered[rows[earlier, 1]]
+            - gathered[rows[earlier, 0]]
+            + (inverse * alone.repeated[later]).sum(1)
+        )
+        unsafe = ~self._is_safe(
+            share, alone.square[earlier, None] + alone.square[later], self._number
+        )
         unsafe &= rows[earlier, 1, None] > first
         unsafe &= (earlier[:, None] < later) & (new[earlier, None] | new[later])
         others, these = np.nonzero(unsafe)
@@ -137,14 +157,19 @@ class Together:
             left = np.flatnonzero(excess > 0)
             if not len(left):
                 break
-            excess[left] = np.minimum(excess[left], self._excess(number, end, later[left], earlier[left]))
+            excess[left] = np.minimum(
+                excess[left], self._excess(number, end, later[left], earlier[left])
+            )
         return excess
 
     def _excess(self, number: int, end: int, later: Steps, earlier: Steps) -> Array:
         """By how much the chi-square of each set is above the threshold, for one drift; 0 where it is not."""
         alone, rows, loops = self._of_each(number), self.rows, self._loops(number)
         squares = alone.square[later] + alone.square[earlier]
-        begin, stop = np.maximum(rows[earlier, 0], rows[later, 0]), rows[earlier, 1]  # of what both loops share
+        begin, stop = (
+            np.maximum(rows[earlier, 0], rows[later, 0]),
+            rows[earlier, 1],
+        )  # of what both loops share
         gathered = loops.of_ends(end)
         share = self._largest_share(alone, later, gathered[stop] - gathered[begin])
         excess = np.zeros(len(later))
@@ -152,20 +177,38 @@ class Together:
         if not len(left):
             return excess
         noise = loops.noise(begin[left], stop[left]).reshape(-1, 9)
-        share = np.minimum(share[left], 1.0) * np.minimum(self._largest_share(alone, earlier[left], noise), 1.0)
+        share = np.minimum(share[left], 1.0) * np.minimum(
+            self._largest_share(alone, earlier[left], noise), 1.0
+        )
         left = left[~self._is_safe(share, squares[left], number)]
         if not len(left):
             return excess
-        joint = joint_squares(loops, rows[later[left]], rows[earlier[left]]) + self._reckoning.unlikely[number]
-        most = np.array([self._thresholds[f] for f in (4 + rows[later[left], 2] + rows[earlier[left], 2]).tolist()])
+        joint = (
+            joint_squares(loops, rows[later[left]], rows[earlier[left]])
+            + self._reckoning.unlikely[number]
+        )
+        most = np.array(
+            [
+                self._thresholds[f]
+                for f in (4 + rows[later[left], 2] + rows[earlier[left], 2]).tolist()
+            ]
+        )
         excess[left] = np.maximum(joint - most, 0.0)
         return excess
 
     def _largest_share(self, alone: _Alone, returns: Steps, noise: Array) -> Array:
         """A bound on the largest share that some noise, m x 9, and the errors that repeat have in the covariance of returns, in any direction."""
-        product = alone.inverse[returns].reshape(-1, 3, 3) @ (noise + alone.repeated[returns]).reshape(-1, 3, 3)
-        trace, square, freedom = np.einsum("mii->m", product), np.einsum("mij,mji->m", product, product), 2 + self.rows[returns, 2]
-        bound: Array = trace / freedom + np.sqrt(np.maximum((freedom - 1) / freedom * (square - trace**2 / freedom), 0.0))
+        product = alone.inverse[returns].reshape(-1, 3, 3) @ (
+            noise + alone.repeated[returns]
+        ).reshape(-1, 3, 3)
+        trace, square, freedom = (
+            np.einsum("mii->m", product),
+            np.einsum("mij,mji->m", product, product),
+            2 + self.rows[returns, 2],
+        )
+        bound: Array = trace / freedom + np.sqrt(
+            np.maximum((freedom - 1) / freedom * (square - trace**2 / freedom), 0.0)
+        )
         return bound
 
     def _likeliest(self) -> int:
@@ -174,16 +217,27 @@ class Together:
             return 0
         rows = self.rows[:: max(len(self.rows) // SAMPLE, 1)]
         numbers = np.arange(len(self._reckoning.bends))
-        closing, covariance = self._reckoning.closings(np.repeat(numbers, len(rows)), *np.tile(rows[:, :2], (len(numbers), 1)).T)
-        squares = _alone(closing, covariance, np.zeros_like(covariance), np.tile(rows[:, 2], len(numbers))).square
+        closing, covariance = self._reckoning.closings(
+            np.repeat(numbers, len(rows)), *np.tile(rows[:, :2], (len(numbers), 1)).T
+        )
+        squares = _alone(
+            closing, covariance, np.zeros_like(covariance), np.tile(rows[:, 2], len(numbers))
+        ).square
         return int((squares.reshape(len(numbers), -1).sum(1) + self._reckoning.unlikely).argmin())
 
     def _of_each(self, number: int) -> _Alone:
         """What is known of each return alone, for one drift."""
         known = self._alone.get(number)
         if known is None or len(known.square) < len(self.rows):
-            loops, rows = self._loops(number), self.rows[0 if known is None else len(known.square) :]
-            new = _alone(*loops.closings(rows[:, 0], rows[:, 1]), loops.repeated(rows[:, 0], rows[:, 1]), rows[:, 2])
+            loops, rows = (
+                self._loops(number),
+                self.rows[0 if known is None else len(known.square) :],
+            )
+            new = _alone(
+                *loops.closings(rows[:, 0], rows[:, 1]),
+                loops.repeated(rows[:, 0], rows[:, 1]),
+                rows[:, 2],
+            )
             known = self._alone[number] = known.followed_by(new) if known else new
         return known
 

@@ -202,7 +202,9 @@ class Belief:
         sure  the entropy, in bits, of the belief before it was lost
         """
         a_number("sure", sure, LocaliserError, 0, what="bits of entropy")
-        return self.nowhere <= 0.5 and (self.probability >= LOCATED or self.entropy <= sure + AS_SURE)
+        return self.nowhere <= 0.5 and (
+            self.probability >= LOCATED or self.entropy <= sure + AS_SURE
+        )
 
     def above(self, least: float) -> tuple[tuple[int, float], ...]:
         """The dstates of at least this probability, and their probabilities, the most probable one first."""
@@ -237,11 +239,20 @@ class Localiser:
     Raises MapError, TraceError, LocaliserError, and PerceptionError for a recogniser whose distances cannot be read.
     """
 
-    def __init__(self, ssh_map: SSHMap, recogniser: Any = None, *, trace: Trace | None = None, chances: Chances | None = None) -> None:
+    def __init__(
+        self,
+        ssh_map: SSHMap,
+        recogniser: Any = None,
+        *,
+        trace: Trace | None = None,
+        chances: Chances | None = None,
+    ) -> None:
         self.ssh_map = _checked(ssh_map)
         self.chances = Chances() if chances is None else chances
         if not isinstance(self.chances, Chances):
-            raise LocaliserError(f"chances: expected Chances, got {brief(chances)}; make them with Chances(misread=…)")
+            raise LocaliserError(
+                f"chances: expected Chances, got {brief(chances)}; make them with Chances(misread=…)"
+            )
         self._number = len(ssh_map.dstates)
         if trace is not None and len(checked_trace(trace)) != len(ssh_map.labels):
             raise MapError(
@@ -249,7 +260,9 @@ class Localiser:
             )
         self._shown = self._view_ratios(trace)
         self._links = self._transitions(trace)
-        self._followed: dict[tuple[Observation, str, Observation], float] = {}  # what _alike found out of views
+        self._followed: dict[
+            tuple[Observation, str, Observation], float
+        ] = {}  # what _alike found out of views
         self._seen = None if recogniser is None else self._likelihood(recogniser)
 
     def __repr__(self) -> str:
@@ -265,13 +278,21 @@ class Localiser:
         """The belief after the first observation, which is none where neither is given. Raises TraceError, LocaliserError, PerceptionError."""
         return self._weighed(self.prior, self._observation(view, image))
 
-    def update(self, belief: Belief, action: Action | str, view: View | None = None, image: ArrayLike | None = None) -> Belief:
+    def update(
+        self,
+        belief: Belief,
+        action: Action | str,
+        view: View | None = None,
+        image: ArrayLike | None = None,
+    ) -> Belief:
         """The belief after an action and what was observed then, which is nothing where neither is given: equations 1 and 2.
 
         image  ranges in metres, (d,). Raises TraceError, LocaliserError, PerceptionError.
         """
         if not isinstance(belief, Belief) or belief.probabilities.shape != (self._number,):
-            raise LocaliserError(f"belief: expected one over {self._number} dstates, got {brief(belief)}; begin with start()")
+            raise LocaliserError(
+                f"belief: expected one over {self._number} dstates, got {brief(belief)}; begin with start()"
+            )
         return self._after(belief, Action.of(action).name, self._observation(view, image))
 
     def beliefs(self, trace: Trace) -> Iterator[Belief]:
@@ -301,9 +322,15 @@ class Localiser:
 
     def _observation(self, view: View | None, image: ArrayLike | None) -> Observation | None:
         if self._seen is not None:
-            return None if image is None else self._spread(next(self._seen.ratios(np.atleast_2d(np.asarray(image)))))
+            return (
+                None
+                if image is None
+                else self._spread(next(self._seen.ratios(np.atleast_2d(np.asarray(image)))))
+            )
         if image is not None:
-            raise LocaliserError("image: expected a view, as the localiser has no recogniser, got an image; give it one, or the view")
+            raise LocaliserError(
+                "image: expected a view, as the localiser has no recogniser, got an image; give it one, or the view"
+            )
         return self._of_view(Step(view).view)
 
     def _of_view(self, view: View | None) -> Observation | None:
@@ -314,11 +341,15 @@ class Localiser:
         assert self._seen is not None
         spread = np.ones(self._number)
         spread[self._seen.classes] = ratios
-        return Observation(slice(None), spread, max(0.0, 1 - float(ratios.sum()) / (len(ratios) + 1)))
+        return Observation(
+            slice(None), spread, max(0.0, 1 - float(ratios.sum()) / (len(ratios) + 1))
+        )
 
     def _after(self, belief: Belief, action: str, seen: Observation | None) -> Belief:
         """The belief after an action and an observation."""
-        found = self._weighed(self._moved(belief, action), seen, self._alike(belief.seen, action, seen))
+        found = self._weighed(
+            self._moved(belief, action), seen, self._alike(belief.seen, action, seen)
+        )
         sure = belief.entropy if belief.sure is None and found.collapsed else belief.sure
         if sure is None or (not found.collapsed and found.found_again(sure)):
             return found
@@ -334,9 +365,15 @@ class Localiser:
             known = links.leads @ p
             moved = (1 - chances.slipped) * known
             anywhere = chances.slipped * float(known.sum()) + float(links.missing @ p)
-        moved += (anywhere * (1 - chances.unmapped) + belief.nowhere * chances.reentered) / self._number
+        moved += (
+            anywhere * (1 - chances.unmapped) + belief.nowhere * chances.reentered
+        ) / self._number
         entered, stayed = anywhere * chances.unmapped, belief.nowhere * (1 - chances.reentered)
-        akin = (AKIN * entered + belief.akin * stayed) / (entered + stayed) if entered + stayed else AKIN
+        akin = (
+            (AKIN * entered + belief.akin * stayed) / (entered + stayed)
+            if entered + stayed
+            else AKIN
+        )
         return Belief(moved, entered + stayed, akin=akin)
 
     def _alike(self, before: Observation | None, action: str, seen: Observation | None) -> float:
@@ -354,8 +391,14 @@ class Localiser:
         total = float(shares.sum())
         if total > _TINY:
             shares /= total
-            count = (1 - before.novel) / float(shares @ shares)  # how many dstates the average is over (Kish 1965)
-            follows = float((links.leads @ shares)[seen.where] @ seen.ratio) * self._number / (self._number + 1)
+            count = (1 - before.novel) / float(
+                shares @ shares
+            )  # how many dstates the average is over (Kish 1965)
+            follows = (
+                float((links.leads @ shares)[seen.where] @ seen.ratio)
+                * self._number
+                / (self._number + 1)
+            )
             alike = (count * follows + 1 - seen.novel) / (count + 1) + seen.novel
         if self._seen is None:
             self._followed[key] = alike
@@ -377,7 +420,13 @@ class Localiser:
         if not total:  # and no dstate allows it whatever came before
             nowhere = total = 1.0
         weights /= total
-        return Belief(_frozen(weights), nowhere / total, normaliser, akin=expected.akin * alike / unknown, seen=seen)
+        return Belief(
+            _frozen(weights),
+            nowhere / total,
+            normaliser,
+            akin=expected.akin * alike / unknown,
+            seen=seen,
+        )
 
     def _products(self, expected: Belief, seen: Observation | None) -> NDArray[np.float64]:
         """p(o|x) / q(o) times the probability of each dstate x."""
@@ -392,9 +441,15 @@ class Localiser:
         """For each view v the dstates that show it, and f(v|x) / q(v) of these: equation 3, or 4 where no step of the trace is there."""
         counts = Counter[tuple[int, View]]()
         if trace is not None:
-            counts.update((x, step.view) for x, step in zip(self.ssh_map.labels, trace, strict=True) if step.view is not None)
+            counts.update(
+                (x, step.view)
+                for x, step in zip(self.ssh_map.labels, trace, strict=True)
+                if step.view is not None
+            )
         seen = {x for x, _ in counts}
-        counts.update((s.id, s.view) for s in self.ssh_map.dstates if s.id not in seen and s.view is not None)
+        counts.update(
+            (s.id, s.view) for s in self.ssh_map.dstates if s.id not in seen and s.view is not None
+        )
         visits = Counter[int]()
         for (x, _), n in counts.items():
             visits[x] += n
@@ -404,7 +459,9 @@ class Localiser:
         ratios: dict[View, Observation] = {}
         for view, pairs in shown.items():
             f = np.array([p for _, p in pairs])
-            ratios[view] = Observation(np.array([x for x, _ in pairs], np.intp), f * ((self._number + 1) / f.sum()), 0.0)
+            ratios[view] = Observation(
+                np.array([x for x, _ in pairs], np.intp), f * ((self._number + 1) / f.sum()), 0.0
+            )
         return ratios
 
     def _transitions(self, trace: Trace | None) -> dict[str, _Links]:
@@ -412,7 +469,10 @@ class Localiser:
         counts = Counter[tuple[int, str, int]]()
         labels = self.ssh_map.labels
         if trace is not None:
-            counts.update((x, action.name, y) for x, action, y in zip(labels, trace.actions, labels[1:], strict=False))
+            counts.update(
+                (x, action.name, y)
+                for x, action, y in zip(labels, trace.actions, labels[1:], strict=False)
+            )
         tried = {(x, action) for x, action, _ in counts}
         counts.update({link for link in self.ssh_map.links if link[:2] not in tried})
         trials = Counter[tuple[int, str]]()
@@ -426,7 +486,10 @@ class Localiser:
             sources, targets, p = (np.array(column) for column in zip(*listed, strict=True))
             missing = np.ones(self._number)
             missing[sources] = 0.0
-            links[action] = _Links(sparse.csr_array((p, (targets, sources)), shape=(self._number, self._number)), missing)
+            links[action] = _Links(
+                sparse.csr_array((p, (targets, sources)), shape=(self._number, self._number)),
+                missing,
+            )
         return links
 
     def _likelihood(self, recogniser: Any) -> ImageLikelihood:
@@ -456,12 +519,18 @@ class _Links:
 
 def _checked(ssh_map: object) -> SSHMap:
     if not isinstance(ssh_map, SSHMap):
-        raise MapError(f"map: expected an SSHMap, got {brief(ssh_map)}; take one of solution.maps, or SSHMap.load")
+        raise MapError(
+            f"map: expected an SSHMap, got {brief(ssh_map)}; take one of solution.maps, or SSHMap.load"
+        )
     ids = [s.id for s in ssh_map.dstates]
     if not ids or ids != list(range(len(ids))):
-        raise MapError(f"map: dstates: expected the ids 0, 1, 2, …, got {brief(ids)}; renumber them")
+        raise MapError(
+            f"map: dstates: expected the ids 0, 1, 2, …, got {brief(ids)}; renumber them"
+        )
     if strange := ({*ssh_map.labels} | {s for x, _, y in ssh_map.links for s in (x, y)}) - {*ids}:
-        raise MapError(f"map: expected dstates 0 to {len(ids) - 1} in labels and links, got {brief(min(strange))}; mend the map")
+        raise MapError(
+            f"map: expected dstates 0 to {len(ids) - 1} in labels and links, got {brief(min(strange))}; mend the map"
+        )
     return ssh_map
 
 
