@@ -531,8 +531,10 @@ class _Words:
     def know(self, conclusions: Iterable[clingo.Symbol]) -> None:
         """What is known by now: paths are named by two steps that are along them."""
         self._courses = {
-            steps for name, steps in map(facts.read_conclusion, conclusions) if name == "one_course"
-        }  # type: ignore[misc]
+            (steps[0], steps[1])
+            for name, steps in map(facts.read_conclusion, conclusions)
+            if name == "one_course"
+        }
 
     def of(self, conclusion: tuple[str, tuple[int, ...]], *, would: bool) -> str:
         """A conclusion as a clause; `would` where it is only supposed."""

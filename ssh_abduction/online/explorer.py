@@ -168,8 +168,12 @@ class Explorer:
         first = self._look()
         assert first.view is not None
         self.mapper = OnlineMapper(
-            first.view, theory, star=first.star, time_limit=time_limit, max_maps=max_maps
-        )  # type: ignore[arg-type]
+            first.view,
+            theory,
+            star=first.star,  # type: ignore[arg-type]
+            time_limit=time_limit,
+            max_maps=max_maps,
+        )
         self._truths = [first.truth]
         self._actions: dict[str, Action] = {}  # all that it was ever able to do
         self._abilities: dict[
@@ -232,10 +236,10 @@ class Explorer:
         self.mapper.observe(
             action,
             seen.view,
-            star=seen.star,
+            star=seen.star,  # type: ignore[arg-type]
             displacement=seen.displacement,
             covariance=seen.covariance,
-        )  # type: ignore[arg-type]
+        )
         self._truths.append(seen.truth)
         self._note(seen)
         if self.mapper.searches > asked or self.mapper.solution.count != known:
