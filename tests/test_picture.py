@@ -200,8 +200,8 @@ def test_labels_do_not_overlap() -> None:
             boxes.append((x - wide, y - size / 2, x + wide, y + size / 2))
         for i, (left, top, right, bottom) in enumerate(boxes):
             assert all(
-                right <= l or r <= left or bottom <= t or b <= top for l, t, r, b in boxes[:i]
-            )  # noqa: E741
+                right <= x or r <= left or bottom <= t or b <= top for x, t, r, b in boxes[:i]
+            )
 
 
 def test_each_place_of_a_large_map_is_named() -> None:
