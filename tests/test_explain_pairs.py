@@ -213,7 +213,7 @@ def test_what_a_rival_costs_that_lost() -> None:
         "steps 0 and 8 are one dstate in every minimal map",
         "the best map with step 0 ≠ step 8 has 9 dstates, not 8",
     )
-    other = solve(RECTANGLE, different=[(0, 8)], max_maps=1)
+    other = solve(RECTANGLE, Theory(different=[(0, 8)]), max_maps=1)
     assert other.cost == explanation.different.cost
 
 
@@ -238,7 +238,7 @@ def test_rivals_that_disagree_are_counted() -> None:
 def test_one_in_every_map() -> None:
     """A turn around, twice, leads back to where a travel came to."""
     trace = Trace.from_steps("aabab", ["travel", "around", "around", "travel"])
-    explanation = explain_pair(trace, 1, 3, without=["functional_view"])
+    explanation = explain_pair(trace, 1, 3, Theory(without=["functional_view"]))
     assert explanation.verdict is Verdict.SAME
     derivation = explanation.derivation
     assert derivation is not None

@@ -90,7 +90,7 @@ def test_a_robot_that_was_carried_away_finds_its_circuit_again(speedups: Speedup
     without = solve(trace).cost
     assert without is not None
     assert without.dstates == 17
-    solution = solve(trace, jumped=2, speedups=speedups, max_maps=None)
+    solution = solve(trace, Theory(jumped=2), speedups=speedups, max_maps=None)
     assert [(len(m.dstates), len(m.places)) for m in solution.maps] == [(8, 4)]
     (fault,) = solution.maps[0].faults
     assert fault == Fault(9, "jumped", "25.0 m ahead, 7.0 m left, turned 52 degrees left")
@@ -104,7 +104,7 @@ def test_a_robot_that_was_carried_away_finds_its_circuit_again(speedups: Speedup
 
 def test_the_checker_believes_what_the_map_believes() -> None:
     trace = circuit(18, (9,))
-    solution = solve(trace, jumped=2)
+    solution = solve(trace, Theory(jumped=2))
     best = solution.maps[0]
 
     def broken(ssh_map: SSHMap) -> set[str]:
@@ -138,7 +138,7 @@ def test_a_maze_with_wrong_displacements_has_a_map_that_costs_no_more_than_the_t
         )
     trace = replace(walk.trace, steps=tuple(steps))
     true = len(set(walk.truth))
-    solution = solve(trace, jumped=3, time_limit=100)
+    solution = solve(trace, Theory(jumped=3), time_limit=100)
     assert solution.cost is not None
     assert solution.cost.dstates + solution.cost.faults <= true + 3 * jumps
     assert check(trace, solution.maps[0], solution.theory) == ()

@@ -103,7 +103,7 @@ def test_a_search_beside_another_changes_no_answer(
         patch.object(named.Chart, "turned", turned),
         patch.object(engine.Task, "has_processors", beside),
     ):
-        found = solve(trace, CAUSAL, max_maps=most)
+        found = solve(trace, CAUSAL, max_maps=most or None)
     assert found.status is Status.OPTIMAL
     assert found.bound == expected.bound
     assert set(found.maps) <= set(expected.maps)
@@ -127,7 +127,7 @@ def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> Non
             solve(
                 trace,
                 CAUSAL,
-                max_maps=most,
+                max_maps=most or None,
                 time_limit=60,
                 speedups=Speedups.without("clique,threads,prefixes"),
             )

@@ -51,7 +51,7 @@ def follow(
         star=first.star,
         odometry=trace.odometry,
         time_limit=limit,
-        max_maps=maps,
+        max_maps=maps or None,
         speedups=speedups or Speedups(),
     )
     answers = [mapper.solution]

@@ -101,7 +101,7 @@ def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.Dat
 @pytest.mark.parametrize(("steps", "dstates"), [(24, 16), (61, 53)])
 def test_a_rule_about_pairs_of_steps_on_circuits(steps: int, dstates: int) -> None:
     trace = Trace.load(EXAMPLES / "notched-rectangle.jsonl").prefix(steps)
-    solution = solve(trace, Theory.causal(), rules=[FORGETFUL])
+    solution = solve(trace, Theory.causal().replace(rules=[FORGETFUL]))
     assert solution.status is Status.OPTIMAL
     assert solution.cost
     assert solution.cost.dstates == dstates
@@ -376,7 +376,7 @@ def test_rules_that_could_never_be_read_say_how_to_write_them(
     Path("own.lp").write_text(text)
     Path("other.lp").write_text("limit(3).")
     with pytest.raises(TheoryError, match=message) as error:
-        solve(Trace.from_steps("aa", ["travel"]), rules=["own.lp"])
+        solve(Trace.from_steps("aa", ["travel"]), Theory(rules=["own.lp"]))
     assert "\n" not in str(error.value)
 
 
@@ -400,7 +400,7 @@ def test_rules_of_any_editor_are_read(data: bytes, tmp_path: Path) -> None:
     assert len(solve(Trace.from_steps("abab", ["travel"] * 3), theory).maps[0].dstates) == 2
     apart = Trace.from_steps("a" + "b" * 11 + "a", ["travel"] * 12, displacements=[(1, 0, 0)] * 12)
     assert (
-        solve(apart, theory, displacement="none").maps[0].labels[-1] != 0
+        solve(apart, theory.replace(displacement="none")).maps[0].labels[-1] != 0
     )  # so the rule is read, and no part of a comment
 
 
@@ -448,7 +448,7 @@ def test_what_is_no_text_is_no_rules() -> None:
     with pytest.raises(TheoryError, match="expected a name and a text"):
         Rules("own.lp", b"a.")  # type: ignore[arg-type]
     with pytest.raises(TheoryError, match=r"a\\1\.lp:1:\d"):
-        solve(Trace.from_steps("aa", ["travel"]), rules=[Rules("a\\1.lp", "a :- b(.")])
+        solve(Trace.from_steps("aa", ["travel"]), Theory(rules=[Rules("a\\1.lp", "a :- b(.")]))
 
 
 @pytest.mark.parametrize(
@@ -459,7 +459,7 @@ def test_of_several_files_of_rules_the_wrong_one_is_named(text: str, where: str)
     rules = [Rules("a.lp", "#const n = 1."), Rules("b.lp", text)]
     for files in (rules, rules[::-1]) if "same" in text else (rules,):
         with pytest.raises(TheoryError, match=where):
-            solve(Trace.from_steps("aa", ["travel"]), rules=files)
+            solve(Trace.from_steps("aa", ["travel"]), Theory(rules=files))
 
 
 @pytest.mark.parametrize("words", ["solve T", "solve T --jobs 1", "check T M"])
@@ -481,7 +481,7 @@ def test_a_step_that_the_trace_does_not_have_is_an_error(
     captured = capsys.readouterr()
     assert "same (--same): expected steps from 0 to 1, got 0,2" in captured.out + captured.err
     with pytest.raises(TheoryError, match="expected steps from 0 to 1, got 0,2"):
-        solve(trace, same=[(0, 2)])
+        solve(trace, Theory(same=[(0, 2)]))
 
 
 def test_a_file_of_rules_without_end_is_an_error(
@@ -499,8 +499,8 @@ def test_rules_may_read_facts_and_atoms_of_their_own() -> None:
         "#const most = 1.\nlimit(most).\nfar(I,T) :- pair(I,T).\npair(0,2).\n#program step(t).\n:- far(I,t), same(I,t), limit(1).",
     )
     assert (
-        solve(Trace.from_steps("aaa", ["right", "right"]), rules=[rules]).cost
-        == solve(Trace.from_steps("aaa", ["right"] * 2), different=[(0, 2)]).cost
+        solve(Trace.from_steps("aaa", ["right", "right"]), Theory(rules=[rules])).cost
+        == solve(Trace.from_steps("aaa", ["right"] * 2), Theory(different=[(0, 2)])).cost
     )
 
 

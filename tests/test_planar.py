@@ -368,7 +368,7 @@ def tour() -> Trace:
 @pytest.fixture(scope="module")
 def smaller(tour: Trace) -> Solution:
     """The minimal maps of the tour without planarity, even if no travel passes a place unseen."""
-    return solve(tour, next_place=True, max_maps=None)
+    return solve(tour, Theory(next_place=True), max_maps=None)
 
 
 def true_labels(trace: Trace) -> tuple[int, ...]:

@@ -44,7 +44,7 @@ def followed(
         confidence=first.confidence,
         odometry=trace.odometry,
         time_limit=limit,
-        max_maps=maps,
+        max_maps=maps or None,
         speedups=speedups or Speedups(),
     )
     yield mapper, mapper.solution

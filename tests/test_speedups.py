@@ -193,7 +193,7 @@ def test_as_many_maps_as_asked_for(most: int) -> None:
     )
     every = solve(trace, Theory.causal(), max_maps=None, speedups=PLAIN)
     with patch.object(solver, "FEW_STEPS", 0):
-        found = solve(trace, Theory.causal(), max_maps=most)
+        found = solve(trace, Theory.causal(), max_maps=most or None)
     assert found.count == min(most, every.count)
     assert set(found.maps) <= set(every.maps)
     assert found.complete == (every.count <= most)

@@ -75,11 +75,11 @@ SOLVED: dict[str, Callable[[], tuple[Trace, Solution]]] = {
     "cut off": lambda: (ACES, solve(ACES, max_maps=2)),
     "levels": lambda: (
         ACES,
-        solve(ACES, within=3, max_maps=None, prefer=("dstates", "places", "paths")),
+        solve(ACES, Theory(prefer=("dstates", "places", "paths")), within=3, max_maps=None),
     ),
     "levels cut off": lambda: (
         ACES,
-        solve(ACES, within=3, max_maps=9, prefer=("dstates", "places", "paths")),
+        solve(ACES, Theory(prefer=("dstates", "places", "paths")), within=3, max_maps=9),
     ),
     "stars": lambda: (
         (trace := drive(*TOURS["comb"], stars=True)),

@@ -77,7 +77,7 @@ def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
         for step in trace.steps
         if isinstance(step.truth, dict)
     ]
-    solution = solve(trace, prefer=("dstates", "places", "paths"), max_maps=None, within=3)
+    solution = solve(trace, Theory(prefer=("dstates", "places", "paths")), max_maps=None, within=3)
     assert solution.complete
     assert [(level.cost.dstates, level.count) for level in solution.levels] == [
         (19, 6),
@@ -99,7 +99,7 @@ def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
 
 def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed() -> None:
     """Then the levels are what clingo counts of maps with dstates, at most one more than the least."""
-    solution = solve(Trace.load(ACES3), prefer=("dstates",), max_maps=None, within=1)
+    solution = solve(Trace.load(ACES3), Theory(prefer=("dstates",)), max_maps=None, within=1)
     assert [(level.cost.dstates, level.count) for level in solution.levels] == [(19, 68), (20, 158)]
 
 
@@ -109,7 +109,7 @@ def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed()
 def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(
     maps: int, levels: list[int]
 ) -> None:
-    solution = solve(Trace.load(ACES3), max_maps=maps, within=3)
+    solution = solve(Trace.load(ACES3), max_maps=maps or None, within=3)
     assert [level.count for level in solution.levels] == levels
     assert solution.complete == (maps == 11)
     assert solution.stopped == (None if maps == 11 else "maps limit")
