@@ -80,11 +80,11 @@ def test_a_trace_shows_its_first_steps() -> None:
         ),
         (
             Trace.from_steps("abcd", ["travel", "around", "around"]),
-            {"limit": 1e-9},
+            {"time_limit": 1e-9},
             "unknown (time limit): no map of 4 steps yet",
             0,
         ),
-        (ACES, {"limit": 1e-9}, "feasible (time limit): 23 dstates", 1),
+        (ACES, {"time_limit": 1e-9}, "feasible (time limit): 23 dstates", 1),
         (rectangle(20), {"theory": Theory.causal().replace(misread=1.5)}, "optimal: 4 dstates", 1),
     ],
 )

@@ -367,7 +367,7 @@ guessing.has_processors = lambda _: True
 
 def begun():
     trace = maze(10, 10, steps=150, seed=1, stars=True).trace
-    mapper = OnlineMapper(trace.steps[0].view, star=trace.steps[0].star, limit=1e-9)
+    mapper = OnlineMapper(trace.steps[0].view, star=trace.steps[0].star, time_limit=1e-9)
     for action, step in zip(trace.actions, trace.steps[1:]):
         mapper.observe(action, step.view, star=step.star)
     return mapper

@@ -267,26 +267,6 @@ def test_every_file_it_names_exists(page: Path) -> None:
     assert page != README or len(whole) > 5
 
 
-def test_the_design_has_a_sentence_for_each_module() -> None:
-    sections = dict(
-        re.findall(
-            r"\n### (\w+):.*?\n(.*?)(?=\n##)", (ROOT / "docs" / "design.md").read_text(), re.DOTALL
-        )
-    )
-    for path in sorted((ROOT / "ssh_abduction").rglob("[a-z]*.py")):
-        folder = (
-            path.relative_to(ROOT / "ssh_abduction").parts[0]
-            if path.parent.name != "ssh_abduction"
-            else "ssh_abduction"
-        )
-        rows = [
-            line
-            for line in sections[folder].splitlines()
-            if f"`{path.stem}`" in line.split(" | ")[0]
-        ]
-        assert rows, path
-
-
 def test_the_design_tells_the_floors_as_they_are_checked() -> None:
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"][
         "contracts"

@@ -172,11 +172,11 @@ def test_arguments_of_another_kind(arguments: tuple[Any, ...], message: str) -> 
         (lambda: check(TRACE, None), "map: expected an SSHMap, got None"),
         (
             lambda: solve(TRACE, memory_limit=float("nan")),
-            "memory (--memory-limit): expected a number of MiB above 0, got nan",
+            "memory_limit (--memory-limit): expected a number of MiB above 0, got nan",
         ),
         (
             lambda: solve(TRACE, time_limit=10**400),
-            "limit (--time-limit): expected a number of seconds above 0, got 1000",
+            "time_limit (--time-limit): expected a number of seconds above 0, got 1000",
         ),
         (lambda: solve(TRACE, speedups="none"), "speedups: expected Speedups, got 'none'"),
         (
@@ -195,7 +195,7 @@ def test_arguments_of_another_kind_are_errors_of_the_package(
         call()
 
 
-@pytest.mark.parametrize("maps", [None, 1.5, True])
+@pytest.mark.parametrize("maps", [0, 1.5, True])
 def test_a_number_of_maps_is_whole(maps: Any) -> None:
     with pytest.raises(SolverError, match="maps"):
         solve(rectangle(8), max_maps=maps)
@@ -354,7 +354,7 @@ def test_a_stream_that_is_left_does_not_abort_python() -> None:
         import sys
         from ssh_abduction import Trace
         from ssh_abduction.solver import Search
-        maps = iter(Search(Trace.load(sys.argv[1]).without_stars(), maps=1))
+        maps = iter(Search(Trace.load(sys.argv[1]).without_stars(), max_maps=1))
         print(len(next(maps).labels))
     """)
     trace = os.path.join(os.path.dirname(__file__), "..", "examples", "aces3-route.jsonl")
@@ -377,10 +377,10 @@ def test_progress_is_reported() -> None:
 @pytest.mark.parametrize(
     ("choices", "name"),
     [
-        ({"limit": "5"}, "limit (--time-limit)"),
-        ({"limit": 0}, "limit (--time-limit)"),
-        ({"maps": -1}, "maps (--maps)"),
-        ({"memory": 0}, "memory (--memory-limit)"),
+        ({"time_limit": "5"}, "time_limit (--time-limit)"),
+        ({"time_limit": 0}, "time_limit (--time-limit)"),
+        ({"max_maps": -1}, "max_maps (--maps)"),
+        ({"memory_limit": 0}, "memory_limit (--memory-limit)"),
     ],
 )
 def test_limits_that_make_no_sense(choices: dict[str, int], name: str) -> None:

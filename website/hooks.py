@@ -17,6 +17,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 import ssh_abduction
+from ssh_abduction import data
 
 ROOT = Path(__file__).parent.parent
 GITHUB = "https://github.com/ssh-abduction/ssh-abduction"
@@ -24,80 +25,63 @@ RAW = "https://raw.githubusercontent.com/ssh-abduction/ssh-abduction"
 
 # The public names by theme: all that `ssh_abduction` exports, and what else the pages import, with the module that has it.
 THEMES: dict[str, tuple[str, ...]] = {
-    "From a trace to its maps": (
-        "solve",
-        "Search",
-        "Trace",
-        "Step",
-        "Action",
-        "Odometry",
-        "Theory",
-        "Speedups",
-    ),
-    "What an answer says": (
-        "Solution",
-        "Status",
-        "Cost",
-        "Bound",
-        "Certificate",
-        "Level",
-        "Progress",
-        "Backbone",
-    ),
-    "Maps": ("SSHMap", "DState", "Path", "Pose", "Fit"),
-    "Rival maps": (
+    "From a trace to its maps": ("solve", "Trace", "Theory", "Solution", "SSHMap", "map_log"),
+    "Is a map right?": ("check", "evaluate"),
+    "Rival maps, and why": (
         "compare",
-        "Comparison",
-        "difference",
-        "Difference",
-        "Listing",
-        "view_page",
-        "Page",
-    ),
-    "Why": (
-        "explain.pairs.explain_pair",
-        "explain.pairs.explain_trace",
-        "explain.no_map.why_apart",
-        "solver.front.fault_front",
-    ),
-    "Is a map right?": (
-        "evaluate",
-        "Evaluation",
-        "MapEvaluation",
-        "evaluate_visits",
-        "VisitsEvaluation",
-        "ladder",
-        "Rung",
-    ),
-    "Using a map": ("route", "Route", "Move", "export_map", "Localiser", "Belief", "Chances"),
-    "While the robot drives": (
-        "OnlineMapper",
         "next_experiment",
-        "Experiment",
-        "Explorer",
-        "Exploration",
+        "explain_pair",
+        "explain_trace",
+        "view_page",
     ),
-    "From images to recognition": (
-        "learning.learner.BootstrapLearner",
+    "Use a map": ("route", "export_map", "Localiser", "OnlineMapper", "Explorer"),
+    "Learn places from images": ("BootstrapLearner",),
+    "Errors": ("AbductionError",),
+    "Package data": tuple(
+        f"data.{name}" for name in data.__all__ if name not in ssh_abduction.__all__
+    ),
+    "Package solver": tuple(
+        f"solver.{name}"
+        for name in (
+            "Search",
+            "Status",
+            "Cost",
+            "Bound",
+            "Certificate",
+            "Level",
+            "Progress",
+            "Backbone",
+            "fault_front",
+        )
+    ),
+    "Other packages": (
+        "theory.Speedups",
+        "explain.why_apart",
+        "rivals.Comparison",
+        "rivals.difference",
+        "rivals.Difference",
+        "rivals.Listing",
+        "rivals.Experiment",
+        "evaluation.Evaluation",
+        "evaluation.MapEvaluation",
+        "evaluation.evaluate_visits",
+        "evaluation.VisitsEvaluation",
+        "evaluation.ladder.ladder",
+        "evaluation.ladder.Rung",
+        "online.Route",
+        "online.Move",
+        "online.Belief",
+        "online.Chances",
+        "online.Exploration",
+        "page.Page",
         "perception.views.ViewClusterer",
         "perception.recognition.recogniser",
-    ),
-    "Simulated robots": (
         "simulator.tours.simulate",
         "simulator.world.World",
         "simulator.panorama.Camera",
         "simulator.panorama.Paint",
         "simulator.plans.Plan",
         "simulator.plans.tour",
-    ),
-    "Errors": (
-        "AbductionError",
-        "TraceError",
-        "TheoryError",
-        "MapError",
-        "SolverError",
-        "LocaliserError",
-        "RangeError",
         "perception.errors.PerceptionError",
         "simulator.errors.SimulatorError",
     ),

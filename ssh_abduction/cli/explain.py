@@ -83,7 +83,10 @@ def run(options: argparse.Namespace) -> int:
         )
     trace = Trace.load(options.trace)
     theory = theory_of(options, _theory_in(options.theory_of) if options.theory_of else None)
-    limits: dict[str, Any] = {"limit": options.time_limit, "memory": options.memory_limit}
+    limits: dict[str, Any] = {
+        "time_limit": options.time_limit,
+        "memory_limit": options.memory_limit,
+    }
     question: PairQuestion | TraceQuestion
     if options.steps:
         first, second = options.steps

@@ -16,7 +16,16 @@ from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.no_map import Explanation, Interrupted, explain
 from ssh_abduction.learning.runner_up import second_map
-from ssh_abduction.solver import Backbone, Cost, Search, Solution, Status, result
+from ssh_abduction.solver import (
+    Backbone,
+    Cost,
+    Search,
+    Solution,
+    Status,
+    written_map,
+)
+from ssh_abduction.solver import ending as written_ending
+from ssh_abduction.solver import opening as written_opening
 
 SOON = 10_000  # steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds
 
@@ -48,13 +57,13 @@ def explained(search: Search) -> Explanation | None:
 
 def opening(search: Search) -> dict[str, Any]:
     """What the JSON of a solution says before its maps."""
-    return result.opening(search.theory, len(search.trace), search.within)
+    return written_opening(search.theory, len(search.trace), search.within)
 
 
 def told(given: Given) -> dict[str, Any]:
     """What the JSON of a solution says of a map: also what it costs, where not all maps cost the same."""
     ssh_map, cost = given
-    return result.written_map(ssh_map, cost)
+    return written_map(ssh_map, cost)
 
 
 def given_by(search: Search, ssh_map: SSHMap) -> Given:
@@ -78,7 +87,7 @@ def ending(
 
     backbone  what the minimal maps share, as far as it is known
     """
-    end = result.ending(solution, maps, backbone)
+    end = written_ending(solution, maps, backbone)
     found = warnings_of(search, solution)
     end.pop("warnings", None)
     return (

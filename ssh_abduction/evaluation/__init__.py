@@ -1,17 +1,46 @@
 """Compare maps with the truth, rung by rung of evidence, and repeat the paper's experiments."""
 
-from ssh_abduction.evaluation.names import Evaluation, MapEvaluation, evaluate, tells_names
-from ssh_abduction.evaluation.relations import Relation, Relations
-from ssh_abduction.evaluation.trajectory import Trajectory, TrajectoryWarning
-from ssh_abduction.evaluation.visits import (
-    MapPairs,
-    MapVisits,
-    Pairs,
-    VisitsEvaluation,
-    evaluate_visits,
-    told_poses,
-)
+from ssh_abduction import lazy_names
 
+TYPE_CHECKING = False
+
+if TYPE_CHECKING:
+    from ssh_abduction.evaluation.names import Evaluation, MapEvaluation, evaluate, tells_names
+    from ssh_abduction.evaluation.relations import Relation, Relations
+    from ssh_abduction.evaluation.trajectory import Trajectory, TrajectoryWarning
+    from ssh_abduction.evaluation.visits import (
+        MapPairs,
+        MapVisits,
+        Pairs,
+        VisitsEvaluation,
+        evaluate_visits,
+        told_poses,
+    )
+
+_HOMES = {
+    "names": (
+        "Evaluation",
+        "MapEvaluation",
+        "evaluate",
+        "tells_names",
+    ),
+    "relations": (
+        "Relation",
+        "Relations",
+    ),
+    "trajectory": (
+        "Trajectory",
+        "TrajectoryWarning",
+    ),
+    "visits": (
+        "MapPairs",
+        "MapVisits",
+        "Pairs",
+        "VisitsEvaluation",
+        "evaluate_visits",
+        "told_poses",
+    ),
+}
 __all__ = [
     "Evaluation",
     "MapEvaluation",
@@ -28,3 +57,5 @@ __all__ = [
     "tells_names",
     "told_poses",
 ]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

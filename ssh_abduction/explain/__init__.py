@@ -1,6 +1,30 @@
 """Why two steps are different dstates, why a trace has no map, and what would mend it."""
 
-from ssh_abduction.explain.no_map import Explanation, explain, why_apart
-from ssh_abduction.explain.pairs import explain_pair, explain_trace
+from ssh_abduction import lazy_names
 
-__all__ = ["Explanation", "explain", "explain_pair", "explain_trace", "why_apart"]
+TYPE_CHECKING = False
+
+if TYPE_CHECKING:
+    from ssh_abduction.explain.no_map import Explanation, explain, why_apart
+    from ssh_abduction.explain.pairs import explain_pair, explain_trace
+
+_HOMES = {
+    "no_map": (
+        "Explanation",
+        "explain",
+        "why_apart",
+    ),
+    "pairs": (
+        "explain_pair",
+        "explain_trace",
+    ),
+}
+__all__ = [
+    "Explanation",
+    "explain",
+    "explain_pair",
+    "explain_trace",
+    "why_apart",
+]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -1,5 +1,17 @@
 """The bootstrap loop of the paper: from images to views, a map, labels and a recogniser."""
 
-from ssh_abduction.learning.learner import BootstrapLearner
+from ssh_abduction import lazy_names
 
-__all__ = ["BootstrapLearner"]
+TYPE_CHECKING = False
+
+if TYPE_CHECKING:
+    from ssh_abduction.learning.learner import BootstrapLearner
+
+_HOMES = {
+    "learner": ("BootstrapLearner",),
+}
+__all__ = [
+    "BootstrapLearner",
+]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

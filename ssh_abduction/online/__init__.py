@@ -1,10 +1,32 @@
 """Map while the robot drives, explore, localise in a known map, and plan routes."""
 
-from ssh_abduction.online.explorer import Exploration, Explorer
-from ssh_abduction.online.localiser import Belief, Chances, Localiser
-from ssh_abduction.online.mapper import OnlineMapper
-from ssh_abduction.online.routes import Move, Route, route
+from ssh_abduction import lazy_names
 
+TYPE_CHECKING = False
+
+if TYPE_CHECKING:
+    from ssh_abduction.online.explorer import Exploration, Explorer
+    from ssh_abduction.online.localiser import Belief, Chances, Localiser
+    from ssh_abduction.online.mapper import OnlineMapper
+    from ssh_abduction.online.routes import Move, Route, route
+
+_HOMES = {
+    "explorer": (
+        "Exploration",
+        "Explorer",
+    ),
+    "localiser": (
+        "Belief",
+        "Chances",
+        "Localiser",
+    ),
+    "mapper": ("OnlineMapper",),
+    "routes": (
+        "Move",
+        "Route",
+        "route",
+    ),
+}
 __all__ = [
     "Belief",
     "Chances",
@@ -16,3 +38,5 @@ __all__ = [
     "Route",
     "route",
 ]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -69,6 +69,7 @@ from ssh_abduction.solver import (
     Cost,
     Judging,
     Outcome,
+    Search,
     Seconds,
     Sketch,
     Solution,
@@ -76,7 +77,6 @@ from ssh_abduction.solver import (
     check_limit,
     observation,
 )
-from ssh_abduction.solver.search import ALL, Search
 from ssh_abduction.theory.evidence import NO_PAIRS, Pairs, evidence_of, pairs_of, said_by
 from ssh_abduction.theory.evidence.displacement import count_returns
 from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
@@ -124,7 +124,7 @@ class OnlineMapper:
         odometry: Odometry | Mapping[str, Any] | None = None,
         time_limit: float | None = 0.5,
         max_maps: int | None = 100,
-        speedups: Speedups = ALL,
+        speedups: Speedups = Speedups(),
     ) -> None:
         first = replace(Step.of(_known(view, 0), star, "step 0"), confidence=confidence)
         theory = checked_theory(theory)

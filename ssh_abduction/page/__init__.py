@@ -1,5 +1,21 @@
 """A page in the browser that shows the maps of a trace, and its server."""
 
-from ssh_abduction.page.html import Page, view_page
+from ssh_abduction import lazy_names
 
-__all__ = ["Page", "view_page"]
+TYPE_CHECKING = False
+
+if TYPE_CHECKING:
+    from ssh_abduction.page.html import Page, view_page
+
+_HOMES = {
+    "html": (
+        "Page",
+        "view_page",
+    ),
+}
+__all__ = [
+    "Page",
+    "view_page",
+]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

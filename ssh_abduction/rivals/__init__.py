@@ -1,10 +1,30 @@
 """Compare the minimal maps of a trace, and find the next experiment that tells them apart."""
 
-from ssh_abduction.rivals.comparison import Comparison, compare
-from ssh_abduction.rivals.differences import Difference, difference
-from ssh_abduction.rivals.explore import Experiment, next_experiment
-from ssh_abduction.rivals.listing import Listing
+from ssh_abduction import lazy_names
 
+TYPE_CHECKING = False
+
+if TYPE_CHECKING:
+    from ssh_abduction.rivals.comparison import Comparison, compare
+    from ssh_abduction.rivals.differences import Difference, difference
+    from ssh_abduction.rivals.explore import Experiment, next_experiment
+    from ssh_abduction.rivals.listing import Listing
+
+_HOMES = {
+    "comparison": (
+        "Comparison",
+        "compare",
+    ),
+    "differences": (
+        "Difference",
+        "difference",
+    ),
+    "explore": (
+        "Experiment",
+        "next_experiment",
+    ),
+    "listing": ("Listing",),
+}
 __all__ = [
     "Comparison",
     "Difference",
@@ -14,3 +34,5 @@ __all__ = [
     "difference",
     "next_experiment",
 ]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

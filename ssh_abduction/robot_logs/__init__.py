@@ -1,5 +1,21 @@
 """From a robot's log to the minimal maps of the building, and a report."""
 
-from ssh_abduction.robot_logs.maps import LogMap, map_log
+from ssh_abduction import lazy_names
 
-__all__ = ["LogMap", "map_log"]
+TYPE_CHECKING = False
+
+if TYPE_CHECKING:
+    from ssh_abduction.robot_logs.maps import LogMap, map_log
+
+_HOMES = {
+    "maps": (
+        "LogMap",
+        "map_log",
+    ),
+}
+__all__ = [
+    "LogMap",
+    "map_log",
+]
+
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -35,7 +35,10 @@ if TYPE_CHECKING:
         Seconds,
         Solution,
         Status,
+        ending,
+        opening,
         summary_of,
+        written_map,
     )
     from ssh_abduction.solver.search import Search, solve
     from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, Sharing, stretches
@@ -82,6 +85,9 @@ _HOMES = {  # module: the names that this package exports from it
     "ranking": ("Ranking",),
     "recorded": ("theory_in",),
     "result": (
+        "ending",
+        "opening",
+        "written_map",
         "Bound",
         "Level",
         "Progress",
@@ -144,17 +150,20 @@ __all__ = [
     "check_rules",
     "cost_as_counted",
     "end_all",
+    "ending",
     "facts",
     "fault_front",
     "has_processors",
     "in_process",
     "observation",
+    "opening",
     "resident_memory",
     "solve",
     "stretches",
     "summary_of",
     "theory_in",
     "workers",
+    "written_map",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
