@@ -296,7 +296,7 @@ def test_steps_said_to_be_at_one_place_that_cannot_be() -> None:
     at_check = Rules("one.lp", "#program check(t).\n:- query(t), not same_place(5,15).")
     at_step = Rules("one.lp", "#program step(t).\n:- t = 15, not same_place(5,t).")
     for choices in ({"same": [(5, 15)]}, {"rules": [at_check]}, {"rules": [at_step]}):
-        assert solve(trace, **choices).status is Status.UNSATISFIABLE  # type: ignore[arg-type]
+        assert solve(trace, Theory(**choices)).status is Status.UNSATISFIABLE  # type: ignore[arg-type]
 
 
 def test_an_explanation_names_assertions_and_own_axioms() -> None:

@@ -275,13 +275,13 @@ def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again()
 
 def test_a_process_of_its_own_solves_the_trace() -> None:
     trace = circuit(20, wrong=17)
-    meanwhile = Meanwhile(trace, BOTH, 0, Speedups())
+    meanwhile = Meanwhile(trace, BOTH, None, Speedups())
     found = meanwhile.result()
     assert meanwhile.done()
     assert found is not None
     assert (found.status, found.complete, found.steps) == (Status.OPTIMAL, True, 21)
     assert found.maps == solve(trace, BOTH, max_maps=None).maps
-    ended = Meanwhile(circuit(2000, wrong=17), BOTH, 0, Speedups())
+    ended = Meanwhile(circuit(2000, wrong=17), BOTH, None, Speedups())
     del ended  # and with it the process
     assert not _under_way
 

@@ -22,7 +22,7 @@ from perception.features import telling_features
 from perception.images import images_of
 from simulator.tours import simulate
 from simulator.world import World
-from ssh_abduction import Trace, solve
+from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.evaluation.paper.figures import (
     draw_quality,
@@ -63,7 +63,7 @@ def loop() -> str:
 def folded() -> SSHMap:
     """The map of the rectangle where no axiom tells its opposite corners apart."""
     return solve(
-        Trace.load(EXAMPLES / "notched-rectangle.jsonl"), without=("side_of_branch",)
+        Trace.load(EXAMPLES / "notched-rectangle.jsonl"), Theory(without=("side_of_branch",))
     ).maps[0]
 
 

@@ -79,7 +79,7 @@ from ssh_abduction.solver import (
 )
 from ssh_abduction.theory.evidence import NO_PAIRS, Pairs, evidence_of, pairs_of, said_by
 from ssh_abduction.theory.evidence.displacement import count_returns
-from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
+from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class OnlineMapper:
         odometry: Odometry | Mapping[str, Any] | None = None,
         time_limit: float | None = 0.5,
         max_maps: int | None = 100,
-        speedups: Speedups = Speedups(),
+        speedups: Speedups = ALL,
     ) -> None:
         first = replace(Step.of(_known(view, 0), star, "step 0"), confidence=confidence)
         theory = checked_theory(theory)

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import TheoryError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
@@ -85,18 +86,19 @@ class Front:
         return {point.faults: point.dstates for point in self.points if point.proven}
 
 
+@renamed_parameters("limit")
 def fault_front(
-    trace: Trace, theory: Theory | None = None, most: int = 5, limit: float | None = None
+    trace: Trace, theory: Theory | None = None, most: int = 5, time_limit: float | None = None
 ) -> Front:
     """The fewest dstates for at most 0, 1, …, `most` faults.
 
     theory  Theory.causal() by default; its prices say which kinds of faults there are, both where it has none
-    limit   seconds in all
+    time_limit   seconds in all
 
     Raises TheoryError where the theory has places, whose axioms are not known to the engine that counts faults, and where it asserts something of steps that the trace does not have.
     """
     theory = Theory.causal() if theory is None else checked_theory(theory)
-    check_limit("limit", "seconds", limit)
+    check_limit("time_limit", "seconds", time_limit)
     if theory.jumped:
         raise TheoryError(
             "jumped: expected no wrong displacements where faults are counted; leave it out (--jumped)"
@@ -113,7 +115,7 @@ def fault_front(
         raise TheoryError(f"front: expected a number of faults from 0 to 1000, got {brief(most)}")
     theory.check_steps(checked_trace(trace))
     theory = (theory if theory.has_faults else theory.replace(**KINDS)).resolve(trace)
-    watch = Watch(limit)
+    watch = Watch(time_limit)
     watch.start()
     points = tuple(_points(Task.of(trace, theory, watch), most))
     return Front(points, stopped=any(not point.proven for point in points))

@@ -73,7 +73,7 @@ from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solutio
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.solver.steps.certificate import Basis
 from ssh_abduction.theory.evidence import evidence_of, said_by
-from ssh_abduction.theory.speedups import Speedups, checked_speedups, row
+from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 FEW_STEPS = (
@@ -89,7 +89,6 @@ SHORTEST = 0.05  # A trace that was mended has so many seconds at least.
 OVERTIME, OVERTIME_SHARE = 0.5, 0.05
 INTERRUPTED = 0.6  # Or so many seconds after Ctrl-C, or where memory is over.
 REASONING = 5.0  # For so many seconds it is sought what all minimal maps share, where the search took less and has no time limit.
-ALL = Speedups()
 _log = log_of(__name__)
 
 

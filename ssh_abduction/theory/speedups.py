@@ -74,6 +74,9 @@ class Speedups:
         return replace(self, **{name: False for name in SPEEDUPS if name not in valid})
 
 
+ALL = Speedups()
+
+
 def checked_speedups(value: object) -> Speedups:
     """The speed-ups that a caller gives. Raises SolverError."""
     if not isinstance(value, Speedups):
