@@ -15,6 +15,7 @@ from pathlib import Path
 import networkx as nx
 
 from ssh_abduction import Theory, Trace, solve
+from ssh_abduction.output import to_networkx
 
 HERE = Path(__file__).parent
 COMPASS = ("north", "south", "east", "west")
@@ -62,7 +63,7 @@ def main() -> None:
     )
     for ssh_map in solution.maps:
         same = nx.is_isomorphic(
-            ssh_map.to_networkx(),
+            to_networkx(ssh_map),
             maze(),
             node_match=lambda a, b: a["view"] == b["view"],
             edge_match=lambda a, b: a.keys() == b.keys(),

@@ -9,7 +9,7 @@ from ssh_abduction import Theory, Trace, compare, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main as main_of_the_shell
 from ssh_abduction.cli.text import compared, describe
-from ssh_abduction.output.picture import svg
+from ssh_abduction.output import to_svg
 
 
 def main() -> None:
@@ -28,7 +28,7 @@ def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out")
     folder.mkdir(parents=True, exist_ok=True)
     picture = folder / "aces3-map.svg"
-    picture.write_text(svg(solution.maps[0]) + "\n", encoding="utf-8")
+    picture.write_text(to_svg(solution.maps[0]) + "\n", encoding="utf-8")
     print(f"\nmap 1 is drawn in {picture}")
     print("\na simulated robot drives through a house with doors, and its log is mapped")
     log = folder / "house.log"

@@ -12,8 +12,7 @@ from worlds import rectangle
 
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.data import DState
-from ssh_abduction.data.cards import ROWS
-from ssh_abduction.data.maps import DRAWN
+from ssh_abduction.output.cards import DRAWN, ROWS
 from ssh_abduction.solver.search import Search
 
 ACES = Trace.load(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")

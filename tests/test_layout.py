@@ -18,6 +18,7 @@ from worlds import COMB, HEADINGS, PLUS, SQUARE, TEE, TOURS, TWO_BLOCKS, Streets
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.data import DState, MapError, MapPath
 from ssh_abduction.data.maps import Fault, Fit, Pose
+from ssh_abduction.output import plot, to_networkx, to_pandas, to_svg
 from ssh_abduction.output.layout import Layout, layout
 
 SIX = streets(
@@ -247,7 +248,7 @@ def test_turns_that_are_none_are_told() -> None:
 
 def test_the_graph_of_places_has_positions_and_streets() -> None:
     ssh_map = mapped(SQUARE)
-    graph = ssh_map.to_networkx("places")
+    graph = to_networkx(ssh_map, "places")
     assert nx.is_isomorphic(graph, nx.cycle_graph(4))
     assert {(frozenset((p, q)), data["path"]) for p, q, data in graph.edges(data=True)} == {
         (frozenset(path.order), path.id) for path in ssh_map.paths
@@ -258,12 +259,13 @@ def test_the_graph_of_places_has_positions_and_streets() -> None:
     )
     assert nx.get_node_attributes(graph, "pos") == layout(ssh_map).places
     assert graph.nodes[1]["dstates"] == tuple(s.id for s in ssh_map.dstates if s.place == 1)
-    metric = replace(
+    posed = replace(
         ssh_map,
         fit=Fit(
             1.0, 1, 0.5, poses=tuple(Pose(3.0 * (s.place or 0), 0.5, 1.0) for s in ssh_map.dstates)
         ),
-    ).to_networkx("places")
+    )
+    metric = to_networkx(posed, "places")
     assert metric.graph["metric"] is True
     assert {data["metres"] for _, _, data in metric.edges(data=True)} == {3.0, 9.0}
 
@@ -284,21 +286,21 @@ def test_faults_are_marked_and_views_stay_text() -> None:
     doubted = replace(square, faults=(Fault(3, "misread", "<script>alert(1)</script>", "v3"),))
     marks = [
         g
-        for g in ET.fromstring(doubted.to_svg()).iter("{http://www.w3.org/2000/svg}g")
+        for g in ET.fromstring(to_svg(doubted)).iter("{http://www.w3.org/2000/svg}g")
         if g.attrib.get("class") == "fault"
     ]
     assert [next(iter(g)).text for g in marks] == [
         "the view at step 3 is misread: <script>alert(1)</script>, expected v3"
     ]
-    assert "<script" not in doubted.to_svg()
-    assert 'class="fault"' not in square.to_svg()
+    assert "<script" not in to_svg(doubted)
+    assert 'class="fault"' not in to_svg(square)
     posed = replace(
         doubted,
         fit=Fit(
             1.0, 1, 0.5, poses=tuple(Pose(3.0 * (s.place or 0), 0.5, 1.0) for s in square.dstates)
         ),
     )
-    assert posed.to_svg().count('class="fault"') == 1
+    assert to_svg(posed).count('class="fault"') == 1
 
 
 def test_the_axes_of_matplotlib_hold_what_is_drawn() -> None:
@@ -308,12 +310,12 @@ def test_the_axes_of_matplotlib_hold_what_is_drawn() -> None:
 
     ssh_map = mapped(SQUARE)
     _, ax = pyplot.subplots()
-    assert ssh_map.plot(ax) is ax
+    assert plot(ssh_map, ax) is ax
     assert {text.get_text() for text in ax.texts} == {
         *map(str, ssh_map.places),
         *(f"x{s.id}" for s in ssh_map.dstates),
     }
-    assert solve(drive(*TOURS["square"]), Theory.causal()).maps[0].plot().texts
+    assert plot(solve(drive(*TOURS["square"]), Theory.causal()).maps[0]).texts
     pyplot.close("all")
 
 
@@ -322,11 +324,11 @@ def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None
         monkeypatch.setitem(sys.modules, module, None)
     ssh_map = mapped(SQUARE)
     with pytest.raises(MapError, match="expected pandas, got none; install"):
-        ssh_map.to_pandas()
+        to_pandas(ssh_map)
     with pytest.raises(
         MapError, match=r"expected matplotlib, got none; install 'ssh-abduction\[plot\]'"
     ):
-        ssh_map.plot()
+        plot(ssh_map)
 
 
 def test_a_table_has_a_row_for_each_step() -> None:
@@ -335,7 +337,7 @@ def test_a_table_has_a_row_for_each_step() -> None:
         Path(__file__).parent.parent / "examples" / "notched-rectangle.jsonl"
     ).prefix(20)
     (ssh_map,) = solve(trace).maps
-    table = ssh_map.to_pandas()
+    table = to_pandas(ssh_map)
     assert list(table["dstate"]) == list(ssh_map.labels)
     assert list(table["view"]) == list(trace.views)
     assert table["heading"].isna().all()

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import xml.etree.ElementTree as ET
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import networkx as nx
 import pytest
 from worlds import SQUARE, TEE, TOURS, Streets, drive, rectangle, streets, written
 
-from ssh_abduction import SSHMap, Theory, solve
+from ssh_abduction import SSHMap, Theory, output, solve
 from ssh_abduction.data import MapError
-from ssh_abduction.output.picture import svg
+from ssh_abduction.data.maps import MOVED
+from ssh_abduction.output import to_dot, to_graphml, to_networkx, to_svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -23,7 +27,7 @@ def the_map(tour: str, theory: Theory) -> SSHMap:
 
 
 def test_the_map_of_a_tee_is_the_tee() -> None:
-    graph = the_map("tee", Theory.circumscriptive()).to_networkx("topological")
+    graph = to_networkx(the_map("tee", Theory.circumscriptive()), "topological")
     truth = nx.Graph([("W", "main"), ("J", "main"), ("E", "main"), ("J", "side"), ("S", "side")])
     assert nx.is_isomorphic(graph, truth)
     assert {data["bipartite"] for _, data in graph.nodes(data=True)} == {0, 1}
@@ -31,7 +35,7 @@ def test_the_map_of_a_tee_is_the_tee() -> None:
 
 def test_the_comb_is_found_with_stars_and_paths_first() -> None:
     """The stand-in for Taylor Hall: 20 dstates, 7 places, 4 paths."""
-    graph = the_map("comb", Theory.circumscriptive()).to_networkx("topological")
+    graph = to_networkx(the_map("comb", Theory.circumscriptive()), "topological")
     truth = nx.Graph([(p, "main") for p in ("P1", "P2", "P3", "P4")])
     truth.add_edges_from(
         [("P1", "s1"), ("D1", "s1"), ("P2", "s2"), ("D2", "s2"), ("P4", "s4"), ("D3", "s4")]
@@ -41,14 +45,14 @@ def test_the_comb_is_found_with_stars_and_paths_first() -> None:
 
 def test_the_causal_graph_has_an_edge_a_link() -> None:
     ssh_map = the_map("comb", Theory.circumscriptive())
-    graph = ssh_map.to_networkx()
+    graph = to_networkx(ssh_map)
     assert {(s, data["action"], x) for s, x, data in graph.edges(data=True)} == set(ssh_map.links)
     assert graph.nodes[0]["view"] == ssh_map.dstates[0].view
     assert nx.parse_graphml(
-        ssh_map.to_graphml(), node_type=int, force_multigraph=True
+        to_graphml(ssh_map), node_type=int, force_multigraph=True
     ).number_of_edges() == len(ssh_map.links)
     with pytest.raises(MapError, match="level: expected"):
-        ssh_map.to_networkx("metrical")  # type: ignore[arg-type]
+        to_networkx(ssh_map, "metrical")  # type: ignore[arg-type]
 
 
 def test_maps_survive_files(tmp_path: Path) -> None:
@@ -103,7 +107,7 @@ def positions(picture: str) -> dict[str, tuple[float, float]]:
 @pytest.mark.parametrize("tour", ["comb", "tee", "plus", "two blocks, further"])
 def test_right_angled_worlds_are_drawn_at_right_angles(tour: str) -> None:
     ssh_map = the_map(tour, Theory.circumscriptive().replace(star="frame"))
-    at = positions(svg(ssh_map))
+    at = positions(to_svg(ssh_map))
     assert len(set(at.values())) == len(ssh_map.places)
     for path in ssh_map.paths:
         xs, ys = zip(*(at[str(p)] for p in path.order), strict=True)
@@ -114,7 +118,7 @@ def test_right_angled_worlds_are_drawn_at_right_angles(tour: str) -> None:
 
 def test_turns_right_go_round_clockwise_on_the_page() -> None:
     (ssh_map,) = solve(rectangle(16)).maps
-    at = positions(svg(ssh_map))
+    at = positions(to_svg(ssh_map))
     corners = [at[str(p)] for p in range(4)]
     area = sum(
         ax * by - bx * ay
@@ -131,12 +135,26 @@ def test_every_map_can_be_drawn(world: Streets) -> None:
         Theory.topological().replace(boundary="none"),
     ):
         for ssh_map in solve(drive(world, min(world), min(world[min(world)]), "TATA"), theory).maps:
-            ET.fromstring(svg(ssh_map))
+            ET.fromstring(to_svg(ssh_map))
 
 
 def test_strange_names_are_drawn_and_written_safely() -> None:
     (ssh_map,) = solve(written('<a>&"\\ T <b>'), Theory.topological()).maps
-    ET.fromstring(svg(ssh_map))
-    assert '\\"' in ssh_map.to_dot()
+    ET.fromstring(to_svg(ssh_map))
+    assert '\\"' in to_dot(ssh_map)
     (causal,) = solve(written("<a> T <b>"), Theory.causal()).maps
-    ET.fromstring(svg(causal))
+    ET.fromstring(to_svg(causal))
+
+
+def test_the_drawing_methods_of_version_0_1_0_warn_and_call_the_functions() -> None:
+    (ssh_map,) = solve(written("a T b")).maps
+    old: Any = ssh_map
+    for name in MOVED:
+        with pytest.warns(DeprecationWarning, match=f"use ssh_abduction.output.{name}$"):
+            method = getattr(old, name)
+        assert method.func is getattr(output, name)
+    with pytest.warns(DeprecationWarning, match="SSHMap.to_svg is deprecated"):
+        assert old.to_svg({"T": 90}) == to_svg(ssh_map, {"T": 90})
+    with pytest.raises(AttributeError, match="'SSHMap' object has no attribute 'to_png'"):
+        _ = old.to_png
+    assert copy.deepcopy(ssh_map) == pickle.loads(pickle.dumps(ssh_map)) == ssh_map

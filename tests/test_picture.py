@@ -17,7 +17,7 @@ from worlds import TOURS, drive
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data.maps import DState, Fit, MapPath, Pose
-from ssh_abduction.output.picture import svg
+from ssh_abduction.output import to_svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 SQUARE = [(10.0, 0.3, 0.02), (0.0, 0.0, math.pi / 2)] * 4
@@ -90,7 +90,7 @@ def page(picture: str) -> tuple[float, float, float, float]:
 def test_dots_are_where_the_dstates_are(theory: str) -> None:
     ssh_map = surveyed(theory)
     assert ssh_map.fit is not None
-    found = dots(svg(ssh_map))
+    found = dots(to_svg(ssh_map))
     names = [
         f"place {s.place}" if s.place is not None else f"dstate {s.id}" for s in ssh_map.dstates
     ]
@@ -104,7 +104,7 @@ def test_dots_are_where_the_dstates_are(theory: str) -> None:
 
 def test_the_bar_is_as_long_as_it_says() -> None:
     ssh_map = grid(4, apart=8.0)
-    picture = svg(ssh_map)
+    picture = to_svg(ssh_map)
     (metres,) = (float(found) for found in re.findall(r">([0-9.]+) m<", picture))
     left, right = (
         float(found)
@@ -122,7 +122,7 @@ def test_arrows_point_where_the_dstates_face() -> None:
     ssh_map = surveyed()
     assert ssh_map.fit is not None
     turned = {}
-    for group in ET.fromstring(svg(ssh_map)).iter(f"{SVG}g"):
+    for group in ET.fromstring(to_svg(ssh_map)).iter(f"{SVG}g"):
         if (number := re.match(r"dstate (\d+):", str(group.findtext(f"{SVG}title")))) and (
             arrow := group.find(f"{SVG}path")
         ) is not None:
@@ -137,7 +137,7 @@ def test_arrows_point_where_the_dstates_face() -> None:
 def test_ellipses_have_the_axes_of_the_covariance() -> None:
     ssh_map = grid(3)
     assert ssh_map.fit is not None
-    picture = svg(ssh_map)
+    picture = to_svg(ssh_map)
     at = dots(picture)
     scale = math.dist(at["place 0"], at["place 2"]) / math.hypot(
         ssh_map.fit.poses[8].x, ssh_map.fit.poses[8].y
@@ -166,7 +166,7 @@ def test_ellipses_have_the_axes_of_the_covariance() -> None:
     ids=["square", "causal", "four", "many", "near"],
 )
 def test_nothing_lies_outside_the_page(ssh_map: SSHMap) -> None:
-    picture = svg(ssh_map)
+    picture = to_svg(ssh_map)
     left, top, right, bottom = page(picture)
     inside = []
     for mark in ET.fromstring(picture).iter():
@@ -194,7 +194,7 @@ def test_nothing_lies_outside_the_page(ssh_map: SSHMap) -> None:
 def test_labels_do_not_overlap() -> None:
     for ssh_map in (grid(2), grid(9), grid(3, apart=0.02), surveyed("causal")):
         boxes = []
-        for mark in ET.fromstring(svg(ssh_map)).iter(f"{SVG}text"):
+        for mark in ET.fromstring(to_svg(ssh_map)).iter(f"{SVG}text"):
             size, x, y = (float(mark.attrib[name]) for name in ("font-size", "x", "y"))
             wide = 0.3 * size * len(str(mark.text))
             boxes.append((x - wide, y - size / 2, x + wide, y + size / 2))
@@ -206,24 +206,24 @@ def test_labels_do_not_overlap() -> None:
 
 def test_each_place_of_a_large_map_is_named() -> None:
     ssh_map = grid(9)
-    named = {str(mark.text) for mark in ET.fromstring(svg(ssh_map)).iter(f"{SVG}text")}
+    named = {str(mark.text) for mark in ET.fromstring(to_svg(ssh_map)).iter(f"{SVG}text")}
     assert {str(p) for p in ssh_map.places} <= named
     assert "x0 start" in named
 
 
 def test_maps_without_poses_are_drawn_as_before() -> None:
     (without,) = solve(drive(*TOURS["comb"]), Theory.circumscriptive()).maps
-    before = svg(without)
+    before = to_svg(without)
     poses = [Pose(0.1 * s.id, 0.0, 0.0) for s in without.dstates]
-    assert svg(replace(without, fit=Fit(1.0, 1, 0.5))) == before
-    assert svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) != before
+    assert to_svg(replace(without, fit=Fit(1.0, 1, 0.5))) == before
+    assert to_svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) != before
     other = next(s.id for s in without.dstates if s.place != without.dstates[0].place)
     poses[other] = Pose(
         0.0, 0.0, 0.0
     )  # a part of the map which no displacement connects with the rest has poses of its own
-    assert svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) == before
+    assert to_svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) == before
     poses[other] = Pose(1e300, 0.0, 0.0)
-    assert svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) == before
+    assert to_svg(replace(without, fit=Fit(1.0, 1, 0.5, poses=tuple(poses)))) == before
 
 
 def test_the_file_is_written_where_it_is_asked_for(

@@ -21,7 +21,7 @@ import pytest
 
 from ssh_abduction.cli import main, parser
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.output.picture import svg
+from ssh_abduction.output import to_svg
 from ssh_abduction.robot_logs import maps as log_maps
 from ssh_abduction.solver.result import Status
 from ssh_abduction.solver.search import solve
@@ -233,7 +233,7 @@ def test_the_trace_of_the_formats_page_has_a_map(tmp_path: Path) -> None:
 
 def test_the_picture_is_the_map() -> None:
     (ssh_map,) = solve(Trace.load(ROOT / "examples" / "notched-rectangle.jsonl")).maps
-    assert (ROOT / "docs" / "notched-rectangle.svg").read_text() == svg(ssh_map) + "\n"
+    assert (ROOT / "docs" / "notched-rectangle.svg").read_text() == to_svg(ssh_map) + "\n"
 
 
 @pytest.mark.parametrize("name", figures.DRAWN)

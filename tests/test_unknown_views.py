@@ -17,6 +17,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
 from ssh_abduction.data.errors import TraceError
+from ssh_abduction.output import to_dot, to_graphml, to_svg
 from ssh_abduction.rivals.comparison import compare
 from ssh_abduction.rivals.explore import next_experiment
 from ssh_abduction.theory.speedups import TABLE
@@ -90,9 +91,9 @@ def test_a_dstate_that_was_never_seen_has_no_view(
     assert [s.view for s in ssh_map.dstates] == ["end", "hall", None, "end", "hall", "end"]
     ssh_map.save(tmp_path / "map.json")
     assert SSHMap.load(tmp_path / "map.json") == ssh_map
-    for text in (ssh_map.to_svg(), ssh_map.to_dot(), ssh_map._repr_html_()):
+    for text in (to_svg(ssh_map), to_dot(ssh_map), ssh_map._repr_html_()):
         assert "None" not in text
-    assert "None" not in ssh_map.to_graphml()
+    assert "None" not in to_graphml(ssh_map)
     trace.save(tmp_path / "trace.jsonl")
     assert main(["solve", str(tmp_path / "trace.jsonl"), "--json"]) == 0
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)

@@ -31,7 +31,7 @@ from ssh_abduction.evaluation.paper.figures import (
     draw_world,
 )
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.output.picture import svg
+from ssh_abduction.output import to_svg
 
 ROOT = Path(__file__).parent.parent
 FIGURES = ROOT / "docs" / "figures"
@@ -75,9 +75,9 @@ def rivals() -> tuple[SSHMap, ...]:
 
 DRAWN: dict[str, Callable[[], str]] = {
     "loop": loop,
-    "folded": lambda: svg(folded()),
-    "rival-1": lambda: svg(rivals()[0]),
-    "rival-3": lambda: svg(rivals()[2]),
+    "folded": lambda: to_svg(folded()),
+    "rival-1": lambda: to_svg(rivals()[0]),
+    "rival-3": lambda: to_svg(rivals()[2]),
 }
 
 

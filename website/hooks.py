@@ -40,6 +40,14 @@ THEMES: dict[str, tuple[str, ...]] = {
     "Package data": tuple(
         f"data.{name}" for name in data.__all__ if name not in ssh_abduction.__all__
     ),
+    "Package output": (
+        "output.to_svg",
+        "output.plot",
+        "output.to_networkx",
+        "output.to_pandas",
+        "output.to_graphml",
+        "output.to_dot",
+    ),
     "Package solver": tuple(
         f"solver.{name}"
         for name in (

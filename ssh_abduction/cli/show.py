@@ -39,6 +39,8 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    from ssh_abduction import output
+
     maps = maps_of(read_json(options.maps), str(options.maps))
     check_number(options.map, maps, options.maps)
     if not maps:
@@ -50,13 +52,11 @@ def run(options: argparse.Namespace) -> int:
         return 0
     chosen = maps[(options.map or 1) - 1]
     if options.dot:
-        print(chosen.to_dot())
+        print(output.to_dot(chosen))
     elif options.graphml:
-        print(chosen.to_graphml())
+        print(output.to_graphml(chosen))
     elif options.svg:
-        from ssh_abduction.output.picture import svg
-
-        picture = svg(chosen)
+        picture = output.to_svg(chosen)
         if options.svg == "-":
             print(picture)
         else:

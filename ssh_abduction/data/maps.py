@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import sys
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from itertools import pairwise
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ssh_abduction.data import cards
 from ssh_abduction.data.checks import a_path, a_text, all_instances, an_instance
 from ssh_abduction.data.errors import (
     MapError,
@@ -28,25 +27,18 @@ from ssh_abduction.data.errors import (
     is_whole,
     is_writable,
     named,
-    printable,
-    xml_text,
 )
 from ssh_abduction.data.files import HalfCharacter, NotFinite, json_line, parse_json, write_file
+from ssh_abduction.data.notebook import in_output
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.data.words import counted
-
-if TYPE_CHECKING:
-    import networkx as nx
-    import pandas as pd
-
-    from ssh_abduction.output.layout import Turns
 
 # What files of solutions and of single maps begin with.
 SOLUTION_FORMAT, MAP_FORMAT, VERSION = "ssh-solution", "ssh-map", 1
 # Bytes that a file of maps may have: some hundred thousand maps. To read it takes ten times as much memory.
 LARGEST = 2**30
-# Notebooks draw maps of so many dstates at most: to lay out more takes seconds, and nobody could read them there.
-DRAWN = 150
+# Methods of version 0.1.0 that are functions of `ssh_abduction.output` now.
+MOVED = ("plot", "to_dot", "to_graphml", "to_networkx", "to_pandas", "to_svg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,35 +191,22 @@ class SSHMap:
         return [whole.labels, dstates, whole.links, whole.places, faults]
 
     def _repr_html_(self) -> str:
-        """What notebooks show: the picture, how well the map closes, what it disbelieves, and its dstates."""
-        from ssh_abduction.output.picture import svg
+        """The map for notebooks: picture, fit, faults and dstates."""
+        card: str = in_output("map_card")(self)
+        return card
 
-        parts = [
-            cards.picture(svg(self))
-            if len(self.dstates) <= DRAWN
-            else cards.paragraph(f"not drawn, as it has more than {DRAWN} dstates")
-        ]
-        if self.faults:
-            parts.append(cards.paragraph("; ".join(map(str, self.faults))))
-        if self.fit:
-            parts.append(
-                cards.paragraph(
-                    f"chi-square {self.fit.chi2:.1f} for {self.fit.dof} degrees of freedom (p = {self.fit.p:.2g})"
-                )
+    if not TYPE_CHECKING:  # so that type checkers still refuse unknown attributes
+
+        def __getattr__(self, name):
+            """Find a method of version 0.1.0 that is a function of `ssh_abduction.output` now."""
+            if name not in MOVED:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            warnings.warn(
+                f"SSHMap.{name} is deprecated; use ssh_abduction.output.{name}",
+                DeprecationWarning,
+                stacklevel=2,
             )
-        leads: dict[int, list[str]] = {}
-        for source, action, target in self.links:
-            leads.setdefault(source, []).append(f"{action} → {target}")
-        topological = bool(self.places)
-        head = ("dstate", "view", *(("place", "path") if topological else ()), "links")
-        rows = [
-            (s.id, s.shown, *(_where(s) if topological else ()), ", ".join(leads.get(s.id, ())))
-            for s in self.dstates[: cards.ROWS + 1]
-        ]
-        table = cards.table(head, [*rows, *(() for _ in self.dstates[len(rows) :])], "dstates")
-        return cards.card(
-            repr(self)[1:-1], *parts, cards.folded(counted(len(self.dstates), "dstates"), table)
-        )
+            return partial(in_output(name), self)
 
     def without_headings(self) -> SSHMap:
         """The same map for a theory in which places have no frames."""
@@ -394,184 +373,6 @@ class SSHMap:
             )
         return self.dstates[self.labels[step]].place
 
-    def to_svg(self, turns: Trace | Turns | None = None) -> str:
-        """The map as SVG text: in metres where it has poses, else with straight paths and turns to their side.
-
-        turns  which way actions turn: the trace that was mapped, or for each name "right", "left", "around" or degrees clockwise. Actions of these names need none
-        """
-        from ssh_abduction.output.layout import degrees_of
-        from ssh_abduction.output.picture import svg
-
-        degrees_of(turns)
-        return svg(self, turns)
-
-    def plot(self, ax: Any = None, turns: Trace | Turns | None = None) -> Any:
-        """Draw the map with matplotlib, into these axes or into new ones, and return the axes. Raises MapError where matplotlib is not installed."""
-        from ssh_abduction.output.layout import degrees_of
-        from ssh_abduction.output.plotting import plot
-
-        degrees_of(turns)
-        return plot(self, ax, turns)
-
-    def to_pandas(self) -> pd.DataFrame:
-        """A table with a row for each step: dstate, view, place, path, direction, heading; where there are poses also x, y (metres) and pose_heading (radians).
-
-        Raises MapError where pandas is not installed.
-        """
-        try:
-            import pandas as pd
-        except ImportError:
-            raise MapError(
-                "to_pandas: expected pandas, got none; install it with pip install pandas"
-            ) from None
-        rows = []
-        for s in (self.dstates[label] for label in self.labels):
-            row: dict[str, Any] = {
-                "dstate": s.id,
-                "view": s.view,
-                "place": s.place,
-                "path": s.path,
-                "direction": s.direction,
-                "heading": s.heading,
-            }
-            if self.fit and self.fit.poses:
-                pose = self.fit.poses[s.id]
-                row |= {"x": pose.x, "y": pose.y, "pose_heading": pose.heading}
-            rows.append(row)
-        table = pd.DataFrame(rows, index=pd.RangeIndex(len(rows), name="step"))
-        whole = ["place", "path", "direction", "heading"]
-        return table.astype(dict.fromkeys(whole, "Int64"))  # which knows missing numbers
-
-    def to_networkx(
-        self,
-        level: Literal["causal", "topological", "places"] = "causal",
-        turns: Trace | Turns | None = None,
-    ) -> nx.Graph[Any]:
-        """The map as a graph of networkx.
-
-        causal       a MultiDiGraph: each dstate is a node (with view, place, path, direction), each link an edge (with action)
-        topological  a Graph: its nodes are ("place", p) and ("path", h), and it has an edge where a place is on a path (with its index in the order)
-        places       a MultiGraph: each place is a node (with pos, x to the right and y up, and its dstates), and it has an edge for each two neighbours on a path
-                     (keyed by the path, with path, order: the index of the first of the two, travelled: whether the robot went from one to the other, and metres,
-                     where there are poses); graph["metric"] says whether positions are metres or a layout
-        turns        for the layout of places, as in `to_svg`
-        """
-        import networkx as nx
-
-        if turns is not None:
-            from ssh_abduction.output.layout import degrees_of  # loads scipy
-
-            degrees_of(turns)
-        if not isinstance(level, str):
-            raise MapError(
-                f'level: expected "causal", "topological" or "places", got {brief(level)}'
-            )
-        if level == "causal":
-            causal: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
-            for s in self.dstates:
-                facts = {
-                    "view": s.view,
-                    "place": s.place,
-                    "path": s.path,
-                    "direction": s.direction,
-                    "heading": s.heading,
-                }
-                causal.add_node(s.id, **{k: v for k, v in facts.items() if v is not None})
-            for source, action, target in self.links:
-                causal.add_edge(source, target, key=action, action=action)
-            return causal
-        if level == "places":
-            return self._graph_of_places(turns)
-        if level != "topological":
-            raise MapError(
-                f'level: expected "causal", "topological" or "places", got {brief(level)}'
-            )
-        bipartite: nx.Graph[Any] = nx.Graph()
-        bipartite.add_nodes_from((("place", p) for p in self.places), bipartite=0)
-        bipartite.add_nodes_from((("path", p.id) for p in self.paths), bipartite=1)
-        for path in self.paths:
-            for index, place in enumerate(path.order):
-                bipartite.add_edge(("place", place), ("path", path.id), index=index)
-        return bipartite
-
-    def _graph_of_places(self, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
-        import networkx as nx
-
-        from ssh_abduction.output.layout import layout, travelled
-
-        found = layout(self, turns)
-        graph: nx.MultiGraph[Any] = nx.MultiGraph(metric=found.metric)
-        for place in self.places:
-            graph.add_node(
-                place,
-                pos=found.places[place],
-                dstates=tuple(s.id for s in self.dstates if s.place == place),
-            )
-        for path in self.paths:
-            streets = travelled(self, path)
-            for index, (p, q) in enumerate(pairwise(path.order)):
-                metres = (
-                    {"metres": math.dist(found.places[p], found.places[q])} if found.metric else {}
-                )
-                graph.add_edge(
-                    p,
-                    q,
-                    key=path.id,
-                    path=path.id,
-                    order=index,
-                    travelled=(min(p, q), max(p, q)) in streets,
-                    **metres,
-                )
-        return graph
-
-    def to_graphml(self) -> str:
-        """The causal graph as GraphML text."""
-        import networkx as nx
-
-        causal = self.to_networkx()
-        graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
-        for s, data in causal.nodes(data=True):
-            graph.add_node(
-                s, **{**data, **({"view": xml_text(str(data["view"]))} if "view" in data else {})}
-            )
-        for source, target, action in causal.edges(data="action"):
-            name = xml_text(action)
-            key = (
-                name
-                if not graph.has_edge(source, target, name)
-                else f"{name} ({graph.number_of_edges(source, target)})"
-            )
-            graph.add_edge(source, target, key=key, action=name)
-        return "\n".join(nx.generate_graphml(graph))
-
-    def to_dot(self) -> str:
-        """The causal graph as Graphviz DOT text, with a cluster for each place."""
-
-        def quoted(text: object) -> str:
-            lines = (
-                printable(line) for line in str(text).split("\n")
-            )  # a terminal would obey some characters
-            return (
-                '"'
-                + "\\n".join(line.replace("\\", "\\\\").replace('"', '\\"') for line in lines)
-                + '"'
-            )
-
-        def node(s: DState) -> str:
-            course = "" if s.path is None else f"\npath {s.path}{'+' if s.direction == 1 else '-'}"
-            return f"{s.id} [label={quoted(f'{s.id}: {s.shown}{course}')}];"
-
-        lines = ["digraph map {", "  node [shape=box, style=rounded];"]
-        lines += [f"  {node(s)}" for s in self.dstates if s.place is None]
-        for p in self.places:
-            inside = " ".join(node(s) for s in self.dstates if s.place == p)
-            lines.append(f"  subgraph cluster_{p} {{ label={quoted(f'place {p}')}; {inside} }}")
-        lines += [
-            f"  {source} -> {target} [label={quoted(action)}];"
-            for source, action, target in self.links
-        ]
-        return "\n".join([*lines, "}"])
-
 
 def checked_map(value: object, name: str = "map") -> SSHMap:
     """The map that a caller gives. Raises MapError."""
@@ -584,15 +385,6 @@ def checked_maps(values: object) -> tuple[SSHMap, ...]:
     """The maps that a caller gives. Raises MapError."""
     return all_instances(
         "maps", values, SSHMap, MapError, mend="take the maps of a solution, or SSHMap.load"
-    )
-
-
-def _where(dstate: DState) -> tuple[object, object]:
-    """The place and the course of a dstate, as a table shows them."""
-    place = "" if dstate.place is None else dstate.place
-    return (
-        place,
-        "" if dstate.path is None else f"{dstate.path}{'+' if dstate.direction == 1 else '-'}",
     )
 
 

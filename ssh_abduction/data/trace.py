@@ -14,13 +14,12 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias, overload
 
-from ssh_abduction.data import cards
 from ssh_abduction.data.checks import a_list, a_path, a_text, a_whole_number, an_instance, an_object
 from ssh_abduction.data.errors import (
     RangeError,
@@ -40,6 +39,7 @@ from ssh_abduction.data.files import (
     parse_json,
     write_file,
 )
+from ssh_abduction.data.notebook import in_output
 from ssh_abduction.data.odometry import (
     Covariance,
     Displacement,
@@ -66,7 +66,6 @@ TurnDirection: TypeAlias = Literal["right", "left", "around"]
 FORMAT, VERSION = "ssh-trace", 1
 # Bytes that a line of a file may have. A step with a panorama of 100,000 numbers fits; a file that has no line ends is refused before it fills the memory.
 LONGEST_LINE = 16 * 2**20
-SHOWN = 10  # So many steps of a trace are shown in a notebook.
 _KINDS = ("travel", "turn")
 _TURNS = ("right", "left", "around")
 _MAPS = (b'{"format": "ssh-solution"', b'{"format": "ssh-map"')  # what files of maps begin with
@@ -303,7 +302,7 @@ class Step:
         if openings is None:
             raise TraceError(
                 f"star: expected bearings that fall into different quarters (ahead, right, back, left), each near its middle and observed, "
-                f"got {brief(_star_to_json(star))}; merge the openings that share a quarter, or take star=gateways (solve --star gateways)"
+                f"got {brief(star_to_json(star))}; merge the openings that share a quarter, or take star=gateways (solve --star gateways)"
             )
         return openings
 
@@ -312,7 +311,7 @@ class Step:
             "view": self.view,
             "image": list(self.image) if isinstance(self.image, tuple) else self.image,
             "action": self.action.to_json() if self.action else None,
-            "star": _star_to_json(self.star) if self.star is not None else None,
+            "star": star_to_json(self.star) if self.star is not None else None,
             "displacement": list(self.displacement) if self.displacement is not None else None,
             "covariance": [list(row) for row in self.covariance]
             if self.covariance is not None
@@ -440,41 +439,9 @@ class Trace:
         return f"<Trace{name}: {', '.join(parts)}{''.join(f'; {what}' for what, is_there in there.items() if is_there)}>"
 
     def _repr_html_(self) -> str:
-        """What notebooks show: the first steps, with what was seen and done at them."""
-        columns: dict[str, Callable[[Step], object]] = {
-            "view": lambda step: "" if step.view is None else step.view,
-            "image": lambda step: (
-                f"{counted(len(step.image), 'numbers')}"
-                if isinstance(step.image, tuple)
-                else ""
-                if step.image is None
-                else step.image
-            ),
-            "star": lambda step: (
-                "" if step.star is None else ", ".join(map(str, _star_to_json(step.star)))
-            ),
-            "displacement": lambda step: (
-                ""
-                if step.displacement is None
-                else ", ".join(f"{x:.2f}" for x in step.displacement)
-            ),
-            "action": lambda step: step.action.name if step.action else "",
-        }
-        shown = {
-            name: cell
-            for name, cell in columns.items()
-            if any(cell(step) != "" for step in self.steps[:SHOWN])
-        }
-        rows = [
-            (t, *(cell(step) for cell in shown.values()))
-            for t, step in enumerate(self.steps[:SHOWN])
-        ]
-        left = (
-            cards.paragraph(f"and {counted(len(self) - SHOWN, 'more steps')}")
-            if len(self) > SHOWN
-            else ""
-        )
-        return cards.card(repr(self)[1:-1], cards.table(("step", *shown), rows), left)
+        """The trace for notebooks: its first steps."""
+        card: str = in_output("trace_card")(self)
+        return card
 
     @property
     def views(self) -> tuple[View | None, ...]:
@@ -959,5 +926,5 @@ def _frozen_image(value: Any) -> tuple[float, ...] | int:
     return _image(value.tolist() if hasattr(value, "tolist") else value, "image")
 
 
-def _star_to_json(star: Sequence[Entry]) -> list[Any]:
+def star_to_json(star: Sequence[Entry]) -> list[Any]:
     return [entry.to_json() if isinstance(entry, Gateway) else entry for entry in star]

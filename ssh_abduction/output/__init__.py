@@ -1,17 +1,40 @@
-"""Pictures, graphs and exports of maps for other programs."""
+"""Pictures, graphs, tables, notebook cards and files for other programs: functions of a map.
+
+Each name is loaded when it is first used, as some need networkx, scipy, matplotlib or pandas.
+"""
 
 from ssh_abduction import lazy_names
 
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
+    from ssh_abduction.output.cards import map_card, trace_card
+    from ssh_abduction.output.dot import to_dot
     from ssh_abduction.output.export import export_map
+    from ssh_abduction.output.graphs import to_graphml, to_networkx
+    from ssh_abduction.output.picture import to_svg
+    from ssh_abduction.output.plotting import plot
+    from ssh_abduction.output.tables import to_pandas
 
-_HOMES = {
+_HOMES = {  # module: the names that this package exports from it
+    "cards": ("map_card", "trace_card"),
+    "dot": ("to_dot",),
     "export": ("export_map",),
+    "graphs": ("to_graphml", "to_networkx"),
+    "picture": ("to_svg",),
+    "plotting": ("plot",),
+    "tables": ("to_pandas",),
 }
 __all__ = [
     "export_map",
+    "map_card",
+    "plot",
+    "to_dot",
+    "to_graphml",
+    "to_networkx",
+    "to_pandas",
+    "to_svg",
+    "trace_card",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

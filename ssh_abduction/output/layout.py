@@ -23,23 +23,15 @@ from scipy.optimize import linprog
 from scipy.sparse import coo_array
 from scipy.spatial.distance import pdist
 
-from ssh_abduction.data.checks import an_object
-from ssh_abduction.data.errors import MapError, brief, is_finite
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.output.turns import SURE, Turns, degrees_of
 
 if TYPE_CHECKING:
     from ssh_abduction.data.maps import DState, MapPath, Pose, SSHMap
 
 Point: TypeAlias = tuple[float, float]
-Turns: TypeAlias = Mapping[str, "str | float"]
 
-# Degrees clockwise that turns go by, where nothing but their side is known.
-SIDES = {"right": 90.0, "around": 180.0, "left": 270.0}
 FARTHEST = 1e7  # metres: positions farther away are not those of a robot
-SURE, GUESSED = (
-    1.0,
-    0.2,
-)  # the weights of a turn of so many degrees, and of one of which the side is known alone
 WRONG, WRONG_GUESS = (
     math.radians(46),
     math.radians(61),
@@ -122,6 +114,7 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
 
     Raises MapError where a turn is none of these.
     """
+    degrees = degrees_of(turns)
     if (poses := located(ssh_map)) is not None:
         at = {
             s.place: (poses[s.id].x, poses[s.id].y)
@@ -133,31 +126,7 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
             tuple((pose.x, pose.y, pose.heading) for pose in poses),
             True,
         )
-    return _Drawing(ssh_map, degrees_of(turns)).layout()
-
-
-def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
-    """How many degrees actions turn by, clockwise, and with which weight that is believed, by name. Raises MapError."""
-    known: dict[str, str | float] = {name: name for name in SIDES}
-    if isinstance(turns, Trace):
-        actions = {action.name: action for action in turns.actions if action.turn is not None}
-        known |= {
-            name: action.turn or "" if action.bearing is None else float(action.bearing)
-            for name, action in actions.items()
-        }
-    elif turns is not None:
-        known |= an_object("turns", turns, MapError)
-    degrees = {}
-    for name, turn in known.items():
-        if isinstance(turn, str) and turn in SIDES:
-            degrees[name] = (SIDES[str(turn)], GUESSED)
-        elif is_finite(turn):
-            degrees[name] = (float(turn), SURE)
-        else:
-            raise MapError(
-                f'turns[{brief(name)}]: expected "right", "left", "around" or degrees clockwise, got {brief(turn)}; say which'
-            )
-    return degrees
+    return _Drawing(ssh_map, degrees).layout()
 
 
 def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:

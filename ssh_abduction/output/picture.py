@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
+from ssh_abduction.data.maps import DState, SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.drawing import COLOURS, RADIUS, Point, escaped, fault_mark, page, text
-from ssh_abduction.output.layout import Layout, Turns, layout, located, travelled
+from ssh_abduction.output.layout import Layout, layout, located, travelled
 from ssh_abduction.output.metric_picture import metric_svg
-
-if TYPE_CHECKING:
-    from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.output.turns import Turns, degrees_of
 
 # In units of the page: between neighbouring places, from the middle of a place to the name of a dstate, and how far a dstate is drawn beside the line of its path.
 SPACING, DSTATE, LANE = 130.0, 38.0, 9.0
@@ -24,11 +22,19 @@ SPACING, DSTATE, LANE = 130.0, 38.0, 9.0
 LONGEST_LABEL = 20
 
 
-def svg(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> str:
-    """The map as SVG text.
+def to_svg(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> str:
+    """A map as SVG text: in metres if it has poses, else with straight paths and turns to their side.
 
-    turns  which way actions turn, as for `layout`: the trace that was mapped, or a turn for each name; actions named right, left and around need none
+    Args:
+        ssh_map: The map.
+        turns: How actions turn: the trace that was mapped, or for each action's name "right",
+            "left", "around" or degrees clockwise. Actions of these three names need none.
+
+    Raises:
+        MapError: If an argument is none of these.
     """
+    checked_map(ssh_map)
+    degrees_of(turns)
     if (where := located(ssh_map)) is not None:
         return metric_svg(ssh_map, where)
     found = layout(ssh_map, turns)

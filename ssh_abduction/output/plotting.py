@@ -4,28 +4,34 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ssh_abduction.data.errors import MapError, brief
+from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.output.drawing import ALARM, COLOURS
-from ssh_abduction.output.layout import Turns, layout, travelled
-
-if TYPE_CHECKING:
-    from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.output.layout import layout, travelled
+from ssh_abduction.output.turns import Turns
 
 # Inches between neighbouring places; and as shares of the way between the two nearest: where the mark of a dstate is, and how far beside the line of its path.
 APART, AHEAD, LANE = 0.9, 0.27, 0.07
 
 
 def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) -> Any:
-    """Draw a map, x to the right and y up; in metres where it has poses.
+    """Draw a map with matplotlib, x to the right and y up; in metres if it has poses.
 
-    ax     the axes of matplotlib to draw into; None: new ones, which `ax.figure` shows and saves
-    turns  as for `layout`
+    Args:
+        ssh_map: The map.
+        ax: The axes to draw into; None for new ones. `ax.figure` shows and saves them.
+        turns: How actions turn, as in `to_svg`.
 
-    Returns the axes. Raises MapError where matplotlib is not installed.
+    Returns:
+        The axes.
+
+    Raises:
+        MapError: If an argument is none of these, or matplotlib is not installed.
     """
+    checked_map(ssh_map)
     if ax is not None and not hasattr(ax, "annotate"):
         raise MapError(
             f"ax: expected axes of matplotlib, got {brief(ax)}; make some with matplotlib.pyplot.subplots, or leave them out"

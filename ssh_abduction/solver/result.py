@@ -9,7 +9,6 @@ from enum import Enum
 from typing import Any, overload
 
 from ssh_abduction.checker.claims import contradictions
-from ssh_abduction.data import cards
 from ssh_abduction.data.errors import MapError, brief, checked_index, named
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import (
@@ -25,6 +24,7 @@ from ssh_abduction.data.maps import (
 )
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted, shortly
+from ssh_abduction.output import cards
 from ssh_abduction.solver.asp.control import Grounding
 from ssh_abduction.solver.asp.limits import Stop
 from ssh_abduction.solver.backbone import Rivals
@@ -235,7 +235,7 @@ class Solution:
                     f"the best map of the first {counted(len(shown.labels), 'steps')}:"
                 )
             )
-            parts.append(first + shown._repr_html_())
+            parts.append(first + cards.map_card(shown))
         return cards.card(
             self.headline,
             *parts,

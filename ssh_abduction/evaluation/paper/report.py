@@ -37,7 +37,7 @@ from ssh_abduction.evaluation.paper.claims import (
     true_dstates,
 )
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.output.picture import svg
+from ssh_abduction.output import to_svg
 from ssh_abduction.solver import workers
 
 NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)  # metres
@@ -148,7 +148,7 @@ def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> 
     figures.draw_spread(folder / "spread.png", run.spread)
     starred = BootstrapLearner(WITH_STARS).fit(trace)
     for file, ssh_map in (("map", learner.map_), ("map-with-openings", starred.map_)):
-        write_file(folder / f"{file}.svg", f"{svg(ssh_map)}\n".encode())
+        write_file(folder / f"{file}.svg", f"{to_svg(ssh_map)}\n".encode())
         figures.draw_map(folder / f"{file}.png", ssh_map)
     on_done("figures")
 

@@ -17,10 +17,12 @@ from ssh_abduction.data.errors import MapError, brief, is_writable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap, checked_map
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.output.dot import to_dot
 from ssh_abduction.output.export.nav2 import nav2
 from ssh_abduction.output.export.roads import Roads
 from ssh_abduction.output.export.tmap2 import tmap2
-from ssh_abduction.output.layout import Turns, degrees_of
+from ssh_abduction.output.graphs import to_graphml, to_networkx
+from ssh_abduction.output.turns import Turns, degrees_of
 
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "networkx-json")
 FOR_NAVIGATION = ("nav2", "tmap2")  # which need positions
@@ -43,7 +45,7 @@ def export_map(
     level  what nodes are, "places" or "dstates"; None for places in what robots navigate by, where the map has any, and dstates elsewhere
     name   of the map, for tmap2 of its pointset, too
     frame  the coordinate frame of the positions
-    turns  which way actions turn, for the layout of a map without poses, as `SSHMap.to_svg` takes them
+    turns  which way actions turn, for the layout of a map without poses, as `to_svg` takes them
 
     Positions are metres where the map has poses, seen from the first dstate; else they are of a layout, and the file says so. Raises MapError for what no such file can hold.
     """
@@ -72,9 +74,9 @@ def export_map(
             )
         graph = _graph_of_places(ssh_map, turns)
     elif to == "networkx-json":
-        graph = ssh_map.to_networkx()
+        graph = to_networkx(ssh_map)
     else:
-        return ssh_map.to_dot() if to == "dot" else ssh_map.to_graphml()
+        return to_dot(ssh_map) if to == "dot" else to_graphml(ssh_map)
     return (
         json_line(nx.node_link_data(graph, edges="edges"))
         if to == "networkx-json"
@@ -84,7 +86,7 @@ def export_map(
 
 def _graph_of_places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.Graph[Any]:
     """The graph of places with plain attributes alone, as files hold them."""
-    graph = ssh_map.to_networkx("places", turns)
+    graph = to_networkx(ssh_map, "places", turns)
     for _, data in graph.nodes(data=True):
         data["x"], data["y"] = (round(float(number), 4) for number in data.pop("pos"))
         data["dstates"] = " ".join(map(str, data["dstates"]))

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, View
-from ssh_abduction.output.layout import Turns, layout, travelled
+from ssh_abduction.output.layout import layout, travelled
+from ssh_abduction.output.turns import Turns
 
 # What an edge costs at least, in metres. A turn on the spot costs as much as half a metre: a robot that drives 0.5 m/s turns by 90° in a second or two.
 LEAST, TURN = 0.01, 0.5

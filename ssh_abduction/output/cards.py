@@ -1,0 +1,128 @@
+"""What notebooks show of maps and traces, and the parts of it: headings, tables and pictures as HTML.
+
+All text is escaped, as views and names may hold anything.
+
+>>> table(("view", "place"), [("<b>", 0)])
+'<table><thead><tr><th>view</th><th>place</th></tr></thead><tbody><tr><td>&lt;b&gt;</td><td>0</td></tr></tbody></table>'
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from html import escape
+
+from ssh_abduction.data.errors import printable
+from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.data.trace import Step, Trace, star_to_json
+from ssh_abduction.data.words import counted
+
+# Limits of a card. A longer one makes a notebook slow, and nobody reads it there.
+ROWS = 50  # rows of a table
+LONGEST = 80  # characters of a cell
+STEPS = 10  # steps of a trace
+DRAWN = 150  # dstates of a map that is drawn, as the layout of more takes seconds
+
+
+def map_card(ssh_map: SSHMap) -> str:
+    """A map as HTML: its picture, faults, fit and dstates."""
+    from ssh_abduction.output.picture import to_svg  # loads scipy
+
+    parts = [
+        picture(to_svg(ssh_map))
+        if len(ssh_map.dstates) <= DRAWN
+        else paragraph(f"not drawn, as it has more than {DRAWN} dstates")
+    ]
+    if ssh_map.faults:
+        parts.append(paragraph("; ".join(map(str, ssh_map.faults))))
+    if fit := ssh_map.fit:
+        freedom = f"{fit.dof} degrees of freedom (p = {fit.p:.2g})"
+        parts.append(paragraph(f"chi-square {fit.chi2:.1f} for {freedom}"))
+    leads: dict[int, list[str]] = {}
+    for source, action, target in ssh_map.links:
+        leads.setdefault(source, []).append(f"{action} → {target}")
+    # Without places only the columns that every map has.
+    topological = bool(ssh_map.places)
+    head = ("dstate", "view", *(("place", "path") if topological else ()), "links")
+    rows = [
+        (s.id, s.shown, *(_where(s) if topological else ()), ", ".join(leads.get(s.id, ())))
+        for s in ssh_map.dstates
+    ]
+    dstates = folded(counted(len(rows), "dstates"), table(head, rows, "dstates"))
+    return card(repr(ssh_map)[1:-1], *parts, dstates)
+
+
+def trace_card(trace: Trace) -> str:
+    """A trace as HTML: its first steps, with the fields that any of them has."""
+    columns: dict[str, Callable[[Step], object]] = {
+        "view": lambda step: "" if step.view is None else step.view,
+        "image": _image,
+        "star": lambda step: ", ".join(map(str, star_to_json(step.star or ()))),
+        "displacement": lambda step: ", ".join(f"{x:.2f}" for x in step.displacement or ()),
+        "action": lambda step: step.action.name if step.action else "",
+    }
+    steps = trace.steps[:STEPS]
+    cells = {name: [cell(step) for step in steps] for name, cell in columns.items()}
+    shown = {name: column for name, column in cells.items() if any(c != "" for c in column)}
+    rows = [(t, *(column[t] for column in shown.values())) for t in range(len(steps))]
+    left = len(trace) - len(steps)
+    more = paragraph(f"and {counted(left, 'more steps')}") if left else ""
+    return card(repr(trace)[1:-1], table(("step", *shown), rows), more)
+
+
+def card(heading: str, *parts: str) -> str:
+    """A heading with parts of HTML below it."""
+    return f"<div><p><b>{text(heading)}</b></p>{''.join(parts)}</div>"
+
+
+def paragraph(sentence: str) -> str:
+    """A sentence."""
+    return f"<p>{text(sentence)}</p>"
+
+
+def table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "rows") -> str:
+    """A table of at most ROWS rows.
+
+    Args:
+        head: The names of the columns.
+        rows: The cells of each row.
+        more: What the sentence calls the rows that are left out.
+    """
+    listed = list(rows)
+    names = "".join(f"<th>{text(name)}</th>" for name in head)
+    body = "".join(
+        f"<tr>{''.join(f'<td>{text(_cut(str(cell)))}</td>' for cell in row)}</tr>"
+        for row in listed[:ROWS]
+    )
+    left = paragraph(f"and {len(listed) - ROWS} more {more}") if len(listed) > ROWS else ""
+    return f"<table><thead><tr>{names}</tr></thead><tbody>{body}</tbody></table>{left}"
+
+
+def folded(title: str, part: str) -> str:
+    """A part that opens when its title is clicked."""
+    return f"<details><summary>{text(title)}</summary>{part}</details>"
+
+
+def picture(svg: str) -> str:
+    """A picture, no wider than the notebook."""
+    return svg.replace("<svg ", '<svg style="max-width:100%;height:auto" ', 1)
+
+
+def text(value: str) -> str:
+    """Text that HTML shows as it is."""
+    return escape(printable(value))
+
+
+def _cut(cell: str) -> str:
+    return cell if len(cell) <= LONGEST else cell[: LONGEST - 1] + "…"
+
+
+def _image(step: Step) -> object:
+    if isinstance(step.image, tuple):
+        return counted(len(step.image), "numbers")
+    return "" if step.image is None else step.image
+
+
+def _where(s: DState) -> tuple[object, object]:
+    """The place of a dstate, and its path with the direction."""
+    course = "" if s.path is None else f"{s.path}{'+' if s.direction == 1 else '-'}"
+    return "" if s.place is None else s.place, course

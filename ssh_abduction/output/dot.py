@@ -1,0 +1,36 @@
+"""A map as Graphviz DOT."""
+
+from __future__ import annotations
+
+from ssh_abduction.data.errors import printable
+from ssh_abduction.data.maps import DState, SSHMap, checked_map
+
+
+def to_dot(ssh_map: SSHMap) -> str:
+    """The causal graph as DOT text: a node for each dstate, a cluster for each place.
+
+    Raises:
+        MapError: If `ssh_map` is not a map.
+    """
+    checked_map(ssh_map)
+    lines = ["digraph map {", "  node [shape=box, style=rounded];"]
+    lines += [f"  {_node(s)}" for s in ssh_map.dstates if s.place is None]
+    for p in ssh_map.places:
+        inside = " ".join(_node(s) for s in ssh_map.dstates if s.place == p)
+        lines.append(f"  subgraph cluster_{p} {{ label={_quoted(f'place {p}')}; {inside} }}")
+    lines += [
+        f"  {source} -> {target} [label={_quoted(action)}];"
+        for source, action, target in ssh_map.links
+    ]
+    return "\n".join([*lines, "}"])
+
+
+def _node(s: DState) -> str:
+    course = "" if s.path is None else f"\npath {s.path}{'+' if s.direction == 1 else '-'}"
+    return f"{s.id} [label={_quoted(f'{s.id}: {s.shown}{course}')}];"
+
+
+def _quoted(text: str) -> str:
+    """A DOT string. Characters that would steer a terminal are escaped."""
+    lines = (printable(line).replace("\\", "\\\\").replace('"', '\\"') for line in text.split("\n"))
+    return '"' + "\\n".join(lines) + '"'

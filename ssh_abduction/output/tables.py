@@ -1,0 +1,47 @@
+"""A map as a table of pandas, where that is installed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ssh_abduction.data.errors import MapError
+from ssh_abduction.data.maps import SSHMap, checked_map
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def to_pandas(ssh_map: SSHMap) -> pd.DataFrame:
+    """A table with a row for each step of the mapped trace.
+
+    Returns:
+        The columns dstate, view, place, path, direction and heading; of a map with poses also x, y
+        (metres) and pose_heading (radians). The index is called step.
+
+    Raises:
+        MapError: If `ssh_map` is not a map, or pandas is not installed.
+    """
+    checked_map(ssh_map)
+    try:
+        import pandas as pd
+    except ImportError:
+        raise MapError(
+            "to_pandas: expected pandas, got none; install it with pip install pandas"
+        ) from None
+    rows = []
+    for s in (ssh_map.dstates[label] for label in ssh_map.labels):
+        row: dict[str, Any] = {
+            "dstate": s.id,
+            "view": s.view,
+            "place": s.place,
+            "path": s.path,
+            "direction": s.direction,
+            "heading": s.heading,
+        }
+        if ssh_map.fit and ssh_map.fit.poses:
+            pose = ssh_map.fit.poses[s.id]
+            row |= {"x": pose.x, "y": pose.y, "pose_heading": pose.heading}
+        rows.append(row)
+    table = pd.DataFrame(rows, index=pd.RangeIndex(len(rows), name="step"))
+    whole = ["place", "path", "direction", "heading"]
+    return table.astype(dict.fromkeys(whole, "Int64"))  # integers that may be missing
