@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssh_abduction import Trace
-from ssh_abduction.data import Action, Step, TraceError
-from ssh_abduction.data import trace as trace_module
+from ssh_abduction.data import Action, Step, TraceError, trace_file
 from ssh_abduction.data.odometry import Odometry
 
 HEADER = '{"format": "ssh-trace", "version": 1}'
@@ -316,7 +315,7 @@ def test_a_line_without_end_is_not_read_into_memory(
         file.truncate(2**30)
     with pytest.raises(TraceError, match=":2: line: expected at most 16 MiB"):
         Trace.load(path)
-    assert trace_module.LONGEST_LINE == 16 * 2**20
+    assert trace_file.LONGEST_LINE == 16 * 2**20
 
 
 def test_a_byte_order_mark_is_no_harm(tmp_path: Path) -> None:

@@ -218,6 +218,11 @@ def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
     return star
 
 
+def star_to_json(star: Sequence[Entry]) -> list[Any]:
+    """A star as plain data, as a trace file holds it."""
+    return [entry.to_json() if isinstance(entry, Gateway) else entry for entry in star]
+
+
 def _is_seen(entry: Entry) -> bool:
     return bool(entry.open) if isinstance(entry, Gateway) else entry is not None
 

@@ -13,7 +13,8 @@ from html import escape
 
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.maps import DState, SSHMap
-from ssh_abduction.data.trace import Step, Trace, star_to_json
+from ssh_abduction.data.star import star_to_json
+from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.data.words import counted
 
 # Limits of a card. A longer one makes a notebook slow, and nobody reads it there.

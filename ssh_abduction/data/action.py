@@ -1,0 +1,168 @@
+"""Actions: sequences of control laws between distinctive states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+from ssh_abduction.data.checks import a_whole_number, an_object
+from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole, is_writable
+from ssh_abduction.data.star import SPREAD, near_quarter
+
+Kind: TypeAlias = Literal["travel", "turn"]
+TurnDirection: TypeAlias = Literal["right", "left", "around"]
+
+_KINDS = ("travel", "turn")
+_TURNS = ("right", "left", "around")
+_FIELDS = ("name", "kind", "turn", "gateway", "bearing")
+_QUARTERS = (None, "right", "around", "left")
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """A sequence of control laws that takes the robot from one distinctive state to another.
+
+    The causal axioms read the name only. The topological axioms read `kind` and `turn`.
+
+    Attributes:
+        name: The name. Two actions of a trace that share it must be equal.
+        kind: "travel", "turn", or None for other actions.
+        turn: Which way a turn goes: "right", "left" or "around".
+        extra: Fields of the trace file that this package does not know.
+        gateway: Which gateway a turn right or left ends at, counted from 1 to that side. A gateway
+            that the robot faces before the turn does not count.
+        bearing: Degrees of a turn, clockwise.
+    """
+
+    name: str
+    kind: Kind | None = None
+    turn: TurnDirection | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    gateway: int | None = None
+    bearing: float | None = None
+
+    def __post_init__(self) -> None:
+        name, kind, turn = self.name, self.kind, self.turn
+        if not isinstance(name, str) or not name or "\0" in name or not is_writable(name):
+            raise TraceError(f"action.name: expected a text, got {brief(name)}; name the action")
+        if not isinstance(kind, str | None) or kind not in (None, *_KINDS):
+            raise TraceError(
+                f'action.kind: expected "travel" or "turn", got {brief(kind)}; '
+                f"leave it out for other actions"
+            )
+        if not isinstance(turn, str | None) or turn not in (None, *_TURNS):
+            raise TraceError(
+                f'action.turn: expected "right", "left" or "around", got {brief(turn)}; '
+                f"choose the nearest"
+            )
+        if turn is not None and kind != "turn":
+            raise TraceError(
+                f'action.kind: expected "turn", as the action has a turn, got {brief(kind)}; '
+                f"set the kind or drop the turn"
+            )
+        an_object("action.extra", self.extra, TraceError)
+        if self.bearing is not None:  # says which way the turn goes
+            turn = self._turn_of_bearing()
+            object.__setattr__(self, "turn", turn)
+        if kind == "turn" and turn is None:
+            raise TraceError(
+                'action.turn: expected "right", "left" or "around" for a turn, got none; '
+                "say which way it goes"
+            )
+        if self.gateway is not None and (
+            not is_whole(self.gateway) or self.gateway < 1 or turn not in ("right", "left")
+        ):
+            raise TraceError(
+                f"action.gateway: expected 1 or more, for a turn right or left, "
+                f"got {brief(self.gateway)}; count the gateways to that side"
+            )
+
+    def _turn_of_bearing(self) -> TurnDirection:
+        """Which way a turn by the bearing goes."""
+        if self.kind != "turn" or not is_finite(self.bearing):
+            raise TraceError(
+                f"action.bearing: expected degrees clockwise, for a turn, "
+                f"got {brief(self.bearing)}; leave it out elsewhere"
+            )
+        assert self.bearing is not None
+        degrees = self.bearing % 360
+        turn: TurnDirection = (
+            "around" if abs(degrees - 180) <= SPREAD else "right" if degrees < 180 else "left"
+        )
+        is_no_turn = min(degrees, 360 - degrees) <= SPREAD
+        if is_no_turn or self.turn not in (None, turn):
+            raise TraceError(
+                f"action.bearing: expected degrees of a turn {self.turn or ''}, "
+                f"got {brief(self.bearing)}, which is {'no turn' if is_no_turn else turn}; mend it"
+            )
+        return turn
+
+    @staticmethod
+    def that_slipped(step: int) -> Action:
+        """The action of a step that did not do what its name says. It equals no other action."""
+        number = a_whole_number("step", step, TraceError)
+        return Action(f"slipped at step {number}", extra={"slipped": True})
+
+    @property
+    def slipped(self) -> bool:
+        """Whether `that_slipped` made this action."""
+        return self.kind is None and self.extra.get("slipped") is True
+
+    @property
+    def in_quarters(self) -> bool:
+        """Whether the action says no more of a turn than right, left or around, by quarters."""
+        if self.gateway is not None:
+            return False
+        if self.bearing is None:
+            return True
+        slot = near_quarter(self.bearing)
+        return slot is not None and _QUARTERS[slot] == self.turn
+
+    @staticmethod
+    def of(value: Action | str | Mapping[str, Any]) -> Action:
+        """An action from its name, or from an object with some of its fields.
+
+        Raises:
+            TraceError: If a field is wrong.
+        """
+        return value if isinstance(value, Action) else parse_action(value, "action")
+
+    def to_json(self) -> Any:
+        """The name, or an object where the name does not say everything."""
+        if self == STANDARD_ACTIONS.get(self.name, Action(self.name)) and not self.extra:
+            return self.name
+        known = {name: getattr(self, name) for name in _FIELDS}
+        return {**{k: v for k, v in known.items() if v is not None}, **self.extra}
+
+
+# Actions whose names say what they are.
+STANDARD_ACTIONS: dict[str, Action] = {
+    "travel": Action("travel", "travel"),
+    "right": Action("right", "turn", "right"),
+    "left": Action("left", "turn", "left"),
+    "around": Action("around", "turn", "around"),
+}
+
+
+def parse_action(value: Any, where: str) -> Action:
+    """An action of a trace file, whose errors begin with `where`."""
+    if isinstance(value, str):
+        value = {"name": value}
+    if not isinstance(value, Mapping):
+        raise TraceError(
+            f'{where}: expected a name or {{"name": …, "kind": …}}, got {brief(value)}; '
+            f"name the action"
+        )
+    name, kind, turn, gateway, bearing = (value.get(key) for key in _FIELDS)
+    # Names of standard actions say the kind and the turn, if nothing else does.
+    standard = STANDARD_ACTIONS.get(name) if isinstance(name, str) else None
+    if standard is not None and kind is turn is gateway is bearing is None:
+        kind, turn = standard.kind, standard.turn
+    if kind == "turn" and turn is None and bearing is None and name in _TURNS:
+        turn = name
+    try:
+        extra = {k: v for k, v in value.items() if k not in _FIELDS}
+        return Action(name, kind, turn, extra, gateway, bearing)  # type: ignore[arg-type]
+    except TraceError as error:  # its message begins with the field: "action.kind: …"
+        raise TraceError(f"{where.removesuffix('action')}{error}") from None

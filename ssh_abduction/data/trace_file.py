@@ -1,0 +1,215 @@
+"""Reading trace files: JSON lines, of which the first is the header and each other one a step.
+
+See docs/formats.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any, BinaryIO
+
+from ssh_abduction.data.action import Action, parse_action
+from ssh_abduction.data.errors import TraceError, brief
+from ssh_abduction.data.files import LINE_OF_A_LOG, HalfCharacter, NotFinite, parse_json
+from ssh_abduction.data.observation import checked_image, checked_view
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.star import parse_star
+from ssh_abduction.data.step import Step
+
+FORMAT, VERSION = "ssh-trace", 1
+# Bytes of a line. A step with a panorama of 100,000 numbers fits. A file without line ends is
+# refused before it fills the memory.
+LONGEST_LINE = 16 * 2**20
+# How files of maps and robots' logs begin. People name them instead of a trace.
+_MAPS = (b'{"format": "ssh-solution"', b'{"format": "ssh-map"')
+_LOGS = {
+    b"\x1f\x8b": "gzipped data",
+    b"#ROSBAG V": "a bag of ROS 1",
+    b"SQLite format 3\0": "a bag of ROS 2",
+    b"\x89MCAP0": "MCAP",
+    b"# message formats defined": "a log of CARMEN",
+}
+_STEP_FIELDS = (
+    "view",
+    "image",
+    "action",
+    "star",
+    "displacement",
+    "covariance",
+    "truth",
+    "confidence",
+)
+_HEADER_FIELDS = ("format", "version", "name", "images", "odometry")
+
+
+def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
+    """Read a trace file.
+
+    Args:
+        file: The open file.
+        source: What messages call it.
+
+    Returns:
+        The arguments of Trace: steps, name, images, odometry and extra.
+
+    Raises:
+        TraceError: With file, line and field.
+    """
+    header: dict[str, Any] | None = None
+    steps: list[Step] = []
+    actions: dict[str, Action] = {}
+    empty_line = number = 0
+    while raw := file.readline(LONGEST_LINE + 1):
+        number += 1
+        where = f"{source}:{number}"
+        if len(raw) > LONGEST_LINE:
+            raise TraceError(
+                f"{where}: line: expected at most {LONGEST_LINE // 2**20} MiB, got more; "
+                f"write one step a line, and big images to a sidecar file"
+            )
+        if not raw.strip():  # empty lines are allowed at the end only
+            empty_line = empty_line or number
+            continue
+        if empty_line:
+            raise TraceError(
+                f"{source}:{empty_line}: line: expected a step, got an empty line; remove it"
+            )
+        record = _record(raw, where)
+        if header is None:
+            header = _header(record, where)
+        else:
+            steps.append(_step(record, where, actions))
+    if header is None:
+        raise TraceError(
+            f'{source}:1: header: expected {{"format": "{FORMAT}", "version": {VERSION}}}, '
+            f"got an empty file; write the header, then a line a step"
+        )
+    if not steps:
+        raise TraceError(
+            f"{source}:2: step: expected at least one after the header, got none; "
+            f"add what the robot saw first"
+        )
+    return {
+        "steps": tuple(steps),
+        **{name: header.get(name) for name in ("name", "images", "odometry")},
+        "extra": {k: v for k, v in header.items() if k not in _HEADER_FIELDS},
+    }
+
+
+def _record(raw: bytes, where: str) -> dict[str, Any]:
+    """The object on a line."""
+    is_first = where.endswith(":1")
+    if is_first:
+        _refuse_other_files(raw, where)
+    if b"\0" in raw:
+        raise TraceError(
+            f"{where}: line: expected text in UTF-8, got a null byte at column "
+            f"{raw.index(0) + 1}; is this a binary file?"
+        )
+    try:
+        record = parse_json(raw.rstrip().decode("utf-8-sig" if is_first else "utf-8"))
+    except UnicodeDecodeError as error:
+        raise TraceError(
+            f"{where}: line: expected text in UTF-8, got the byte 0x{raw[error.start]:02x} "
+            f"at column {error.start + 1}; is this a binary file?"
+        ) from None
+    except json.JSONDecodeError as error:
+        raise TraceError(
+            f"{where}: line: expected one JSON object, got broken JSON at column {error.colno} "
+            f"({error.msg}); mend it there"
+        ) from None
+    except NotFinite as error:
+        raise TraceError(
+            f"{where}: {error.field}: expected a finite number, got {error.text}; "
+            f"replace it, or leave the field out"
+        ) from None
+    except HalfCharacter as error:
+        raise TraceError(f"{where}: line: expected text, got {error}") from None
+    except ValueError as error:
+        raise TraceError(f"{where}: line: expected one JSON object, got {error}") from None
+    if not isinstance(record, dict):
+        raise TraceError(
+            f"{where}: line: expected a JSON object in braces, got {brief(record)}; "
+            f"write one step a line"
+        )
+    return record
+
+
+def _refuse_other_files(raw: bytes, where: str) -> None:
+    """Refuse a file whose first line is that of a robot's log or of maps."""
+    log = next((kind for magic, kind in _LOGS.items() if raw.startswith(magic)), None)
+    if log is None and LINE_OF_A_LOG.match(raw):
+        log = "lines of CARMEN or g2o"
+    if log:
+        raise TraceError(
+            f"{where}: header: expected a trace, got {log}, as robots' logs are; "
+            f"make a trace of it with ssh-abduction import LOG -o trace.jsonl"
+        )
+    if raw.startswith(_MAPS):
+        raise TraceError(
+            f"{where}: header: expected a trace, got maps, as solve prints them; "
+            f"name the two files in the other order, or solve's trace"
+        )
+
+
+def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The header, checked, with its odometry as Odometry."""
+    if record.get("format") != FORMAT:
+        came = (
+            brief(record["format"])
+            if "format" in record
+            else f"a line without it: {brief(dict(record))}"
+        )
+        raise TraceError(
+            f'{where}: format: expected "{FORMAT}" in a header, got {came}; '
+            f'put {{"format": "{FORMAT}", "version": {VERSION}}} on the first line'
+        )
+    version = record.get("version")
+    if version != VERSION or isinstance(version, bool):
+        raise TraceError(
+            f"{where}: version: expected {VERSION}, got {brief(version)}; "
+            f"convert the file, or take a newer ssh-abduction"
+        )
+    for key in ("name", "images"):
+        if not isinstance(record.get(key), str | None):
+            raise TraceError(
+                f"{where}: {key}: expected a text, got {brief(record[key])}; "
+                f"quote it or leave it out"
+            )
+    if record.get("odometry") is None:
+        return dict(record)
+    try:
+        return {**record, "odometry": Odometry.of(record["odometry"])}
+    except TraceError as error:
+        raise TraceError(f"{where}: {error}") from None
+
+
+def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> Step:
+    """The step on a line.
+
+    Args:
+        record: The object on the line.
+        where: File and line, for messages.
+        actions: The actions of earlier steps by name. Equal actions become one object.
+    """
+    given = {name: record.get(name) for name in _STEP_FIELDS}
+    if given["view"] is not None:
+        given["view"] = checked_view(given["view"], f"{where}: view")
+    if given["image"] is not None:
+        given["image"] = checked_image(given["image"], f"{where}: image")
+    elif "view" not in record:
+        raise TraceError(
+            f"{where}: view: expected a text or an integer (or an image to make one from), "
+            f"got none; say what the robot saw, or null where that was not logged"
+        )
+    if given["action"] is not None:
+        action = parse_action(given["action"], f"{where}: action")
+        known = action if action.extra else actions.setdefault(action.name, action)
+        given["action"] = known if known == action else action
+    if given["star"] is not None:
+        given["star"] = parse_star(given["star"], f"{where}: star")
+    try:
+        return Step(**given, extra={k: v for k, v in record.items() if k not in _STEP_FIELDS})
+    except TraceError as error:
+        raise TraceError(f"{where}: {error}") from None
