@@ -74,9 +74,6 @@ class Speedups:
         return replace(self, **{name: False for name in SPEEDUPS if name not in valid})
 
 
-ALL = Speedups()
-
-
 def checked_speedups(value: object) -> Speedups:
     """The speed-ups that a caller gives. Raises SolverError."""
     if not isinstance(value, Speedups):
@@ -397,3 +394,6 @@ TABLE = (
 def row(name: str) -> Speedup:
     """A row of the table, by its name."""
     return next(speedup for speedup in TABLE if speedup.name == name)
+
+
+ALL = Speedups()
