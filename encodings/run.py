@@ -1,7 +1,10 @@
-"""Run the encodings on the facts of a trace, with clingo's own options and output.
+"""Solve the facts of a trace with the encodings, with clingo's own options and output.
 
-ssh-abduction facts trace.jsonl > trace.lp      # its first lines say which encodings the theory needs
-python run.py --project=project --opt-mode=optN -n 0 trace.lp causal.lp topological.lp boundary.lp preference.lp show.lp
+The first lines of the facts say which encodings the theory needs:
+
+ssh-abduction facts trace.jsonl > trace.lp
+python run.py --project=project --opt-mode=optN -n 0 trace.lp causal.lp topological.lp \\
+    boundary.lp preference.lp show.lp
 """
 
 import sys
@@ -10,7 +13,7 @@ import clingo
 
 
 class Run(clingo.Application):
-    """Grounds the program part of every step at once, and solves."""
+    """Ground the program parts of all steps at once, and solve."""
 
     program_name = "ssh-abduction encodings"
 
@@ -18,6 +21,7 @@ class Run(clingo.Application):
         for file in files:
             control.load(file)
         control.ground([("base", [])])
+        # The base part has the facts of the trace, which tell the last step.
         last = max(
             (
                 atom.symbol.arguments[0].number

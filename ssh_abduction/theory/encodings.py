@@ -101,7 +101,7 @@ def axioms_in(text: str, level: str) -> list[Axiom]:
     """The axioms that the comments of an encoding name."""
     found: list[Axiom] = []
     subject: tuple[str, ...] = ()
-    for line in text.splitlines():
+    for line in _unwrapped(text):
         if match := _WHEN.match(line):
             subject += tuple(match["when"].split(" and "))
         elif match := _AXIOM.match(line):
@@ -117,6 +117,20 @@ def axioms_in(text: str, level: str) -> list[Axiom]:
                 )
             )
     return found
+
+
+def _unwrapped(text: str) -> list[str]:
+    """The lines of an encoding, with each `% @axiom` comment joined to its continuation lines.
+
+    A continuation line starts with `%` and at least three spaces.
+    """
+    lines: list[str] = []
+    for line in text.splitlines():
+        if lines and lines[-1].startswith("% @axiom(") and line.startswith("%   "):
+            lines[-1] += f" {line.removeprefix('%').strip()}"
+        else:
+            lines.append(line)
+    return lines
 
 
 def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
