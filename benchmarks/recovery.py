@@ -35,7 +35,7 @@ from fault_cases import (
 from instances import Walk
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace
-from ssh_abduction.online.rivals import Rival
+from ssh_abduction.online.hypotheses import Rival
 from ssh_abduction.solver import Cost
 from ssh_abduction.solver.asp import facts
 

@@ -33,7 +33,7 @@ from ssh_abduction.evaluation import (
     evaluate_visits,
     told_poses,
 )
-from ssh_abduction.evaluation.visits import NEAR
+from ssh_abduction.evaluation.pose_truth import NEAR
 
 Array = NDArray[np.float64]
 # A robot visits a place when it comes so near to it, in metres. In ACES3, anything from 1.5 to 6 m makes the same 15 visits.

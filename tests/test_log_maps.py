@@ -30,8 +30,8 @@ from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import between
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
-from ssh_abduction.robot_logs import maps as log_maps
-from ssh_abduction.robot_logs.maps import SPEED, map_log, seconds_left
+from ssh_abduction.robot_logs import log_maps
+from ssh_abduction.robot_logs.log_maps import SPEED, map_log, seconds_left
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.result import Solution, Status
 

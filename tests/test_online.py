@@ -23,7 +23,7 @@ from worlds import TOURS, drive, rectangle
 from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, Odometry, Step, TheoryError, TraceError
-from ssh_abduction.online import background as guessing
+from ssh_abduction.online import background_guess as guessing
 from ssh_abduction.online import mapper as online
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.engines.base import Task
@@ -362,7 +362,7 @@ def test_a_guess_ends_with_its_mapper_and_with_the_program() -> None:
 import threading
 from instances import maze
 from ssh_abduction import OnlineMapper
-from ssh_abduction.online import background as guessing
+from ssh_abduction.online import background_guess as guessing
 guessing.has_processors = lambda _: True
 
 def begun():

@@ -22,7 +22,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import program
 from ssh_abduction.evaluation.ladder import UnderWay
 from ssh_abduction.evaluation.paper import report
-from ssh_abduction.robot_logs.maps import LogMapping
+from ssh_abduction.robot_logs.log_maps import LogMapping
 from ssh_abduction.solver.asp import process, workers
 from ssh_abduction.solver.asp.limits import Watch
 

@@ -18,8 +18,8 @@ from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import TheoryError, TraceError
 from ssh_abduction.online import Belief, recovery
-from ssh_abduction.online.meanwhile import Meanwhile
-from ssh_abduction.online.rivals import Rival, Scale
+from ssh_abduction.online.background_solve import Meanwhile
+from ssh_abduction.online.hypotheses import Rival, Scale
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.asp.process import _under_way
 from ssh_abduction.theory import Speedups

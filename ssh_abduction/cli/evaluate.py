@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
         tells_names,
         told_poses,
     )  # which load scipy
-    from ssh_abduction.evaluation.visits import NEAR
+    from ssh_abduction.evaluation.pose_truth import NEAR
 
     data = read_maps(options.maps)
     maps = maps_of(data, str(options.maps))

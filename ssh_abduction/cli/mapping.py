@@ -36,7 +36,7 @@ from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from perception.readers.scans import RobotLog
-    from ssh_abduction.robot_logs.maps import LogMap, LogMapping
+    from ssh_abduction.robot_logs.log_maps import LogMap, LogMapping
 
 KILLED = "process: expected an answer, got killed, as happens when memory runs out; map fewer logs at a time (--jobs)"
 GIVEN_UP = "expected time to map this log, got an interruption; map it again"
@@ -162,7 +162,7 @@ class MapQuestion:
         ):  # a worker is told what it is to do
             with guard:
                 from perception.readers.logs import read_log
-                from ssh_abduction.robot_logs.maps import LogMapping, map_log
+                from ssh_abduction.robot_logs.log_maps import LogMapping, map_log
 
                 log = read_log(here, **self.reading)
                 begun.append((log, LogMapping()))

@@ -5,10 +5,13 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.evaluation.names import Evaluation, MapEvaluation, evaluate, tells_names
-    from ssh_abduction.evaluation.relations import Relation, Relations
-    from ssh_abduction.evaluation.trajectory import Trajectory, TrajectoryWarning
-    from ssh_abduction.evaluation.visits import (
+    from ssh_abduction.evaluation.named_truth import (
+        Evaluation,
+        MapEvaluation,
+        evaluate,
+        tells_names,
+    )
+    from ssh_abduction.evaluation.pose_truth import (
         MapPairs,
         MapVisits,
         Pairs,
@@ -16,9 +19,11 @@ if TYPE_CHECKING:
         evaluate_visits,
         told_poses,
     )
+    from ssh_abduction.evaluation.relations import Relation, Relations
+    from ssh_abduction.evaluation.trajectory import Trajectory, TrajectoryWarning
 
 _HOMES = {
-    "names": (
+    "named_truth": (
         "Evaluation",
         "MapEvaluation",
         "evaluate",
@@ -32,7 +37,7 @@ _HOMES = {
         "Trajectory",
         "TrajectoryWarning",
     ),
-    "visits": (
+    "pose_truth": (
         "MapPairs",
         "MapVisits",
         "Pairs",

@@ -41,7 +41,7 @@ that the checker finds consistent; or a sketch of all steps. Where places have f
 contradicted is mended: what does not fit is something new. clingo is asked again when the trace is longer by RETRY and PAUSE; it goes on
 where it was stopped, and may prove a map minimal again.
 
-Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`online/background.py`), one after another,
+Where places have frames, and there is a second processor, maps are made of guesses meanwhile (`online/background_guess.py`), one after another,
 in a process of their own, and mended there where that takes longer than a step may.
 
 Where faults are allowed
@@ -83,7 +83,7 @@ from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 if TYPE_CHECKING:
-    from ssh_abduction.online.background import MapGuess
+    from ssh_abduction.online.background_guess import MapGuess
     from ssh_abduction.online.recovery import Recovery, Standing
 
 # After a search that was stopped the trace grows by this factor before the next one, so that few steps are slow.
@@ -159,7 +159,7 @@ class OnlineMapper:
         ):  # now rather than at the step that first needs it, as it takes its time
             importlib.import_module("ssh_abduction.solver.engines.causal")
         elif row("visits").holds_for(settled):
-            importlib.import_module("ssh_abduction.online.background")
+            importlib.import_module("ssh_abduction.online.background_guess")
         began = time.perf_counter()
         self._searches = 0
         self._seen = [observation(first, settled)]
@@ -376,7 +376,7 @@ class OnlineMapper:
         steps, now = len(self._steps), time.perf_counter()
         if now - began + self._mending * steps**2 > self._limit:
             return False
-        from ssh_abduction.online.background import mended_map  # loads numpy
+        from ssh_abduction.online.background_guess import mended_map  # loads numpy
 
         mended = mended_map(self.trace, self.theory, ssh_map, self._speedups)
         self._mending = (time.perf_counter() - now) / steps**2
@@ -406,7 +406,7 @@ class OnlineMapper:
 
     def _begin_guess(self, known: SSHMap | None) -> None:
         """Begin a guess where no map is known to be minimal, or let a map that is contradicted be mended."""
-        from ssh_abduction.online.background import MapGuess  # loads numpy
+        from ssh_abduction.online.background_guess import MapGuess  # loads numpy
 
         if not known:
             self._next_guess = int(GUESS_AGAIN * len(self._steps))

@@ -34,9 +34,9 @@ import numpy as np
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.online.background_solve import Meanwhile, Solved, solved
+from ssh_abduction.online.hypotheses import Rival, Scale
 from ssh_abduction.online.localiser import Belief, Chances, Localiser
-from ssh_abduction.online.meanwhile import Meanwhile, Solved, solved
-from ssh_abduction.online.rivals import Rival, Scale
 from ssh_abduction.solver import (
     Bound,
     Judging,

@@ -5,10 +5,10 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from ssh_abduction.robot_logs.maps import LogMap, map_log
+    from ssh_abduction.robot_logs.log_maps import LogMap, map_log
 
 _HOMES = {
-    "maps": (
+    "log_maps": (
         "LogMap",
         "map_log",
     ),

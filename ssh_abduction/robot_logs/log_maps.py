@@ -24,7 +24,7 @@ from ssh_abduction.data.files import json_line
 from ssh_abduction.data.logs import log_of
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
-from ssh_abduction.robot_logs.report import report
+from ssh_abduction.robot_logs.log_report import report
 from ssh_abduction.solver import Solution, Status
 from ssh_abduction.theory.theory import Theory
 

@@ -7,7 +7,7 @@ from functools import partial
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.online.beside import Beside
+from ssh_abduction.online.background import Beside
 from ssh_abduction.solver import Bound, Status, Stop, Watch, has_processors, in_process, solve
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory

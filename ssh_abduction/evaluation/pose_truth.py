@@ -36,7 +36,7 @@ from ssh_abduction.data.errors import TraceError, brief, is_finite, named
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
-from ssh_abduction.evaluation.names import checked_map
+from ssh_abduction.evaluation.named_truth import checked_map
 from ssh_abduction.evaluation.relations import Relations
 from ssh_abduction.evaluation.trajectory import checked_pose, checked_time
 
