@@ -20,7 +20,7 @@ from ssh_abduction.data.maps import Fault
 from ssh_abduction.data.odometry import in_words
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.solver.front import fault_front
-from ssh_abduction.solver.guesses.jumps import wrong_displacements
+from ssh_abduction.solver.guesses.outliers import wrong_displacements
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.speedups import SPEEDUPS
 

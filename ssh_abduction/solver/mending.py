@@ -1,10 +1,10 @@
 """Maps with faults in theories that have places: faults are guessed and mended in the trace, and the mended trace is solved as if nothing had been wrong.
 
 To disbelieve a view is to believe another one, to disbelieve an action is to know nothing of it, and a displacement that is disbelieved might be missing. So a map with faults is a map without them of a mended trace, which
-all fast engines take. Where faults may be is guessed twice: by robust merging of visits (`guesses/mending.py`), where places have frames, and by the causal theory with
+all fast engines take. Where faults may be is guessed twice: by robust merging of visits (`guesses/voting.py`), where places have frames, and by the causal theory with
 faults (`engines/faulty.py`), whose maps any map with places is one of, places aside.
 
-*Displacements.* Which of them may be wrong is guessed by labels for which displacements were not asked (`guesses/jumps.py`), and by those of the maps that come of that.
+*Displacements.* Which of them may be wrong is guessed by labels for which displacements were not asked (`guesses/outliers.py`), and by those of the maps that come of that.
 A map need not disbelieve all that were guessed: those are believed again with which it agrees.
 
 *Bound.* A map of the theory, its places taken away, is a causal map with the same dstates, and with no more faults: so what is proven of the causal theory holds here.
@@ -25,8 +25,8 @@ from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.faulty import FaultyEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
-from ssh_abduction.solver.guesses.jumps import wrong_displacements
-from ssh_abduction.solver.guesses.mending import Merging
+from ssh_abduction.solver.guesses.outliers import wrong_displacements
+from ssh_abduction.solver.guesses.voting import Merging
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.speedups import row
