@@ -28,7 +28,8 @@ from visited import Events, Truth, judged, truth_of
 
 from perception.readers.logs import read_log
 from ssh_abduction import Trace
-from ssh_abduction.data.maps import maps_of, read_json
+from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.maps import maps_of
 
 OURS = "ssh-abduction"
 # By name the poses at which scans are laid into the grid, and whether doors are nodes.

@@ -410,7 +410,7 @@ def test_what_is_no_json_is_named(text: str, said: str, tmp_path: Path) -> None:
 
 def test_a_huge_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     SOLUTION.save(tmp_path / "maps.json")
-    monkeypatch.setattr("ssh_abduction.data.maps.LARGEST", 2**20)
+    monkeypatch.setattr("ssh_abduction.data.map_file.LARGEST", 2**20)
     assert Solution.load(tmp_path / "maps.json") == SOLUTION
     with pytest.raises(MapError, match="expected at most 1 MiB, got more"):
         Solution.load("/dev/zero")

@@ -13,7 +13,8 @@ from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import MapError, brief, is_finite, printable
-from ssh_abduction.data.maps import SSHMap, maps_of, read_json
+from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import RESTS_ON, Ranking, Sharing, Solution, summary_of
 from ssh_abduction.theory.theory import Theory

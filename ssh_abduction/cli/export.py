@@ -56,7 +56,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.data.maps import write_map
+    from ssh_abduction.data.map_file import write_map
     from ssh_abduction.output.export.formats import doubts, export_map  # which loads networkx
     from ssh_abduction.rivals.listing import Listing
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.data.errors import AbductionError, MapError, named
-from ssh_abduction.data.maps import read_json
+from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.theory import (
     ASSERTIONS,

@@ -7,7 +7,8 @@ import argparse
 from ssh_abduction.cli.options import Verbs, check_number
 from ssh_abduction.cli.text import describe
 from ssh_abduction.data.errors import MapError
-from ssh_abduction.data.maps import maps_of, read_json, write_map
+from ssh_abduction.data.map_file import read_json, write_map
+from ssh_abduction.data.maps import maps_of
 
 
 def add_parser(verbs: Verbs) -> None:

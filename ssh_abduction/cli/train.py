@@ -10,7 +10,8 @@ from typing import Any
 from ssh_abduction.cli.options import Verbs, check_number, check_picture, output, picture_file, seed
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named
-from ssh_abduction.data.maps import SSHMap, maps_of, read_json
+from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
 
 

@@ -70,7 +70,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.data.maps import read_json
+    from ssh_abduction.data.map_file import read_json
     from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.content import Called, content_of  # which loads numpy
     from ssh_abduction.page.html import Page
@@ -162,7 +162,8 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
 
 def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     """The run with the beliefs in a file. Raises MapError."""
-    from ssh_abduction.data.maps import maps_of, read_json
+    from ssh_abduction.data.map_file import read_json
+    from ssh_abduction.data.maps import maps_of
     from ssh_abduction.page.content import Run
 
     told = read_json(file)

@@ -18,7 +18,8 @@ from typing import Any, TypeAlias
 
 from ssh_abduction.data.checks import a_flag, a_text, an_instance
 from ssh_abduction.data.errors import MapError, brief, is_whole, named
-from ssh_abduction.data.maps import ID_LENGTH, SSHMap, maps_of, read_json
+from ssh_abduction.data.map_file import read_json
+from ssh_abduction.data.maps import ID_LENGTH, SSHMap, maps_of
 from ssh_abduction.data.trace import View
 from ssh_abduction.solver import Backbone, Solution, Status, theory_in
 from ssh_abduction.theory.theory import Theory

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssh_abduction.data.errors import MapError, TheoryError
-from ssh_abduction.data.maps import FieldReader
+from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.solver.asp.control import Grounding
 from ssh_abduction.solver.engines.base import Cost
 from ssh_abduction.solver.sharing import Backbone

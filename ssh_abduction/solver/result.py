@@ -10,18 +10,10 @@ from typing import Any, overload
 
 from ssh_abduction.checker.claims import contradictions
 from ssh_abduction.data.errors import MapError, brief, checked_index, named
+from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.maps import (
-    SOLUTION_FORMAT,
-    VERSION,
-    FieldReader,
-    SSHMap,
-    check_format,
-    check_of_trace,
-    maps_of,
-    read_json,
-    write_map,
-)
+from ssh_abduction.data.map_file import SOLUTION_FORMAT, VERSION, check_format, read_json, write_map
+from ssh_abduction.data.maps import SSHMap, check_of_trace, maps_of
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted, shortly
 from ssh_abduction.output import cards

@@ -1,0 +1,82 @@
+"""Reading the fields of JSON objects, with errors that name the field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from ssh_abduction.data.checks import a_text
+from ssh_abduction.data.errors import MapError, brief, is_finite, is_writable
+from ssh_abduction.data.observation import View
+
+T = TypeVar("T")
+
+
+class FieldReader:
+    """Checks fields of an object that was read from a file of maps.
+
+    Each method returns the value or raises MapError. `name` is what messages call the field.
+
+    Args:
+        where: The file, as messages call it.
+    """
+
+    def __init__(self, where: str) -> None:
+        self.where = a_text("where", where, MapError)
+
+    def wrong(self, name: str, expected: str, value: Any) -> MapError:
+        """The error for a field that is wrong."""
+        return MapError(
+            f"{self.where}: {name or 'map'}: expected {expected}, got {brief(value)}; "
+            f"write it with solve --json"
+        )
+
+    def mapping(self, value: Any, name: str) -> Mapping[str, Any]:
+        if not isinstance(value, Mapping):
+            raise self.wrong(name, "an object", value)
+        return value
+
+    def list(self, record: Mapping[str, Any], name: str, optional: bool = False) -> list[Any]:
+        """The list in a field of a record. An optional one may be missing."""
+        value = record.get(name, [] if optional else None)
+        if not isinstance(value, list):
+            raise self.wrong(name, "a list", value)
+        return value
+
+    def each(
+        self,
+        record: Mapping[str, Any],
+        name: str,
+        read: Callable[[Any, str], T],
+        optional: bool = False,
+    ) -> tuple[T, ...]:
+        """The members of the list in a field, each read by a function of value and name."""
+        members = self.list(record, name, optional)
+        return tuple(read(value, f"{name}[{i}]") for i, value in enumerate(members))
+
+    def integer(self, value: Any, name: str) -> int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise self.wrong(name, "an integer", value)
+        return value
+
+    def optional(self, value: Any, name: str) -> int | None:
+        return None if value is None else self.integer(value, name)
+
+    def number(self, value: Any, name: str) -> float:
+        if not is_finite(value):
+            raise self.wrong(name, "a finite number", value)
+        return float(value)
+
+    def numbers(self, value: Any, name: str) -> tuple[float, float, float]:
+        if not isinstance(value, list) or len(value) != 3:
+            raise self.wrong(name, "three numbers", value)
+        x, y, z = (self.number(number, name) for number in value)
+        return x, y, z
+
+    def view(self, value: Any, name: str, expected: str) -> View | None:
+        """A view, or None for an unknown one."""
+        is_view = isinstance(value, str | int | None) and not isinstance(value, bool)
+        if not is_view or (isinstance(value, str) and not is_writable(value)):
+            raise self.wrong(name, expected, value)
+        view: View | None = value
+        return view

@@ -1,0 +1,286 @@
+"""Reading and writing the JSON of maps. See docs/formats.md."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ssh_abduction.data.checks import a_path
+from ssh_abduction.data.errors import MapError, brief, is_writable, named
+from ssh_abduction.data.fields import FieldReader
+from ssh_abduction.data.files import HalfCharacter, NotFinite, parse_json, write_file
+from ssh_abduction.data.map_parts import FAULTS, DState, Fault, Fit, MapPath, Pose
+
+# What files of solutions and of single maps begin with.
+SOLUTION_FORMAT, MAP_FORMAT, VERSION = "ssh-solution", "ssh-map", 1
+# Bytes of a file: some hundred thousand maps. Reading it takes ten times as much memory.
+LARGEST = 2**30
+
+
+def write_map(
+    path: str | os.PathLike[str], text: str, what: str = "map", option: str = "output"
+) -> None:
+    """Write a map, or a picture of one, into a file.
+
+    Args:
+        path: The file.
+        text: Its text, without the last line end.
+        what: What messages call the text.
+        option: The parameter or option that named the file.
+
+    Raises:
+        MapError: If the file cannot be written.
+    """
+    path = a_path("path" if option == "output" else option, path, MapError)
+    try:
+        write_file(path, f"{text}\n".encode())
+    except OSError as error:
+        raise MapError(
+            f"{named(path)}: cannot write the {what}: {error.strerror or error}; check the folder"
+        ) from None
+    except ValueError as error:
+        raise MapError(f"{option}: cannot write the {what}: {error}; name a file") from None
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """The JSON value in a file of maps, or on standard input for "-".
+
+    Raises:
+        MapError: With file and line, if there is none.
+    """
+    path = a_path("path", path, MapError)
+    source = "standard input" if path == "-" else named(path)
+    try:
+        text = sys.stdin.buffer.read(LARGEST + 1) if path == "-" else _start_of(path, LARGEST + 1)
+        if len(text) > LARGEST:
+            raise MapError(
+                f"{source}: expected at most {LARGEST // 2**20} MiB, got more; "
+                f"list fewer (solve --maps)"
+            )
+        if not text.strip():
+            raise MapError(
+                f"{source}: expected JSON, got an empty file; write it with solve --json"
+            )
+        return parse_json(text.decode("utf-8"))
+    except MapError:
+        raise
+    except OSError as error:
+        raise MapError(
+            f"{source}: expected a readable file of maps: {error.strerror or error}; check the path"
+        ) from None
+    except MemoryError:
+        raise MapError(
+            f"{source}: expected a file of maps that fits into memory, got a larger one; "
+            f"list fewer (solve --maps)"
+        ) from None
+    except json.JSONDecodeError as error:
+        raise _broken(error, text, source) from None
+    except NotFinite as error:
+        raise MapError(
+            f"{source}: {error.field or 'value'}: expected a finite number, got {error.text}; "
+            f"write it with solve --json"
+        ) from None
+    except HalfCharacter as error:
+        raise MapError(f"{source}: expected text, got {error}") from None
+    except (UnicodeDecodeError, AttributeError):  # text in another encoding, a closed stream
+        raise MapError(
+            f"{source}: expected JSON in UTF-8, got something else; write it with solve --json"
+        ) from None
+    except ValueError as error:
+        raise MapError(
+            f"{source}: expected JSON, got {error}; write it with solve --json"
+        ) from None
+
+
+def _start_of(path: str, most: int) -> bytes:
+    with Path(path).open("rb") as file:
+        return file.read(most)
+
+
+def _broken(error: json.JSONDecodeError, text: bytes, source: str) -> MapError:
+    """The error for JSON that is broken, or for a file that holds something else."""
+    if text.startswith(b'{"format": "ssh-trace"'):
+        return MapError(
+            f"{source}: expected maps, got a trace; "
+            f"name the two files in the other order, or solve it first"
+        )
+    if error.msg == "Extra data":
+        return MapError(
+            f"{source}:{error.lineno}: expected one JSON value, got more after it; "
+            f"solve prints a line for each of several traces: take one of them"
+        )
+    return MapError(
+        f"{source}:{error.lineno}: expected JSON, got broken JSON at column {error.colno} "
+        f"({error.msg}); write it with solve --json"
+    )
+
+
+def check_format(data: Mapping[str, Any], expected: str, where: str) -> None:
+    """Check the format and the version. Files of early versions have neither.
+
+    Raises:
+        MapError: If the file is of another format or version.
+    """
+    if "format" in data and data["format"] != expected:
+        raise MapError(
+            f'{where}: format: expected "{expected}", got {brief(data["format"])}; '
+            f"write it with solve --json"
+        )
+    version = data.get("version", VERSION)
+    if version != VERSION or isinstance(version, bool):
+        raise MapError(
+            f"{where}: version: expected {VERSION}, got {brief(version)}; "
+            f"read it with the ssh-abduction that wrote it, or solve again"
+        )
+
+
+def map_fields(data: Any, where: str) -> dict[str, Any]:
+    """The fields of a map, from the JSON that `SSHMap.to_dict` makes.
+
+    Args:
+        data: The JSON.
+        where: What messages call it.
+
+    Returns:
+        The arguments of SSHMap.
+
+    Raises:
+        MapError: If a field is wrong; it names the field.
+    """
+    read = FieldReader(where)
+    record = read.mapping(data, "")
+    dstates = read.each(record, "dstates", lambda s, name: _dstate(read, s, name))
+    places = read.each(record, "places", read.integer, optional=True)
+    paths = read.each(record, "paths", lambda p, name: _path(read, p, name), optional=True)
+    ids = [s.id for s in dstates]
+    if ids != list(range(len(dstates))):
+        raise MapError(
+            f"{where}: dstates: expected the ids 0, 1, 2, … in this order, got {brief(ids)}; "
+            f"renumber them"
+        )
+    path_ids = tuple(p.id for p in paths)
+    used_places = {s.place for s in dstates} | {q for p in paths for q in p.order}
+    _check_used(where, "places", places, used_places)
+    _check_used(where, "paths", path_ids, {s.path for s in dstates})
+    labels = read.each(record, "labels", read.integer)
+    if not labels:
+        raise read.wrong("labels", "the dstate of each step", [])
+    for name, numbers in (("places", places), ("paths", path_ids)):
+        if len(set(numbers)) < len(numbers):
+            raise read.wrong(name, "each id once", list(numbers))
+    for i, label in enumerate(labels):
+        if not 0 <= label < len(dstates):
+            raise MapError(
+                f"{where}: labels[{i}]: expected the id of a dstate, got {label}; "
+                f"there are {len(dstates)} dstates"
+            )
+    known = set(ids)
+    return {
+        "labels": labels,
+        "dstates": dstates,
+        "links": read.each(record, "links", lambda x, name: _link(read, x, known, name)),
+        "places": places,
+        "paths": paths,
+        "excused": read.each(
+            record, "excused", lambda pair, name: _pair(read, pair, name), optional=True
+        ),
+        "faults": read.each(
+            record, "faults", lambda x, name: _fault(read, x, len(labels), name), optional=True
+        ),
+        "fit": _fit(read, record, len(dstates)),
+    }
+
+
+def _check_used(where: str, name: str, known: tuple[int, ...], used: set[int | None]) -> None:
+    """Check that every place or path that is used is listed."""
+    if missing := used - {None, *known}:
+        raise MapError(
+            f"{where}: {name}: expected every id that is used, "
+            f"got none for {brief(sorted(missing, key=str))}; add it"
+        )
+
+
+def _dstate(read: FieldReader, value: Any, name: str) -> DState:
+    record = read.mapping(value, name)
+    expected = "a text or an integer, or null where it is unknown"
+    if "view" not in record:
+        raise read.wrong(f"{name}.view", expected, None)
+    view = read.view(record["view"], f"{name}.view", expected)
+    direction = read.optional(record.get("direction"), f"{name}.direction")
+    path = read.optional(record.get("path"), f"{name}.path")
+    if direction not in (None, 1, -1) or (direction is None) != (path is None):
+        raise read.wrong(
+            f"{name}.direction", "1 or -1 where there is a path, null elsewhere", direction
+        )
+    heading = read.optional(record.get("heading"), f"{name}.heading")
+    if heading is not None and not 0 <= heading < 360:
+        raise read.wrong(f"{name}.heading", "a slot, 0 to 3, or degrees, 0 to 359", heading)
+    place = read.optional(record.get("place"), f"{name}.place")
+    return DState(
+        read.integer(record.get("id"), f"{name}.id"), view, place, path, direction, heading
+    )
+
+
+def _path(read: FieldReader, value: Any, name: str) -> MapPath:
+    record = read.mapping(value, name)
+    places = read.list(record, "order")
+    order = tuple(read.integer(p, f"{name}.order[{i}]") for i, p in enumerate(places))
+    if len(set(order)) < len(order):
+        raise read.wrong(f"{name}.order", "each place once", list(order))
+    return MapPath(read.integer(record.get("id"), f"{name}.id"), order)
+
+
+def _link(read: FieldReader, value: Any, ids: set[int], name: str) -> tuple[int, str, int]:
+    good = (
+        isinstance(value, list)
+        and len(value) == 3
+        and type(value[0]) is type(value[2]) is int
+        and isinstance(value[1], str)
+    )
+    if not good or not is_writable(value[1]) or not {value[0], value[2]} <= ids:
+        raise read.wrong(name, "[dstate, action name, dstate]", value)
+    return value[0], value[1], value[2]
+
+
+def _pair(read: FieldReader, value: Any, name: str) -> tuple[int, int]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise read.wrong(name, "a list of two numbers", value)
+    return read.integer(value[0], name), read.integer(value[1], name)
+
+
+def _fault(read: FieldReader, value: Any, steps: int, name: str) -> Fault:
+    record = read.mapping(value, name)
+    if record.get("kind") not in FAULTS:
+        raise read.wrong(f"{name}.kind", " or ".join(FAULTS), record.get("kind"))
+    step = read.integer(record.get("step"), f"{name}.step")
+    if not 0 <= step < steps:
+        raise read.wrong(f"{name}.step", f"a step from 0 to {steps - 1}", step)
+    seen, expected = (
+        read.view(record.get(part), f"{name}.{part}", "a text or an integer")
+        for part in ("seen", "expected")
+    )
+    cost = read.number(record.get("cost", 0), f"{name}.cost")
+    return Fault(step, record["kind"], seen, expected, cost)
+
+
+def _fit(read: FieldReader, record: Mapping[str, Any], dstates: int) -> Fit | None:
+    """The fit of a map with so many dstates, with their poses."""
+    if record.get("fit") is None:
+        return None
+    found = read.mapping(record["fit"], "fit")
+    chi2, dof, p, scale, bend = (
+        read.number(found.get(name, 0), f"fit.{name}")
+        for name in ("chi2", "dof", "p", "scale", "bend")
+    )
+    rows = read.each(record, "poses", read.numbers, optional=True)
+    spreads = read.each(record, "spreads", read.numbers, optional=True)
+    for name, listed in (("poses", rows), ("spreads", spreads)):
+        if listed and len(listed) != dstates:
+            raise read.wrong(name, f"{dstates}, one a dstate", len(listed))
+    spreads = spreads or ((0.0, 0.0, 0.0),) * len(rows)
+    poses = tuple(Pose(*row, spread) for row, spread in zip(rows, spreads, strict=True))
+    return Fit(chi2, int(dof), p, scale, bend, poses)

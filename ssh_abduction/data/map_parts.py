@@ -1,0 +1,125 @@
+"""The parts of a map: distinctive states, paths, faults, poses and fits. All are frozen values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ssh_abduction.data.observation import View
+
+FAULTS = ("misread", "misseen", "slipped", "jumped")
+
+
+@dataclass(frozen=True, slots=True)
+class DState:
+    """A distinctive state: a position and a heading that hill-climbing brings the robot to.
+
+    Attributes:
+        id: Its number.
+        view: The view; None if the view of each step at the dstate is unknown.
+        place: Its place; None if the theory has no places.
+        path: The path that it is along; None if there is none.
+        direction: +1 or -1, which way it faces along its path.
+        heading: With star=frame the slot (0 to 3, clockwise) of the frame of its place that it
+            faces. With star=gateways degrees (0 to 359), clockwise from the heading of the first
+            dstate at its place.
+    """
+
+    id: int
+    view: View | None
+    place: int | None = None
+    path: int | None = None
+    direction: int | None = None
+    heading: int | None = field(default=None, compare=False)
+
+    @property
+    def shown(self) -> View:
+        """The view for people: "?" if it is unknown."""
+        return "?" if self.view is None else self.view
+
+
+@dataclass(frozen=True, slots=True)
+class MapPath:
+    """A path and the order of its places.
+
+    Attributes:
+        id: Its number.
+        order: The places, as direction +1 meets them. With path_order=partial this is one of the
+            orders that the map allows.
+    """
+
+    id: int
+    order: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What a map disbelieves at a step.
+
+    Attributes:
+        step: The step.
+        kind: "misread": the view of the step is not that of its dstate. "misseen": its star is not.
+            "slipped": the action did not do what its name says, so that nothing links this step
+            and the next one. "jumped": the displacement from the step before is wrong.
+        seen: The view, the name of the action, or the displacement in words; None for a star.
+        expected: The view of the dstate, if the view is misread.
+        cost: The cost in dstates.
+    """
+
+    step: int
+    kind: Literal["misread", "misseen", "slipped", "jumped"]
+    seen: View | None = None
+    expected: View | None = None
+    cost: float = field(default=0.0, compare=False)
+
+    def __str__(self) -> str:
+        if self.kind == "misread":
+            return f"the view at step {self.step} is misread: {self.seen}, expected {self.expected}"
+        if self.kind == "misseen":
+            return f"the star at step {self.step} is misread"
+        if self.kind == "jumped":
+            return f"the displacement that leads to step {self.step} is wrong: {self.seen}"
+        return f"the action at step {self.step} slipped: {self.seen}"
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """The pose of a dstate relative to the dstate of the first step.
+
+    Attributes:
+        x: Metres ahead of the first dstate.
+        y: Metres to its left.
+        heading: Radians, counterclockwise.
+        spread: The covariance of x and y, as (xx, xy, yy), in square metres.
+    """
+
+    x: float
+    y: float
+    heading: float
+    spread: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How well a map agrees with the displacements of its trace.
+
+    Attributes:
+        chi2: The sum of the squared normalised residuals.
+        dof: The degrees of freedom, which chi2 is near if the map and the noise model are right.
+        p: The probability of this chi2 or a larger one.
+        scale: The share by which displacements are too long.
+        bend: The drift of the heading, in radians a metre.
+        poses: The poses of the dstates, by id.
+    """
+
+    chi2: float
+    dof: int
+    p: float
+    scale: float = 0.0
+    bend: float = 0.0
+    poses: tuple[Pose, ...] = field(default=(), repr=False)
+
+    def to_dict(self) -> dict[str, float]:
+        """The numbers as plain data, without the poses."""
+        names = ("chi2", "dof", "p", "scale", "bend")
+        return {name: round(getattr(self, name), 6) for name in names}
