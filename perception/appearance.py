@@ -1,4 +1,6 @@
-"""Makes features of panoramas in which the light hardly shows: how bright each patch is by how bright the patches beside it and below it are.
+"""Makes features of panoramas that hardly depend on the light.
+
+Each feature compares the brightness of a patch with that of the patch beside or below it.
 
 >>> import numpy as np
 >>> day = np.random.default_rng(0).uniform(40, 200, (2, 24 * 180 * 3))
@@ -23,22 +25,29 @@ from ssh_abduction.data.errors import brief, is_finite, is_whole
 from ssh_abduction.data.trace import Trace
 
 Shape = tuple[int, int, int]
-# The field of a trace's header that says what shape its panoramas have.
+# The field of a trace's header with the shape of its panoramas.
 FIELD = "panorama"
 
 
 class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Makes differences of log brightness of panoramas, (n, rows * columns * colours) values of 0 or more, row by row.
+    """Turns panoramas into differences of log brightness between neighbouring patches.
 
-    Patches of neighbouring pixels are averaged, and the logarithm of each patch is compared with those of the patch on its right and of the one below, colour by colour. What multiplies
-    the light of a colour drops out where it is the same in both patches: the brightness of the hour, its colour, and the exposure. A sun from one side is left only at corners,
-    where walls that face it differently meet. This is the first step of Retinex (Land and McCann 1971). Distances between panoramas are Euclidean on these.
+    The pixels of each patch are averaged. The logarithm of each patch is compared with those of the
+    patch on its right and the patch below, for each colour. A factor that multiplies a colour in
+    both patches cancels out: time of day, tint of the light, exposure. Light from one side remains
+    visible only at corners between walls of different directions. Distances between panoramas are
+    Euclidean distances of these features.
 
-    shape  rows, columns and colours; None for one row of grey pixels. The columns go all around: the last one is beside the first
-    patch  rows and columns of pixels that are averaged; where they do not divide a panorama, the last patches are smaller
-    floor  is added to each value before the logarithm, so that noise in the dark counts little; 5 suits values of 0 to 255
+    Args:
+        shape: Rows, columns and colours; None means one row of grey pixels. The last column is
+            beside the first.
+        patch: Rows and columns of pixels to average. The last patches are smaller if these do not
+            divide the panorama.
+        floor: Number added to each value before the logarithm, which damps noise in the dark; 5
+            suits values of 0 to 255.
 
-    Raises PerceptionError for settings that are out of range or do not fit the images, and ValueError for images that are no finite (n, d) table of values of 0 or more.
+    Reference:
+        The first step of Retinex (Land and McCann 1971).
     """
 
     def __init__(
@@ -47,7 +56,17 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
         self.shape, self.patch, self.floor = shape, patch, floor
 
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
-        """Learn the shape, and nothing else."""
+        """Learn the shape of the images and check the settings.
+
+        Args:
+            X: (n, rows * columns * colours) values of 0 or more, row by row.
+            y: Ignored.
+
+        Raises:
+            PerceptionError: A setting is out of range or does not fit the images, or a value is
+                negative.
+            ValueError: The images are not a finite table.
+        """
         images = _bright(validate_data(self, equal_length(X), dtype=np.float64))
         self.shape_ = (
             (1, images.shape[1], 1) if self.shape is None else _numbers("shape", self.shape, 3)
@@ -60,15 +79,17 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
         if np.prod(self.shape_) != images.shape[1]:
             rows, columns, colours = self.shape_
             raise PerceptionError(
-                f"images: expected {rows} x {columns} x {colours} values each, got {images.shape[1]}; give the shape that they have"
+                f"images: expected {rows} x {columns} x {colours} values each, got "
+                f"{images.shape[1]}; give the shape that they have"
             )
         return self
 
     def transform(self, X: ArrayLike) -> NDArray[np.float64]:
-        """The differences, (n, f): to the right for all patches, then downwards for all but the lowest."""
+        """The differences, (n, f): to the right of all patches, then below all but the lowest."""
         check_is_fitted(self)
         images = _bright(validate_data(self, equal_length(X), dtype=np.float64, reset=False))
         patches = images.reshape(-1, *self.shape_)
+        # Average patches along rows, then along columns.
         for axis, pixels in ((1, self.patch[0]), (2, self.patch[1])):
             begins = np.arange(0, patches.shape[axis], pixels)
             size = np.diff([*begins, patches.shape[axis]]).reshape(
@@ -86,7 +107,15 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
 
 
 def features_of(trace: Trace) -> ReciprocalTransformer | PanoramaTransformer:
-    """What makes features of the images of a trace, not fitted yet: of panoramas if its header has their shape, as `"panorama": [24, 180, 3]`, else of ranges. Raises PerceptionError."""
+    """Make the transformer for the images of a trace; it is not fitted yet.
+
+    Args:
+        trace: If its header gives the shape of panoramas, as `"panorama": [24, 180, 3]`, they are
+            panoramas, otherwise ranges.
+
+    Raises:
+        PerceptionError: The shape in the header is not three whole numbers of at least 1.
+    """
     shape = trace.extra.get(FIELD)
     if shape is None:
         return ReciprocalTransformer()
@@ -100,7 +129,8 @@ def features_of(trace: Trace) -> ReciprocalTransformer | PanoramaTransformer:
 def _bright(images: Any) -> NDArray[np.float64]:
     if (images < 0).any():
         raise PerceptionError(
-            f"images: expected values of 0 or more, got {images.min():g} (Negative values in data); give brightness as it is"
+            f"images: expected values of 0 or more, got {images.min():g} (Negative values in "
+            "data); give brightness as it is"
         )
     return np.asarray(images)
 
@@ -112,6 +142,7 @@ def _numbers(name: str, given: Any, count: int) -> tuple[int, ...]:
         or not all(is_whole(number) and number >= 1 for number in given)
     ):
         raise PerceptionError(
-            f"{name}: expected {count} whole numbers of at least 1, got {brief(given)}; give rows and columns of pixels first"
+            f"{name}: expected {count} whole numbers of at least 1, got {brief(given)}; give "
+            "rows and columns of pixels first"
         )
     return tuple(int(number) for number in given)

@@ -1,4 +1,4 @@
-"""How sure a view is: whether an image is near the others of its cluster, and far from the next one.
+"""Measures the confidence of views: is an image near its own cluster and far from the next?
 
 >>> confidence([[0.0], [0.2], [4.0], [4.2], [1.9]], [0, 0, 1, 1, 0]).round(2).tolist()
 [0.94, 0.96, 1.0, 1.0, 0.6]
@@ -16,26 +16,36 @@ from sklearn.utils import check_array
 
 from perception.errors import ImageWarning, PerceptionError, equal_length
 
-NOISE = -1  # the label that clusterers give to an image that is in no cluster
-# An image with less confidence than this is said to be doubtful. Good images of the paper's worlds have 0.93 and more, those with somebody before the laser 0.5.
+NOISE = -1  # The label that clusterers give to an image in no cluster.
+# An image with less confidence is doubtful. Good images of the paper's worlds have 0.93 or more,
+# those with a person in front of the laser 0.5.
 SURE = 0.8
-# A view of FEW images or less, or of at most RARE times as many as the view of the middle image has, is said to be doubtful where that one has SEEN or more: while a
-# robot explores, views that were seen once are nothing strange.
+# If the median view has at least SEEN images, a view is doubtful that has at most FEW images or at
+# most RARE times as many as the median view. While a robot explores, views that were seen once are
+# normal.
 FEW, RARE, SEEN = 2, 0.1, 6
-# So many images are named at most.
+# Largest number of images to name in a warning.
 NAMED = 8
 
 
 def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
-    """How sure the view of each image is, (n,), in [0, 1].
+    """Confidence of the view of each image, in [0, 1].
 
-    With `own` the distance of an image to the centre of the other images of its view, and `next` its distance to the nearest centre of another view, it is
-    next² / (own² + next²): 1 at the own centre, 0.5 half way. This is the membership of fuzzy c-means with two centres (Bezdek 1981). An image that is alone in
-    its view has 0.5, as nothing speaks for the view or against it. Noise (label -1) has 0: it has no view. Where there is one view, all of its images have 1.
+    Let `own` be the distance from an image to the centre of the other images of its view, and
+    `next` its distance to the nearest centre of another view. The confidence is next² / (own² +
+    next²): 1 at its own centre, 0.5 half way. This is the membership of fuzzy c-means with two
+    centres (Bezdek 1981). An image that is alone in its view has 0.5. Noise has 0. If there is only
+    one view, all of its images have 1.
 
-    X       (n, d) images, finite
-    labels  (n,), views, or -1 for noise
-    Raises PerceptionError for labels of another length.
+    Args:
+        X: (n, d) images, finite.
+        labels: (n,) views; -1 for noise.
+
+    Returns:
+        (n,) confidences.
+
+    Raises:
+        PerceptionError: The labels have another length.
     """
     images, of = _checked(X, labels)
     views, number, counts = np.unique(of[of != NOISE], return_inverse=True, return_counts=True)
@@ -46,9 +56,8 @@ def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
     inside = images[of != NOISE]
     distances = cdist(inside, _centres(inside, number, len(views)))
     here, size = np.arange(len(inside)), counts[number]
-    own = (
-        distances[here, number] * size / np.maximum(size - 1, 1)
-    )  # the centre without the image itself
+    # The distance to the centre without the image itself: the centre moves away from the image.
+    own = distances[here, number] * size / np.maximum(size - 1, 1)
     distances[here, number] = np.inf
     next_ = distances.min(axis=1)
     own[size == 1] = next_[size == 1]
@@ -58,12 +67,24 @@ def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
 
 
 def nearest_views(X: ArrayLike, labels: ArrayLike) -> NDArray[np.intp]:
-    """The labels, (n,), but for noise (-1) the view of the nearest centre. Raises PerceptionError where all is noise."""
+    """Replace noise (-1) by the view of the nearest centre.
+
+    Args:
+        X: (n, d) images, finite.
+        labels: (n,) views; -1 for noise.
+
+    Returns:
+        (n,) views without noise.
+
+    Raises:
+        PerceptionError: All images are noise, or the labels have another length.
+    """
     images, of = _checked(X, labels)
     noise = of == NOISE
     if noise.all():
         raise PerceptionError(
-            f"images: expected some that are in a cluster, got {len(of)} that are noise; let clusters be smaller, or wider"
+            f"images: expected some that are in a cluster, got {len(of)} that are noise; let "
+            "clusters be smaller, or wider"
         )
     if not noise.any():
         return of
@@ -76,10 +97,12 @@ def nearest_views(X: ArrayLike, labels: ArrayLike) -> NDArray[np.intp]:
 
 
 def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
-    """An ImageWarning where images are noise, have little confidence, or are nearly alone in their view, and one where M says that views overlap.
+    """Warn of images that are noise, uncertain or nearly alone, and of overlapping views.
 
-    labels, sure  (n,): views, or -1 for noise, and the confidence of each
-    quality       M
+    Args:
+        labels: (n,) views; -1 for noise.
+        sure: (n,) confidence of each view.
+        quality: M of the views; they overlap if it is below 1.
     """
     of, certain = np.asarray(labels), np.asarray(sure)
     number, counts = np.unique(of, return_inverse=True, return_counts=True)[1:]
@@ -91,14 +114,23 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
         named = ", ".join(map(str, doubtful[:NAMED].tolist())) + (
             ", …" if len(doubtful) > NAMED else ""
         )
-        text = f"{len(doubtful)} of {len(of)} images are like those of no view, or of a view that was hardly ever seen (image {named})"
+        text = (
+            f"{len(doubtful)} of {len(of)} images are like those of no view, or of a view that "
+            f"was hardly ever seen (image {named})"
+        )
         warnings.warn(
-            f"{text}: their views may be wrong, and the map with them; look whether something stood before the laser",
+            (
+                f"{text}: their views may be wrong, and the map with them; look whether something "
+                "stood before the laser"
+            ),
             ImageWarning,
             2,
         )
     if quality < 1:
-        text = f"views overlap (M is {quality:.2f}, below 1): some images of two views are nearer to each other than some of one view"
+        text = (
+            f"views overlap (M is {quality:.2f}, below 1): some images of two views are nearer to "
+            "each other than some of one view"
+        )
         warnings.warn(
             f"{text}; log images where the robot stands still, at places that it comes back to",
             ImageWarning,
@@ -118,6 +150,7 @@ def _checked(X: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64], NDAr
     of = np.asarray(labels)
     if of.shape != (len(images),) or not np.issubdtype(of.dtype, np.integer):
         raise PerceptionError(
-            f"labels: expected {len(images)} whole numbers, one an image, got an array of shape {of.shape}"
+            f"labels: expected {len(images)} whole numbers, one an image, got an array of "
+            f"shape {of.shape}"
         )
     return images, of.astype(np.intp)

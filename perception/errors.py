@@ -8,24 +8,33 @@ from ssh_abduction.data.errors import AbductionError
 
 
 class PerceptionError(AbductionError, ValueError):
-    """Images, labels, settings or a stored recogniser are not what was asked for. A ValueError too, as scikit-learn expects."""
+    """Invalid images, labels, settings or stored recogniser. A ValueError for scikit-learn."""
 
 
 class LogError(AbductionError, ValueError):
-    """A robot's log, or what it holds, cannot be read or written. The text says what was expected, what came, and how to mend it."""
+    """A robot's log, or its content, cannot be read or written.
+
+    The text says what was expected, what came, and how to mend it.
+    """
 
 
 class ImageWarning(UserWarning):
-    """Images were poor, but could be used. The text says how much of them was replaced, or what was assumed."""
+    """Images were poor but usable. The text says how much was replaced, or what was assumed."""
 
 
 def equal_length(images: Any) -> Any:
-    """The images, unchanged. Raises PerceptionError where they are a list of unequal lengths, as numpy's own message for that is hard to understand."""
+    """Return the images unchanged.
+
+    Raises:
+        PerceptionError: They are a list of unequal lengths. The message of numpy is hard to
+            understand.
+    """
     if isinstance(images, list | tuple):
         lengths = [len(image) if hasattr(image, "__len__") else 0 for image in images]
         for i, length in enumerate(lengths):
             if length != lengths[0]:
                 raise PerceptionError(
-                    f"image {i}: expected {lengths[0]} ranges, as image 0 has, got {length}; give every image the same number of beams"
+                    f"image {i}: expected {lengths[0]} ranges, as image 0 has, got {length}; "
+                    "give every image the same number of beams"
                 )
     return images

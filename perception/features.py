@@ -1,15 +1,20 @@
-"""Which beams tell two dstates apart that look alike: what a recogniser goes by, once the map has told it that they are two.
+"""Finds the beams that tell two dstates apart that look alike.
 
->>> images = [[1.0, 2.0, 3.0], [1.1, 2.0, 3.0], [1.0, 2.0, 5.0], [1.1, 2.0, 5.1], [1.0, 2.1, 3.0], [1.0, 2.1, 5.0]]
->>> found = telling_features(images, [4, 4, 7, 7, 4, 7], 4, 7)
+>>> images = [[1.0, 2.0, 3.0], [1.1, 2.0, 3.0], [1.0, 2.1, 3.0]]
+>>> images += [[1.0, 2.0, 5.0], [1.1, 2.0, 5.1], [1.0, 2.1, 5.0]]
+>>> found = telling_features(images, [4, 4, 4, 7, 7, 7], 4, 7)
 >>> {method: int(shares.argmax()) for method, shares in found.methods.items()}, found.recognised
 ({'margin': 2, 'permutation': 2, 'linear': 2}, 1.0)
 
-The paper hopes that back-propagation could learn which features of an image matter. Its recogniser is the nearest neighbour, which has no weights; so three answers stand beside each other, each with its own blind spot:
+The paper hopes that back-propagation could learn which features of an image matter. Our recogniser
+is the nearest neighbour, which has no weights. So three measures stand side by side, each with its
+own weakness:
 
-- margin: by how much a feature makes the nearest image of the other dstate farther than the nearest one of the own (Relief: Kira and Rendell 1992);
-- permutation: how much of that margin is lost once the feature is shuffled among the images (scikit-learn's permutation_importance);
-- linear: what a feature adds to the difference between the two dstates in a logistic regression.
+- margin: by how much a feature makes the nearest image of the other dstate farther than the nearest
+  image of its own dstate (Relief: Kira and Rendell 1992);
+- permutation: how much of that margin is lost when the feature is shuffled among the images
+  (scikit-learn's permutation_importance);
+- linear: what a feature adds to the difference of the dstates in a logistic regression.
 """
 
 from __future__ import annotations
@@ -28,17 +33,22 @@ from sklearn.utils import check_array
 from perception.errors import PerceptionError, equal_length
 
 Floats = NDArray[np.float64]
-# How often each feature is shuffled.
+# Number of times that each feature is shuffled.
 SHUFFLED = 10
 
 
 @dataclass(frozen=True, eq=False)
 class TellingFeatures:
-    """How much each feature does to tell two dstates apart: for each method shares, (d,), that are not negative and sum to 1, or are all 0 where nothing tells.
+    """How much each feature helps to tell two dstates apart, by three methods.
 
-    margin, permutation, linear  the shares, by method
-    recognised                   the share of images whose nearest other image is of their own dstate; about 0.5 where the two cannot be told apart, and then
-                                 the shares mean nothing
+    The shares of a method are not negative. They sum to 1, or are all 0 if no feature helps.
+
+    Attributes:
+        margin: (d,) shares by margin.
+        permutation: (d,) shares by permutation.
+        linear: (d,) shares by logistic regression.
+        recognised: Share of images whose nearest other image is of their own dstate. At about 0.5
+            the dstates cannot be told apart, and the shares mean nothing.
     """
 
     margin: Floats
@@ -54,12 +64,17 @@ class TellingFeatures:
 def telling_features(
     X: ArrayLike, labels: ArrayLike, a: Any, b: Any, random_state: int = 0
 ) -> TellingFeatures:
-    """Which features tell the dstates `a` and `b` apart.
+    """Find the features that tell the dstates `a` and `b` apart.
 
-    X       (n, d) images, as the recogniser compares them: reciprocals of ranges
-    labels  (n,) the dstate of each image; images of other dstates are left out
+    Args:
+        X: (n, d) images as the recogniser compares them, which are reciprocals of ranges.
+        labels: (n,) dstate of each image. Images of other dstates are ignored.
+        a: One dstate.
+        b: The other dstate.
+        random_state: Seed for shuffling.
 
-    Raises PerceptionError where one of the two has fewer than two images, or a is b.
+    Raises:
+        PerceptionError: a is b, or one of the two has fewer than two images.
     """
     images = check_array(equal_length(X), dtype=np.float64)
     of = np.asarray(labels)
@@ -75,9 +90,11 @@ def telling_features(
         if np.count_nonzero(of == name) < 2:
             seen = np.count_nonzero(of == name)
             raise PerceptionError(
-                f"dstates: expected at least two images of {name!r}, got {seen}; log more, or name another one"
+                f"dstates: expected at least two images of {name!r}, got {seen}; log more, or "
+                "name another one"
             )
     images, second = images[(of == a) | (of == b)], of[(of == a) | (of == b)] == b
+    # Compare each image with the nearest of its own dstate and the nearest of the other one.
     hit, miss = _neighbours(images, second)
     margin = (np.abs(images - images[miss]) - np.abs(images - images[hit])).mean(axis=0)
     far = np.linalg.norm(images - images[miss], axis=1) - np.linalg.norm(
@@ -92,7 +109,7 @@ def telling_features(
 
 
 def strongest(shares: ArrayLike, most: float = 0.5) -> str:
-    """The features that have the largest shares, and together `most` of all, as stretches: "3–14, 80"."""
+    """The features with the largest shares that sum to `most`, as ranges: "3–14, 80"."""
     weights = np.asarray(shares)
     order = np.argsort(-weights, kind="stable")
     chosen = np.sort(
@@ -107,7 +124,7 @@ def strongest(shares: ArrayLike, most: float = 0.5) -> str:
 def _neighbours(
     images: Floats, second: NDArray[np.bool_]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each image the nearest other one of its dstate, and the nearest one of the other dstate."""
+    """For each image, the nearest other one of its dstate and the nearest of the other dstate."""
     distances = cdist(images, images)
     np.fill_diagonal(distances, np.inf)
     same = second[:, None] == second
@@ -119,7 +136,7 @@ def _neighbours(
 
 
 def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
-    """The margin lost by shuffling each feature. Every second image of each dstate is known, and the others are asked for."""
+    """The margin lost by shuffling each feature; every second image is known, others test."""
     order = np.argsort(second, kind="stable")
     known, asked = order[::2], order[1::2]
     model = KNeighborsClassifier(1, algorithm="brute").fit(images[known], second[known])
@@ -136,9 +153,9 @@ def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
 
 
 def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
-    """By how much the nearest image known of the other dstate is farther than that of the own, squared, on the average.
+    """Mean squared distance to the nearest image of the other dstate, minus that of the own.
 
-    Squares, as to them a shuffled feature that tells nothing adds the same on both sides.
+    With squares, shuffling a useless feature adds the same to both distances.
     """
     distances = cdist(images, model._fit_X, "sqeuclidean")
     same = second[:, None] == model.classes_[model._y]
@@ -151,7 +168,7 @@ def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
 
 
 def _linear(images: Floats, second: NDArray[np.bool_]) -> Floats:
-    """What each feature adds to the score of the one dstate against the other."""
+    """What each feature adds to the score of one dstate against the other."""
     model = LogisticRegression(max_iter=1000).fit(images - images.mean(axis=0), second)
     return np.asarray(model.coef_[0] * (images[second].mean(axis=0) - images[~second].mean(axis=0)))
 

@@ -1,4 +1,4 @@
-"""Makes one table of the images of a trace."""
+"""Collects the images of a trace in one table."""
 
 from __future__ import annotations
 
@@ -12,14 +12,22 @@ from numpy.typing import NDArray
 from perception.errors import PerceptionError
 from ssh_abduction.data.trace import Trace
 
-# Bytes that a sidecar file may have once it is unpacked: a small archive may claim to hold more than the memory.
+# Limit in bytes of an unpacked sidecar file, since a small archive may unpack to more than the
+# memory.
 LARGEST = 4 * 2**30
 
 
 def images_of(trace: Trace) -> NDArray[np.float64]:
-    """The images of all steps, (n, d) ranges in metres. They stand in the trace or in its sidecar file: .npy, or .npz with one array or with `images`.
+    """The images of all steps.
 
-    Raises PerceptionError where a step has no image, lengths differ, or the sidecar file cannot be read.
+    They come from the trace, or from its sidecar file: .npy, or .npz with one array or with
+    `images`.
+
+    Returns:
+        (n, d) ranges in metres.
+
+    Raises:
+        PerceptionError: A step has no image, lengths differ, or the sidecar file cannot be read.
     """
     for i, step in enumerate(trace.steps):
         if step.image is None:
@@ -36,13 +44,18 @@ def images_of(trace: Trace) -> NDArray[np.float64]:
         if beams != lengths[0]:
             mend = "give every image the same number of beams"
             raise PerceptionError(
-                f"{trace.at(i)}: image: expected {lengths[0]} ranges, as the first has, got {beams}; {mend}"
+                f"{trace.at(i)}: image: expected {lengths[0]} ranges, as the first has, got "
+                f"{beams}; {mend}"
             )
     return np.array(held, dtype=float)
 
 
 def images_held(trace: Trace) -> list[NDArray[np.float64] | None]:
-    """The image of each step, (d,) ranges in metres; None where a step has none. Raises PerceptionError where the sidecar file cannot be read."""
+    """The image of each step, (d,) ranges in metres; None for a step without an image.
+
+    Raises:
+        PerceptionError: The sidecar file cannot be read.
+    """
     held = [step.image for step in trace.steps]
     if not any(isinstance(image, int) for image in held):
         return [None if image is None else np.array(image, dtype=float) for image in held]
@@ -51,7 +64,8 @@ def images_held(trace: Trace) -> list[NDArray[np.float64] | None]:
     for i, image in enumerate(held):
         if isinstance(image, int) and image >= len(table):
             raise PerceptionError(
-                f"{trace.at(i)}: image: expected an index below {len(table)}, got {image}; {trace.images} has no more"
+                f"{trace.at(i)}: image: expected an index below {len(table)}, got {image}; "
+                f"{trace.images} has no more"
             )
         rows.append(
             None
@@ -67,11 +81,13 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
     """The table in the sidecar file of a trace."""
     if trace.images is None:
         raise PerceptionError(
-            f"{trace.at(0)}: image: expected the header to name a file of images for the indices, got none; add images"
+            f"{trace.at(0)}: image: expected the header to name a file of images for the "
+            "indices, got none; add images"
         )
     path = Path(trace.source or ".").parent / trace.images
     try:
-        with path.open("rb") as file:  # numpy leaves a damaged file open
+        # numpy leaves a damaged file open, so open it here.
+        with path.open("rb") as file:
             _affordable(file)
             data = np.load(file, allow_pickle=False)
             table = (
@@ -85,29 +101,35 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
             shape = table.shape
     except OSError as error:
         raise PerceptionError(
-            f"{path}: expected a .npy or .npz file of images: {error.strerror or error}; check the header's images"
+            f"{path}: expected a .npy or .npz file of images: {error.strerror or error}; "
+            "check the header's images"
         ) from None
     except PerceptionError:
         raise
-    except Exception as error:  # each part of a damaged archive fails in its own way: zlib.error, MemoryError, AttributeError, …
+    # Each part of a damaged archive fails in its own way: zlib.error, MemoryError, AttributeError,
+    # …
+    except Exception as error:
         why = f"{type(error).__name__}: {error}"
         raise PerceptionError(
-            f"{path}: expected a .npy or .npz file of images, got something else ({why}); write it again"
+            f"{path}: expected a .npy or .npz file of images, got something else ({why}); "
+            "write it again"
         ) from None
     if len(shape) != 2 or not floats:
         raise PerceptionError(
-            f"{path}: expected a table of images x ranges, got {table.dtype} of shape {shape}; store one image a row"
+            f"{path}: expected a table of images x ranges, got {table.dtype} of shape "
+            f"{shape}; store one image a row"
         )
     return table.astype(float)
 
 
 def _affordable(file: BinaryIO) -> None:
-    """Raises PerceptionError where an archive would have more than LARGEST bytes once it is unpacked."""
+    """Raise PerceptionError if an archive would unpack to more than LARGEST bytes."""
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
             unpacked = sum(part.file_size for part in archive.infolist())
         if unpacked > LARGEST:
             raise PerceptionError(
-                f"images: expected at most {LARGEST} bytes once unpacked, got {unpacked}; write fewer images a file"
+                f"images: expected at most {LARGEST} bytes once unpacked, got {unpacked}; "
+                "write fewer images a file"
             )
     file.seek(0)

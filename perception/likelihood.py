@@ -1,19 +1,25 @@
-"""How probable an image is at each place that a recogniser knows, and how probable it is at none of them.
+"""Computes how probable an image is at each known place, and at none of them.
 
 >>> from perception.recognition import PlaceRecogniser
->>> known = PlaceRecogniser().fit([[1.0, 4.0], [1.2, 4.0], [3.0, 3.0], [3.0, 3.1]], ["corner", "corner", "hall", "hall"])
+>>> images = [[1.0, 4.0], [1.2, 4.0], [3.0, 3.0], [3.0, 3.1]]
+>>> known = PlaceRecogniser().fit(images, ["corner", "corner", "hall", "hall"])
 >>> likelihood = ImageLikelihood.of(known)
 >>> likelihood.labels([[1.1, 4.0], [3.0, 3.2], [9.0, 0.0]])
 ['corner', 'hall', None]
 
-The nearest neighbour always has an answer, even for an image of nothing. Here its distances are read as densities:
+The nearest neighbour always answers, even for an image of nothing. Here its distances are read as
+densities:
 
-p(o|x)      the squared distance from image o to the nearest image of place x is a sum of `dimensions` squares of Gaussian deviations of one variance. Mean
-            and variance of that sum are those of the distances from each remembered image to the nearest other one of its own place. So `dimensions`
-            says how many beams deviate independently of each other: fewer than there are (Satterthwaite 1946, moment matching)
-p(o|novel)  what no known place looks like: a Gaussian about the mean of all remembered images, as wide as they all are
-p(o|nowhere) = (sum over the places x of p(o|x) + p(o|novel)) / (places + 1): a place that is not known looks like one of those that are, or like none, as likely as each of
-            them (FAB-MAP, Cummins & Newman 2008, takes the average place as well, there by sampling). So what is seen everywhere tells nothing
+- p(o|x): the squared distance from image o to the nearest image of place x is a sum of `dimensions`
+  squared Gaussian deviations of equal variance. Its mean and variance are those of the distances
+  from each remembered image to the nearest other image of its place. So `dimensions` counts the
+  beams that vary independently, fewer than there are beams (moment matching, Satterthwaite 1946).
+- p(o|novel): the density of an unknown appearance, which is a Gaussian around the mean of all
+  remembered images, as wide as all of them.
+- p(o|nowhere) = (sum over places x of p(o|x) + p(o|novel)) / (places + 1). An unknown place looks
+  like one of the known places or like none of them, all with equal probability. Hence what is seen
+  everywhere is no evidence. FAB-MAP (Cummins and Newman 2008) also uses the average place, by
+  sampling.
 """
 
 from __future__ import annotations
@@ -34,24 +40,28 @@ from perception.errors import PerceptionError, equal_length
 from perception.recognition import PlaceRecogniser
 from ssh_abduction.data.errors import brief
 
-# The spread of a place's images is at least this share of the spread of all images: images without any noise, such as those of a test, are not infinitely certain.
+# The spread within a place is at least this share of the spread of all images, so that images
+# without noise, such as those of a test, do not give infinite certainty.
 LEAST_SPREAD = 1e-6
-# So many images are compared with all remembered ones in one go.
+# Number of images to compare with all remembered ones at once.
 AT_ONCE = 256
-# Prior probability that an image is of no place that the recogniser knows. RTAB-Map (Labbé and Michaud 2013) gives a robot 0.1 of being at a place that it does not know.
+# Prior probability that an image is of no known place. RTAB-Map (Labbé and Michaud 2013) also uses
+# 0.1.
 UNMAPPED = 0.1
 
 
 @dataclass(frozen=True)
 class ImageLikelihood:
-    """What a recogniser's distances say of images.
+    """Densities of images, from the distances of a recogniser.
 
-    recogniser  the fitted estimator: a PlaceRecogniser, or a pipeline that ends with one
-    classes     its places, (c,)
-    within      mean squared distance from an image to the nearest other one of its place
-    spread      mean squared distance from an image to the mean of all images
-    centre      that mean, (d,)
-    dimensions  how many squares of independent deviations a squared distance is the sum of, from 1 to d
+    Attributes:
+        recogniser: The fitted PlaceRecogniser, or a pipeline that ends with one.
+        classes: (c,) its places.
+        within: Mean squared distance from an image to the nearest other one of its place.
+        spread: Mean squared distance from an image to the mean of all images.
+        centre: (d,) mean of all images.
+        dimensions: Number of independent squared deviations that a squared distance is the sum of,
+            from 1 to d.
     """
 
     recogniser: Any
@@ -63,45 +73,68 @@ class ImageLikelihood:
 
     @classmethod
     def of(cls, recogniser: Any) -> ImageLikelihood:
-        """Measure the distances within a recogniser's memory. Raises PerceptionError where it is of another kind, or saw no place twice."""
+        """Measure the distances between the images that a recogniser remembers.
+
+        Raises:
+            PerceptionError: It is another kind of recogniser, or saw no place twice.
+        """
         nearest = _nearest(recogniser)
         if not isinstance(nearest, PlaceRecogniser):
             raise PerceptionError(
-                f"recogniser: expected a PlaceRecogniser, or a pipeline that ends with one, got a {type(nearest).__name__}; make one with recogniser()"
+                "recogniser: expected a PlaceRecogniser, or a pipeline that ends with one, "
+                f"got a {type(nearest).__name__}; make one with recogniser()"
             )
         try:
             images, labels = nearest.remembered()
         except NotFittedError:
             raise PerceptionError(
-                "recogniser: expected one that has learnt, got a new one; call fit with images and labels first"
+                "recogniser: expected one that has learnt, got a new one; call fit with "
+                "images and labels first"
             ) from None
         with np.errstate(over="ignore", invalid="ignore"):
             finite = np.isfinite(np.sum((images - images[:1]) ** 2))
         if not finite:
             raise PerceptionError(
-                "recogniser: expected one that remembers images of finite numbers, got NaN, infinity, or numbers too large to square; train it again"
+                "recogniser: expected one that remembers images of finite numbers, got NaN, "
+                "infinity, or numbers too large to square; train it again"
             )
         squares = np.concatenate(
             [_to_nearest_other(images[labels == label]) for label in np.unique(labels)]
         )
         if not len(squares):
             raise PerceptionError(
-                "recogniser: expected two images of some place, to learn how images of one place differ, got one of each; train it on a longer trace"
+                "recogniser: expected two images of some place, to learn how images of one "
+                "place differ, got one of each; train it on a longer trace"
             )
         centre = images.mean(axis=0)
         spread = float(np.mean(np.sum((images - centre) ** 2, axis=1))) or 1.0
         within = max(float(squares.mean()), LEAST_SPREAD * spread)
         variance = float(squares.var())
         beams = float(images.shape[1])
+        # Moment matching: a sum of k squares has the variance 2 mean² / k.
         dimensions = min(beams, max(1.0, 2 * within**2 / variance)) if variance else beams
         return cls(recogniser, nearest.classes_, within, max(spread, within), centre, dimensions)
 
     def log_likelihoods(self, images: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Logarithms of p(o|x) for each of `classes`, (n, c), and of p(o|novel), (n,), of images as the recogniser takes them, (n, d)."""
+        """Log densities of images.
+
+        Args:
+            images: (n, d) images as the recogniser takes them.
+
+        Returns:
+            log p(o|x) for each of `classes`, (n, c), and log p(o|novel), (n,).
+        """
         return self._of_features(self._features(images))
 
     def ratios(self, images: ArrayLike) -> Iterator[NDArray[np.float64]]:
-        """For each of these images, (n, d), p(o|x) / p(o|nowhere) for each of `classes`, (c,): from 0 to c + 1."""
+        """Likelihood ratios of images.
+
+        Args:
+            images: (n, d) images as the recogniser takes them.
+
+        Yields:
+            For each image, p(o|x) / p(o|nowhere) for each of `classes`, (c,), from 0 to c + 1.
+        """
         features = self._features(images)
         for some in np.array_split(features, max(1, math.ceil(len(features) / AT_ONCE))):
             known, novel = self._of_features(some)
@@ -111,9 +144,14 @@ class ImageLikelihood:
             yield from np.exp(known - nowhere[:, None])
 
     def labels(self, images: ArrayLike, unmapped: float = UNMAPPED) -> list[Any]:
-        """The likeliest place of each image, (n, d), if all are equally likely before; None where it is likelier that the image is of none of them.
+        """The most probable place of each image, with equal priors for all places.
 
-        unmapped  the probability, before it is seen, that an image is of none of them
+        Args:
+            images: (n, d) images as the recogniser takes them.
+            unmapped: Prior probability that an image is of no known place.
+
+        Returns:
+            For each image a class, or None if no known place is more probable.
         """
         found = []
         for ratios in self.ratios(images):
@@ -122,19 +160,21 @@ class ImageLikelihood:
         return found
 
     def _features(self, images: ArrayLike) -> NDArray[np.float64]:
-        """Images as the last estimator of the pipeline takes them. Raises PerceptionError."""
+        """Features of images, as the last estimator of the pipeline takes them."""
         try:
             table = np.asarray(equal_length(images), np.float64)
         except PerceptionError:
             raise
         except (TypeError, ValueError):
             raise PerceptionError(
-                f"images: expected a table of numbers, got {brief(images)}; give a row of ranges for each image"
+                f"images: expected a table of numbers, got {brief(images)}; give a row of "
+                "ranges for each image"
             ) from None
         beams = self.recogniser.n_features_in_
         if table.ndim != 2 or table.shape[1] != beams:
             raise PerceptionError(
-                f"images: expected {beams} ranges each, as the recogniser learnt, got a table of shape {table.shape}; take its own images"
+                f"images: expected {beams} ranges each, as the recogniser learnt, got a table "
+                f"of shape {table.shape}; take its own images"
             )
         try:
             features = np.asarray(
@@ -145,24 +185,27 @@ class ImageLikelihood:
             )
         except (
             Exception
-        ) as error:  # each part of a model that was damaged in its file fails in its own way
+        ) as error:  # Each part of a model that was damaged in its file fails in its own way.
             raise PerceptionError(
-                f"recogniser: expected one that reads images, got {type(error).__name__}: {error}; train it again"
+                f"recogniser: expected one that reads images, got {type(error).__name__}: "
+                f"{error}; train it again"
             ) from None
         if not np.isfinite(features).all():
             raise PerceptionError(
-                "images: expected finite numbers, got NaN or infinity; take recogniser(), which reads them as nothing seen"
+                "images: expected finite numbers, got NaN or infinity; take recogniser(), "
+                "which reads them as nothing seen"
             )
         return features
 
     def _of_features(
         self, features: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Log densities of features at each place, (n, c), and at an unknown one, (n,)."""
         known = self._log_density(_nearest(self.recogniser).distances(features) ** 2, self.within)
         return known, self._log_density(np.sum((features - self.centre) ** 2, axis=1), self.spread)
 
     def _log_density(self, squares: NDArray[np.float64], mean: float) -> NDArray[np.float64]:
-        """Log density of an isotropic Gaussian in `dimensions` dimensions whose squared distances from its centre have this mean."""
+        """Log density of an isotropic Gaussian with this mean squared distance."""
         return np.asarray(
             -0.5 * self.dimensions * (np.log(2 * np.pi * mean / self.dimensions) + squares / mean)
         )
@@ -173,7 +216,7 @@ def _nearest(recogniser: Any) -> Any:
 
 
 def _to_nearest_other(images: NDArray[np.float64]) -> NDArray[np.float64]:
-    """For each image, the squared distance to the nearest other one; empty for a single image."""
+    """Squared distance from each image to the nearest other one; empty for a single image."""
     if len(images) < 2:
         return np.empty(0)
     squares = cdist(images, images, "sqeuclidean")

@@ -1,22 +1,26 @@
-"""Measures how well a clustering separates images: without knowing the truth (M, and M trimmed), and knowing it (U).
+"""Measures how well clusters separate images: M and trimmed M without the truth, U with it.
 
 >>> import numpy as np
 >>> images = np.array([[0.0], [1.0], [5.0], [6.0]])
 >>> float(cluster_quality(images, [0, 0, 1, 1]))
 4.0
 
-Where M is wanted for many labelings of the same images, the costly half of the work is done once. For *any* labeling, the smallest distance
-between two images of different clusters is the length of the shortest edge of a minimum spanning tree whose ends have different labels. So
-`spanning_tree` finds the tree once, and `SpanningTree.separation` then reads the distance off n - 1 edges.
+For many labelings of the same images, the costly half of M is computed once. For any labeling, the
+smallest distance between two images of different clusters is the length of the shortest edge of a
+minimum spanning tree whose ends have different labels. `spanning_tree` finds the tree once.
+`SpanningTree.separation` then reads the distance off its n - 1 edges.
 
-    Proof. Let (a, b) be a closest pair with different labels, and S the images labelled like a. The tree joins a to b, so its path
-    from a to b leaves S by an edge e, whose ends are labelled differently, hence |e| >= |ab|. If |e| > |ab|, replacing e by (a, b) would
-    give a shorter spanning tree: a contradiction. So |e| = |ab|, and no edge that crosses can be shorter.
+    Proof. Let (a, b) be a closest pair with different labels, and S the images with the label of a.
+    The path of the tree from a to b leaves S by an edge e, whose ends have different labels.
+    Hence |e| >= |ab|. If |e| > |ab|, replacing e by (a, b) would give a shorter spanning tree:
+    a contradiction. So |e| = |ab|, and no edge between different labels is shorter.
 
-Distances here are exact to rounding. Matrix products only tell which pairs cannot matter, with a rigorous bound of their rounding error, and
-the distances of the pairs that are left are computed from differences in float64. Only one block of pairs is in memory at a time.
+Distances are exact to rounding. Matrix products only exclude pairs that cannot matter, with a
+rigorous bound of their rounding error. The distances of the remaining pairs are computed from
+differences in float64. Only one block of pairs is in memory at a time.
 
-References: Kuipers and Beeson, "Bootstrap Learning for Place Recognition", AAAI 2002, eq. 5 (M), and "Clustering" (U).
+References: Kuipers and Beeson, "Bootstrap Learning for Place Recognition", AAAI 2002, eq. 5 (M),
+and "Clustering" (U).
 """
 
 from __future__ import annotations
@@ -41,17 +45,20 @@ from perception.errors import PerceptionError, equal_length
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
-# The most images of a cell. Small cells let more pairs of far images be skipped; large ones make the products of matrices faster.
+# Largest number of images in a cell. Smaller cells let the search skip more far pairs; larger ones
+# make the matrix products faster.
 CELL = 256
-# So many pairs of cells are compared before those left are looked at again, as more of them may be skipped by then.
+# Number of pairs of cells to compare before skipping more of the remaining pairs.
 BATCH = 64
-# When a cluster is compared with itself, blocks have this many images a side: as float32 a block of distances takes 16 MB.
+# Images on each side of a block when a cluster is compared with itself. A float32 block of
+# distances takes 16 MB.
 BLOCK = 2048
-# Quantiles of distances are estimated on this many images, where there are more: the distances between all of these take 32 MB.
+# Quantiles of distances are estimated on at most this many images, whose distances take 32 MB.
 SAMPLE = 2_000
-# Where the middle cluster has SEEN images or more, trimmed M takes no width from clusters of FEW images or less: strange images are often put together, however unlike.
+# If the median cluster has at least SEEN images, trimmed M ignores the width of clusters of at most
+# FEW images, because clusterers often put unlike strange images together.
 SEEN, FEW = 6, 2
-# So many pairs of images are recomputed from differences at once: with 180 ranges an image, the differences take 12 MB.
+# Number of pairs of images recomputed from differences at once; 12 MB for 180 ranges an image.
 GATHERED = 8192
 
 
@@ -59,8 +66,9 @@ GATHERED = 8192
 class SpanningTree:
     """A minimum spanning tree of n images under Euclidean distance.
 
-    edges    (n - 1, 2) numbers of images
-    lengths  (n - 1,) distances, ascending; equal images are joined by edges of length 0
+    Attributes:
+        edges: (n - 1, 2) indices of images.
+        lengths: (n - 1,) distances, ascending. Edges between equal images have length 0.
     """
 
     edges: Integers
@@ -68,30 +76,33 @@ class SpanningTree:
 
     @property
     def distinct(self) -> int:
-        """How many different images there are."""
+        """Number of different images."""
         return 1 + int(np.count_nonzero(self.lengths))
 
     def separation(self, labels: ArrayLike) -> float:
-        """The smallest distance between two images of different labels; infinite where all labels are the same."""
+        """Smallest distance between images of different labels; infinite for one label."""
         of = np.asarray(labels)
         crossing = of[self.edges[:, 0]] != of[self.edges[:, 1]]
         return float(self.lengths[crossing].min(initial=math.inf))
 
 
 def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None = None) -> float:
-    """M of eq. 5: the smallest distance between images of two clusters, divided by the largest distance within one cluster. Larger is better.
+    """M of eq. 5: the smallest distance between clusters divided by the largest within one.
 
-    X       (n, d) images, finite
-    labels  (n,), where each value is one cluster, DBSCAN's -1 among them
-    tree    `spanning_tree(X)`, to save time where M is wanted for many labelings
+    Larger is better.
 
-    Returns M in [0, inf]. In the limiting cases it is
+    Args:
+        X: (n, d) images, finite.
+        labels: (n,) cluster of each image. The noise label -1 counts as a cluster.
+        tree: `spanning_tree(X)`, to save time when M is computed for many labelings.
 
-    - NaN for one cluster, as there is no distance between clusters;
-    - 0 for clusters that share an image, so also where all images are equal;
-    - infinite for different clusters each of which consists of equal images (or of one image).
+    Returns:
+        M in [0, inf]: NaN for one cluster; 0 if two clusters share an image; infinite if each of
+        several clusters consists of equal images.
 
-    Raises PerceptionError for labels of another length, ValueError for images that are not finite.
+    Raises:
+        PerceptionError: The labels have another length.
+        ValueError: The images are not finite.
     """
     images = check_array(equal_length(X), dtype=np.float64)
     clusters = _numbered(labels, len(images))
@@ -107,20 +118,28 @@ def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None =
 def trimmed_quality(
     X: ArrayLike, labels: ArrayLike, trim: float = 0.5, distances: Floats | None = None
 ) -> float:
-    """M with quantiles in the place of its extremes, so that one lost beam or one strange image does not decide. Larger is better.
+    """M with quantiles in place of extremes, so that no single beam or image decides.
 
-    In M, the smallest distance between clusters and the largest within one are each that of a single pair of images. Here two clusters are as far from each
-    other as the `trim`-quantile of the distances between their images says, and a cluster is as wide as the (1 - `trim`)-quantile of the distances within it.
-    The result is the smallest of the former divided by the largest of the latter. Clusters of one image have no width, and those of two are left out where others
-    are large.
+    In M, the smallest distance between clusters and the largest within one each come from a single
+    pair of images. Here, the gap between two clusters is the `trim`-quantile of the distances
+    between their images, and the width of a cluster is the (1 - `trim`)-quantile of the distances
+    within it. The result is the smallest gap divided by the largest width; larger is better. A
+    cluster of one image has no width. A cluster of two images is ignored if most clusters are
+    large.
 
-    X          (n, d) images, finite; of more than 2,000 a fixed random sample is measured
-    labels     (n,), where each value is one cluster
-    trim       share of the pairs that is left out at each end, in [0, 0.5]: 0 is M of the images measured, 0.5 compares medians
-    distances  (n, n) between all images, to save time where many labelings of the same few images are measured
+    Args:
+        X: (n, d) images, finite. Of more than 2,000 images, a fixed random sample is measured.
+        labels: (n,) cluster of each image.
+        trim: Share of the pairs to ignore at each end, in [0, 0.5]: 0 gives M of the measured
+            images, 0.5 compares medians.
+        distances: (n, n) distances between all images, to save time for many labelings of the same
+            few images.
 
-    Returns a number in [0, inf]: NaN for one cluster, infinite where no cluster has a width. Raises PerceptionError for labels of another length, and for
-    another trim.
+    Returns:
+        A number in [0, inf]: NaN for one cluster, infinite if no cluster has a width.
+
+    Raises:
+        PerceptionError: The labels have another length, or trim is out of range.
     """
     if not (
         isinstance(trim, int | float | np.number)
@@ -153,17 +172,24 @@ def trimmed_quality(
 
 
 def sampled(count: int) -> Integers:
-    """Which images of `count` the quantiles of distances are estimated on: all, or a fixed random sample, ascending."""
+    """Ascending indices of the images for quantiles: all `count`, or a fixed random sample."""
     if count <= SAMPLE:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, SAMPLE, replace=False))
 
 
 def uncertainty_coefficient(views: ArrayLike, truth: ArrayLike) -> float:
-    """U(v|x) = I(v; x) / H(v), in [0, 1]: which share of the uncertainty about the view v is gone once the true state x is known.
+    """U(v|x) = I(v; x) / H(v): the share of the entropy of views v that states x explain.
 
-    U is 1 where the state determines the view, so that images of one state have one view. Several states may share a view, as aliasing does not
-    lower U. A single view leaves no uncertainty, so that U is 1. Raises PerceptionError where the lengths differ or are 0.
+    U is 1 if all images of one state have one view. Several states may share a view: aliasing does
+    not lower U. U is also 1 for a single view.
+
+    Args:
+        views: (n,) view of each image.
+        truth: (n,) true state of each image.
+
+    Raises:
+        PerceptionError: The lengths differ or are 0.
     """
     seen, true = _numbered(views), _numbered(truth)
     if len(seen) != len(true):
@@ -175,10 +201,11 @@ def uncertainty_coefficient(views: ArrayLike, truth: ArrayLike) -> float:
 
 
 def spanning_tree(X: ArrayLike) -> SpanningTree:
-    """A minimum spanning tree of the images, (n, d), by Borůvka's rounds over blocks of pairs. It takes O(n) memory beside the images.
+    """Find a minimum spanning tree of images, (n, d), with Borůvka's algorithm on blocks of pairs.
 
-    In each round, every component picks its shortest edge to another component. The picks are added from short to long, but for those that would close a
-    cycle; so the forest stays part of a minimum spanning tree even where lengths are equal.
+    It needs O(n) memory besides the images. In each round, every component picks its shortest edge
+    to another component. The picks are added from short to long; a pick that would close a cycle is
+    skipped. Hence the forest is part of a minimum spanning tree even if lengths are equal.
     """
     images = check_array(equal_length(X), dtype=np.float64)
     cells, count = _Cells(images), len(images)
@@ -199,10 +226,10 @@ def spanning_tree(X: ArrayLike) -> SpanningTree:
 
 
 def cluster_spread(X: ArrayLike, labels: ArrayLike) -> float:
-    """The largest distance between two images of one cluster; 0 where the images of each cluster are equal.
+    """The largest distance between two images of one cluster; 0 if each cluster has equal images.
 
-    Two images are no farther apart than their distances from the centre of the cluster together. Pairs that cannot exceed the largest distance so far are
-    skipped.
+    By the triangle inequality, the distance of two images is at most the sum of their distances
+    from the centre. Pairs that cannot exceed the largest distance so far are skipped.
     """
     images = check_array(equal_length(X), dtype=np.float64)
     clusters = _numbered(labels, len(images))
@@ -215,14 +242,15 @@ def cluster_spread(X: ArrayLike, labels: ArrayLike) -> float:
 
 
 def _separation(images: Floats, clusters: Integers) -> float:
-    """The smallest distance between two clusters: one round of Borůvka's, in which the clusters are the components."""
+    """Smallest distance between two clusters: a round of Borůvka's with clusters as components."""
     return math.sqrt(float(_Cells(images).shortest_leaving(clusters)[0].min()))
 
 
 class _Cells:
-    """Images, put into cells of near ones. For each pair of cells there is a lower bound of the squared distance between images of different components.
+    """Images grouped into cells of near ones, with a lower bound for each pair of cells.
 
-    Components only ever merge. So that distance only grows for a pair of cells, and a bound stays true in later rounds.
+    The bound is on the squared distance between images of different components. Components only
+    merge, so this distance only grows, and a bound stays valid in later rounds.
     """
 
     def __init__(self, images: Floats) -> None:
@@ -250,13 +278,21 @@ class _Cells:
         self.bounds = np.maximum(gap, 0) ** 2
 
     def shortest_leaving(self, components: Integers) -> tuple[Floats, Integers]:
-        """For each component, 0 … c - 1 of `components`, the squared length (c,) and ends (c, 2) of the shortest edge that leaves it."""
+        """Find the shortest edge that leaves each component.
+
+        Args:
+            components: (n,) component of each image, 0 … c - 1.
+
+        Returns:
+            Squared lengths, (c,), and ends, (c, 2), of these edges.
+        """
         search = _Search(self.images, components[self.order])
         pairs = np.argsort(self.bounds, kind="stable")
-        with threadpool_limits(
-            1, user_api="blas"
-        ):  # products are so small here that threads would wait for each other longer than they work
+        # The products are small: threads would wait for each other longer than they work.
+        with threadpool_limits(1, user_api="blas"):
             while len(pairs):
+                # A pair of cells is worth a look only if its bound is below the best edge of some
+                # component in it.
                 limits = np.maximum.reduceat(search.best[search.components], self.starts[:-1])
                 pairs = pairs[
                     self.bounds[pairs]
@@ -270,7 +306,7 @@ class _Cells:
         return search.best, self.order[search.ends]
 
     def _compare(self, a: int, b: int, search: _Search) -> float:
-        """Look at all pairs of two cells; return the new bound."""
+        """Compare all pairs of images of two cells; return the new bound."""
         rows, columns = self.slices[a], self.slices[b]
         squares = self.images[rows] @ self.images[columns].T
         squares *= -2
@@ -294,17 +330,20 @@ class _Search:
         self.ends = np.zeros((len(self.best), 2), np.intp)
 
     def improve(self, lower: Floats, slack: float, row: int, column: int) -> None:
-        """Look through a block of pairs for shorter edges.
+        """Search a block of pairs for shorter edges.
 
-        lower   lower bounds of the squared distances of the pairs
-        row     the image that the rows of the block begin with
-        column  the image that its columns begin with
+        Args:
+            lower: Lower bounds of the squared distances of the pairs.
+            slack: Largest error of these bounds.
+            row: Image of the first row of the block.
+            column: Image of the first column of the block.
         """
         components, least = self.components[row : row + len(lower)], lower.min(axis=1)
         hot = np.flatnonzero(least < self.best[components])
         if not len(hot):
             return
-        # The pair that is nearest by the products is offered first: after it, hardly any other pair is still below the limit.
+        # Offer the pair with the smallest bound first. Hardly any other pair is below the limit
+        # then.
         self._offer(row + hot, column + lower[hot].argmin(axis=1))
         limits = self.best[components[hot]]
         hot = hot[(least[hot] < limits) & (limits > 0)]
@@ -313,6 +352,7 @@ class _Search:
             self._offer(row + hot[near[k : k + GATHERED]], column + far[k : k + GATHERED])
 
     def _offer(self, i: Integers, j: Integers) -> None:
+        """Keep the shortest of the pairs (i, j) for each component if it beats the best."""
         squares, components = _squares(self.images[i] - self.images[j]), self.components[i]
         order = np.lexsort((squares, components))
         order = order[np.flatnonzero(np.diff(components[order], prepend=-1))]
@@ -322,7 +362,7 @@ class _Search:
 
 
 def _halves(images: Floats, members: Integers) -> Iterator[Integers]:
-    """Cells of at most CELL images: images are split at the median along the line between two far ones, again and again."""
+    """Split images into cells of at most CELL, recursively at the median along a long axis."""
     if len(members) <= CELL:
         yield members
         return
@@ -336,16 +376,19 @@ def _halves(images: Floats, members: Integers) -> Iterator[Integers]:
 
 
 def _two_sweeps(images: Floats) -> float:
-    """A distance that is often near the largest one between two of the images: from the image that is farthest from the centre to the image farthest from that."""
+    """A lower bound of the diameter that is often close to it.
+
+    It is the largest distance from the image that is farthest from the centre.
+    """
     start = images[_squares(images - images.mean(axis=0)).argmax()]
     return math.sqrt(_squares(images - start).max())
 
 
 def _wider(images: Floats, best: float) -> float:
-    """The largest distance between two of the images, if it is larger than `best`; else some number that is not larger than `best`."""
+    """The diameter of the images if it exceeds `best`; otherwise any number of at most `best`."""
     centred = images - images.mean(axis=0)
     radii = np.sqrt(_squares(centred))
-    margin = 1 + 1e-12  # the radii are rounded too
+    margin = 1 + 1e-12  # The radii are rounded, too.
     kept = np.flatnonzero((radii + radii.max()) * margin > best)
     if len(kept) < 2:
         return 0.0
@@ -354,6 +397,8 @@ def _wider(images: Floats, best: float) -> float:
     scale = radii[0]
     if scale == 0:
         return 0.0
+    # Float32 products tell which pairs may exceed the best. Radii fall, so that a row can stop
+    # early.
     small = (centred[kept] / scale).astype(np.float32)
     norms = np.einsum("ij,ij->i", small, small)
     for a in range(0, len(kept), BLOCK):
@@ -386,15 +431,19 @@ def _squares(differences: Floats) -> Floats:
 
 
 def _rounding(beams: int, dtype: type[np.floating[Any]], reach: float) -> float:
-    """A bound of the rounding error of |a|² + |b|² - 2ab, where |a| + |b| <= reach: that of a dot product, and of the rounding of its inputs."""
+    """A bound of the rounding error of |a|² + |b|² - 2ab with |a| + |b| <= reach.
+
+    It covers the dot product and the rounding of its inputs.
+    """
     return float((beams + 16) * np.finfo(dtype).eps * reach**2)
 
 
 def _numbered(labels: ArrayLike, count: int | None = None) -> Integers:
-    """Labels as numbers 0, 1, … Raises PerceptionError where they are not a row, or are not `count`."""
+    """Number the labels 0, 1, … Raises PerceptionError unless they are a row (of `count`)."""
     of = np.asarray(labels)
     if of.ndim != 1 or not len(of) or (count is not None and len(of) != count):
         raise PerceptionError(
-            f"labels: expected a row of {'labels' if count is None else f'{count} labels'}, got an array of shape {of.shape}"
+            f"labels: expected a row of {'labels' if count is None else f'{count} labels'}, "
+            f"got an array of shape {of.shape}"
         )
     return np.unique(of, return_inverse=True)[1].astype(np.intp)

@@ -1,4 +1,4 @@
-"""Makes reciprocals of ranges: so what is near matters most, and "nothing seen" is simply far away.
+"""Turns ranges into reciprocals: near things matter most, and "nothing seen" is 0.
 
 >>> ReciprocalTransformer().fit_transform([[0.5, 2.0, 100.0]])
 array([[2.  , 0.5 , 0.01]])
@@ -19,20 +19,31 @@ from ssh_abduction.data.errors import is_finite
 
 
 class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Makes 1 / max(r, floor) of images of ranges r in metres, (n, d). Distances between images are Euclidean on these (Kuipers and Beeson 2002).
+    """Turns ranges r in metres, (n, d), into 1 / max(r, floor).
 
-    floor: the shortest range that is believed, in metres, > 0.
+    Distances between images are Euclidean on these (Kuipers and Beeson 2002). Lasers report
+    "nothing seen" as +inf, and some report a lost beam as NaN: both become 0. Ranges of zero or
+    less are invalid and become the floor. `transform` counts these replacements in one
+    ImageWarning. Ranges between 0 and the floor become the floor without a warning.
 
-    Lasers report "nothing seen" as +inf, and some report a lost beam as NaN: both become 0, which is infinitely far. Ranges of zero or less are no
-    measurements, and are raised to the floor. `transform` counts all of these in one ImageWarning; ranges between 0 and the floor are raised without a
-    warning. Raises PerceptionError for a floor that is not a positive number, ValueError for images that are not an (n, d) table.
+    Args:
+        floor: Shortest range that is believed, in metres, greater than 0.
     """
 
     def __init__(self, floor: float = 0.05) -> None:
         self.floor = floor
 
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
-        """Learn the number of beams, and nothing else."""
+        """Learn the number of beams.
+
+        Args:
+            X: (n, d) ranges in metres.
+            y: Ignored.
+
+        Raises:
+            PerceptionError: The floor is not a positive number.
+            ValueError: The images are not a table.
+        """
         if not is_finite(self.floor) or self.floor <= 0:
             raise PerceptionError(
                 f"floor: expected a positive number of metres, got {self.floor!r}"
@@ -50,7 +61,8 @@ class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimato
         counts = [int(np.count_nonzero(part)) for part in (infinite, missing, without)]
         if any(counts):
             warnings.warn(
-                f"{sum(counts)} of {ranges.size} ranges were replaced: {counts[0]} infinite and {counts[1]} missing (NaN) "
+                f"{sum(counts)} of {ranges.size} ranges were replaced: {counts[0]} infinite and "
+                f"{counts[1]} missing (NaN) "
                 f"are taken as nothing seen, {counts[2]} of zero or less as {self.floor} m",
                 ImageWarning,
                 stacklevel=2,

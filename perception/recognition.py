@@ -1,4 +1,6 @@
-"""Recognises places in images, once the map has labelled images: the nearest image seen before tells where the robot is.
+"""Recognises places in images: the label of the nearest image that was learnt.
+
+The map labels the images to learn from.
 
 >>> recogniser().fit([[1.0, 4.0], [3.0, 3.0]], ["corner", "hall"]).predict([[1.1, 4.2]]).tolist()
 ['corner']
@@ -27,17 +29,30 @@ from ssh_abduction.data.errors import brief
 
 
 class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-    """The label of the nearest image, or the commonest among the `n_neighbors` nearest (Euclidean distance).
+    """Gives an image the commonest label among the `n_neighbors` nearest (Euclidean distance).
 
-    Attributes: classes_, (c,); neighbours_, the fitted KNeighborsClassifier. Raises PerceptionError for a number of neighbours that is
-    not in 1 … n, and ValueError for images that are not a finite (n, d) table or labels that are not classes.
+    Args:
+        n_neighbors: Number of neighbours that vote, from 1 to the number of images.
+
+    Attributes:
+        classes_: (c,) labels.
+        neighbours_: The fitted KNeighborsClassifier.
     """
 
     def __init__(self, n_neighbors: int = 1) -> None:
         self.n_neighbors = n_neighbors
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Remember images, (n, d), and their labels, (n,)."""
+        """Remember images and their labels.
+
+        Args:
+            X: (n, d) images, finite.
+            y: (n,) labels.
+
+        Raises:
+            PerceptionError: The number of neighbours is not in 1 … n.
+            ValueError: The images are not a finite table, or the labels are not classes.
+        """
         images, labels = validate_data(self, equal_length(X), y, dtype=np.float64)
         number = self.n_neighbors
         if (
@@ -46,40 +61,46 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             or not 1 <= number <= len(images)
         ):
             raise PerceptionError(
-                f"n_neighbors: expected a whole number from 1 to the {len(images)} images, got {number!r}"
+                f"n_neighbors: expected a whole number from 1 to the {len(images)} images, "
+                f"got {number!r}"
             )
-        with warnings.catch_warnings():  # scikit-learn takes labels for numbers to regress on where many of them occur once or twice
+        # If many labels occur once or twice, scikit-learn warns that they might be numbers.
+        with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "The number of unique classes")
             check_classification_targets(labels)
-            # A tree of images does not help in 180 dimensions, and a plain table of images is safer to store.
+            # A tree does not help in 180 dimensions, and a plain table of images is safer to store.
             self.neighbours_ = KNeighborsClassifier(number, algorithm="brute").fit(images, labels)
         self.classes_ = self.neighbours_.classes_
         return self
 
     def predict(self, X: ArrayLike) -> NDArray[Any]:
-        """Labels, (n,)."""
+        """Labels of images, (n,)."""
         return np.asarray(self._neighbours().predict(self._images(X)))
 
     def predict_proba(self, X: ArrayLike) -> NDArray[np.float64]:
-        """Share of the neighbours that have each of `classes_`, (n, c)."""
+        """Share of the neighbours with each of `classes_`, (n, c)."""
         return np.asarray(self._neighbours().predict_proba(self._images(X)), np.float64)
 
     def distances(self, X: ArrayLike) -> NDArray[np.float64]:
-        """Euclidean distance from each image to the nearest remembered one of each of `classes_`, (n, c)."""
+        """Euclidean distance from each image to the nearest learnt image of each class, (n, c)."""
         remembered, labels = self.remembered()
         found = cdist(self._images(X), remembered)
         return np.column_stack([found[:, labels == label].min(axis=1) for label in self.classes_])
 
     def remembered(self) -> tuple[NDArray[np.float64], NDArray[Any]]:
-        """The images that were learnt, (m, d), and their labels, (m,)."""
+        """The learnt images, (m, d), and their labels, (m,)."""
         held = self._neighbours()
         return np.asarray(held._fit_X), np.asarray(self.classes_)[np.asarray(held._y)]
 
     def learnt_again(self) -> PlaceRecogniser:
-        """A recogniser that learns from scratch the images and labels that this one remembers, and so answers the same.
+        """Learn the remembered images and labels from scratch; the result answers the same.
 
-        scikit-learn's compiled search trusts its tables, and tables that were damaged in a file can end the whole process. What is learnt
-        again has been checked again. Raises PerceptionError, ValueError or another error of numpy's where the tables are not sound.
+        scikit-learn's compiled search trusts its tables, and a table that was damaged in a file can
+        crash the process. Learning again checks the tables.
+
+        Raises:
+            PerceptionError, ValueError: The tables are not sound. Other errors of numpy are
+                possible.
         """
         return PlaceRecogniser(self.n_neighbors).fit(*self.remembered())
 
@@ -92,10 +113,15 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def recogniser(floor: float = 0.05, n_neighbors: int = 1, features: Any = None) -> Pipeline:
-    """From images, (n, d), to labels: features, then the nearest neighbour. Not fitted yet.
+    """Make a pipeline from images, (n, d), to labels: features, then the nearest neighbour.
 
-    floor     of the reciprocals of ranges in metres, which are the features where no others are given
-    features  a transformer of scikit-learn's kind for other images, such as a PanoramaTransformer. It is cloned
+    The pipeline is not fitted yet.
+
+    Args:
+        floor: Shortest range in metres for the reciprocals, which are the default features.
+        n_neighbors: Number of neighbours that vote.
+        features: A scikit-learn transformer for other images, such as a PanoramaTransformer. It is
+            cloned.
     """
     made = (
         ("reciprocal", ReciprocalTransformer(floor))
@@ -106,23 +132,28 @@ def recogniser(floor: float = 0.05, n_neighbors: int = 1, features: Any = None) 
 
 
 def cloned(name: str, estimator: Any, *methods: str) -> Any:
-    """A clone of an estimator of scikit-learn's kind, which has `fit` and these methods. Raises PerceptionError for anything else."""
+    """Clone a scikit-learn estimator. Raises PerceptionError if it lacks `fit` or these methods."""
     wanted = ("fit", "get_params", *methods)
     if isinstance(estimator, type) or not all(hasattr(estimator, method) for method in wanted):
         raise PerceptionError(
-            f"{name}: expected an estimator with {', '.join(wanted)}, got {brief(estimator)}; make one of scikit-learn's"
+            f"{name}: expected an estimator with {', '.join(wanted)}, got {brief(estimator)}; "
+            "make one of scikit-learn's"
         )
     return clone(estimator)
 
 
 @dataclass(frozen=True)
 class LearningCurve:
-    """The recognition rate by the number of images seen.
+    """The recognition rate as a function of the number of images seen.
 
-    sizes      (s,) how many images, from the first on, had been seen
-    mean, lowest, highest  (s,) the share of images recognised, in [0, 1], over the folds
-    folds      how many folds there were
-    untested   classes with a single image. They are never tested, as nothing is known of them once that image is left out
+    Attributes:
+        sizes: (s,) numbers of first images that were seen.
+        mean: (s,) mean share of recognised images over the folds, in [0, 1].
+        lowest: (s,) lowest share over the folds.
+        highest: (s,) highest share over the folds.
+        folds: Number of folds.
+        untested: Classes with a single image. They cannot be tested, since nothing is known of them
+            once that image is left out.
     """
 
     sizes: tuple[int, ...]
@@ -141,20 +172,34 @@ def learning_curve(
     random_state: int | np.random.RandomState | None = None,
     estimator: Any = None,
 ) -> LearningCurve:
-    """The recognition rate, by cross-validation, for growing numbers of images (Kuipers and Beeson 2002, the learning curves).
+    """Cross-validate the recognition rate for growing numbers of images.
 
-    The n images, (n, d), in the order in which they were seen, are dealt into `folds` parts, each class spread evenly. For each size m and
-    each fold, a clone of `estimator` (default: `recogniser()`, so images are ranges in metres) learns from those of the first m images
-    that are not in the fold, and is tested on the whole fold. So all sizes are tested on the same images; those of places that are not among the first m
-    images count as errors. A clone that has no image to learn from recognises nothing.
+    The images are dealt into folds, each class spread evenly. For each size m and each fold, a
+    clone of the estimator learns from those of the first m images that are not in the fold. It is
+    tested on the whole fold, so all sizes are tested on the same images. An image of a place that
+    is not among the first m images counts as an error. A clone without images to learn from
+    recognises nothing.
 
-    Raises PerceptionError for sizes outside 1 … n, fewer than 2 folds, or fewer images to test than folds.
+    Args:
+        X: (n, d) images in the order in which they were seen.
+        y: (n,) labels.
+        sizes: Numbers of images to learn from, each from 1 to n.
+        folds: Number of folds, at least 2.
+        random_state: Seed for dealing the images.
+        estimator: Default is `recogniser()`, for ranges in metres.
+
+    Raises:
+        PerceptionError: A size or the number of folds is out of range, or there are fewer images to
+            test than folds.
+
+    Reference:
+        Kuipers and Beeson 2002, the learning curves.
     """
     estimator = recogniser() if estimator is None else estimator
     images, labels = np.asarray(equal_length(X)), np.asarray(y)
-    clone(estimator).fit(
-        images, labels
-    )  # so that warnings and errors about the images come once, and not for each fold
+    # Fit once to all images, so that warnings and errors about the images come once, not once a
+    # fold.
+    clone(estimator).fit(images, labels)
     wanted = tuple(int(size) for size in sizes)
     for size in wanted:
         if not 1 <= size <= len(images):
@@ -183,9 +228,12 @@ def learning_curve(
 def _deal(
     labels: NDArray[Any], folds: int, random_state: Any
 ) -> tuple[NDArray[np.intp], tuple[Any, ...]]:
-    """The fold of each image, -1 for those never tested, and the classes that are never tested.
+    """Deal the images into folds, one class after the other.
 
-    Images are dealt round like cards, one class after the other. So the sizes of folds differ by at most one image, in all and within each class.
+    The sizes of folds differ by at most one image, in total and within each class.
+
+    Returns:
+        The fold of each image, -1 if it is never tested, and the classes that are never tested.
     """
     if folds < 2:
         raise PerceptionError(f"folds: expected at least 2, got {folds}")
@@ -195,11 +243,12 @@ def _deal(
     cards = cards[counts[of[cards]] > 1]
     if len(cards) < folds:
         raise PerceptionError(
-            f"folds: expected at most {len(cards)}, the images of places seen more than once, got {folds}"
+            f"folds: expected at most {len(cards)}, the images of places seen more than once, "
+            f"got {folds}"
         )
     fold = np.full(len(labels), -1, np.intp)
     fold[cards] = np.arange(len(cards)) % folds
     return fold, tuple(classes[counts == 1].tolist())
 
 
-PlaceRecognizer = PlaceRecogniser  # its name of version 0.1.0, which files of recognisers hold
+PlaceRecognizer = PlaceRecogniser  # Its name in version 0.1.0, which is in files of recognisers.

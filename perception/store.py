@@ -1,7 +1,7 @@
-"""Keeps a fitted recogniser in a file that cannot run code when it is read.
+"""Stores a fitted recogniser in a file that cannot run code when it is read.
 
-The file is a skops archive: a description of types and arrays. Reading it makes objects of scikit-learn's own types and of those in
-`OURS`, and refuses anything else; a pickle is not an archive, and is refused unread.
+The file is a skops archive, which describes types and arrays. Reading it makes objects of
+scikit-learn's own types and of those in `OURS` only. A pickle is refused unread.
 """
 
 from __future__ import annotations
@@ -35,19 +35,20 @@ OURS = (
         f"{kind.__module__}.{kind.__qualname__}"
         for kind in (PlaceRecogniser, PanoramaTransformer, ReciprocalTransformer, ViewClusterer)
     ),
-    "perception.recognition.PlaceRecognizer",  # in files of version 0.1.0
+    "perception.recognition.PlaceRecognizer",  # The name in files of version 0.1.0.
 )
-# Bytes that a file may have once it is unpacked: a small archive may claim to hold more than the memory.
+# Limit in bytes of an unpacked file, since a small archive may unpack to more than the memory.
 LARGEST = 4 * 2**30
 
 
 @dataclass(frozen=True)
 class Stored:
-    """What the file of a recogniser holds.
+    """Content of a file of a recogniser.
 
-    model     the fitted estimator or pipeline
-    classes   its labels, in order; empty where it has none
-    versions  of Python, numpy, scikit-learn, skops and this package, when it was saved
+    Attributes:
+        model: The fitted estimator or pipeline.
+        classes: Its labels, in order; empty if it has none.
+        versions: Versions of Python, numpy, scikit-learn, skops and this package that saved it.
     """
 
     model: Any
@@ -55,45 +56,60 @@ class Stored:
     versions: Mapping[str, str]
 
     def likelihood(self) -> ImageLikelihood | None:
-        """How probable images are at the places that the model knows; None for a model of another kind, or one that saw no place twice."""
+        """Densities of images; None if the model saw no place twice or is of another kind."""
         try:
             return ImageLikelihood.of(self.model)
         except PerceptionError:
             return None
 
     def labels(self, images: ArrayLike) -> list[int]:
-        """The label, a whole number, that the model gives each image, (n, d).
+        """Predict the label of each image.
 
-        Raises PerceptionError for images of another length than the model learnt, and for a model that was damaged in its file, which may not
-        show before it answers.
+        Args:
+            images: (n, d) images.
+
+        Returns:
+            n whole numbers.
+
+        Raises:
+            PerceptionError: The images have another length than the learnt ones, or the model was
+                damaged in its file, which may show only when it answers.
         """
         table = np.asarray(images, np.float64)
         try:
             learnt = getattr(self.model, "n_features_in_", table.shape[1])
             if is_whole(learnt) and learnt != table.shape[1]:
                 raise PerceptionError(
-                    f"images: expected {learnt} ranges, as the recogniser learnt, got {table.shape[1]}; take its own images"
+                    f"images: expected {learnt} ranges, as the recogniser learnt, got "
+                    f"{table.shape[1]}; take its own images"
                 )
             found = np.asarray(self.model.predict(table))
             labels = [int(label) for label in found]
             sound = found.shape == (len(table),) and found.dtype.kind in "iu"
         except PerceptionError:
             raise
-        except Exception as error:  # each part of a damaged model fails in its own way
+        except Exception as error:  # Each part of a damaged model fails in its own way.
             raise PerceptionError(
-                f"recogniser: expected one that answers, got {type(error).__name__}: {error}; train it again"
+                f"recogniser: expected one that answers, got {type(error).__name__}: {error}; "
+                "train it again"
             ) from None
         if not sound:
             raise PerceptionError(
-                f"recogniser: expected whole numbers as labels, got {found.dtype} of shape {found.shape}; train it again"
+                f"recogniser: expected whole numbers as labels, got {found.dtype} of shape "
+                f"{found.shape}; train it again"
             )
         return labels
 
 
 def save(model: Any, path: str | os.PathLike[str]) -> None:
-    """Write a fitted estimator or pipeline of this package's and scikit-learn's types. A file appears whole or not at all.
+    """Write a fitted estimator or pipeline to a file, completely or not at all.
 
-    Raises PerceptionError where `load` would refuse it, or the file cannot be written.
+    Args:
+        model: An estimator of this package's or scikit-learn's types.
+        path: The file to write.
+
+    Raises:
+        PerceptionError: `load` would refuse the model, or the file cannot be written.
     """
     classes = np.asarray(getattr(model, "classes_", ())).tolist()
     versions = {
@@ -125,8 +141,13 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
 
 
 def load(path: str | os.PathLike[str]) -> Stored:
-    """Read what `save` wrote. Raises PerceptionError for anything else; nothing in the file is ever run."""
+    """Read what `save` wrote, without running anything in the file.
+
+    Raises:
+        PerceptionError: The file cannot be read, or is anything else.
+    """
     try:
+        # Measure and check the types before reading any object.
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(part.file_size for part in archive.infolist())
         if unpacked > LARGEST:
@@ -135,7 +156,8 @@ def load(path: str | os.PathLike[str]) -> Stored:
             )
         if foreign := _foreign(file=path):
             raise PerceptionError(
-                f"{path}: expected scikit-learn's and this package's types only, got {', '.join(foreign)}; do not trust it"
+                f"{path}: expected scikit-learn's and this package's types only, got "
+                f"{', '.join(foreign)}; do not trust it"
             )
         held = skops.io.load(path, trusted=list(OURS))
     except PerceptionError:
@@ -144,9 +166,10 @@ def load(path: str | os.PathLike[str]) -> Stored:
         raise PerceptionError(
             f"{path}: expected a readable recogniser: {error.strerror or error}; check the path"
         ) from None
-    except Exception as error:  # each part of a damaged archive fails in its own way
+    except Exception as error:  # Each part of a damaged archive fails in its own way.
         raise PerceptionError(
-            f"{path}: expected a .skops file that train or save wrote, got something else ({type(error).__name__})"
+            f"{path}: expected a .skops file that train or save wrote, got something else "
+            f"({type(error).__name__})"
         ) from error
     if (
         not isinstance(held, dict)
@@ -154,28 +177,32 @@ def load(path: str | os.PathLike[str]) -> Stored:
         or held["format"] != FORMAT
     ):
         raise PerceptionError(
-            f"{path}: expected a file of format {FORMAT}, got another object; write it with train or save"
+            f"{path}: expected a file of format {FORMAT}, got another object; write it with "
+            "train or save"
         )
     version = held.get("version")
     if not is_whole(version) or version != VERSION:
         raise PerceptionError(
-            f"{path}: expected version {VERSION}, got {_kind(version)}; use the program that wrote it"
+            f"{path}: expected version {VERSION}, got {_kind(version)}; use the program that "
+            "wrote it"
         )
     for part, kind in (("model", BaseEstimator), ("classes", list), ("versions", dict)):
         if not isinstance(held.get(part), kind):
             raise PerceptionError(
-                f"{path}: {part}: expected a {kind.__name__}, got {_kind(held.get(part))}; save the recogniser again"
+                f"{path}: {part}: expected a {kind.__name__}, got {_kind(held.get(part))}; "
+                "save the recogniser again"
             )
     try:
         return Stored(_learnt_again(held["model"]), tuple(held["classes"]), held["versions"])
-    except Exception as error:  # each part of a damaged model fails in its own way
+    except Exception as error:  # Each part of a damaged model fails in its own way.
         raise PerceptionError(
-            f"{path}: model: expected a fitted one, got {type(error).__name__}: {error}; train it again"
+            f"{path}: model: expected a fitted one, got {type(error).__name__}: {error}; "
+            "train it again"
         ) from None
 
 
 def _learnt_again(model: Any) -> Any:
-    """The model, in which each recogniser of places has learnt its images again, so that no damaged table reaches compiled code."""
+    """Let the place recognisers of a model learn again, which checks their tables."""
     if isinstance(model, PlaceRecogniser):
         return model.learnt_again()
     if isinstance(model, Pipeline):
@@ -184,7 +211,7 @@ def _learnt_again(model: Any) -> Any:
 
 
 def _kind(value: object) -> str:
-    """A value as an error message shows it. Of objects only the type is shown, as to make a text of one that was tampered with may itself raise."""
+    """A value for an error message. Objects show their type only, as their own text may raise."""
     return (
         brief(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
     )

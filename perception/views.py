@@ -1,4 +1,4 @@
-"""Makes views of images: they are clustered, into as many clusters as are separated best.
+"""Clusters images into views and chooses the number of views.
 
 >>> import numpy as np
 >>> images = np.concatenate([np.random.default_rng(0).normal(c, 0.1, (20, 3)) for c in (0, 2, 5)])
@@ -30,61 +30,72 @@ from perception.quality import cluster_quality, sampled, spanning_tree, trimmed_
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import brief, is_finite
 
-# Up to this many images all starts of k-means are made on all images. Where there are more, the starts are made on a sample of this many, so that the time for
-# them does not grow any further.
+# Up to this many images, k-means makes all of its starts on all images. Of more images, it makes
+# the starts on a random sample of this size, to limit the time.
 MANY = 5_000
-# Where there are more than MANY images, k-means has at most this many rounds: once over the sample, and once over all images from the best centres of the sample.
+# The largest number of rounds of k-means for more than MANY images: once on the sample, and once on
+# all images from the best centres of the sample.
 ROUNDS = 30
-# Another k is a doubt where trimmed M of the chosen one is less than so many times the largest of the others. docs/reproduction.md has a table of what that finds.
+# There is a runner-up if trimmed M of the chosen k is below this multiple of the largest trimmed M
+# of the others. docs/reproduction.md has measurements.
 NEAR = 1.5
-# More views than the chosen ones are a doubt, too, where their trimmed M is at least this: few views may be far from each other, and each be several that are well apart.
+# A larger k is also a runner-up if its trimmed M is at least this. A few views that are far apart
+# can each hide several well-separated ones.
 APART = 2.3
-# Medians of trimmed M that differ by less than a twentieth do not tell two k apart: then the smaller one is preferred.
+# Values of trimmed M within this factor of the largest count as equal, and the smallest k wins.
 EQUAL = 0.95
-# Which image is isolated is told by its third nearest neighbour, so that two or three that show the same stranger are isolated, too.
+# An image is isolated by its distance to this nearest neighbour, so that two or three images of one
+# strange thing are isolated, too.
 NEIGHBOURS = 3
-# More starts of k-means than this are a mistake: each takes as long as the first.
+# More starts of k-means than this are an error, since each takes as long as the first.
 MOST_STARTS = 10_000
-# For which `isolated` the loop takes images to be noise where views may be disbelieved. docs/reproduction.md has what it rests on.
+# The value of `isolated` that the learning loop uses when the theory allows wrong views.
+# docs/reproduction.md has measurements.
 ISOLATED = 10.0
 
 
 class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
-    """Clusters images, (n, d), into k views. If k is not given, it is the number in [k_min, k_max] with the largest M (eq. 5), or the smallest of several.
+    """Clusters images into k views.
 
-    M stands on two distances, and one lost beam can change these. So each k also has a trimmed M, and the number of views that this prefers, or nearly does, is
-    the runner-up: a reason to look at the map that its views give, too.
+    If k is not given, it is the number in [k_min, k_max] with the largest M (eq. 5 of the paper);
+    ties go to the smallest k. M depends on two distances only, so a single lost beam can change it.
+    Each k therefore also has a trimmed M, which uses quantiles. If trimmed M clearly or nearly
+    prefers another number of views, that number is the runner-up: it is worth making a map with its
+    views, too. If all images are equal, there is one view, and an ImageWarning.
 
-    Parameters
-    ----------
-    k             number of views, or None to choose it by M
-    k_min, k_max  the range of k that is searched; k_max None stands for the smaller of 20 and n - 1. No k is larger than the number of different images
-    clusterer     None for k-means, or any scikit-learn clusterer or mixture. It is cloned, and its `n_clusters` or `n_components` is set to k. A clusterer
-                  without these (DBSCAN, HDBSCAN), or one in which n_clusters is None (AgglomerativeClustering with a distance_threshold), is used as it is,
-                  and finds k itself
-    n_init        the number of starts of k-means. For more than 5,000 images the starts are made on a random sample of 5,000, and the best one is refined over
-                  all images, both in at most 30 rounds; a view that is too rare for the sample may then be missed
-    random_state  seed, RandomState or None; if the clusterer has a seed of its own, that is used instead
-    by            "M", or "trimmed" for the smallest k with a trimmed M of at least 0.95 times the largest
-    trim          the share of distances that trimmed M leaves out at each end, in [0, 0.5]
-    isolated      an image is noise, and takes no part in the clustering, where its third nearest neighbour is more than so many times as far as that of the
-                  middle image; more than 1. So a view that was seen three times or less is noise where most were seen more often. None: no image is isolated
+    Args:
+        k: Number of views; None chooses it by M.
+        k_min: Smallest k that is tried.
+        k_max: Largest k that is tried, at most the number of different images. None means the
+            smaller of 20 and n - 1.
+        clusterer: None for k-means, or a scikit-learn clusterer or mixture. It is cloned, and its
+            `n_clusters` or `n_components` is set to k. A clusterer that finds k itself (DBSCAN,
+            HDBSCAN, or AgglomerativeClustering with n_clusters=None) is used as it is.
+        n_init: Number of starts of k-means. For more than 5,000 images, the starts use a random
+            sample of 5,000 images, and the best start is refined on all images, each in at most 30
+            rounds. A view that is too rare for the sample may be missed.
+        random_state: Seed, RandomState or None. A seed of the clusterer takes precedence.
+        by: "M", or "trimmed" for the smallest k whose trimmed M is at least 0.95 times the largest.
+        trim: Share of distances that trimmed M ignores at each end, in [0, 0.5].
+        isolated: A factor greater than 1: an image is noise if the distance to its third nearest
+            neighbour exceeds this factor times the median of these distances. If most views were
+            seen more often, a view that was seen three times or less is then noise. None isolates
+            no image.
 
-    Attributes
-    ----------
-    labels_           (n,) views of the fitted images; -1 where an image is isolated, or the clusterer says that it is noise
-    k_                how many views there are, noise not counted
-    confidence_       (n,) how sure each view is, in [0, 1]; 0 for noise (perception.confidence)
-    quality_          M for each k that was tried, noise left out; only one, where the clusterer finds k itself
-    trimmed_          trimmed M for each k that was tried (perception.quality.trimmed_quality)
-    labels_by_k_      the views, (n,), for each k that was tried
-    runner_up_        what trimmed M chooses of the other k, where that of k_ is less than 1.5 times the largest of theirs; else the best larger k with a trimmed M of
-                      2.3 or more; None where there is no such doubt
-    cluster_centers_  (k, d), where the clusterer has centres
-    clusterer_        the fitted clusterer; None where all images are equal
-
-    If all images are equal, there is one view and an ImageWarning. Raises PerceptionError for settings that contradict each other or the images,
-    and ValueError for images that are not a finite (n, d) table with n >= 2.
+    Attributes:
+        labels_: (n,) view of each fitted image; -1 for noise, which is an isolated image or one
+            that the clusterer calls noise.
+        k_: Number of views without noise.
+        confidence_: (n,) confidence of each view, in [0, 1]; 0 for noise (perception.confidence).
+        quality_: M for each k that was tried, without noise. One entry if the clusterer finds k
+            itself.
+        trimmed_: Trimmed M for each k that was tried (perception.quality.trimmed_quality).
+        labels_by_k_: Views, (n,), for each k that was tried.
+        runner_up_: The best other k by trimmed M, if trimmed M of k_ is below 1.5 times that of the
+            best other k; otherwise the best larger k with a trimmed M of at least 2.3, if there is
+            one; otherwise None.
+        cluster_centers_: (k, d) centres, if the clusterer has them.
+        clusterer_: The fitted clusterer; None if all images are equal.
     """
 
     def __init__(
@@ -110,6 +121,16 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         self.isolated = isolated
 
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
+        """Cluster images.
+
+        Args:
+            X: (n, d) images, finite, n >= 2.
+            y: Ignored.
+
+        Raises:
+            PerceptionError: The settings contradict each other or the images.
+            ValueError: The images are not a finite table of at least two rows.
+        """
         self._check()
         images = validate_data(self, equal_length(X), dtype=np.float64, ensure_min_samples=2)
         if (images == images[0]).all():
@@ -117,10 +138,12 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return self._fit_all(images) if self.isolated is None else self._fit_together(images)
 
     def _fit_together(self, images: NDArray[np.float64]) -> Self:
-        """Fit to the images that are not isolated. The others are noise."""
+        """Fit to the images that are not isolated. The others become noise."""
         far = _to_neighbour(images, images, 1)
         self.reach_ = float(self.isolated or math.inf) * float(np.median(far))
         inside = (far <= self.reach_) | (self.reach_ == 0)
+        # If only equal images are left, isolating would hide all differences: keep all images
+        # instead.
         if (images[inside] == images[inside][0]).all():
             inside[:] = True
         self._fit_all(images[inside])
@@ -147,8 +170,16 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return self._keep(best, images)
 
     def predict(self, X: ArrayLike) -> NDArray[np.intp]:
-        """The views of images, (n,), as the clusterer predicts them (k-means: by the nearest centre). For a clusterer that does not predict, the view of the
-        nearest image that was fitted. -1 for an image that is isolated among those that were fitted.
+        """Predict the views of images.
+
+        A clusterer that can predict is asked (k-means takes the nearest centre). Otherwise an image
+        gets the view of the nearest fitted image.
+
+        Args:
+            X: (n, d) images, finite.
+
+        Returns:
+            (n,) views; -1 for an image that is isolated from the fitted images.
         """
         check_is_fitted(self)
         images = validate_data(self, equal_length(X), dtype=np.float64, reset=False)
@@ -162,7 +193,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return views
 
     def score(self, X: ArrayLike, y: Any = None) -> float:
-        """M of the views of images, (n, d), as `predict` gives them; larger is better. NaN where they have one view."""
+        """M of the predicted views of images, (n, d); larger is better. NaN for one view."""
         views, images = self.predict(X), np.asarray(X, float)
         return (
             cluster_quality(images[views != NOISE], views[views != NOISE])
@@ -172,11 +203,11 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
     @property
     def runner_up_labels_(self) -> NDArray[np.intp] | None:
-        """The views of the runner-up, (n,), where there is one."""
+        """The views of the runner-up, (n,); None without a runner-up."""
         return None if self.runner_up_ is None else self.labels_by_k_[self.runner_up_]
 
     def _tell(self, best: Any, images: NDArray[np.float64]) -> None:
-        """Take down a clustering that has no rival."""
+        """Record the only clustering that was tried."""
         labels = _labels(best, images)
         inside = labels != NOISE
         self.k_ = len(set(labels[inside].tolist()))
@@ -192,7 +223,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         self.labels_by_k_ = {self.k_: labels}
 
     def _search(self, images: NDArray[np.float64], seed: int) -> Any:
-        """A fitted clusterer for the k with the largest M. Sets what is told of each k."""
+        """Try each k, record the results, and return the fitted clusterer with the best k."""
         tree, chosen = spanning_tree(images), sampled(len(images))
         distances = cdist(images[chosen], images[chosen])
         most = min(20, len(images) - 1) if self.k_max is None else self.k_max
@@ -204,7 +235,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             tried = self._cluster(images, k, seed)
             labels = _labels(tried, images)
             if fitted and len(set(labels.tolist())) < k:
-                continue  # a mixture left some of its components empty
+                continue  # A mixture left some of its components empty.
             fitted[k], self.labels_by_k_[k] = tried, labels
             self.quality_[k] = cluster_quality(images, labels, tree)
             self.trimmed_[k] = trimmed_quality(images[chosen], labels[chosen], self.trim, distances)
@@ -217,7 +248,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return fitted[self.k_]
 
     def _doubted(self) -> int | None:
-        """The number of views that is a reason to doubt the chosen one."""
+        """The number of views that rivals the chosen one; None without a rival."""
         others = {k: worth for k, worth in self.trimmed_.items() if k != self.k_}
         if others and self.trimmed_[self.k_] < NEAR * max(others.values()):
             return _smallest_good(others)
@@ -241,13 +272,14 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return chosen.fit(images)
 
     def _k_means(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
-        """k-means fitted to all images, from the best of several starts."""
-        with threadpool_limits(
-            1
-        ):  # rounds are so short that, where cores are shared, two threads wait for each other longer than they work
+        """Fit k-means to all images, from the best of several starts."""
+        # Rounds are short: on shared cores, two threads would wait for each other longer than they
+        # work.
+        with threadpool_limits(1):
             if len(images) > MANY:
                 sample = np.random.default_rng(seed).choice(len(images), MANY, replace=False)
-                with warnings.catch_warnings():  # if the sample has fewer different images than views, all images may still have enough
+                # The sample may have fewer different images than k while all images have enough.
+                with warnings.catch_warnings():
                     warnings.simplefilter("ignore", ConvergenceWarning)
                     start = (
                         KMeans(k, n_init=self.n_init, max_iter=ROUNDS, random_state=seed)
@@ -260,6 +292,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             return KMeans(k, n_init=self.n_init, random_state=seed).fit(images)
 
     def _keep(self, best: Any, images: NDArray[np.float64]) -> Self:
+        """Record the fitted clusterer and its labels."""
         self.clusterer_ = best
         self.labels_ = _labels(best, images)
         self.confidence_ = confidence(images, self.labels_)
@@ -275,6 +308,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def _one_view(self, images: NDArray[np.float64]) -> Self:
+        """Record that all images are one view."""
         warnings.warn(
             f"all {len(images)} images are equal: they are taken as one view",
             ImageWarning,
@@ -291,6 +325,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def _check(self) -> None:
+        """Check the settings."""
         for name in ("k", "k_min", "k_max", "n_init"):
             value, least = getattr(self, name), 2 if name == "k_min" else 1
             if value is None and name in ("k", "k_max"):
@@ -301,7 +336,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 )
         if self.n_init > MOST_STARTS:
             raise PerceptionError(
-                f"n_init: expected at most {MOST_STARTS} starts, got {brief(self.n_init)}; a few dozen are many"
+                f"n_init: expected at most {MOST_STARTS} starts, got {brief(self.n_init)}; a "
+                "few dozen are many"
             )
         if self.random_state is not None and not isinstance(
             self.random_state, np.random.RandomState
@@ -329,24 +365,35 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             hasattr(self.clusterer, "fit") and hasattr(self.clusterer, "get_params")
         ):
             raise PerceptionError(
-                f"clusterer: expected a scikit-learn clusterer, such as DBSCAN(), got {self.clusterer!r}"
+                "clusterer: expected a scikit-learn clusterer, such as DBSCAN(), got "
+                f"{self.clusterer!r}"
             )
         if self.k is not None and self.clusterer is not None and _size(self.clusterer) is None:
             raise PerceptionError(
-                f"k: {type(self.clusterer).__name__} finds the number of clusters itself; leave k out"
+                f"k: {type(self.clusterer).__name__} finds the number of clusters itself; "
+                "leave k out"
             )
 
     def _affordable(self, k: int, images: NDArray[np.float64], distinct: int | None = None) -> None:
-        """Raise where there are fewer different images than views."""
+        """Raise PerceptionError if there are fewer different images than views."""
         found = len(np.unique(images, axis=0)) if distinct is None else distinct
         if found < k:
             raise PerceptionError(
-                f"k: expected at most {found}, as there are {found} different images among {len(images)}, got {k}"
+                f"k: expected at most {found}, as there are {found} different images among "
+                f"{len(images)}, got {k}"
             )
 
 
 def as_view_clusterer(clusterer: Any) -> ViewClusterer:
-    """A ViewClusterer for one of scikit-learn's clusterers: it makes as many views as that one is set to. A ViewClusterer, as it is."""
+    """Wrap a scikit-learn clusterer; a ViewClusterer is returned unchanged.
+
+    Args:
+        clusterer: A ViewClusterer, or a scikit-learn clusterer. The wrapper makes as many views as
+            the clusterer is set to.
+
+    Raises:
+        PerceptionError: It is not a clusterer.
+    """
     if isinstance(clusterer, ViewClusterer):
         return clusterer
     checked = ViewClusterer(clusterer=clusterer)
@@ -358,9 +405,12 @@ def as_view_clusterer(clusterer: Any) -> ViewClusterer:
 def _to_neighbour(
     images: NDArray[np.float64], among: NDArray[np.float64], itself: int
 ) -> NDArray[np.float64]:
-    """How far each image is from its third nearest neighbour among others, (n,); from the last one, where there are fewer.
+    """Distance from each image to its third nearest neighbour, or its last of fewer, (n,).
 
-    itself  1 where each image is among these, too, else 0
+    Args:
+        images: (n, d) images.
+        among: (m, d) possible neighbours.
+        itself: 1 if `among` contains the images themselves, otherwise 0.
     """
     number = min(NEIGHBOURS + itself, len(among))
     distances, _ = (
@@ -370,19 +420,19 @@ def _to_neighbour(
 
 
 def _among(inside: NDArray[np.bool_], labels: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The labels of the images that are inside, and noise for the others."""
+    """Labels for all images: `labels` for those inside, noise for the others."""
     every = np.full(len(inside), NOISE, np.intp)
     every[inside] = labels
     return every
 
 
 def _smallest_good(worth: dict[int, float]) -> int:
-    """The smallest k whose trimmed M is EQUAL times the largest, or more."""
+    """The smallest k whose trimmed M is at least EQUAL times the largest."""
     return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
 
 
 def _size(clusterer: Any) -> str | None:
-    """The parameter of a clusterer that says how many clusters there are to be; None where it finds that out itself."""
+    """The parameter that sets the number of clusters; None if the clusterer finds it."""
     settings = clusterer.get_params()
     if settings.get("n_clusters") is not None:
         return "n_clusters"
@@ -392,7 +442,7 @@ def _size(clusterer: Any) -> str | None:
 
 
 def _labels(fitted: Any, images: NDArray[np.float64]) -> NDArray[np.intp]:
-    """The cluster of each image that was fitted, (n,). Mixtures predict it."""
+    """The cluster of each fitted image, (n,). Mixtures have no labels_ and predict instead."""
     return np.asarray(
         fitted.labels_ if hasattr(fitted, "labels_") else fitted.predict(images), np.intp
     )

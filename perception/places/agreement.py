@@ -1,16 +1,16 @@
-"""Whether the way by scans is the way by odometry.
+"""Compares the trajectory by scan matching with the trajectory by odometry.
 
-Scan matching mends an odometer that drifts by some percent. If both ways differ by more, something
-is read wrongly: the field of view, the place of the laser on the robot, a range that means "nothing
-came back", or the odometer itself. How they differ tells which.
+Scan matching corrects an odometer that drifts by some percent. If the trajectories differ by more,
+something is read wrongly: the field of view, the position of the laser on the robot, a range that
+means "nothing came back", or the odometer itself. The kind of difference tells which.
 
-Both ways are cut into stretches. A stretch is a motion in the plane: a complex number in the frame of
-the robot at its beginning. The factor that best leads from the odometer's motions to those of the
-scans (least squares) has an angle: the robot moves in another direction by scans.
+Both trajectories are cut into stretches. A stretch is a motion in the plane: a complex number in
+the frame of the robot at its beginning. The least-squares factor that maps odometry motions to scan
+motions has an angle: the difference of the directions of motion.
 
-Matching scans begins at the odometer's motion. So in a corridor, the way by scans hardly tells that
-the laser looks elsewhere. Pairs of scans tell it: moved as the odometer says, their points meet only
-if the laser looks as the log says. They tell the field of view in the same way.
+Matching scans starts from the odometry, so in a corridor it hardly shows that the laser points
+elsewhere. Pairs of scans show it: moved by the odometry, their points coincide only if the
+direction of the laser is right. The field of view is tested in the same way.
 """
 
 from __future__ import annotations
@@ -29,40 +29,46 @@ from perception.readers.echoes import moving
 from perception.readers.scans import RobotLog, Scan
 from ssh_abduction.data.odometry import between
 
-# A stretch ends when the robot has gone this many metres or turned by this many radians, by odometry.
+# A stretch ends after this many metres or radians, by odometry.
 STRETCH, BEND = 1.0, math.radians(30)
-# Turns are compared in stretches that turn by this many radians, if there are enough of them.
+# Turns are compared over stretches that turn by at least this many radians, if there are at least
+# LEAST_TURNS of them.
 TURN, LEAST_TURNS = math.radians(15), 8
-# The ways part in a stretch if they end farther apart than this share of it plus this many metres.
+# The trajectories part in a stretch if their ends differ by more than this share of it plus this
+# many metres.
 PARTED, ASIDE = 0.25, 0.2
-# In good logs, recorded and simulated, both ways differ by at most 4 % in length, 2 degrees in
-# direction and 6 % in turns, and they part in at most 3 % of the stretches. Matching is there to mend
-# that. Differences of about twice as much are worth a warning.
+# In good logs, recorded and simulated, the trajectories differ by at most 4 % in length, 2 degrees
+# in direction and 6 % in turns, and they part in at most 3 % of the stretches. Matching can correct
+# that. About twice as much is worth a warning.
 LENGTH, ANGLE, TURNING, PARTING = 0.1, math.radians(10), 0.15, 0.05
-# A robot that was pushed or slipped once has ways that part in fewer stretches.
+# A robot that was pushed or slipped once has trajectories that part in fewer stretches than this.
 LEAST_PARTED = 3
-# The scans of a pair are at least this far apart, in metres or radians, and less than that far.
+# Distance of the scans of a pair: at least the first number and less than the second, in metres
+# (GAP) or radians (TURN_OF_PAIR).
 GAP, TURN_OF_PAIR = (0.8, 2.4), (0.35, 1.2)
-# This many pairs are enough.
+# Number of pairs to compare.
 PAIRS = 60
-# Points farther apart than this many metres do not meet, and points farther away than that do not count.
+# Points coincide within MEET metres; points beyond NEAR metres are ignored.
 MEET, NEAR = 0.3, 8.0
-# The laser is turned by 5 degrees at a time, and its field of view is tried from 60 to 360 degrees. In
-# all good logs points meet best within 5 degrees of the true direction and 10 of the true field.
+# Directions of the laser, in degrees, and fields of view to try. In all good logs, points coincide
+# best within 5 degrees of the true direction and 10 of the true field.
 TURNS, FIELDS = np.arange(-180, 180, 5), np.arange(60, 361, 10)
-# Another direction or field is likely if it differs by this many degrees, and if points are closer by
-# these factors.
+# Another direction or field is likely if it differs by this many degrees and reduces the distance
+# of points by these factors.
 LEAST_CHANGE, CLOSER_TURNED, CLOSER_WIDENED = 10, 0.75, 0.85
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How the way by scans compares with the way by odometry.
+    """Comparison of the trajectories by scan matching and by odometry.
 
-    odometry, scans  metres of both ways, along the stretches
-    angle            radians by which the robot moves farther to the left by scans than by odometry
-    turning          median ratio of the turns by scans to those by odometry; None for few turns
-    parted, of       in how many stretches both ways part, and how many stretches there are
+    Attributes:
+        odometry: Metres by odometry, over all stretches.
+        scans: Metres by scan matching.
+        angle: Radians by which the motion by scans points farther to the left than by odometry.
+        turning: Median ratio of turns by scans to turns by odometry; None if there are few turns.
+        parted: Number of stretches in which the trajectories part.
+        of: Number of stretches.
     """
 
     odometry: float
@@ -74,17 +80,17 @@ class Agreement:
 
     @property
     def has_other_turns(self) -> bool:
-        """Whether the robot turns more, or less, by scans than by odometry."""
+        """Whether the robot turns more or less by scans than by odometry."""
         return self.turning is not None and abs(self.turning - 1) > TURNING
 
     @property
     def is_askew(self) -> bool:
-        """Whether the robot moves in another direction by scans than by odometry."""
+        """Whether the direction of motion by scans differs from that by odometry."""
         return abs(self.angle) > ANGLE
 
     @property
     def is_good(self) -> bool:
-        """Whether matching can mend the difference."""
+        """Whether matching can correct the differences."""
         is_other_length = abs(self.scans - self.odometry) > max(LENGTH * self.odometry, STRETCH)
         is_parted = self.parted >= max(LEAST_PARTED, PARTING * self.of)
         return not (is_other_length or self.is_askew or self.has_other_turns or is_parted)
@@ -94,12 +100,12 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
     """Compare the track of a log with its odometry.
 
     Args:
-        log: The scans and where the odometer was at each.
-        track: Where the robot was at each scan, by matching scans.
+        log: The scans with odometry.
+        track: Poses by scan matching.
 
     Returns:
-        How both compare, but for where the track is cut: nothing is known there. Only lengths are
-        compared if the odometer hardly moved.
+        The comparison without stretches across a cut of the track, where nothing is known. If the
+        odometer hardly moved, only lengths are compared.
     """
     odometry = np.array([scan.odometry for scan in log.scans])
     stretches = [
@@ -113,7 +119,7 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
     seen = np.array([between(track.poses[i], track.poses[j]) for i, j in stretches])
     motion_told, motion_seen = (way[:, 0] + 1j * way[:, 1] for way in (told, seen))
     length = np.abs(motion_told)
-    # The robot may turn on the spot: such a stretch says nothing of the way.
+    # Turning on the spot has no direction of motion.
     driven = length >= STRETCH / 2
     parted = np.abs(motion_seen - motion_told)[driven] > PARTED * length[driven] + ASIDE
     turned = np.abs(told[:, 2]) >= TURN
@@ -129,14 +135,14 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
 
 
 def disagreement(log: RobotLog, track: Track) -> str | None:
-    """Say that the way by scans is not the way by odometry.
+    """Describe a disagreement between scan matching and odometry.
 
     Args:
-        log: The scans and where the odometer was at each.
-        track: Where the robot was at each scan, by matching scans.
+        log: The scans with odometry.
+        track: Poses by scan matching.
 
     Returns:
-        How they differ, with the likely causes and the options that mend them. None if they agree.
+        The differences, with likely causes and the options that mend them; None if they agree.
     """
     found = agreement(log, track)
     covers = None if found.is_good else field_of_view(log)
@@ -146,6 +152,7 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
     laser = log.scans[0].laser
     differences = [f"{found.scans:.0f} m by scans, {found.odometry:.0f} m by odometry"]
     causes: list[str] = []
+    # Turns tell the field of view; a negative ratio means that left and right are swapped.
     fov = _fov(log.scans[0])
     if found.turning is not None and found.has_other_turns:
         differences.append(f"turns by scans are {found.turning:.2f} times those by odometry")
@@ -167,7 +174,8 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
         x, y, _ = laser.mount
         side = "left" if looks >= 0 else "right"
         causes.append(
-            f"the laser looks {abs(looks):.0f} degrees to the {side} of straight ahead (--mount={x:g},{y:g},{looks:.0f})"
+            f"the laser looks {abs(looks):.0f} degrees to the {side} of straight ahead "
+            f"(--mount={x:g},{y:g},{looks:.0f})"
         )
     if not causes:
         causes = [
@@ -178,13 +186,16 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
     causes.append("the odometer jumps, slips or is out of scale")
     if found.parted:
         differences.append(f"they part in {found.parted} of {found.of} stretches of a metre")
-    return f"The way by scans is not the way by odometry: {'; '.join(differences)}. The map may be wrong. Likely causes: {'; '.join(causes)}."
+    return (
+        f"The way by scans is not the way by odometry: {'; '.join(differences)}. The map may be "
+        f"wrong. Likely causes: {'; '.join(causes)}."
+    )
 
 
 def direction(log: RobotLog) -> float | None:
-    """Degrees to the left of straight ahead in which the laser seems to look.
+    """Estimate the direction of the laser, in degrees to the left of straight ahead.
 
-    None if it looks as the log says, if the scans do not tell, or if there are several lasers.
+    None if it is as the log says, if the scans do not tell, or if there are several lasers.
     """
     angles = {scan.laser.mount[2] for scan in log.scans}
     apart = _apart(log, np.radians(TURNS)) if len(angles) == 1 else None
@@ -197,7 +208,10 @@ def direction(log: RobotLog) -> float | None:
 
 
 def field_of_view(log: RobotLog) -> float | None:
-    """Degrees that the beams seem to cover. None if they cover what the log says, or if the scans do not tell."""
+    """Estimate the field of view in degrees.
+
+    None if it is as the log says, or if the scans do not tell.
+    """
     fov = _fov(log.scans[0])
     tried = [_apart(log, np.zeros(1), float(degrees) / fov) for degrees in FIELDS]
     now = _apart(log, np.zeros(1))
@@ -213,20 +227,20 @@ def field_of_view(log: RobotLog) -> float | None:
 
 
 def _fov(scan: Scan) -> float:
-    """Degrees that the beams of a scan cover, as the log says."""
+    """Field of view of a scan in degrees, as the log says."""
     return math.degrees(abs(scan.laser.step)) * scan.laser.steps
 
 
 def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
-    """How far apart points of pairs of scans are that are moved as the odometer says.
+    """Mean distance of points in pairs of scans that are moved by the odometry.
 
     Args:
         log: The scans.
-        turns: Radians by which the laser is turned on the robot, (n,).
-        stretch: How many times as wide as the log says the beams spread.
+        turns: (n,) radians to rotate the laser on the robot.
+        stretch: Factor for the angle between beams.
 
     Returns:
-        Mean metres to the nearest point, (n,). None if there are too few pairs.
+        (n,) mean metres to the nearest point; None if there are too few pairs.
     """
     apart = []
     for first, second in _pairs(log):
@@ -236,7 +250,8 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
         here, there = _points(first, stretch), _points(second, stretch)
         if first.laser != second.laser or not len(here) or not len(there):
             continue
-        # From the laser of the second scan to its robot, to the robot of the first scan, and to its laser.
+        # From the laser of the second scan to its robot, to the robot of the first scan, to its
+        # laser.
         moved = complex(dx, dy) + (at + there[:, None] * looks) * np.exp(1j * turn)
         seen = (moved - at) / looks
         tree = cKDTree(np.stack([here.real, here.imag], axis=-1))
@@ -248,7 +263,7 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
 
 
 def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
-    """Pairs of scans, so near each other that the odometer is right and that both see the same."""
+    """Pairs of scans near enough that the odometry is accurate and that both see the same."""
     kept = moving(log.scans)
     pairs = []
     for i, scan in enumerate(kept):
@@ -265,7 +280,7 @@ def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
 
 
 def _points(scan: Scan, stretch: float) -> NDArray[np.complex128]:
-    """What the beams of a scan met, seen from the laser, as complex numbers."""
+    """Points that the beams of a scan hit, in the frame of the laser, as complex numbers."""
     met = (scan.ranges > 0) & (scan.ranges < min(scan.laser.reach, NEAR))
     middle = scan.laser.bearings.mean()
     return np.asarray(
@@ -274,7 +289,7 @@ def _points(scan: Scan, stretch: float) -> NDArray[np.complex128]:
 
 
 def _stretches(odometry: Array) -> list[tuple[int, int]]:
-    """The first and the last scan of each stretch of a way, whose poses are (n, 3)."""
+    """First and last scan of each stretch of a trajectory of poses (n, 3)."""
     cuts, way, turned = [0], 0.0, 0.0
     steps = np.hypot(*np.diff(odometry[:, :2], axis=0).T)
     for i, (step, turn) in enumerate(zip(steps, np.diff(odometry[:, 2]), strict=True), 1):

@@ -1,7 +1,8 @@
-"""The doors that a robot drives through, where they are the places of a building.
+"""Finds the doors that a robot drives through, for buildings whose places are doors.
 
-In a building of rooms the robot crosses wide spaces as it likes, and no way bends or parts where it must. What it cannot avoid there are doors: constrictions of the free space that its way leads
-through. So a place is a door, and a path leads across a room from one door to the next.
+In a building of rooms, the robot crosses wide spaces freely, and no corridor bends or parts. It
+cannot avoid doors: constrictions of the free space on its trajectory. So a place is a door, and a
+path crosses a room from one door to the next.
 """
 
 from __future__ import annotations
@@ -18,20 +19,26 @@ from perception.places.track import Array, Track
 from perception.places.visits import Visit, Way
 from perception.readers.scans import RobotLog
 
-# The way is looked at once in so many metres: a door may be no deeper than a wall. A local map is good for so many of these looks.
+# The width is measured once every STRIDE metres, since a door may be as thin as a wall. One local
+# map serves this many measurements.
 STRIDE, LOOKS = 0.1, 5
-# Widths are measured across the way, and askew to either side by up to this, in radians: the robot need not go straight through.
+# Widths are measured at angles of up to 50 degrees to either side of the perpendicular, since the
+# robot may drive through a door at an angle.
 ASKEW = np.radians(np.arange(-50.0, 51.0, 10.0))
-# And no farther to either side than this, in metres.
+# Largest measured width to either side, in metres.
 ASIDE = 3.0
-# A door is at most so wide, in metres, and the way is wider by such a share within so many metres before and after it.
+# A door is at most DOOR metres wide. Within BESIDE metres before and after it, the free space is at
+# least WIDER times as wide.
 DOOR, WIDER, BESIDE = 1.6, 1.33, 2.0
-# Two doors are at least so many metres of the way apart, and between them the way is wider than either by that share.
+# Two doors are at least this many metres apart along the trajectory, and the space between is at
+# least WIDER times as wide as either.
 DEEP = 0.5
-# A building is one of rooms if most of the way is wider than this, in metres, and the robot drives through a door at least once in so many metres.
+# A building is one of rooms if most of the trajectory is wider than WIDE metres and the robot
+# drives through at least one door in OFTEN metres.
 WIDE, OFTEN = 2.2, 30.0
-# Two doors, one after the other, are one if their middles are nearer than this, in metres; and a narrow part within so many metres of a door that the robot came out of again right after it
-# is a part of that door.
+# Two consecutive doors are the same if their middles are nearer than SAME metres. A narrow part
+# within WITHIN metres of a door belongs to that door if the robot returned through the door right
+# after it.
 SAME, WITHIN = 0.6, 1.0
 
 
@@ -39,10 +46,11 @@ SAME, WITHIN = 0.6, 1.0
 class Door:
     """A door that the robot drove through.
 
-    scan    the first scan behind it
-    middle  (x, y) in metres, in the frame of the track
-    width   in metres
-    way     metres of the robot's way up to it
+    Attributes:
+        scan: First scan behind the door.
+        middle: (x, y) in metres, in the frame of the track.
+        width: Metres.
+        way: Metres that the robot drove up to the door.
     """
 
     scan: int
@@ -52,7 +60,10 @@ class Door:
 
 
 def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
-    """The doors that the robot drove through, in order. One that it drove through twice is there twice. Where the track is broken, each part is a way of its own."""
+    """Find the doors that the robot drove through, in order, once for each pass.
+
+    Each unbroken part of the track is searched separately.
+    """
     return tuple(
         replace(
             door,
@@ -65,9 +76,11 @@ def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
 
 
 def _doors_of_span(log: RobotLog, track: Track) -> tuple[Door, ...]:
+    """Find the doors of a log whose track is unbroken."""
     maps = LocalMaps(log.scans, track, 2 * ASIDE)
     ways = np.arange(0.0, track.way[-1], STRIDE)
-    # While the robot stands, its way does not grow: only the first of such scans is a point to interpolate between.
+    # While the robot stands, its distance does not grow. Only the first of such scans is used to
+    # interpolate.
     moving = np.concatenate([[True], np.diff(track.way) > 0])
     positions = np.stack(
         [np.interp(ways, track.way[moving], track.poses[moving, k]) for k in (0, 1)], axis=1
@@ -79,6 +92,7 @@ def _doors_of_span(log: RobotLog, track: Track) -> tuple[Door, ...]:
     )
     across = np.arctan2(ahead[:, 1], ahead[:, 0]) + math.pi / 2
     gaps: list[tuple[float, Array]] = []
+    # Measure the width across the trajectory, a few positions for each local map.
     for begin in range(0, len(ways), LOOKS):
         some = slice(begin, begin + LOOKS)
         middle = begin + len(positions[some]) // 2
@@ -88,7 +102,8 @@ def _doors_of_span(log: RobotLog, track: Track) -> tuple[Door, ...]:
         ]
     widths = np.array([width for width, _ in gaps])
     found: list[Door] = []
-    # The narrowest look comes first, so that each door is taken where it is narrowest, and what is found beside it later is the same door.
+    # Start with the narrowest: each door is found where it is narrowest, and nearby finds are the
+    # same door.
     for k in np.argsort(widths, kind="stable"):
         if widths[k] > DOOR:
             break
@@ -116,7 +131,7 @@ def _doors_of_span(log: RobotLog, track: Track) -> tuple[Door, ...]:
 
 
 def _gap(patch: Patch, at: Array, across: float) -> tuple[float, Array]:
-    """The least width of the free space across a way, in metres, and the middle of that."""
+    """The smallest width of free space across the trajectory in metres, and its middle."""
     directions = np.stack([np.cos(across + ASKEW), np.sin(across + ASKEW)], axis=1)
     free = patch.free_along(at, np.stack([directions, -directions], axis=1), ASIDE)
     k = int(free.sum(axis=1).argmin())
@@ -124,17 +139,20 @@ def _gap(patch: Patch, at: Array, across: float) -> tuple[float, Array]:
 
 
 def is_wide(scale: Scale) -> bool:
-    """Whether most of the building is wider than corridors are, so that it may be one of rooms."""
+    """Whether most of the trajectory is wider than corridors, as in a building of rooms."""
     return scale.most > WIDE
 
 
 def are_frequent(doors: Sequence[Door], track: Track) -> bool:
-    """Whether the robot drives through doors again and again, as it does in a building of rooms."""
+    """Whether the robot drives through doors often, as in a building of rooms."""
     return bool(len(doors) * OFTEN > track.way[-1])
 
 
 def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
-    """The visits to doors, in order: one where the robot went into a room and came back by the same door. Corrected poses are not read."""
+    """The visits to doors, in order; entering and leaving a room by one door is one visit.
+
+    Corrected poses are not read.
+    """
     spans = [
         [door for door in doors if begin <= min(door.scan, len(track.poses) - 1) < end]
         for begin, end in track.spans
@@ -143,6 +161,8 @@ def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
 
 
 def _visits_of_span(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
+    """The visits to doors on an unbroken track."""
+    # Join the passes of one door, and a narrow part behind it that the robot left by the same door.
     passes: list[list[Door]] = []
     for door in doors:
         if passes and math.dist(door.middle, passes[-1][-1].middle) < SAME:
@@ -156,16 +176,15 @@ def _visits_of_span(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
             passes[-1] += [*part, door]
         else:
             passes.append([door])
-    middles = [
-        min(same, key=lambda door: door.width).middle for same in passes
-    ]  # where it is narrowest
+    # The middle of a door is where it is narrowest.
+    middles = [min(same, key=lambda door: door.width).middle for same in passes]
     return tuple(_visit(track, passes, middles, number) for number in range(len(passes)))
 
 
 def _visit(
     track: Track, passes: Sequence[Sequence[Door]], middles: Sequence[Array], number: int
 ) -> Visit:
-    """The visit to a door, whose ways out are the straight ways to the doors before and after it."""
+    """The visit to a door, whose exits point straight to the doors before and after it."""
     same, middle = passes[number], middles[number]
     came = _bearing(middle, middles[number - 1]) if number > 0 else None
     went = _bearing(middle, middles[number + 1]) if number < len(passes) - 1 else None

@@ -1,7 +1,8 @@
-"""Which ways lead out of the free space around a point, and from where they part.
+"""Finds the exits of the free space around a point, and the point where they part.
 
-A way out is a part of the free space that lies as far from the point as places are large, by the way that one would drive, and that is wide enough all along. So an alcove is none, and a corridor
-is one, whatever stands in it.
+An exit is a part of the free space at the distance of the radius, along the shortest drivable path,
+that can be reached at full width. So an alcove is no exit, and a corridor is one even if something
+stands in it.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from scipy import ndimage
 from perception.places.local_map import CELL, STRIDE, Bools, Cell, Patch, distances
 from perception.places.track import Array
 
-# Ways out that are seen in directions that differ by less than this are one, in radians.
+# Exits whose directions differ by less than this, in radians, are one.
 MERGED = math.radians(35)
-# A way out has at least so many cells.
+# Smallest number of cells of an exit.
 LEAST = 3
-# How much farther than the radius the ring reaches in which ways out are looked for, in metres.
+# Width of the ring outside the radius in which exits are searched, in metres.
 RING = 0.6
-# A point is as good a middle as the best one if the ways to it are longer by no more than this, in metres.
+# A middle is as good as the best if the paths to the exits are at most this much longer, in metres.
 AS_GOOD = 0.35
 
 _EIGHT = np.ones((3, 3), bool)
@@ -29,10 +30,11 @@ _EIGHT = np.ones((3, 3), bool)
 
 @dataclass(frozen=True, eq=False)
 class Exit:
-    """A way out of a place.
+    """An exit of a place.
 
-    bearing  its direction from the middle of the place, in radians counterclockwise in the frame of the track
-    cells    where the ring crosses it
+    Attributes:
+        bearing: Direction from the middle, in radians counterclockwise in the frame of the track.
+        cells: Mask of the cells of the ring that belong to it.
     """
 
     bearing: float
@@ -41,11 +43,12 @@ class Exit:
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """The ways out that are seen from a cell of a patch.
+    """The exits seen from a cell of a patch.
 
-    middle    the cell
-    exits     counterclockwise
-    reached   metres from the middle to each cell, as far as ways out were looked for
+    Attributes:
+        middle: The cell.
+        exits: Exits, counterclockwise.
+        reached: Metres from the middle to each cell, up to the end of the ring.
     """
 
     middle: Cell
@@ -58,7 +61,7 @@ class Outlook:
 
 
 def nearest(open_cells: Bools, cell: Cell, within: float) -> Cell | None:
-    """The open cell nearest to a cell, if it is not farther away than so many metres."""
+    """The open cell nearest to a cell, if it is within this many metres."""
     rows, columns = np.nonzero(open_cells)
     if not len(rows):
         return None
@@ -68,7 +71,7 @@ def nearest(open_cells: Bools, cell: Cell, within: float) -> Cell | None:
 
 
 def outlook(open_cells: Bools, middle: Cell, radius: float) -> Outlook:
-    """The ways out that lead at least `radius` metres from a cell through open cells."""
+    """The exits at least `radius` metres from a cell through open cells."""
     seed = np.zeros(open_cells.shape, bool)
     seed[middle] = True
     reached = distances(open_cells, seed, radius + RING)
@@ -84,7 +87,7 @@ def outlook(open_cells: Bools, middle: Cell, radius: float) -> Outlook:
 
 
 def _merged(exits: list[Exit], middle: Cell) -> list[Exit]:
-    """Ways out in nearly one direction are one: something stands in the middle of it."""
+    """Merge exits in nearly the same direction, since an obstacle may split an exit."""
     kept: list[Exit] = []
     for exit in sorted(exits, key=lambda exit: -int(exit.cells.sum())):
         for i, other in enumerate(kept):
@@ -102,9 +105,10 @@ def apart(a: float, b: float) -> float:
 
 
 def parting(patch: Patch, open_cells: Bools, seen: Outlook, radius: float) -> Cell:
-    """Where the ways to all exits part: the cell from which they are shortest together; of those that are nearly as good, the one with most room.
+    """The cell where the paths to all exits part.
 
-    Of two ways out it is where the way from one to the other bends most.
+    The sum of the paths to the exits is shortest there. Of nearly equal cells, the one with the
+    most room is taken. With two exits, it is the sharpest bend of the path between them.
     """
     inside = open_cells & np.isfinite(seen.reached)
     total = sum(

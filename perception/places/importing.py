@@ -1,7 +1,9 @@
-"""From a robot's log to a trace, one line a stage.
+"""Turns a robot's log into a trace, one line a stage.
 
-The robot did not stop at distinctive states. Where its way leads past a junction, a corner or a dead end, or where it turned around, the local map tells what it would have seen from
-the middle of the place: the plan of Kuipers & Beeson (2002) to do without physical motion to the actual location.
+The robot did not stop at distinctive states. Where its trajectory passes a junction, a corner or a
+dead end, or where it turned around, the local map shows what the robot would have seen from the
+middle of the place. Kuipers & Beeson (2002) planned this: to localise without physical motion to
+the actual location.
 """
 
 from __future__ import annotations
@@ -32,24 +34,27 @@ from ssh_abduction.data.trace import Trace
 
 _log = log_of("ssh_abduction.perception.places")
 
-# A view is to be seen so many times in the mean, at least: of few images of many places most views would be seen once, and tell nothing.
+# Mean number of times that each view is seen, at least. With few images of many places, most views
+# would be seen once and would carry no information.
 SEEN = 12
-# A track that is broken before more than such a share of the scans is none.
+# Largest share of scans before which a track may be broken.
 MOST_BREAKS = 0.1
-# Units by how many there are in a metre. The way by odometry is compared with that by scans in so many scans, from which it may be off by such a share.
+# Units of odometry and how many make a metre; number of scans over which odometry is compared with
+# scan matching; largest relative difference of the two.
 UNITS, STRETCH, UNLIKE = {"millimetres": 1000.0, "centimetres": 100.0}, 80, 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class Imported:
-    """What became of a log.
+    """Result of `import_log`.
 
-    trace    a step for each dstate that was visited, with view, image, star and displacement
-    track    the way of the robot
-    scale    what the building was measured by
-    visits   the distinctive places that the robot passed
-    seconds  processor time of each stage
-    notes    what makes the track suspicious, in sentences
+    Attributes:
+        trace: One step for each visited dstate, with view, image, star and displacement.
+        track: Trajectory of the robot.
+        scale: Scale of the building.
+        visits: The distinctive places that the robot passed, in order.
+        seconds: Processor time of each stage.
+        notes: Sentences about what makes the track suspicious.
     """
 
     trace: Trace
@@ -67,31 +72,47 @@ def import_log(
     name: str | None = None,
     doors: bool | None = None,
 ) -> Imported:
-    """The trace of a log. Corrected poses are truth for evaluation, and nothing here reads them for anything else.
+    """Import a log as a trace.
 
-    gateway, radius  metres, as in Scale; what the log itself suggests, where they are None
-    name             of the trace
-    doors            whether the doors that the robot drives through are the places, rather than where ways part or bend. Where it is None, the log itself suggests it;
-                     but no doors are asked for where gateway or radius is given, as these are about ways that part
+    Corrected poses become the truth for evaluation; nothing else reads them.
 
-    Raises LogError where the robot passed no distinctive place, or hardly moved.
+    Args:
+        log: The log of one drive.
+        gateway: Smallest width of a gateway in metres; None estimates it from the log.
+        radius: Distance in metres that an exit must lead from the middle of a place; None estimates
+            it.
+        name: Name of the trace.
+        doors: Whether places are the doors that the robot drives through, instead of where
+            corridors part or bend. None decides by the log, or means False if gateway or radius is
+            given, as these describe corridors that part.
+
+    Returns:
+        The trace, and what it was made from.
+
+    Raises:
+        LogError: The robot passed no distinctive place or hardly moved, or the scans do not match.
     """
     seconds: dict[str, float] = {}
     if doors is None and (gateway is not None or radius is not None):
         doors = False
     if not any(((scan.ranges > 0) & (scan.ranges < scan.laser.reach)).any() for scan in log.scans):
         raise LogError(
-            f"{named(log.source)}: expected scans that meet walls, got {len(log)} in which no beam meets anything; look at the laser"
+            f"{named(log.source)}: expected scans that meet walls, got {len(log)} in which no "
+            "beam meets anything; look at the laser"
         )
+    # Each stage is timed. Errors repeat the notes about the track, which are the likely causes.
     with _timed(seconds, "track"):
         log, track, notes = tracked(log)
     if len(track.breaks) > MOST_BREAKS * len(log):
         raise LogError(
-            f"{named(log.source)}: expected a log of one drive, got {len(log)} scans of which {len(track.breaks)} show nothing of what the one before them shows; sort it by time, or cut it into drives{_besides(notes)}"
+            f"{named(log.source)}: expected a log of one drive, got {len(log)} scans of which "
+            f"{len(track.breaks)} show nothing of what the one before them shows; sort it by "
+            f"time, or cut it into drives{_besides(notes)}"
         )
     if track.way[-1] < 1.0:
         raise LogError(
-            f"{named(log.source)}: expected a robot that drives, got a way of {track.way[-1]:.1f} m; take a longer log{_besides(notes)}"
+            f"{named(log.source)}: expected a robot that drives, got a way of "
+            f"{track.way[-1]:.1f} m; take a longer log{_besides(notes)}"
         )
     with _timed(seconds, "scale"):
         found = suggested(log.scans, track)
@@ -106,12 +127,15 @@ def import_log(
         visits = visits_of(track, passed) if scale.doors else find_visits(log, track, scale)
     if not visits and scale.doors:
         raise LogError(
-            f"{named(log.source)}: expected a way through doors, got {track.way[-1]:.0f} m without any; look for junctions instead (--places junctions){_besides(notes)}"
+            f"{named(log.source)}: expected a way through doors, got {track.way[-1]:.0f} m "
+            f"without any; look for junctions instead (--places junctions){_besides(notes)}"
         )
     if not visits:
         raise LogError(
-            f"{named(log.source)}: expected a way past junctions, corners or dead ends, got {track.way[-1]:.0f} m without any at a radius of "
-            f"{scale.radius:g} m; take a longer log, or a smaller radius (--radius){_besides(notes)}"
+            f"{named(log.source)}: expected a way past junctions, corners or dead ends, got "
+            f"{track.way[-1]:.0f} m without any at a radius of "
+            f"{scale.radius:g} m; take a longer log, or a smaller radius "
+            f"(--radius){_besides(notes)}"
         )
     with _timed(seconds, "trace"):
         trace = to_trace(log, track, scale, visits, name)
@@ -121,12 +145,17 @@ def import_log(
 
 
 def tracked(log: RobotLog) -> tuple[RobotLog, Track, tuple[str, ...]]:
-    """The log with odometry of one source in metres, its track, and what makes that suspicious."""
+    """Follow the log.
+
+    Returns:
+        The log with the odometry of one source in metres, its track, and notes about the track.
+    """
     log, alternating = jumps.of_one_source(log)
     log, counted = in_metres(log)
     track = follow(log)
     notes = alternating + counted + jumps.said_of(log, track, turned_wrongly(log, track))
-    # An odometry that is wrong throughout explains each difference between both ways.
+    # An odometry that is wrong throughout already explains all differences between the
+    # trajectories.
     notes += jumps.said_of_whole(log) or [doubt for doubt in [disagreement(log, track)] if doubt]
     for note in notes:
         _log.warning("%s: %s", named(log.source), note)
@@ -134,9 +163,13 @@ def tracked(log: RobotLog) -> tuple[RobotLog, Track, tuple[str, ...]]:
 
 
 def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
-    """The log in metres, where its odometry counts a smaller unit, and what is to be said of that.
+    """Convert a log to metres if its odometry counts a smaller unit.
 
-    The unit is that in which a stretch of the way is most like the way by scans. Where it is like it in none, the log stays as it is.
+    The unit is the one in which a stretch of the odometry is most like scan matching. If no unit
+    fits, the log is unchanged.
+
+    Returns:
+        The log, and a note if it was converted.
     """
     usual = jumps.usual_step(log)
     if usual <= jumps.LONG:
@@ -145,6 +178,7 @@ def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
     begin = int(np.argmax(np.hypot(*np.diff(far, axis=0).T) > usual / 2))
     stretch = replace(log, scans=log.scans[begin : begin + STRETCH])
 
+    # Relative difference between odometry in this unit and scan matching.
     def off(unit: str) -> float:
         tried = jumps.in_unit(stretch, UNITS[unit])
         told, seen = np.array([scan.odometry[:2] for scan in tried.scans]), follow(tried)
@@ -160,17 +194,25 @@ def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
         return log, []
     count = UNITS[found]
     return jumps.in_unit(log, count), [
-        f"The odometry does not count metres: its usual step between two scans would be {usual:.0f} m. It is read as {found}, as then it is like the way by scans, {usual / count:.2f} m a step."
+        (
+            "The odometry does not count metres: its usual step between two scans would be "
+            f"{usual:.0f} m. It is read as {found}, as then it is like the way by scans, "
+            f"{usual / count:.2f} m a step."
+        )
     ]
 
 
 def _besides(notes: Sequence[str]) -> str:
-    """Notes as the end of an error."""
+    """The notes as the end of an error message."""
     return f". {' '.join(notes)}" if notes else ""
 
 
 def with_views(trace: Trace) -> Trace:
-    """The trace with views of its images: few, so that one place has one view, whatever stood around (Kuipers & Beeson 2002, section 3)."""
+    """Add views of the images, by clustering.
+
+    Few views are made, so that each place has one view in spite of moved objects (Kuipers & Beeson
+    2002, section 3).
+    """
     images = ReciprocalTransformer(floor=0.3).fit_transform(
         np.array([step.image for step in trace.steps])
     )

@@ -1,4 +1,4 @@
-"""Odometers that jump: where they do, in which unit they count, and what is to be said of it."""
+"""Finds jumps and wrong units in odometry, and describes them in notes."""
 
 from __future__ import annotations
 
@@ -17,30 +17,38 @@ from ssh_abduction.data.odometry import between
 if TYPE_CHECKING:
     from perception.places.track import Track
 
-# A step between two scans is impossible beyond so many metres and so many times the usual step, and doubtful beyond half of each.
+# A step between two scans is impossible beyond FAR metres and UNUSUAL times the usual step; it is
+# doubtful beyond half of both.
 FAR, UNUSUAL = 1.5, 3.5
-# Where no scan was logged for so many times the usual time, the robot may have driven on, at so many times its usual speed.
+# After a pause of PAUSE times the usual interval, the robot may have driven on at up to FASTER
+# times its usual speed.
 PAUSE, FASTER = 3.0, 2.0
-# A usual step between two scans of more than so many metres is none.
+# A usual step longer than this many metres means that the odometry has another unit.
 LONG = 5.0
-# The odometer says the same pose up to this, in metres and radians. Of the beams of a robot that stands still, less than such a share changes, by more than so many metres and such a share of them.
+# Odometry stands still up to STILL metres and radians. For a robot that stands still, less than
+# MOVED of the beams change by more than CHANGED metres plus CHANGED_SHARE of the range.
 STILL, MOVED, CHANGED, CHANGED_SHARE = 1e-3, 0.35, 0.2, 0.03
-# The same share where no scan was logged meanwhile, as then the robot may be far away, in a corridor that looks alike.
+# The same share after a pause, when the robot may be far away in a corridor that looks similar.
 MOVED_UNSEEN = 0.15
-# An odometer that stands still in more than such a share of the steps is missing.
+# Odometry that stands still in more than this share of the steps is missing.
 MISSING = 0.5
-# The way over every second scan is about as long as the way, unless poses go to and fro: then it is shorter than such a share.
+# The trajectory over every second scan is about as long as the whole one. If it is shorter than
+# this share, poses go back and forth.
 TO_AND_FRO = 0.8
-# A log is not in order if the times of more than such a share of its scans run back.
+# A log is out of order if the times of more than this share of its scans run backwards.
 SHUFFLED = 0.05
-# Beams see no farther than so many metres here.
+# Limit of ranges in metres, for comparing scans.
 NO_RANGE = 25.0
-# A step to so near the origin, in metres, is that of an odometer that starts anew.
+# A step to within this many metres of the origin means that the odometer restarted.
 ANEW = 1.0
 
 
 def of_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
-    """The log with the odometry of one source, where the poses of several alternate, and what is to be said of that."""
+    """Keep the odometry of one source if the poses of several sources alternate.
+
+    Returns:
+        The log, and a note if there were several sources.
+    """
     odometry = Odometry()
     for number, scan in enumerate(log.scans):
         odometry.add(number, number, scan.odometry)
@@ -48,20 +56,21 @@ def of_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
     if len(sources) == 1:
         return log, []
     said = (
-        f"The poses of several sources alternate in the odometry, {len(sources[0])} and {len(sources[1])} of {len(log)}: those of the first are used. "
+        f"The poses of several sources alternate in the odometry, {len(sources[0])} and "
+        f"{len(sources[1])} of {len(log)}: those of the first are used. "
         "Stop the other source, and record again, if it is the better one."
     )
     return replace(log, scans=_of_source(log.scans, sources[0])), [said]
 
 
 def usual_step(log: RobotLog) -> float:
-    """The usual step between two scans, by the odometer: the median of those that are no standing still. 0 where there are none."""
+    """Median step in metres by odometry, ignoring steps of 0; 0 if there is no other."""
     far = _far(log, 1)
     return float(np.median(far[far > 0])) if (far > 0).any() else 0.0
 
 
 def in_unit(log: RobotLog, count: float) -> RobotLog:
-    """The log in metres, where its odometry counts something of which there are so many in a metre."""
+    """Convert odometry with `count` units in a metre to metres."""
     return replace(
         log,
         scans=tuple(
@@ -75,7 +84,7 @@ def in_unit(log: RobotLog, count: float) -> RobotLog:
 
 
 def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan, ...]:
-    """The scans with the odometry of some of them, between which it is interpolated, and beyond which it goes on."""
+    """The scans with odometry interpolated and extrapolated from the scans of one source."""
     from scipy.interpolate import interp1d
 
     poses = np.array([scans[number].odometry for number in members])
@@ -88,13 +97,18 @@ def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan
 
 
 def said_of(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> list[str]:
-    """What is to be said of where a track is cut or broken.
+    """Describe where a track is cut or broken.
 
     Args:
         log: The log that was followed.
         track: Its track.
-        turned: The scans at which the robot turned otherwise than the odometer says, and by how many radians.
+        turned: Scans at which the robot turned differently from the odometry, and by how many
+            radians.
+
+    Returns:
+        Notes in sentences.
     """
+    # A cut with a step is a jump. A cut without one is a stretch in which the odometer stood still.
     steps = {
         cut: between(log.scans[cut - 1].odometry, log.scans[cut].odometry) for cut in track.cuts
     }
@@ -110,31 +124,41 @@ def said_of(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> lis
             else ""
         )
         notes.append(
-            f"The odometry jumps {_times(len(jumps))} in {len(log)} scans: by {far[first]:.1f} m before scan {first} ({_where(log, first)}){anew}"
+            (
+                f"The odometry jumps {_times(len(jumps))} in {len(log)} scans: by "
+                f"{far[first]:.1f} m before scan {first} ({_where(log, first)}){anew}"
+            )
             + (f", and by {far[most]:.1f} m at most" if len(jumps) > 1 else "")
-            + ". Nothing is known of how the robot moved there, so the trace has no displacement across. An odometer that is started anew, or a second program that "
-            "publishes the same odometry, jumps like this."
+            + ". Nothing is known of how the robot moved there, so the trace has no displacement "
+            "across. An odometer that is started anew, or a second program that publishes the same "
+            "odometry, jumps like this."
         )
     if still:
         notes.append(
-            f"The odometry stands still in {len(still)} steps, from scan {still[0]} ({_where(log, still[0])}) on, while the scans show that the robot moved: it was carried, or the odometer "
+            f"The odometry stands still in {len(still)} steps, from scan {still[0]} "
+            f"({_where(log, still[0])}) on, while the scans show that the robot moved: it was "
+            "carried, or the odometer "
             "hung. The trace has no displacement across."
         )
     if track.breaks:
         notes.append(
-            f"The scans show nothing of what was seen before, {_times(len(track.breaks))}: from scan {track.breaks[0]} ({_where(log, track.breaks[0])}) on. The robot may have been carried "
+            f"The scans show nothing of what was seen before, {_times(len(track.breaks))}: from "
+            f"scan {track.breaks[0]} ({_where(log, track.breaks[0])}) on. The robot may have been "
+            "carried "
             "there, so that what comes after is mapped as a way of its own."
         )
     if turned:
         first, angle = turned[0]
         notes.append(
-            f"Scans turn otherwise than the odometry, {_times(len(turned))}: at scan {first} ({_where(log, first)}) by {abs(math.degrees(angle)):.0f} degrees. The track turns as the scans do."
+            f"Scans turn otherwise than the odometry, {_times(len(turned))}: at scan {first} "
+            f"({_where(log, first)}) by {abs(math.degrees(angle)):.0f} degrees. The track "
+            "turns as the scans do."
         )
     return notes
 
 
 def said_of_whole(log: RobotLog) -> list[str]:
-    """What is to be said of an odometry that is wrong throughout, or of a log that is not in order."""
+    """Describe odometry that is wrong throughout, or a log that is out of order."""
     notes = []
     far_apart, to_and_fro = (
         usual_step(log),
@@ -142,22 +166,28 @@ def said_of_whole(log: RobotLog) -> list[str]:
     )
     if far_apart > LONG:
         notes.append(
-            f"The usual step between two scans is {far_apart:.0f} m by the odometry: it does not count metres, or the log is not in order."
+            f"The usual step between two scans is {far_apart:.0f} m by the odometry: it does "
+            "not count metres, or the log is not in order."
         )
     elif to_and_fro < TO_AND_FRO and far_apart > 0:
         notes.append(
-            f"The odometry goes to and fro: over every second scan its way is {100 * to_and_fro:.0f} % of that over every scan. Two programs may publish it, or the log is not in order."
+            "The odometry goes to and fro: over every second scan its way is "
+            f"{100 * to_and_fro:.0f} % of that over every scan. Two programs may publish it, "
+            "or the log is not in order."
         )
     missing = stands_still(log) if len(log) > 1 else np.zeros(1, bool)
     if missing.mean() > MISSING:
         notes.append(
-            f"The odometry stands still in {missing.sum()} of {len(missing)} steps. If the robot did not, its odometry is missing there, and the map rests on the scans alone."
+            f"The odometry stands still in {missing.sum()} of {len(missing)} steps. If the "
+            "robot did not, its odometry is missing there, and the map rests on the scans "
+            "alone."
         )
     times = np.array([scan.time for scan in log.scans if scan.time is not None])
     back = int((np.diff(times) < 0).sum())
     if back > SHUFFLED * len(log):
         notes.append(
-            f"The times of the scans run back {back} times in {len(log)} scans. If the log is not in the order of time, sort it."
+            f"The times of the scans run back {back} times in {len(log)} scans. If the log is "
+            "not in the order of time, sort it."
         )
     return notes
 
@@ -167,7 +197,7 @@ def _times(count: int) -> str:
 
 
 def _where(log: RobotLog, number: int) -> str:
-    """Where a scan is in its log."""
+    """The position of a scan in its log, for a note."""
     scan = log.scans[number]
     time = "" if scan.time is None else f", {scan.time:.1f} s"
     return f"line or message {scan.line}{time}"
@@ -175,12 +205,14 @@ def _where(log: RobotLog, number: int) -> str:
 
 @dataclass(frozen=True)
 class Unknown:
-    """The scans to which steps lead of which the odometer knows nothing.
+    """Scans that a step with unknown odometry leads to.
 
-    unknown   it jumps, or stands still while the robot was moved
-    carried   those of them to which the robot was carried while nobody logged
-    doubtful  other long steps, which are jumps if scans do not match there, but match where the robot was
-    still     the first and the last scan of each stretch in which the odometer stands still
+    Attributes:
+        unknown: The odometer jumps, or stands still while the robot was moved.
+        carried: Those of them to which the robot was carried while nothing was logged.
+        doubtful: Other long steps. They are jumps if the scan does not match there but matches at
+            the previous pose.
+        still: First and last scan of each stretch in which the odometer stands still.
     """
 
     unknown: frozenset[int] = frozenset()
@@ -189,12 +221,12 @@ class Unknown:
     still: tuple[tuple[int, int], ...] = ()
 
     def but_for(self, standing: frozenset[int]) -> Unknown:
-        """The same, but for steps in which the robot stood still indeed."""
+        """The same without the scans in which the robot really stood still."""
         return replace(self, unknown=self.unknown - (standing - self.carried), still=())
 
 
 def unknown_steps(log: RobotLog) -> Unknown:
-    """Where the odometer jumps, by itself, and where it stands still although what the laser sees changes."""
+    """Find jumps of the odometer, and where it stands still while the laser sees changes."""
     if len(log) < 3:
         return Unknown()
     seconds = _seconds(log)
@@ -208,18 +240,22 @@ def unknown_steps(log: RobotLog) -> Unknown:
 
 
 def _after(steps: NDArray[np.bool_]) -> frozenset[int]:
-    """The scans to which steps lead."""
+    """The scans that steps lead to."""
     return frozenset((np.flatnonzero(steps) + 1).tolist())
 
 
 def _impossible(
     log: RobotLog, seconds: NDArray[np.float64] | None, paused: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """The steps that are impossible, by metres, by many times the usual step, and too fast for the time since the scan before; and those that are doubtful."""
+    """Find impossible steps and doubtful ones.
+
+    A step is impossible if it is long in metres, compared with the usual step, and for the time
+    that it took.
+    """
     far, over_two = _far(log, 1), _far(log, 2)
     if not far.any():
         return np.zeros(len(far), bool), np.zeros(len(far), bool)
-    # Where poses alternate, each step is a jump, but those over two steps are not.
+    # If poses of two sources alternate, each step is a jump, but steps over two scans are not.
     usual = min(
         float(np.median(steps[steps > 0])) for steps in (far, over_two) if (steps > 0).any()
     )
@@ -236,14 +272,17 @@ def _impossible(
 def _moved_while_still(
     log: RobotLog, paused: NDArray[np.bool_]
 ) -> tuple[frozenset[int], tuple[tuple[int, int], ...]]:
-    """Where the odometer stood still while what the laser sees changed: the scans before which none was logged for long, and the first and the last scan of other stretches.
+    """Find where the odometer stood still while the laser saw changes.
 
-    None where it mostly stands still, as then there is no odometer.
+    Returns:
+        Scans after a pause, and the first and last scan of other stretches. Both are empty if the
+        odometer mostly stands still, because then there is no odometry.
     """
     still = stands_still(log)
     if still.mean() > MISSING:
         return frozenset(), ()
     carried, found = set[int](), list[tuple[int, int]]()
+    # Each stretch of standing still begins and ends at an edge of the mask.
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still, [0]])))
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         if any(_change(log.scans[begin], log.scans[k]) > MOVED for k in range(begin + 1, end + 1)):
@@ -257,13 +296,16 @@ def _moved_while_still(
 
 
 def stands_still(log: RobotLog) -> NDArray[np.bool_]:
-    """The steps in which the odometer says exactly the same pose, (n - 1,)."""
+    """The steps, (n - 1,), in which the odometer repeats the same pose."""
     poses = np.array([scan.odometry for scan in log.scans])
     return np.asarray(np.abs(np.diff(poses, axis=0)).max(axis=1) < STILL)
 
 
 def _change(first: Scan, last: Scan) -> float:
-    """The share of the beams whose ranges changed from one scan to another, of those that met something in either; 0 for scans of two lasers."""
+    """Share of the beams that changed between two scans; 0 for scans of different lasers.
+
+    Only beams that hit something in either scan count.
+    """
     if first.laser != last.laser:
         return 0.0
     before, after = (
@@ -276,13 +318,13 @@ def _change(first: Scan, last: Scan) -> float:
 
 
 def _far(log: RobotLog, steps: int) -> NDArray[np.float64]:
-    """Metres by the odometer from each scan to the one so many scans later."""
+    """Metres by odometry from each scan to the one `steps` later."""
     positions = np.array([scan.odometry[:2] for scan in log.scans])
     return np.asarray(np.hypot(*(positions[steps:] - positions[:-steps]).T))
 
 
 def _seconds(log: RobotLog) -> NDArray[np.float64] | None:
-    """Seconds from each scan to the next; None where the times are missing, or do not go on."""
+    """Seconds from each scan to the next; None if times are missing or run backwards."""
     if any(scan.time is None for scan in log.scans):
         return None
     seconds = np.diff(np.array([scan.time for scan in log.scans], dtype=float))

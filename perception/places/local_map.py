@@ -1,7 +1,9 @@
-"""The local perceptual map: free space around the robot, from the scans of a short stretch of its way.
+"""Makes the local perceptual map: free space around the robot, from a short stretch of scans.
 
-A window of scans moves along the log. Each cell of a grid counts how many scans of the window saw through it, and how many saw something in it. What leaves the window is taken
-back, and the grid is a torus that scrolls with the robot, so nothing global is ever made, and drift matters only within a window (Beeson, Modayil & Kuipers 2010).
+A window of scans moves along the log. Each cell of a grid counts how many scans of the window saw
+through it and how many hit something in it. Scans that leave the window are subtracted. The grid is
+a torus that scrolls with the robot. There is no global map, so drift matters only within a window
+(Beeson, Modayil & Kuipers 2010).
 """
 
 from __future__ import annotations
@@ -23,13 +25,15 @@ from perception.readers.scans import Scan
 Bools = NDArray[np.bool_]
 Cell = tuple[int, int]
 
-# The side of a cell, in metres.
+# Side of a cell in metres.
 CELL = 0.1
-# Beams say nothing beyond so many metres: farther away they are too far from each other to show what is between.
+# Beams are ignored beyond this many metres, where they are too far apart to show what is between.
 SIGHT = 12.0
-# Something is in a cell if at least such a share of the scans that looked there met something: who walks by is soon overruled.
+# A cell is occupied if at least this share of the scans that looked there hit something. So passing
+# people are soon overruled.
 OCCUPIED = 0.25
-# One step of a wave that alternates between four and eight neighbours leads so many cells on, in the mean over all directions.
+# Cells per step of a wave that alternates between four and eight neighbours, averaged over all
+# directions.
 STRIDE = 1.08
 
 _EIGHT = np.ones((3, 3), bool)
@@ -37,12 +41,13 @@ _EIGHT = np.ones((3, 3), bool)
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A square piece of a local map.
+    """A square section of a local map.
 
-    free      what was seen to be free
-    occupied  where something is; what is neither was not observed
-    trail     where the robot itself went within the window
-    corner    the position of the middle of cell (0, 0), in metres, in the frame of the track
+    Attributes:
+        free: Mask of cells that were seen to be free.
+        occupied: Mask of cells with an obstacle. A cell that is neither was not observed.
+        trail: Mask of cells that the robot drove over within the window.
+        corner: (x, y) centre of cell (0, 0) in metres, in the frame of the track.
     """
 
     free: Bools
@@ -52,21 +57,30 @@ class Patch:
 
     @cached_property
     def clearance(self) -> Array:
-        """Metres from each cell to the nearest one that is not free."""
+        """Metres from each cell to the nearest cell that is not free."""
         return np.asarray(ndimage.distance_transform_edt(np.pad(self.free, 1))[1:-1, 1:-1]) * CELL
 
     @cached_property
     def room(self) -> Array:
-        """Metres from each cell to the nearest one that something is in."""
+        """Metres from each cell to the nearest occupied cell."""
         return np.asarray(ndimage.distance_transform_edt(~self.occupied)) * CELL
 
     @cached_property
     def _met(self) -> Bools:
-        """Where a look that passes through a cell meets something: in the cell itself, or in one of the next ones."""
+        """Cells at which a ray stops: occupied cells and their next neighbours."""
         return np.asarray(ndimage.binary_dilation(self.occupied, np.ones((2, 2), bool)))
 
     def free_along(self, begin: Array, directions: Array, most: float) -> Array:
-        """Metres that one can look from a position before something is met, and no more than `most`: one number for each direction, of unit vectors (..., 2)."""
+        """Free distance from a position in several directions.
+
+        Args:
+            begin: (x, y) in metres.
+            directions: (..., 2) unit vectors.
+            most: Largest distance in metres.
+
+        Returns:
+            (...) metres to the first obstacle, at most `most`.
+        """
         far = np.arange(0.0, most, CELL / 2)
         cells = np.rint(
             (begin + far[:, None] * directions[..., None, :] - self.corner) / CELL
@@ -75,29 +89,35 @@ class Patch:
         return np.where(met.any(axis=-1), far[met.argmax(axis=-1)], most)
 
     def drivable(self, width: float) -> Bools:
-        """Where something of this width in metres can go. Where the robot went is always one of these cells."""
+        """Mask of cells for a vehicle of this width in metres, and the robot's own trail."""
         return np.asarray(
             (self.clearance >= width / 2)
             | ndimage.binary_dilation(self.trail, _EIGHT, iterations=2)
         )
 
     def cell(self, position: Array | Sequence[float]) -> Cell:
-        """The cell of a position; it may be outside of the patch."""
+        """The cell of a position, which may lie outside the patch."""
         row, column = np.rint((np.asarray(position) - self.corner) / CELL).astype(int)
         return int(row), int(column)
 
     def position(self, cell: Array | Cell) -> Array:
-        """The middle of a cell, in the frame of the track."""
+        """The centre of a cell in metres, in the frame of the track."""
         return np.asarray(cell) * CELL + self.corner
 
 
 class LocalMaps:
-    """Local maps of a track, made as the window moves along."""
+    """Makes local maps along a track, with a moving window of scans.
+
+    Args:
+        scans: Scans of the log.
+        track: Their poses.
+        reach: Metres of trajectory before and after a scan that belong to its window.
+    """
 
     def __init__(self, scans: Sequence[Scan], track: Track, reach: float) -> None:
-        """reach: how many metres of the way before and after a scan its window has."""
+        """Start with an empty window."""
         self._scans, self._track, self._reach = scans, track, reach
-        # The torus is wide enough for all that the scans of one window can see, and for a patch around any of them.
+        # The torus covers all that the scans of one window can see, and a patch around any of them.
         self._side = int(2 * (reach + SIGHT + 2) / CELL)
         self._passed = np.zeros(self._side**2, np.int32)
         self._met = np.zeros(self._side**2, np.int32)
@@ -105,11 +125,16 @@ class LocalMaps:
         self._begin = self._end = 0
 
     def around(self, scan: int, middle: Array | Sequence[float], half: float) -> Patch:
-        """The square patch of 2 x half metres around a position near a scan, as the scans of its window saw it."""
+        """Make the square patch around a position near a scan.
+
+        Args:
+            scan: Index of the scan whose window is used.
+            middle: (x, y) in metres.
+            half: Half the side of the patch in metres.
+        """
+        # The window stays within one unbroken part of the track.
         way = self._track.way
-        first_scan, last_scan = self._track.span_of(
-            scan
-        )  # what was seen elsewhere says nothing here
+        first_scan, last_scan = self._track.span_of(scan)
         begin = max(int(np.searchsorted(way, way[scan] - self._reach)), first_scan)
         end = min(int(np.searchsorted(way, way[scan] + self._reach, side="right")), last_scan)
         self._move(begin, end)
@@ -120,13 +145,15 @@ class LocalMaps:
         occupied = (met > 0) & (met >= OCCUPIED * (met + passed))
         trail = self._trail(begin, end, first, passed.shape)
         free = ((passed > 0) & ~occupied) | ndimage.binary_dilation(trail, _EIGHT, iterations=2)
-        # Between two beams a cell may have been missed: gaps of up to two cells are closed, but not through what was met.
+        # A cell between two beams may have been missed. Close gaps of up to two cells, but not
+        # through obstacles.
         closed = ndimage.binary_closing(np.pad(free, 3), _EIGHT)[3:-3, 3:-3]
         return Patch((free | closed) & ~(occupied & ~free), occupied & ~trail, trail, first * CELL)
 
     def _trail(
         self, begin: int, end: int, first: NDArray[np.int64], shape: tuple[int, ...]
     ) -> Bools:
+        """Mask of the cells on the trajectory of the window."""
         path = self._track.poses[begin:end, :2]
         legs = [
             np.linspace(a, b, 2 + int(math.dist(a, b) / CELL)) for a, b in itertools.pairwise(path)
@@ -138,7 +165,7 @@ class LocalMaps:
         return trail
 
     def _move(self, begin: int, end: int) -> None:
-        """Moves the window to the scans from begin up to end, end excluded."""
+        """Move the window to the scans begin … end - 1, adding and subtracting counts."""
         if begin < self._begin or begin >= self._end:
             self._passed[:], self._met[:] = 0, 0
             self._window.clear()
@@ -161,7 +188,7 @@ class LocalMaps:
             self._end -= 1
 
     def _cells(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The cells that a scan looked through, and those in which it met something, each once."""
+        """The cells that a scan looked through and those in which it hit something."""
         scan, pose = self._scans[i], self._track.poses[i]
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         x = pose[0] + cos * scan.laser.mount[0] - sin * scan.laser.mount[1]
@@ -170,6 +197,7 @@ class LocalMaps:
         told = ~np.isnan(scan.ranges)
         ranges = np.minimum(np.where(told, scan.ranges, 0.0), SIGHT)
         met = told & (scan.ranges < min(SIGHT, scan.laser.reach))
+        # Sample each beam along its free part.
         along = np.arange(0.0, SIGHT, 0.8 * CELL)
         through = along < (ranges - CELL)[:, None]
         rays = np.broadcast_to(along, through.shape)[through]
@@ -181,12 +209,21 @@ class LocalMaps:
         return np.setdiff1d(passed, ends, assume_unique=True), ends
 
     def _numbers(self, x: Array, y: Array) -> NDArray[np.int64]:
+        """Unique indices in the torus of the cells of positions."""
         rows, columns = (np.rint(values / CELL).astype(np.int64) % self._side for values in (x, y))
         return np.unique(rows * self._side + columns)
 
 
 def distances(open_cells: Bools, seeds: Bools, limit: float) -> Array:
-    """Metres from the seeds to each cell through open cells, up to a limit; infinite beyond. Waves are octagons: off by 4 % at most."""
+    """Distance in metres from the nearest seed to each cell through open cells.
+
+    Waves are octagons, which are off by at most 4 %.
+
+    Args:
+        open_cells: Mask of the cells that may be crossed.
+        seeds: Mask of the cells to start from.
+        limit: Largest distance in metres; beyond it the result is infinite.
+    """
     padded = np.pad(open_cells, 1)
     width = padded.shape[1]
     unreached = padded.reshape(-1)
@@ -202,7 +239,7 @@ def distances(open_cells: Bools, seeds: Bools, limit: float) -> Array:
         unreached[cells] = False
         numbers = np.arange(len(cells))
         last[cells] = numbers
-        wave = cells[last[cells] == numbers]  # each cell once, and faster than by sorting
+        wave = cells[last[cells] == numbers]  # Keeps each cell once, faster than sorting.
         if not len(wave):
             break
         found[wave] = (count + 1) * STRIDE * CELL

@@ -1,4 +1,4 @@
-"""At which scale a building is to be looked at: the log itself suggests it, by the passages that the robot drove through."""
+"""Estimates the scale of a building from the passages that the robot drove through."""
 
 from __future__ import annotations
 
@@ -12,30 +12,34 @@ from perception.places.local_map import LocalMaps
 from perception.places.track import Track
 from perception.readers.scans import Scan
 
-# Passages are measured once in so many metres.
+# Passages are measured once every this many metres.
 EVERY = 0.5
-# And no farther to either side than this, in metres.
+# Largest measured distance to either side, in metres.
 ASIDE = 6.0
-# The narrow passages of the way are those at this percentile, and its corridors those at this one.
+# Percentiles of the width along the trajectory for narrow passages and for corridors.
 NARROW, CORRIDOR = 5, 20
-# Most of the way is at least as wide as this percentile.
+# Percentile that most of the trajectory exceeds in width.
 MOST = 30
-# A gateway is at least such a share of a narrow passage wide: walls look thicker in a grid than they are, and the robot needs less room than it had.
+# A gateway is at least this share of a narrow passage wide. Walls look thicker in a grid than they
+# are, and the robot needs less room than it had.
 SHARE = 0.75
-# A place is looked at from its middle to so many corridor widths away: beyond the mouths of its gateways, and not as far as the next place.
+# The radius of a place in corridor widths: beyond the mouths of its gateways, but not as far as the
+# next place.
 RADII = 3.2
-# That is so many metres at least and at most. It is also no farther than the laser reaches: whether a way leads on there, nothing tells.
+# Limits of the radius in metres. It is also limited by the range of the laser.
 RADIUS = (3.0, 8.0)
 
 
 @dataclass(frozen=True)
 class Scale:
-    """What the distinctive places of a building are measured by, in metres.
+    """The scale of a building: the lengths in metres by which its distinctive places are found.
 
-    gateway   the least width of a way out that counts as a gateway
-    radius    how far a way out must lead from the middle of a place
-    most      most of the robot's way is at least so wide
-    doors     whether the places of the building are the doors between its rooms; if not, they are where ways part or bend
+    Attributes:
+        gateway: Smallest width of a gateway.
+        radius: Distance that an exit must lead from the middle of a place.
+        most: Width that most of the trajectory exceeds.
+        doors: Whether places are the doors between rooms; otherwise they are where corridors part
+            or bend.
     """
 
     gateway: float
@@ -45,24 +49,29 @@ class Scale:
 
     @property
     def doubtful(self) -> float:
-        """Ways out that are narrower than a gateway, but at least this wide, may be gateways."""
+        """Width from which an exit that is too narrow for a gateway may still be one."""
         return 0.6 * self.gateway
 
     @property
     def window(self) -> float:
-        """Metres of the way before and after a scan from which its local map is made."""
+        """Metres of trajectory before and after a scan whose scans make its local map."""
         return 2 * self.radius
 
     @property
     def half(self) -> float:
-        """Half the side of a local map around a place."""
+        """Half the side of a local map around a place, in metres."""
         return 2 * self.radius + 2
 
 
 def suggested(scans: Sequence[Scan], track: Track) -> Scale:
-    """The scale that the robot's own way suggests: gateways nearly as narrow as the narrowest passages, places a few corridor widths large."""
+    """Estimate the scale from the robot's trajectory.
+
+    Gateways are nearly as narrow as the narrowest passages, and places are a few corridor widths
+    large.
+    """
     maps = LocalMaps(scans, track, ASIDE)
     widths = []
+    # Measure the free width across the trajectory at each milestone.
     for i in milestones(track, EVERY)[1:-1]:
         ahead = track.poses[min(i + 1, len(track.poses) - 1), :2] - track.poses[i - 1, :2]
         if (length := math.hypot(*ahead)) > 0.2:
@@ -83,7 +92,7 @@ def suggested(scans: Sequence[Scan], track: Track) -> Scale:
 
 
 def milestones(track: Track, every: float) -> list[int]:
-    """Scans that are at least so many metres of the way apart."""
+    """Scans that are at least `every` metres of the trajectory apart."""
     kept = [0]
     for i, way in enumerate(track.way):
         if way - track.way[kept[-1]] >= every:

@@ -1,4 +1,8 @@
-"""From the visits of a log to a trace: what the robot saw at each dstate, the turns and travels between, displacements and stars."""
+"""Turns the visits of a log into a trace.
+
+Each step has what the robot saw at a dstate. Turns and travels lead from step to step, with
+displacements and stars.
+"""
 
 from __future__ import annotations
 
@@ -19,30 +23,33 @@ from ssh_abduction.data.star import Gateway
 from ssh_abduction.data.trace import Action, Step, Trace
 
 QUARTER = math.pi / 2
-# A way out that is farther than this from all quarters, in radians, fits no right angle.
+# An exit that is farther than this from all quarters, in radians, does not fit a right angle.
 OFF = math.radians(27)
-# A building has right angles if such a share of the ways that the robot took fit them.
+# A building has right angles if this share of the exits that the robot took fit them.
 RIGHT = 0.85
-# The walls around a visit tell their direction if they agree with it at least so well.
+# Smallest agreement of the walls around a visit for their direction to be used.
 AGREE = 0.2
-# How far the middle of a place and the direction of a way are off at one visit, by another: standard deviations in metres and radians.
+# Standard deviations between two visits of the middle of a place, in metres, and of the direction
+# of an exit, in radians.
 MIDDLE, DIRECTION = 0.4, 0.1
-# The same of the middle of a door, which is told more exactly, and of the straight way from one door to the next.
+# The same for the middle of a door, which is more exact, and for the straight line between doors.
 THRESHOLD, ACROSS = 0.05, 0.05
-# Besides what matching scans says of itself, each displacement may be off by so much: standard deviations in metres and radians.
+# Additional standard deviations of each displacement, beside those of scan matching, in metres and
+# radians.
 FLOOR = (0.02, 0.02, 0.002)
-# What repeats in a track of matched scans: how far the scale of the odometer is off, as a share, and how the heading drifts, in radians a metre.
+# Systematic errors of a track of matched scans: relative error of the scale, and drift of the
+# heading in radians a metre.
 SCALE, DRIFT = 0.01, 0.0003
-# Degrees that the bearing of a gateway may be off.
+# Standard deviation of the bearing of a gateway, in degrees.
 SPREAD = 16.0
-# A turn by less than this is none: the way goes on, in radians.
+# A turn by less than this, in radians, goes straight on.
 AHEAD = math.radians(35)
-# An image has a beam in each degree, from the right (-90) to the left (90).
+# Bearings of an image: a beam in each degree, from the right (-90) to the left (90).
 BEAMS = np.radians(np.arange(-90.0, 91.0))
 
 
 def has_right_angles(visits: Sequence[Visit]) -> bool:
-    """Whether the ways that the robot took meet at right angles, as walls do."""
+    """Whether the exits that the robot took meet at right angles, as walls do."""
     taken = [
         abs(_off(visit.ways[k].bearing - visit.axis, QUARTER)) < OFF
         for visit in visits
@@ -55,8 +62,20 @@ def has_right_angles(visits: Sequence[Visit]) -> bool:
 def to_trace(
     log: RobotLog, track: Track, scale: Scale, visits: Sequence[Visit], name: str | None = None
 ) -> Trace:
-    """The trace of a log: steps with images, stars and displacements, and the actions between them. Views are left to cluster."""
-    # Ways are turned by multiples of the stride, an angle in radians; from door to door they lead in any direction.
+    """Make the trace of a log, without views.
+
+    Args:
+        log: The scans.
+        track: Their poses.
+        scale: Scale of the building.
+        visits: The visits, in order.
+        name: Name of the trace.
+
+    Returns:
+        Steps with images, stars and displacements, and the actions between them.
+    """
+    # Exits are rounded to multiples of the stride, in radians. Paths from door to door have any
+    # direction.
     stride = None if scale.doors else QUARTER if has_right_angles(visits) else QUARTER / 2
     if stride is not None:
         visits = _aligned(visits, stride)
@@ -64,12 +83,13 @@ def to_trace(
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
     for number, visit in enumerate(visits):
+        # One step for the heading of arrival and one for that of departure, unless these are alike.
         patch = maps.around(visit.scan, visit.middle, scale.half)
         came = (
             None if visit.arrived is None else wrapped(visit.ways[visit.arrived].bearing + math.pi)
         )
         went = None if visit.left is None else visit.ways[visit.left].bearing
-        # The only visit of a log that neither came from anywhere nor went on faces as the robot did.
+        # A single visit without arrival and departure has the heading of the robot.
         headings = [heading for heading in (came, went) if heading is not None] or [
             float(track.poses[visit.scan, 2])
         ]
@@ -109,6 +129,7 @@ def _step(
     stride: float | None,
     number: int,
 ) -> Step:
+    """Make one step; its displacement leads from the last step, unless the track is cut between."""
     onward = covariance = None
     cuts = [] if last is None else track.cuts_between(last[0].scan, visit.scan)
     if last is not None and not cuts:
@@ -118,7 +139,7 @@ def _step(
     extra: dict[str, object] = {"scan": visit.scan, "visit": number}
     if scan.time is not None:
         extra["time"] = scan.time
-    if cuts:  # why there is no displacement
+    if cuts:  # Why there is no displacement.
         extra["cuts"] = cuts
     truth = None
     seen = between(_pose(track, visit.scan), pose)
@@ -138,15 +159,21 @@ def _step(
 
 
 def _aligned(visits: Sequence[Visit], stride: float) -> list[Visit]:
-    """The visits with ways out in multiples of a stride (an angle in radians) from the direction of the walls, so that a way has one direction at each visit.
+    """Align the exits of all visits to multiples of a stride from the direction of the walls.
 
-    A way that is far from all of these is unsure. Where walls tell no direction it is that of the visit before.
+    So an exit has the same direction at each visit. An exit that is far from all multiples becomes
+    uncertain. If the walls tell no direction, that of the visit before is used.
+
+    Args:
+        visits: The visits, in order.
+        stride: Angle in radians.
     """
     aligned: list[Visit] = []
     axis = next((visit.axis for visit in visits if visit.straight >= AGREE), 0.0)
     count = round(2 * math.pi / stride)
     for visit in visits:
-        # Of the directions that a quarter turn makes alike, the one nearest to the last: the axis goes on without jumps.
+        # Walls tell the axis up to quarter turns. Take the nearest to the last axis, so that it
+        # does not jump.
         here = visit.axis if visit.straight >= AGREE else axis
         axis = axis + _off(here - axis, QUARTER)
         ways: dict[int, Way] = {}
@@ -174,7 +201,7 @@ def _aligned(visits: Sequence[Visit], stride: float) -> list[Visit]:
 
 
 def _off(angle: float, stride: float) -> float:
-    """How far an angle is from the nearest multiple of a stride."""
+    """Signed difference of an angle from the nearest multiple of a stride."""
     return (angle + stride / 2) % stride - stride / 2
 
 
@@ -184,7 +211,7 @@ def _pose(track: Track, scan: int) -> Pose:
 
 
 def _star(visit: Visit, heading: float, stride: float) -> tuple[float | Gateway | None, ...]:
-    """The star of a visit, as it is seen with a heading: bearings in degrees, clockwise."""
+    """The star of a visit relative to a heading: bearings in degrees, clockwise."""
     seen = [(-math.degrees(wrapped(way.bearing - heading)), way.sure) for way in visit.ways]
     if stride == QUARTER:
         quarters = {round(bearing / 90) % 4: sure for bearing, sure in seen}
@@ -196,7 +223,7 @@ def _star(visit: Visit, heading: float, stride: float) -> tuple[float | Gateway 
 
 
 def _image(patch: Patch, middle: Array, heading: float) -> Array:
-    """What a laser in the middle of a place would see, along the path: metres to where free space ends, in each direction, (181,)."""
+    """The ranges, (181,), that a laser in the middle of a place would measure."""
     far = np.arange(0.0, min(patch.free.shape) * CELL / 2, CELL / 2)
     angles = heading + BEAMS
     cells = np.rint(
@@ -210,12 +237,13 @@ def _image(patch: Patch, middle: Array, heading: float) -> Array:
     inside = ((cells >= 0) & (cells < patch.free.shape)).all(axis=2)
     cells = np.clip(cells, 0, np.array(patch.free.shape) - 1)
     free = patch.free[cells[..., 0], cells[..., 1]] & inside
+    # The middle itself counts as free.
     free[:, : round(2 * CELL / (CELL / 2))] = True
     return np.asarray(np.where(free.all(axis=1), far[-1], far[np.argmin(free, axis=1)]))
 
 
 def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> Covariance:
-    """The covariance of the displacement from one dstate to the next, in the frame of the first."""
+    """Covariance of the displacement between two dstates, in the frame of the first."""
     if begin > end:
         begin, end = end, begin
     total = np.zeros((3, 3))
@@ -223,7 +251,8 @@ def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> 
     for i in range(begin + 1, end + 1):
         pose = track.poses[i - 1]
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
-        # An error of an increment turns and shifts all that comes after it: the end of the way moves with the arm from there.
+        # An error of an increment rotates and shifts all later poses: the end moves with the arm
+        # from there.
         arm = np.array(
             [
                 [cos, -sin, -(y - track.poses[i, 1])],
@@ -242,7 +271,7 @@ def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> 
 
 
 def _with_turns(steps: list[Step], stride: float | None, visits: Sequence[Visit]) -> list[Step]:
-    """The steps with the turns between two of one visit: to the nearest multiple of a stride, or, where that is None, by any angle."""
+    """Add the turns within visits, rounded to the stride; None allows any angle."""
     done = list(steps)
     for i, step in enumerate(steps[:-1]):
         if step.action is None:
@@ -260,7 +289,7 @@ def _with_turns(steps: list[Step], stride: float | None, visits: Sequence[Visit]
 
 
 def _turn(clockwise: float, stride: float) -> Action:
-    """A turn by degrees to the nearest multiple of a stride, in radians."""
+    """A turn in degrees, rounded to the nearest multiple of a stride in radians."""
     rounded = round(clockwise / math.degrees(stride)) * round(math.degrees(stride)) % 360
     names = {90: "right", 180: "around", 270: "left"}
     if rounded in names:
@@ -271,7 +300,7 @@ def _turn(clockwise: float, stride: float) -> Action:
 
 
 def _any_turn(clockwise: float, back: bool) -> Action:
-    """A turn by degrees towards another door: around if it leads back to where the robot came from, else to another path, however little it turns."""
+    """A turn in degrees towards another door; "around" if it leads back to the door of arrival."""
     if back:
         return Action.of("around")
     degrees = round(clockwise % 360, 1)

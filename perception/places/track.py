@@ -1,11 +1,13 @@
-"""Where the robot went, from one scan to the next: odometry, mended by matching each scan with those shortly before it.
+"""Follows the robot from scan to scan: odometry, corrected by matching each scan with recent ones.
 
-A scan is matched by points to lines (Chen & Medioni 1992; Censi 2008): the pose of the robot moves until the points of the scan lie on the walls that the last few scans
-saw. Odometry is a prior, so along a bare corridor, where walls tell nothing of how far the robot went, the odometer does. Nothing here is global: errors add up along the
-way, and the covariance of each increment says by how much.
+A scan is matched from points to lines (Chen & Medioni 1992; Censi 2008): the pose moves until the
+points of the scan lie on the walls that the last scans saw. Odometry is a prior. In a bare
+corridor, where walls do not show how far the robot went, the odometer decides. Nothing is global:
+errors accumulate along the trajectory, and the covariance of each increment says by how much.
 
-An odometer that jumps says nothing there (`jumps`). The scan is then matched without it, near where the robot was. If it matches, the track goes on, and only the increment is unknown. If it shows
-nothing of what was seen before, the robot may be anywhere, and the track is broken: what comes after is a way of its own.
+Where an odometer jumps, it is ignored (`jumps`), and the scan is matched near the previous pose. If
+it matches, the track goes on, and only the increment is unknown. If nothing in the scan was seen
+before, the robot may be anywhere, and the track is broken: a new trajectory begins.
 """
 
 from __future__ import annotations
@@ -27,45 +29,53 @@ from ssh_abduction.data.odometry import between, moved
 
 Array = NDArray[np.float64]
 
-# A scan is matched with as many scans before it.
+# Number of previous scans to match a scan with.
 RECENT = 40
-# Beams that reach farther are not matched, in metres: neighbouring beams are then too far apart to tell how a wall lies.
+# Longer beams are not matched, in metres, since neighbouring beams are too far apart to show a
+# wall.
 FARTHEST = 25.0
-# Of a scan with more points so many are matched, evenly spread, which is enough and keeps the time for each scan small.
+# Largest number of points of a scan to match, evenly spread. It bounds the time for a scan.
 POINTS = 150
-# Standard deviation of the distance of a point to the wall that it lies on, in metres: the laser's noise, and that walls are not straight.
+# Standard deviation in metres of the distance from a point to its wall: noise of the laser and
+# unevenness of walls.
 ROUGHNESS = 0.05
-# Errors of neighbouring points go together, so that many points tell as much as an independent one.
+# Errors of neighbouring points are correlated: this many points count as one independent point.
 TOGETHER = 3
-# A point may be off by so much at first, in metres, and by less in each round, down to the second number.
+# Largest distance in metres from a point to a wall: in the first round and in the last, with the
+# factor for each round, and the number of rounds.
 BEGIN, END, SHRINK, ROUNDS = 1.0, 0.25, 0.75, 12
-# A match is poor where less than such a share of the points lies on walls. Odometers miss turns, and logs miss lines: then all headings are tried, in so many steps.
+# A match is poor if less than this share of the points lies on walls. Odometers miss turns and logs
+# miss lines, so this many headings are then tried.
 POOR, HEADINGS = 0.5, 24
-# Of scans that show nothing of what was seen before, less than such a share of the points lies on walls, in so many scans in a row.
+# A scan is of an unseen place if less than STRANGE of its points lies on walls, in IN_A_ROW scans
+# in a row.
 STRANGE, IN_A_ROW = 0.3, 3
-# A robot that went no farther than so many metres, by its odometer, sees something of what it saw before.
+# A robot that went at most this many metres, by odometry, still sees something of what it saw
+# before.
 NEARBY = 1.0
-# Where the odometer says nothing, the robot moved like this, in metres and radians: standard deviations.
+# Standard deviations of the motion without odometry, in metres and radians.
 UNKNOWN = (0.5, 0.5, 0.5)
-# An odometer has turned wrongly if a scan that matches well says otherwise by more than this, in radians.
+# The odometer turned wrongly if a well-matched scan differs by more than this, in radians.
 TURNED = math.radians(60)
-# A robot that stands, by its odometer, was carried if scans moved by more than so many metres.
+# A robot whose odometer stands still was carried if scans moved by more than this many metres.
 CARRIED = 1.0
-# Without odometry a scan has to match better: at least such a share of its points lies on walls.
+# Share of points on walls that a match needs without odometry.
 SURE = 0.7
-# In a bare corridor, to go on and to stay match alike, up to such a share: then the robot went on.
+# In a bare corridor, moving on and standing still match equally well, up to this share. Then the
+# robot moved on.
 ALIKE = 0.03
 
 
 @dataclass(frozen=True)
 class Trust:
-    """How far the increments of an odometer are believed while scans are matched: standard deviations.
+    """Standard deviations of the increments of an odometer, for scan matching.
 
-    way      along the way, as a share of it; across it is half of that
-    offset   in metres, whatever the way
-    turning  as a share of the turn
-    drift    of the heading, in radians a metre
-    angle    of the heading, in radians, whatever the way
+    Attributes:
+        way: Error along the motion, as a share of it; half of that across.
+        offset: Constant error in metres.
+        turning: Error of a turn, as a share of it.
+        drift: Error of the heading in radians a metre.
+        angle: Constant error of the heading in radians.
     """
 
     way: float = 0.1
@@ -75,7 +85,7 @@ class Trust:
     angle: float = 0.02
 
     def covariance(self, onward: Pose) -> Array:
-        """The covariance of an increment, (3, 3), in the frame of the robot before it."""
+        """Covariance of an increment, (3, 3), in the frame of the robot before it."""
         way = math.hypot(onward[0], onward[1])
         along, across = self.offset + self.way * way, self.offset + self.way * way / 2
         heading = self.angle + self.turning * abs(onward[2]) + self.drift * way
@@ -84,13 +94,18 @@ class Trust:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The way of the robot, by short-term odometry and scan matching.
+    """The trajectory of the robot, by odometry and scan matching.
 
-    poses        (n, 3): x, y in metres and the heading in radians, in the frame of the first scan
-    covariances  (n, 3, 3): of the increment that led to each scan, in the frame of the robot at the scan before it; zeros for the first
-    shares       (n,): how much of each scan lay on walls that were seen before; 1 for the first. Empty where nothing was matched
-    cuts         the scans before which nothing is known of how the robot moved, as the odometer jumped: no displacement leads across
-    breaks       those of them that show nothing of what was seen before: the robot may be anywhere, and neither path nor place leads across
+    Attributes:
+        poses: (n, 3) x, y in metres and heading in radians, in the frame of the first scan.
+        covariances: (n, 3, 3) covariance of the increment to each scan, in the frame of the robot
+            at the previous scan; zeros for the first.
+        shares: (n,) share of each scan that lies on known walls; 1 for the first. Empty if nothing
+            was matched.
+        cuts: Scans before which the motion is unknown because the odometer jumped. No displacement
+            crosses a cut.
+        breaks: Those of the cuts at which the robot may be anywhere, because nothing was seen
+            before. Neither a path nor a place crosses a break.
     """
 
     poses: Array
@@ -106,35 +121,35 @@ class Track:
 
     @cached_property
     def spans(self) -> tuple[tuple[int, int], ...]:
-        """The first scan of each unbroken way, and the one after its last."""
+        """First scan of each unbroken part, and the scan after its last."""
         return tuple(pairwise((0, *self.breaks, len(self.poses))))
 
     def span_of(self, scan: int) -> tuple[int, int]:
-        """The unbroken way that a scan is on."""
+        """The unbroken part that contains a scan."""
         return self.spans[bisect(self.breaks, scan)]
 
     def part(self, begin: int, end: int) -> Track:
-        """An unbroken way as a track of its own, in the same frame."""
+        """An unbroken part as a track of its own, in the same frame."""
         some = slice(begin, end)
         cuts = tuple(cut - begin for cut in self.cuts if begin < cut < end)
         return Track(self.poses[some], self.covariances[some], self.shares[some], cuts)
 
     def cuts_between(self, first: int, last: int) -> list[int]:
-        """The cuts after one scan and up to another."""
+        """The cuts after scan `first` and up to scan `last`."""
         return [cut for cut in self.cuts if first < cut <= last]
 
 
 def wrapped(angle: float) -> float:
-    """The same angle, from -pi to pi."""
+    """The same angle in [-pi, pi)."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def follow(log: RobotLog, trust: Trust | None = None) -> Track:
-    """The way of the robot. Corrected poses are not read."""
+    """Follow the robot through a log. Corrected poses are not read."""
     steps = unknown_steps(log)
     follower = _Follower(log, trust or Trust(), steps)
     track = follower.followed(steps.carried)
-    # Where people pass, or an arm of the robot moves, what the laser sees changes though the robot stands.
+    # People or an arm of the robot can change what the laser sees while the robot stands.
     standing = frozenset(
         k
         for first, last in steps.still
@@ -154,7 +169,10 @@ def follow(log: RobotLog, trust: Trust | None = None) -> Track:
 class _Follower:
     """Follows a log.
 
-    steps  those of which the odometer knows nothing
+    Attributes:
+        log: The log.
+        trust: Standard deviations of the odometer.
+        steps: Steps with unknown odometry.
     """
 
     log: RobotLog
@@ -162,7 +180,7 @@ class _Follower:
     steps: Unknown
 
     def followed(self, carried: frozenset[int]) -> Track:
-        """The track, which is broken before the scans to which the robot was carried."""
+        """Make the track, which is broken before each scan to which the robot was carried."""
         poses: list[Pose] = [(0.0, 0.0, 0.0)]
         covariances, shares = [np.zeros((3, 3))], [1.0]
         cuts: list[int] = []
@@ -174,6 +192,8 @@ class _Follower:
             if i > 0:
                 onward = between(self.log.scans[i - 1].odometry, scan.odometry)
                 pose, covariance, share = poses[-1], self.trust.covariance((0.0, 0.0, 0.0)), 0.0
+                # Match with the odometry, or without it if it is unknown or if it is doubtful and
+                # matches badly.
                 if i in carried:
                     breaks.append(i)
                 elif i in self.steps.unknown:
@@ -213,7 +233,12 @@ class _Follower:
 def _bridged(
     points: Array, normals: Array, recent: deque[tuple[Array, Array]], last: Pose, before: Pose
 ) -> tuple[Pose, Array, float] | None:
-    """The pose of a scan by walls alone, with the covariance of the increment and the share of points on walls: near where the robot was, or where it went on as before. None where it matches nowhere."""
+    """Match a scan without odometry, near the previous pose and at constant velocity.
+
+    Returns:
+        The pose, the covariance of the increment and the share of points on walls; None if it
+        matches nowhere.
+    """
     wide = np.diag(UNKNOWN) ** 2
     onward, stayed = (
         _matched(points, normals, recent, last, guess, wide) for guess in (before, (0.0, 0.0, 0.0))
@@ -223,7 +248,10 @@ def _bridged(
 
 
 def _carried(log: RobotLog, track: Track) -> list[int]:
-    """The scans from which on nothing is seen of what was seen before, though the odometer does not jump: the robot was carried while nobody logged."""
+    """Find scans from which on nothing was seen before although the odometer does not jump.
+
+    There the robot was carried while nothing was logged.
+    """
     found: list[int] = []
     for i in np.flatnonzero(track.shares < STRANGE).tolist():
         if (
@@ -249,14 +277,14 @@ def _carried(log: RobotLog, track: Track) -> list[int]:
             )[2]
             for k in range(i, i + IN_A_ROW)
         ]
-        # They have to see each other, or else it is the laser that sees nothing.
+        # The scans must match each other; otherwise the laser sees nothing.
         if max(shares) < STRANGE and track.shares[i + 1 : i + IN_A_ROW].min() >= POOR:
             found.append(i)
     return found
 
 
 def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
-    """The scans that match well where the robot turned otherwise than the odometer says, and by how many radians."""
+    """Well-matched scans that turned differently from the odometry, by how many radians."""
     found: list[tuple[int, float]] = []
     for i in range(1, len(log)):
         told = between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
@@ -271,17 +299,22 @@ def _as_pose(row: Array) -> Pose:
 
 
 def surfaces(scan: Scan) -> tuple[Array, Array]:
-    """The points of a scan that lie on a smooth surface, (m, 2), in metres in the frame of the robot, and the unit normals of the surface there, (m, 2)."""
+    """Points of a scan on a smooth surface, and the normals of the surface.
+
+    Returns:
+        (m, 2) points in metres and (m, 2) unit normals, in the frame of the robot.
+    """
     laser, ranges = scan.laser, scan.ranges
     good = np.isfinite(ranges) & (ranges < min(FARTHEST, laser.reach))
     r = np.where(good, ranges, 0.0)
     points = np.stack([r * np.cos(laser.bearings), r * np.sin(laser.bearings)], axis=1)
     normals = np.full(points.shape, np.nan)
+    # The farthest neighbours that still lie on one line with the point give the best normal.
     for k in (
         1,
         2,
         3,
-    ):  # The farthest neighbours that still lie on one line with the point tell the normal best.
+    ):
         if len(points) <= 2 * k:
             break
         middle = slice(k, len(points) - k)
@@ -312,7 +345,20 @@ def _matched(
     onward: Pose,
     prior: Array,
 ) -> tuple[Pose, Array, float]:
-    """The pose of a scan, the covariance of the increment, in the frame of the robot at the scan before, and the share of the points that lie on walls."""
+    """Match a scan with walls.
+
+    Args:
+        points: (m, 2) points of the scan in metres.
+        normals: (m, 2) unit normals.
+        recent: Points and normals of previous scans, in the frame of the track.
+        last: Pose of the previous scan.
+        onward: Expected increment.
+        prior: (3, 3) covariance of the increment.
+
+    Returns:
+        The pose, the covariance of the increment in the frame of the robot at the previous scan,
+        and the share of the points on walls.
+    """
     turn: Array = np.eye(3)
     turn[:2, :2] = _rotation(last[2])
     walls = np.concatenate([wall for wall, _ in recent])
@@ -324,6 +370,7 @@ def _matched(
         kept = np.unique(np.linspace(0, len(points) - 1, min(len(points), POINTS)).astype(int))
         fit = _Fit(points[kept], normals[kept], walls, wall_normals, cKDTree(walls))
         share, pose, information = fit.improved(guess, weight)
+        # A poor match may have a wrong heading: try all headings.
         if share < POOR:
             turned = [guess + np.array([0, 0, 2 * math.pi * k / HEADINGS]) for k in range(HEADINGS)]
             best = max(
@@ -336,13 +383,15 @@ def _matched(
 
 
 def _accumulating(information: Array, prior: Array) -> Array:
-    """The covariance of what an increment adds to the error of the track in the long run, (3, 3).
+    """The covariance that an increment adds to the error of the track in the long run, (3, 3).
 
-    What walls do not tell is the odometer's error, all of which stays. What they tell is told by the mean of many scans before, so that little of its error is handed on:
-    of a value that is always measured against the mean of the last n, each error shifts what comes later by 2 / (n + 1) of itself.
+    In directions without walls, the error of the odometer accumulates fully. In the others, a pose
+    is measured against the mean of n previous scans, so little error is passed on: each error
+    shifts later poses by 2 / (n + 1) of itself.
 
-    information  of the pose, by the odometer and by walls
-    prior        that of the odometer alone
+    Args:
+        information: Information of the pose by odometer and walls.
+        prior: Information of the odometer alone.
     """
     posterior = np.linalg.inv(information)
     by_odometer = posterior @ prior
@@ -354,7 +403,7 @@ def _accumulating(information: Array, prior: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Points of a scan with their normals, in the frame of the robot, and the walls that they are to lie on, in the frame of the track."""
+    """Points of a scan, in the frame of the robot, and walls, in the frame of the track."""
 
     points: Array
     normals: Array
@@ -363,7 +412,15 @@ class _Fit:
     tree: cKDTree
 
     def improved(self, guess: Array, weight: Array) -> tuple[float, Array, Array]:
-        """From a guess with its weight, (3, 3): the share of the points that lie on walls, the pose at which they do, and its information, (3, 3)."""
+        """Move a pose until the points lie on the walls, by Gauss-Newton steps.
+
+        Args:
+            guess: (3,) initial pose.
+            weight: (3, 3) information of the guess.
+
+        Returns:
+            The share of the points on walls, the pose, and its information, (3, 3).
+        """
         information, pose, share = weight, guess, 0.0
         for count in range(ROUNDS):
             placed = _moved(pose, self.points)
@@ -384,9 +441,8 @@ class _Fit:
             jacobian = np.column_stack(
                 [normal, arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]]
             )
-            weights = 1 / (
-                TOGETHER * ROUGHNESS**2 * (1 + (off / (2 * ROUGHNESS)) ** 2)
-            )  # Cauchy's: what is far off counts little.
+            # Cauchy weights: points that are far off count little.
+            weights = 1 / (TOGETHER * ROUGHNESS**2 * (1 + (off / (2 * ROUGHNESS)) ** 2))
             astray = pose - guess
             astray[2] = wrapped(astray[2])
             information = jacobian.T @ (jacobian * weights[:, None]) + weight
@@ -403,10 +459,10 @@ def _rotation(angle: float) -> Array:
 
 
 def points_turned(angle: float, points: Array) -> Array:
-    """Points or directions, (n, 2), turned counterclockwise."""
+    """Rotate points or directions, (n, 2), counterclockwise."""
     return np.asarray(points @ _rotation(angle).T)
 
 
 def _moved(pose: Pose | Array, points: Array) -> Array:
-    """Points that are seen from a pose, (n, 2), in the frame in which the pose is."""
+    """Transform points, (n, 2), out of the frame of a pose."""
     return np.asarray(points_turned(pose[2], points) + np.asarray(pose[:2]))

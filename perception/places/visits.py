@@ -1,7 +1,9 @@
-"""Where a robot's way leads past distinctive places: junctions, corners, dead ends, and where it turned around.
+"""Finds the distinctive places that a robot passes: junctions, corners, dead ends, turning points.
 
-From each milestone of the way the local map is asked for its ways out, and for the point where these part. If three or more ways part there, or the way bends, the milestone votes for
-a place with its middle there. What most milestones nearby vote for is a place, and the robot visits it as it passes.
+At each milestone of the trajectory, the local map gives the exits and the point where they part. If
+three or more exits part there, or if the corridor bends, the milestone votes for a place with its
+middle at that point. A point that most of the nearby milestones vote for is a place. The robot
+visits it as it passes.
 """
 
 from __future__ import annotations
@@ -18,26 +20,31 @@ from perception.places.scale import EVERY, Scale, milestones
 from perception.places.track import Array, Track, surfaces
 from perception.readers.scans import RobotLog
 
-# Two ways out that are straight opposite to within this are one corridor, and no place, in radians.
+# Two exits that are opposite to within this, in radians, are one corridor and no place.
 BEND = math.radians(40)
-# The robot may be so far from drivable cells, in metres, where the local map is asked.
+# Largest distance in metres from the robot to a drivable cell of the local map.
 ASTRAY = 1.5
-# Shares of the radius: votes within the first are for one middle, the robot passes within the second, and milestones within the third are asked for their votes.
+# Shares of the radius. SAME: largest distance between votes for the same middle. PASSING: largest
+# distance at which the robot passes a place. ASKED: milestones this near are counted for the
+# support.
 SAME, PASSING, ASKED = 0.5, 0.6, 0.8
-# At least so many milestones, and such a share of those nearby, have to vote for a place.
+# Smallest number of votes for a place, and smallest share of the nearby milestones that vote for
+# it.
 VOTES, AGREED = 3, 0.5
-# The robot turned around where its direction before and after differs by more than this, in radians.
+# The robot turned around if its direction of motion changed by more than this, in radians.
 REVERSED = math.radians(135)
-# And it left a path where its direction differs by more than this between two places.
+# The robot left a path if its direction between two places changed by more than this, in radians.
 BENT = math.radians(65)
 
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """A way out of a place.
+    """An exit of a place.
 
-    bearing  in radians counterclockwise, in the frame of the track
-    sure     whether it is surely a gateway; if not, it may be none: it is narrow, or leads to where nothing was observed
+    Attributes:
+        bearing: Radians counterclockwise in the frame of the track.
+        sure: Whether it is certainly a gateway. An uncertain one is narrow or leads into unknown
+            space.
     """
 
     bearing: float
@@ -46,18 +53,19 @@ class Way:
 
 @dataclass(frozen=True, eq=False)
 class Visit:
-    """The stay at a distinctive place.
+    """A stay at a distinctive place.
 
-    scan      the scan nearest to the middle
-    middle    (x, y) of the middle of the place, in metres in the frame of the track
-    begin     the first scan of the stay
-    end       the last scan of the stay
-    ways      the ways out, counterclockwise
-    arrived   the number of the way by which the robot came, None at the beginning of the log
-    left      the number of the way by which it went, None at the end of the log
-    axis      the direction of the walls, in radians modulo a quarter turn
-    straight  how well the walls agree with that, from 0 to 1
-    support   the share of the milestones nearby that vote for the place
+    Attributes:
+        scan: The scan nearest to the middle of the place.
+        middle: (x, y) middle of the place in metres, in the frame of the track.
+        begin: First scan of the stay.
+        end: Last scan of the stay.
+        ways: Exits, counterclockwise.
+        arrived: Index of the exit by which the robot came; None at the beginning of the log.
+        left: Index of the exit by which it left; None at the end of the log.
+        axis: Direction of the walls, in radians modulo a quarter turn.
+        straight: Agreement of the walls with the axis, from 0 to 1.
+        support: Share of the nearby milestones that vote for the place.
     """
 
     scan: int
@@ -72,7 +80,7 @@ class Visit:
     support: float = 1.0
 
     def later(self, scans: int) -> Visit:
-        """The same visit, so many scans later."""
+        """The same visit with its scan numbers shifted."""
         return replace(self, scan=self.scan + scans, begin=self.begin + scans, end=self.end + scans)
 
 
@@ -83,7 +91,10 @@ class _Vote:
 
 
 def find_visits(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
-    """The visits of a log, in the order of the way. Where the track is broken, each part is a way of its own. Corrected poses are not read."""
+    """Find the visits of a log, in order. Each unbroken part of the track is searched separately.
+
+    Corrected poses are not read.
+    """
     return tuple(
         visit.later(begin)
         for begin, end in track.spans
@@ -94,6 +105,7 @@ def find_visits(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
 
 
 def _visits_of_span(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
+    """Find the visits in a log whose track is unbroken."""
     maps = LocalMaps(log.scans, track, scale.window)
     asked = milestones(track, EVERY)
     votes = [vote for i in asked if (vote := _vote(maps, track, scale, i)) is not None]
@@ -104,7 +116,7 @@ def _visits_of_span(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, .
 
 
 def _vote(maps: LocalMaps, track: Track, scale: Scale, i: int) -> _Vote | None:
-    """The place that can be told from a milestone, if there is one."""
+    """The vote of milestone i for a place, if it sees one."""
     patch = maps.around(i, track.poses[i, :2], scale.half)
     open_cells, here = _start(patch, track.poses[i, :2], scale.gateway)
     if here is None:
@@ -119,15 +131,16 @@ def _vote(maps: LocalMaps, track: Track, scale: Scale, i: int) -> _Vote | None:
 
 
 def is_decisive(seen: Outlook) -> bool:
-    """Whether there is something to decide: three ways out or more, or a bend."""
+    """Whether there are at least three exits, or two that are not opposite."""
     bearings = seen.bearings
     return len(bearings) > 2 or (len(bearings) == 2 and math.pi - apart(*bearings) > BEND)
 
 
 def _supported(votes: list[_Vote], asked: list[int], track: Track, scale: Scale) -> list[Visit]:
-    """Places that most of the milestones nearby vote for, each once for each time that the robot passes."""
+    """Group votes into places with enough support, once for each pass of the robot."""
     groups: list[list[_Vote]] = []
     for vote in votes:
+        # Only recent groups are candidates: an earlier one is another pass, even at the same place.
         for group in groups[:-4:-1]:
             last = track.way[vote.scan] - track.way[group[-1].scan]
             if last < scale.radius and math.dist(vote.middle, _middle(group)) < SAME * scale.radius:
@@ -160,7 +173,10 @@ def _middle(group: list[_Vote]) -> Array:
 
 
 def _stay(track: Track, middle: Array, scan: int, radius: float) -> tuple[int, int]:
-    """The first and the last scan of the stretch around a scan in which the robot is within the radius of a middle, or passes as near as it does."""
+    """First and last scan of the stretch around a scan in which the robot is at a place.
+
+    The robot is at a place while it is within the radius of the middle or still approaches it.
+    """
     near = np.hypot(*(track.poses[:, :2] - middle).T)
     begin = end = scan
     while begin > 0 and (near[begin - 1] < radius or near[begin - 1] < near[begin]):
@@ -171,7 +187,10 @@ def _stay(track: Track, middle: Array, scan: int, radius: float) -> tuple[int, i
 
 
 def _one_for_each_pass(found: list[Visit], scale: Scale) -> list[Visit]:
-    """The visits, where those in a row whose middles are too near to be two places are one: the best supported of them, for as long as all together."""
+    """Merge consecutive visits whose middles are too close for two places.
+
+    The best supported visit stays and covers the stays of all.
+    """
     kept: list[Visit] = []
     for visit in found:
         if kept and math.dist(kept[-1].middle, visit.middle) < PASSING * scale.radius:
@@ -186,8 +205,9 @@ def _one_for_each_pass(found: list[Visit], scale: Scale) -> list[Visit]:
 
 
 def _with_turnings(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
-    """The visits, and one more wherever the robot turned around away from any of them."""
+    """Add a visit wherever the robot turned around away from all other visits."""
     positions, way = track.poses[:, :2], track.way
+    # Compare the direction of motion before and after each scan, over a third of the radius.
     stride = scale.radius / 3
     turned: list[tuple[float, int]] = []
     for i in range(len(way)):
@@ -201,6 +221,7 @@ def _with_turnings(found: list[Visit], track: Track, scale: Scale) -> list[Visit
                 if angle > REVERSED:
                     turned.append((angle, i))
     visits = list(found)
+    # The sharpest turn comes first; later ones near it are the same turning point.
     for _, i in sorted(turned, reverse=True):
         if all(
             math.dist(visit.middle, positions[i]) > scale.radius
@@ -213,7 +234,10 @@ def _with_turnings(found: list[Visit], track: Track, scale: Scale) -> list[Visit
 
 
 def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
-    """The visits, and one more wherever the robot came back, or went on in another direction, without any: a path from one place to the next leads on straight."""
+    """Add a visit where the robot came back or changed direction between two visits.
+
+    A path between two neighbouring places should lead straight on.
+    """
     positions = track.poses[:, :2]
     visits: list[Visit] = []
     for visit in found:
@@ -227,7 +251,8 @@ def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
                 directions = went - last.middle, visit.middle - came
                 turned = apart(*(math.atan2(y, x) for x, y in directions))
                 between = positions[last.end : visit.begin + 1]
-                # It turned where it was farthest from the straight line between the two places, or, where it came back, from both of them together.
+                # The robot turned where it was farthest from the straight line between the two
+                # places. If it came back, it turned where it was farthest from both places.
                 line = visit.middle - last.middle
                 length = math.hypot(*line)
                 off = np.hypot(*(between - last.middle).T) + np.hypot(*(between - visit.middle).T)
@@ -251,7 +276,7 @@ def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
 
 
 def _described(visit: Visit, log: RobotLog, track: Track, scale: Scale, maps: LocalMaps) -> Visit:
-    """The visit with its ways out, those by which the robot came and went, and the direction of the walls."""
+    """Add to a visit its exits, those that the robot took, and the direction of walls."""
     patch = maps.around(visit.scan, visit.middle, scale.half)
     ways = _ways(patch, visit.middle, scale)
     ways, arrived = _taken(ways, _crossing(track, visit, scale.radius, -1), visit.middle)
@@ -269,7 +294,7 @@ def _described(visit: Visit, log: RobotLog, track: Track, scale: Scale, maps: Lo
 
 
 def _ways(patch: Patch, middle: Array, scale: Scale) -> list[Way]:
-    """The ways out that are seen from a middle: those that are surely gateways, and those that may be some."""
+    """The exits seen from a middle: certain gateways, and those that may be gateways."""
     sure = _outlook(patch, middle, scale.gateway, scale.radius)
     ways = [Way(bearing) for bearing in (sure.bearings if sure else ())]
     doubtful = _outlook(patch, middle, scale.doubtful, scale.radius)
@@ -282,20 +307,22 @@ def _ways(patch: Patch, middle: Array, scale: Scale) -> list[Way]:
 
 
 def _start(patch: Patch, position: Array, width: float) -> tuple[Bools, Cell | None]:
-    """The cells in which something of this width can drive, and the one of them that is nearest to a position; None where all are farther than ASTRAY."""
+    """The drivable cells for this width, and the one nearest to a position, at most ASTRAY away."""
     open_cells = patch.drivable(width)
     return open_cells, nearest(open_cells, patch.cell(position), ASTRAY)
 
 
 def _outlook(patch: Patch, middle: Array, width: float, radius: float) -> Outlook | None:
+    """The exits for this width seen from a middle; None if no drivable cell is near."""
     open_cells, here = _start(patch, middle, width)
     return None if here is None else outlook(open_cells, here, radius)
 
 
 def _unseen(patch: Patch, seen: Outlook, scale: Scale) -> list[float]:
-    """Bearings at which drivable space ends, within the radius, because nothing was observed beyond, over the width of a gateway or more."""
+    """Bearings where drivable space ends in unobserved space at least a gateway wide."""
     unknown = ~patch.free & ~patch.occupied
-    # Cells next to a wall also border on what is behind it: the border to the unknown counts only away from what was met.
+    # Cells next to a wall also border on the unknown behind it. The border counts only away from
+    # walls.
     border = (
         ndimage.binary_dilation(unknown, iterations=2)
         & patch.free
@@ -316,7 +343,10 @@ def _unseen(patch: Patch, seen: Outlook, scale: Scale) -> list[float]:
 
 
 def _crossing(track: Track, visit: Visit, radius: float, side: int) -> Array | None:
-    """Where the robot came into the radius of a place (side -1), or went out of it (side 1); None where the log begins or ends before that."""
+    """Where the robot entered (side -1) or left (side 1) the radius of a place.
+
+    None if the log begins or ends before that.
+    """
     positions = track.poses[:, :2]
     i = visit.begin if side < 0 else visit.end
     near = math.dist(positions[i], visit.middle)
@@ -330,7 +360,11 @@ def _crossing(track: Track, visit: Visit, radius: float, side: int) -> Array | N
 
 
 def _taken(ways: list[Way], crossing: Array | None, middle: Array) -> tuple[list[Way], int | None]:
-    """The ways out, and the number of the one by which the robot went: it is surely a gateway, and if none was seen in that direction, there is one."""
+    """Mark the exit that the robot took as certain; add one if none was seen in that direction.
+
+    Returns:
+        The exits, and the index of the one that was taken.
+    """
     if crossing is None:
         return ways, None
     bearing = math.atan2(*(crossing - middle)[::-1])
@@ -341,7 +375,8 @@ def _taken(ways: list[Way], crossing: Array | None, middle: Array) -> tuple[list
 
 
 def _walls(log: RobotLog, track: Track, visit: Visit) -> tuple[float, float]:
-    """The direction of the walls around a visit, modulo a quarter turn, and how well they agree with it."""
+    """Direction of the walls around a visit, modulo a quarter turn, and their agreement with it."""
+    # Multiplying angles by four makes directions a quarter turn apart equal, so that they average.
     total, count = 0j, 0
     for i in range(visit.begin, visit.end + 1):
         _, normals = surfaces(log.scans[i])

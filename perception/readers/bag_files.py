@@ -1,6 +1,7 @@
-"""The files of a bag are found and opened: one file or several parts of one drive, packed or not, whole or cut.
+"""Finds and opens the files of a bag: one file or several parts of a drive, packed or not.
 
-rosbags reads what is whole and has an index. What it cannot open is read record by record (`salvage`), up to where it was cut.
+rosbags reads complete files with an index. Other files are read record by record (`salvage`), up to
+where they were cut.
 """
 
 from __future__ import annotations
@@ -18,16 +19,17 @@ from perception.readers.lines import copied, damages, is_full, no_room, packer, 
 from perception.readers.salvage import Salvage
 from ssh_abduction.data.errors import named
 
-# How a file begins, and what its name has to end in for rosbags.
+# First bytes of a file, with its format and the ending that rosbags expects.
 MAGICS = {
     b"#ROSBAG V": ("ros1", ".bag"),
     b"\x89MCAP0\r\n": ("mcap", ".mcap"),
     b"SQLite format 3\0": ("ros2", ".db3"),
 }
 HEAD = max(map(len, MAGICS))
-# How the names of the files of bags end, packed ones too.
+# Endings of the files of bags, also of packed ones.
 NAMES = re.compile(r"\.(bag|bag\.active|mcap|db3)(\.(gz|bz2|xz|zstd|zst))?$")
-# How recorders number the parts of a bag: drive_0.db3, drive_1.db3. A longer number is a date or a year.
+# Recorders number the parts of a bag: drive_0.db3, drive_1.db3. A longer number is a date or a
+# year.
 PART = re.compile(r"(?P<drive>.*)_(?P<number>\d{1,3})$", re.DOTALL)
 REINDEX = "index it again (rosbag reindex, ros2 bag reindex, mcap recover), or record it anew"
 
@@ -38,8 +40,8 @@ class Files:
 
     Attributes:
         format: `ros1`, `ros2` or `mcap`.
-        readers: Readers of rosbags, or salvages, one a part, in the order of the drive.
-        notes: What is to be said of the files.
+        readers: Readers of rosbags, or salvages, one for each part, in order.
+        notes: Notes on the files.
     """
 
     format: str
@@ -48,26 +50,27 @@ class Files:
 
 
 def format_of(head: bytes) -> str | None:
-    """The format of a file that begins in some way; None where it is no bag."""
+    """The format of a file with these first bytes; None if it is no bag."""
     return next((name for magic, (name, _) in MAGICS.items() if head.startswith(magic)), None)
 
 
 @contextmanager
 def opened(path: Path, format: str) -> Iterator[Files]:
-    """The open files of a bag: of a file, or of a folder.
+    """Open the files of a bag.
 
     Args:
-        path: The file or the folder.
-        format: The format that the file has, or is to have.
+        path: The file or folder.
+        format: The format of the file.
 
     Raises:
         LogError: The bag cannot be opened, or a disk is full.
     """
     try:
-        from rosbags import rosbag1, rosbag2  # noqa: F401 - only whether they are there
+        from rosbags import rosbag1, rosbag2  # noqa: F401 - only whether they are installed
     except ImportError:
         raise LogError(
-            f"{named(path)}: expected the package rosbags to read it with, got none; pip install 'ssh-abduction[ros]'"
+            f"{named(path)}: expected the package rosbags to read it with, got none; pip "
+            "install 'ssh-abduction[ros]'"
         ) from None
     with ExitStack() as stack:
         try:
@@ -87,7 +90,7 @@ def opened(path: Path, format: str) -> Iterator[Files]:
 
 
 def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
-    """The files of a folder: by its metadata.yaml, or else all of them in the order of their numbers."""
+    """Open a folder: by its metadata.yaml, or else all files by their numbers."""
     parts = sorted(
         (part for part in path.iterdir() if NAMES.search(part.name) and part.is_file()), key=_number
     )
@@ -98,29 +101,36 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
             files.readers.append(reader)
             if len(reader.storage.storages) < len(parts):
                 files.notes.append(
-                    f"{named(path / 'metadata.yaml')} names {len(reader.storage.storages)} of the {len(parts)} files beside it, and only these are read. To read all, run ros2 bag reindex."
+                    f"{named(path / 'metadata.yaml')} names {len(reader.storage.storages)} of "
+                    f"the {len(parts)} files beside it, and only these are read. To read all, "
+                    "run ros2 bag reindex."
                 )
             return files
-        except Exception as error:  # whatever a library runs into in damaged bytes
+        except Exception as error:  # Damaged bytes can raise any error in the library.
             check_room(error, named(path))
             if not parts:
                 raise LogError(
-                    f"{named(path)}: expected a bag of ROS 2, got one that cannot be opened ({cause(error)}); {REINDEX}"
+                    f"{named(path)}: expected a bag of ROS 2, got one that cannot be opened "
+                    f"({cause(error)}); {REINDEX}"
                 ) from None
             files.notes.append(
-                f"{named(path / 'metadata.yaml')} cannot be used ({cause(error)}): the bag is read without it."
+                f"{named(path / 'metadata.yaml')} cannot be used ({cause(error)}): the bag is "
+                "read without it."
             )
     if not parts:
         raise LogError(
-            f"{named(path)}: expected a folder of ROS 2 with metadata.yaml, or with files *.mcap, *.db3 or *.bag, got none of these; name a file"
+            f"{named(path)}: expected a folder of ROS 2 with metadata.yaml, or with files "
+            "*.mcap, *.db3 or *.bag, got none of these; name a file"
         )
+    # Without metadata.yaml, only the names tell which files belong together.
     drives = {_drive(part) for part in parts}
     if len(drives) > 1:
         names = ", ".join(named(part.name) for part in parts[:4]) + (
             ", …" if len(parts) > 4 else ""
         )
         raise LogError(
-            f"{named(path)}: expected the parts of one drive, as drive_0.db3 and drive_1.db3, got {names}; name one of the files, or ros2 bag reindex the folder"
+            f"{named(path)}: expected the parts of one drive, as drive_0.db3 and drive_1.db3, "
+            f"got {names}; name one of the files, or ros2 bag reindex the folder"
         )
     files.format = next((found for part in parts if (found := _format(part))), "ros2")
     unread = []
@@ -131,7 +141,8 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
             check_room(error, named(part))
             unread.append(
                 LogError(
-                    f"{named(part)}: expected a readable bag: {error.strerror or error}; check the path"
+                    f"{named(part)}: expected a readable bag: {error.strerror or error}; "
+                    "check the path"
                 )
             )
         except LogError as error:
@@ -141,7 +152,8 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
     files.notes += [f"A part was not read. {error}" for error in unread]
     if len(parts) > 1:
         files.notes.append(
-            f"{named(path)} has no metadata.yaml that can be used: its {len(parts)} parts are read as one drive, from {named(parts[0].name)} to {named(parts[-1].name)}."
+            f"{named(path)} has no metadata.yaml that can be used: its {len(parts)} parts are "
+            f"read as one drive, from {named(parts[0].name)} to {named(parts[-1].name)}."
         )
     files.notes += _gaps(parts)
     return files
@@ -159,22 +171,24 @@ def _open_part(path: Path, files: Files, folder: Path, stack: ExitStack) -> None
     try:
         files.readers.append(_by_rosbags(here, files.format, stack))
         return
-    except Exception as error:  # whatever a library runs into in damaged bytes
+    except Exception as error:  # Damaged bytes can raise any error in the library.
         check_room(error, named(path))
         why = cause(error).replace(str(here), source)
     salvage = Salvage(here, files.format)
     if not salvage.count:
         raise LogError(
-            f"{source}: expected a bag ({files.format}), got one that cannot be opened ({why}); {REINDEX}"
+            f"{source}: expected a bag ({files.format}), got one that cannot be opened "
+            f"({why}); {REINDEX}"
         )
     files.readers.append(salvage)
     files.notes.append(
-        f"{source} is cut, or was never closed ({why}): its {salvage.count} whole messages are read, {salvage.seconds:.1f} s of the drive. What came after is lost."
+        f"{source} is cut, or was never closed ({why}): its {salvage.count} whole messages "
+        f"are read, {salvage.seconds:.1f} s of the drive. What came after is lost."
     )
 
 
 def _by_rosbags(path: Path, format: str, stack: ExitStack) -> Any:
-    """An open reader of rosbags, which closes with the stack."""
+    """An open reader of rosbags, which the stack closes."""
     from rosbags import rosbag1, rosbag2
 
     reader: Any = rosbag1.Reader(path) if format == "ros1" else rosbag2.Reader(path)
@@ -184,7 +198,7 @@ def _by_rosbags(path: Path, format: str, stack: ExitStack) -> Any:
 
 
 def _copied(file: IO[bytes], here: Path, source: str) -> list[str]:
-    """Unpack a file, as far as it is whole, and say where it is not."""
+    """Unpack a file as far as it is intact; return a note if it is not."""
     with here.open("wb") as copy:
         try:
             copied(unpacked(file, source), copy, source)
@@ -197,7 +211,7 @@ def _copied(file: IO[bytes], here: Path, source: str) -> list[str]:
 
 
 def _format(path: Path) -> str | None:
-    """The format of a file by what it holds; None where that cannot be told."""
+    """The format of a file by its content; None if unknown."""
     try:
         with path.open("rb") as file:
             return format_of(unpacked(file, named(path)).read(HEAD))
@@ -213,25 +227,28 @@ def _drive(part: Path) -> str:
 
 
 def _number(part: Path) -> tuple[int, str]:
-    """By what parts are sorted: their numbers, and then their names."""
+    """Key that sorts parts by number, then by name."""
     found = PART.match(NAMES.sub("", part.name))
     return int(found["number"]) if found else -1, part.name
 
 
 def _gaps(parts: list[Path]) -> list[str]:
-    """What is to be said of the numbers of parts that are not there."""
+    """Notes on missing numbers of parts."""
     numbers = [number for number, _ in map(_number, parts) if number >= 0]
     missing = sorted(set(range(max(numbers, default=-1))) - set(numbers))
     if not missing:
         return []
     listed = ", ".join(map(str, missing[:5])) + (", …" if len(missing) > 5 else "")
     return [
-        f"Of the drive that {named(parts[-1].name)} is a part of, these parts are not there: {listed}. What they hold is missing."
+        (
+            f"Of the drive that {named(parts[-1].name)} is a part of, these parts are not there: "
+            f"{listed}. What they hold is missing."
+        )
     ]
 
 
 def _beside(path: Path) -> list[str]:
-    """What is to be said where one part of several is read alone."""
+    """Notes if one of several parts is read alone."""
     number, _ = _number(path)
     if number < 0 or not NAMES.search(path.name):
         return []
@@ -248,17 +265,20 @@ def _beside(path: Path) -> list[str]:
             ", …" if len(with_it) > 3 else ""
         )
         return [
-            f"{named(path)} is one part of a drive, and is read alone. Beside it lie {names}: name the folder to read all of them."
+            (
+                f"{named(path)} is one part of a drive, and is read alone. Beside it lie {names}: "
+                "name the folder to read all of them."
+            )
         ]
     return _gaps([path])
 
 
 def check_room(error: Exception, source: str) -> None:
-    """Raise LogError where a disk is full, and nothing is wrong with the bag."""
+    """Raise LogError if a disk is full, which is no fault of the bag."""
     if is_full(error):
         raise no_room(source) from None
 
 
 def cause(error: Exception) -> str:
-    """The first line of what a library says."""
+    """The first line of the message of an error."""
     return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")[:200]

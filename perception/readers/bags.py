@@ -1,13 +1,19 @@
-"""Reader of ROS bags, by the package rosbags (extra `ros`): files of ROS 1, folders and files of ROS 2, and MCAP. No ROS needs to be installed.
+"""Reads ROS bags: files of ROS 1, folders and files of ROS 2, and MCAP.
 
-Read are the laser's scans (sensor_msgs/LaserScan, or the first echoes of MultiEchoLaserScan), the odometer's poses (nav_msgs/Odometry) and the transforms between frames
-(tf2_msgs/TFMessage), as ROS calls frames (REP 105):
+It uses the package rosbags (extra `ros`); ROS itself need not be installed. It reads the laser's
+scans (sensor_msgs/LaserScan, or the first echoes of MultiEchoLaserScan), the odometer's poses
+(nav_msgs/Odometry) and the transforms between frames (tf2_msgs/TFMessage), with frames named as in
+REP 105:
 
-- Odometry is the pose in messages of Odometry, and where there are none the transform from `odom` to the robot. It is interpolated at the time of each scan.
-- The laser's mount is the transform from the robot's frame to that of the scan, for each scan by the frame that it names. A laser that hangs upside down turns clockwise.
-- Where somebody localised the robot, so that there are transforms from `map` to `odom`, the scans have corrected poses.
+- Odometry is the pose in Odometry messages. Without these, it is the transform from `odom` to the
+  robot. It is interpolated at the time of each scan.
+- The mount of the laser is the transform from the frame of the robot to the frame that the scan
+  names. A laser that hangs upside down turns clockwise.
+- If the robot was localised, so that there are transforms from `map` to `odom`, the scans have
+  corrected poses.
 
-Times are those of the messages' headers. Where these contradict themselves or each other, they are the times at which messages were recorded (`poses`).
+Times come from the headers of the messages. If these contradict themselves or each other, the times
+of recording are used (`poses`).
 """
 
 from __future__ import annotations
@@ -37,7 +43,7 @@ SCANS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan")
 ODOMETRY = ("nav_msgs/msg/Odometry",)
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 NANO = 1e-9
-# A transform that never moves differs from one message to the next by rounding alone: metres and radians.
+# Largest difference of the messages of a fixed transform, from rounding: metres and radians.
 FIXED = (0.01, 0.01)
 
 
@@ -47,13 +53,16 @@ class _Damaged(Exception):  # noqa: N818 - becomes a Damage
 
 @dataclass
 class _Frame:
-    """The transform from a frame's parent to the frame.
+    """The transform from a parent frame to a frame.
 
-    translation, rotation  the last one, (3,) and (3, 3)
-    first                  the first one, in the plane
-    track                  those that came over time, in the plane; None for one that never changes
-    count                  how many came
-    off                    by how much others differ from the first, at most, in metres and radians
+    Attributes:
+        parent: Name of the parent frame.
+        translation: (3,) last translation.
+        rotation: (3, 3) last rotation.
+        first: First transform in the plane.
+        track: Transforms over time in the plane; None for a static one.
+        count: Number of messages.
+        off: Largest difference from the first one, in metres and radians.
     """
 
     parent: str
@@ -69,12 +78,20 @@ class _Frame:
         return self.off[0] <= FIXED[0] and self.off[1] <= FIXED[1]
 
 
-# The transforms to each frame, by its parents. A frame should have one parent, but some have more.
+# The transforms to each frame, by parent. A frame should have one parent, but some have several.
 _Frames = dict[str, dict[str, _Frame]]
 
 
 class Bag:
-    """An open bag."""
+    """An open bag.
+
+    Attributes:
+        readers: Readers of rosbags, one for each part.
+        format: `ros1`, `ros2` or `mcap`.
+        notes: Notes on the files.
+        source: Name of the bag.
+        deserialize: Turns bytes of a message kind into a message.
+    """
 
     def __init__(self, files: bag_files.Files, store: Any, source: str) -> None:
         self.readers, self.format, self.notes, self.source = (
@@ -92,7 +109,7 @@ class Bag:
         return [connection for reader in self.readers for connection in reader.connections]
 
     def topics(self, *kinds: str) -> dict[str, int]:
-        """The topics of some kinds, or all, and how many messages each has."""
+        """The topics of these kinds, or all topics, with the number of messages."""
         counts: dict[str, int] = {}
         for connection in self.connections:
             if not kinds or connection.msgtype in kinds:
@@ -100,7 +117,7 @@ class Bag:
         return counts
 
     def listed(self) -> str:
-        """All topics with their kinds, as messages list them."""
+        """All topics with their kinds, for error messages."""
         topics = dict.fromkeys(
             f"{c.topic} ({c.msgtype.rpartition('/')[2]})" for c in self.connections
         )
@@ -109,7 +126,12 @@ class Bag:
         )
 
     def messages(self, topics: set[str]) -> Iterator[tuple[Any, int, float, Any]]:
-        """The messages of some topics: connection, number among those of the topic, time of recording, and the message, or the Damage that it is."""
+        """Read the messages of some topics.
+
+        Yields:
+            The connection, the number within the topic, the time of recording, and the message or
+            its Damage.
+        """
         from rosbags.serde import SerdeError
 
         numbers = dict.fromkeys(topics, 0)
@@ -121,11 +143,14 @@ class Bag:
                     connection, time, raw = next(stored)
                 except StopIteration:
                     break
-                except Exception as error:  # whatever a library runs into in damaged bytes
+                except Exception as error:  # Damaged bytes can raise any error in the library.
                     bag_files.check_room(error, self.source)
                     number = sum(numbers.values()) + 1
                     where = " and ".join(sorted(topics))
-                    what = f"{where}: expected a message, got damaged data ({cause(error)}); what follows was not read"
+                    what = (
+                        f"{where}: expected a message, got damaged data ({cause(error)}); what "
+                        "follows was not read"
+                    )
                     yield connections[0], number, 0.0, Damage(number, what)
                     break
                 topic = connection.topic
@@ -138,13 +163,16 @@ class Bag:
                         self.deserialize(raw, connection.msgtype),
                     )
                 except (SerdeError, ValueError, IndexError) as error:
-                    what = f"{topic}: expected a message {connection.msgtype.rpartition('/')[2]}, got damaged data ({cause(error)})"
+                    what = (
+                        f"{topic}: expected a message {connection.msgtype.rpartition('/')[2]}, "
+                        f"got damaged data ({cause(error)})"
+                    )
                     yield connection, numbers[topic], time * NANO, Damage(numbers[topic], what)
 
 
 @contextmanager
 def opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
-    """An open bag of a format. Raises LogError."""
+    """Open a bag of a format. Raises LogError."""
     with bag_files.opened(Path(path), format) as files:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -158,15 +186,18 @@ def opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
 
 
 def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Reading:
-    """A bag, surveyed.
+    """Survey a bag, so that its scans can be read.
 
     Args:
         bag: The open bag.
-        scan_topics: The topics of the scans; none for the only one.
-        odom_topic: The topic of the odometry; None for the only one, or for transforms.
+        scan_topics: Topics of the scans; none for the only one.
+        odom_topic: Topic of the odometry; None for the only one, or for transforms.
+
+    Returns:
+        The notes and the scans.
 
     Raises:
-        LogError: It holds no scan or no odometry, or several topics could be meant and none is named.
+        LogError: There are no scans or no odometry, or several topics and none is named.
     """
     notes = list(bag.notes)
     scans = _scan_topics(bag, scan_topics)
@@ -183,7 +214,8 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Readin
     else:
         odometer, odom, base = _odometer_of_transforms(bag, frames, frame)
         notes.append(
-            f"Scans are those of {said}. There are no messages Odometry: odometry is the transform from {odom} to {base}."
+            f"Scans are those of {said}. There are no messages Odometry: odometry is the "
+            f"transform from {odom} to {base}."
         )
         called = f"the transforms from {odom} to {base}"
     odometer = _of_one_source(odometer, called, notes)
@@ -191,8 +223,11 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Readin
     mounts = {frame: _mount(frames, odom, base, frame, notes, assumed) for frame in seen}
     if len(seen) > 1:
         notes.append(
-            f"The scans are of several frames ({', '.join(f'{count} of {name}' for name, count in seen.most_common())}): each is mounted as its own frame says."
+            "The scans are of several frames "
+            f"({', '.join(f'{count} of {name}' for name, count in seen.most_common())}): each "
+            "is mounted as its own frame says."
         )
+    # Transforms above the frame of the odometry correct its poses.
     above = [
         track
         for child in _ancestors(frames, odom)
@@ -218,17 +253,18 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Readin
 
 
 def _scan_topics(bag: Bag, named: Sequence[str]) -> list[str]:
-    """The topics of the scans. Raises LogError where there are none, or several and none is named."""
+    """The topics of the scans. Raises LogError if there are none, or several and none is named."""
     found = [_chosen(bag, SCANS, name, "scan") for name in named or (None,)]
     if found == [None]:
         raise LogError(
-            f"{bag.source}: expected scans (messages LaserScan), got none; topics: {bag.listed()}; record the laser, too"
+            f"{bag.source}: expected scans (messages LaserScan), got none; topics: "
+            f"{bag.listed()}; record the laser, too"
         )
     return list(dict.fromkeys(topic for topic in found if topic is not None))
 
 
 def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> str | None:
-    """The topic of some kinds: the one that is named, or the only one; None where there is none."""
+    """The topic of these kinds: the named one or the only one; None if there is none."""
     counts = {topic: count for topic, count in bag.topics(*kinds).items() if count}
     short = kinds[0].rpartition("/")[2]
     listed = (
@@ -239,19 +275,21 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
         match = [topic for topic in counts if topic.strip("/") == name.strip("/")]
         if not match:
             raise LogError(
-                f"{bag.source}: --{option}-topic: expected a topic of {short}, got {brief(name)}; those in the bag: {listed}"
+                f"{bag.source}: --{option}-topic: expected a topic of {short}, got "
+                f"{brief(name)}; those in the bag: {listed}"
             )
         return match[0]
     if len(counts) > 1:
         several = ", once for each that is to be read" if option == "scan" else ""
         raise LogError(
-            f"{bag.source}: expected one topic of {short}, got {len(counts)}: {listed}; name one with --{option}-topic{several}"
+            f"{bag.source}: expected one topic of {short}, got {len(counts)}: {listed}; name "
+            f"one with --{option}-topic{several}"
         )
     return next(iter(counts), None)
 
 
 def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float64]], Counter[str]]:
-    """The two times of the scans of each topic, (n, 2), and how many scans name each frame."""
+    """The two times of the scans of each topic, (n, 2), and the number of scans of each frame."""
     times: dict[str, list[tuple[float, float]]] = {}
     frames: Counter[str] = Counter()
     for connection, _, recorded, message in bag.messages(set(topics)):
@@ -268,7 +306,7 @@ def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float
 def _odometer(
     bag: Bag, topic: str, damaged: list[Damage], notes: list[str]
 ) -> tuple[Track, str, str]:
-    """The odometer's poses, the frame in which they are, and the robot's frame. Raises LogError."""
+    """The poses of the odometer, their frame, and the frame of the robot. Raises LogError."""
     tracks: dict[tuple[str, str, str], Track] = {}
     for connection, number, recorded, message in bag.messages({topic}):
         if isinstance(message, Damage):
@@ -288,6 +326,7 @@ def _odometer(
         tracks.setdefault(source, Track()).add(_stamp(message.header), recorded, flat)
     if not tracks:
         raise LogError(f"{bag.source}: expected odometry in {topic}, got none that can be read")
+    # Several programs may publish one topic: take the longest track, preferably from a frame odom.
     best = max(tracks, key=lambda source: (len(tracks[source].numbers), "odom" in source[0]))
     if len(tracks) > 1:
 
@@ -299,13 +338,14 @@ def _odometer(
             f"{len(track.table())} {told(source)}" for source, track in tracks.items()
         )
         notes.append(
-            f"Several sources publish {topic}: {listed}. Those {told(best)} are read; record each source to a topic of its own."
+            f"Several sources publish {topic}: {listed}. Those {told(best)} are read; record "
+            "each source to a topic of its own."
         )
     return tracks[best], best[0], best[1]
 
 
 def _odometer_of_transforms(bag: Bag, frames: _Frames, frame: str) -> tuple[Track, str, str]:
-    """The same of the transforms from `odom` to the robot. Raises LogError."""
+    """The same as `_odometer`, from the transforms from `odom` to the robot. Raises LogError."""
     chain = [(child, _parent(frames, child)) for child in _ancestors(frames, frame)]
     moving = [(child, one) for child, one in chain if one.track is not None]
     found = next(
@@ -313,7 +353,8 @@ def _odometer_of_transforms(bag: Bag, frames: _Frames, frame: str) -> tuple[Trac
     ) or next(iter(moving), None)
     if found is None:
         raise LogError(
-            f"{bag.source}: expected odometry (messages Odometry, or transforms from odom to the frame {frame!r} of the scans), got none; topics: {bag.listed()}"
+            f"{bag.source}: expected odometry (messages Odometry, or transforms from odom to "
+            f"the frame {frame!r} of the scans), got none; topics: {bag.listed()}"
         )
     base, edge = found
     assert edge.track is not None
@@ -321,7 +362,7 @@ def _odometer_of_transforms(bag: Bag, frames: _Frames, frame: str) -> tuple[Trac
 
 
 def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
-    """The poses of one source, where those of several alternate."""
+    """The poses of the first source, if those of several sources alternate."""
     sources = sources_of(track)
     if len(sources) == 1:
         return track
@@ -334,14 +375,18 @@ def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
     here, there = Poses.of(first, False), Poses.of(second, False)
     apart = max(math.dist(here.at(time)[:2], there.at(time)[:2]) for time in there.times)
     notes.append(
-        f"Several sources publish {called}, whose poses alternate, up to {apart:.1f} m apart: {len(sources[0])} and {len(sources[1])} of {len(table)} messages. "
+        f"Several sources publish {called}, whose poses alternate, up to {apart:.1f} m apart: "
+        f"{len(sources[0])} and {len(sources[1])} of {len(table)} messages. "
         "The first of these is read; stop the other, and record again, if it is the better one."
     )
     return first
 
 
 def _frames(bag: Bag, seen: set[str], damaged: list[Damage]) -> _Frames:
-    """The transforms to frames. Those that change are kept over time for the ancestors of the scans' frames alone, as a robot has many joints."""
+    """Read the transforms. Only the ancestors of the scans' frames keep theirs over time.
+
+    A robot has many joints, whose transforms are not needed.
+    """
     frames: _Frames = {}
     topics = set(bag.topics(*TRANSFORMS))
     fixed = {topic for topic in topics if topic.endswith("tf_static")}
@@ -369,7 +414,7 @@ def _frames(bag: Bag, seen: set[str], damaged: list[Damage]) -> _Frames:
 
 
 def _heard(frames: _Frames, child: str, parent: str, transform: Any, is_static: bool) -> _Frame:
-    """The transform to a frame, once another message of it came. Raises _Damaged."""
+    """Record a message of the transform to a frame. Raises Damaged."""
     move, turn = transform.translation, transform.rotation
     flat = _flat(move, turn)
     parents = frames.setdefault(child, {})
@@ -377,7 +422,7 @@ def _heard(frames: _Frames, child: str, parent: str, transform: Any, is_static: 
     if edge is None or (edge.track is None) != is_static:
         edge = _Frame(parent, np.zeros(3), np.eye(3), flat, None if is_static else Track())
     parents.pop(parent, None)
-    parents[parent] = edge  # the last parent comes last
+    parents[parent] = edge  # The last parent comes last.
     edge.translation = np.array([move.x, move.y, move.z])
     if edge.track is None or edge.count == 0 or edge.off != (0.0, 0.0) or flat != edge.first:
         edge.rotation = _rotation(turn)
@@ -388,13 +433,16 @@ def _heard(frames: _Frames, child: str, parent: str, transform: Any, is_static: 
 
 
 def _parent(frames: _Frames, child: str) -> _Frame:
-    """The transform to a frame from its parent: from the frame of the odometry where that is one of several, else from the one that came last."""
+    """The transform to a frame from its parent.
+
+    With several parents, it is a frame of the odometry, or else the last one.
+    """
     parents = list(frames[child].values())
     return next((one for one in parents if "odom" in one.parent.rpartition("/")[2]), parents[-1])
 
 
 def _ancestors(frames: _Frames, frame: str) -> list[str]:
-    """The frame, its parent, and so on, as far as there are transforms to them."""
+    """The frame, its parent and so on, as far as transforms lead."""
     chain: list[str] = []
     while frame in frames and frame not in chain:
         chain.append(frame)
@@ -405,11 +453,12 @@ def _ancestors(frames: _Frames, frame: str) -> list[str]:
 def _mount(
     frames: _Frames, odom: str, base: str, frame: str, notes: list[str], assumed: dict[str, str]
 ) -> tuple[Pose, bool]:
-    """The laser's pose in the frame of the robot, and whether it hangs upside down."""
+    """The pose of the laser in the frame of the robot, and whether it hangs upside down."""
     if base == frame:
         return (0.0, 0.0, 0.0), False
     chain = _ancestors(frames, frame)
     parents = [_parent(frames, child).parent for child in chain]
+    # If the robot's frame is unknown, the frame below the odometry's is the robot.
     top = (
         parents.index(base)
         if base in parents
@@ -419,7 +468,8 @@ def _mount(
     )
     if top is None:
         assumed["mount"] = (f"{assumed['mount']} " if "mount" in assumed else "") + (
-            f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser ({frame}): the laser is taken to sit in the robot's middle and to look ahead. "
+            f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser "
+            f"({frame}): the laser is taken to sit in the robot's middle and to look ahead. "
             "If it does not, say where it sits: --mount X,Y,DEGREES."
         )
         return (0.0, 0.0, 0.0), False
@@ -431,14 +481,17 @@ def _mount(
         if not edge.is_fixed:
             off, angle = edge.off[0], math.degrees(edge.off[1])
             notes.append(
-                f"The {edge.count} transforms from {edge.parent} to {child}, by which the laser is mounted, contradict each other by up to {off:.2f} m and {angle:.0f} degrees: the last one is used."
+                f"The {edge.count} transforms from {edge.parent} to {child}, by which the "
+                f"laser is mounted, contradict each other by up to {off:.2f} m and "
+                f"{angle:.0f} degrees: the last one is used."
             )
         if len(frames[child]) > 1:
             others = ", ".join(
                 f"{one.parent} ({one.count} transforms)" for one in frames[child].values()
             )
             notes.append(
-                f"The frame {child} has several parents, {others}: that from {edge.parent} is used for the laser's mount."
+                f"The frame {child} has several parents, {others}: that from {edge.parent} is "
+                "used for the laser's mount."
             )
     heading = math.atan2(rotation[1, 0], rotation[0, 0])
     x, y, angle = (round(float(v), 6) for v in (translation[0], translation[1], heading))
@@ -447,10 +500,14 @@ def _mount(
 
 @dataclass(frozen=True)
 class _Where:
-    """Where the robot and its lasers were.
+    """Poses of the robot and its lasers.
 
-    corrections  transforms above the frame of the odometry, the nearest first
-    mounts       by the frame of a scan, the laser's pose in the frame of the robot, and whether it hangs upside down
+    Attributes:
+        odometry: Poses by the odometer.
+        corrections: Transforms above the frame of the odometry, the nearest first.
+        mounts: For each frame of scans, the pose of the laser in the frame of the robot, and
+            whether it hangs upside down.
+        by_stamp: Whether times are those of the headers.
     """
 
     odometry: Poses
@@ -459,11 +516,12 @@ class _Where:
     by_stamp: bool
 
     def at(self, time: float) -> tuple[Pose, Pose | None]:
-        """The pose by the odometer, and the corrected one. Raises _Damaged."""
+        """The pose by the odometer, and the corrected one. Raises Damaged."""
         if not self.odometry.tells(time):
             begin, end = self.odometry.times[[0, -1]]
             raise _Damaged(
-                f"expected odometry at the time of the scan, {time:.3f} s, got it from {begin:.3f} to {end:.3f} s"
+                f"expected odometry at the time of the scan, {time:.3f} s, got it from "
+                f"{begin:.3f} to {end:.3f} s"
             )
         pose = self.odometry.at(time)
         corrected: Pose | None = pose if self.corrections else None
@@ -476,6 +534,7 @@ class _Where:
 def _scans(
     bag: Bag, topics: set[str], where: _Where, damaged: list[Damage]
 ) -> Iterator[Scan | Damage]:
+    """Read the scans, after the damage found so far."""
     yield from damaged
     for connection, number, recorded, message in bag.messages(topics):
         if isinstance(message, Damage):
@@ -491,13 +550,14 @@ def _scans(
 
 
 def _measured(message: Any, mount: Pose, is_flipped: bool) -> tuple[NDArray[np.float64], Laser]:
+    """The ranges of a message and its laser. Raises Damaged."""
     first, step, nearest, reach = (
         float(v)
         for v in (message.angle_min, message.angle_increment, message.range_min, message.range_max)
     )
     if message.__msgtype__ == SCANS[0]:
         ranges = np.array(message.ranges, dtype=np.float64)
-    else:  # where nothing came back there is no echo
+    else:  # A beam without an echo met nothing.
         ranges = np.array(
             [beam.echoes[0] if len(beam.echoes) else np.inf for beam in message.ranges],
             dtype=np.float64,
@@ -526,12 +586,13 @@ def _laser(
 
 
 def _flat(position: Any, orientation: Any) -> Pose:
-    """The pose in the plane. Raises _Damaged where it is none."""
+    """The pose in the plane. Raises Damaged if the numbers are no pose."""
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
     numbers = position.x, position.y, position.z, x, y, z, w
     if not all(map(math.isfinite, numbers)) or x * x + y * y + z * z + w * w < 0.5:
         raise _Damaged(
-            f"expected a position in metres and a quaternion, got {', '.join(f'{v:g}' for v in numbers)}"
+            "expected a position in metres and a quaternion, got "
+            f"{', '.join(f'{v:g}' for v in numbers)}"
         )
     return position.x, position.y, math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
@@ -544,10 +605,10 @@ def _rotation(q: Any) -> NDArray[np.float64]:
 
 
 def _stamp(header: Any) -> float:
-    """The time of a header, in seconds; 0 where there is none."""
+    """The time of a header in seconds; 0 if it is missing."""
     return float(header.stamp.sec + header.stamp.nanosec * NANO)
 
 
 def _name(frame: str) -> str:
-    """A frame's name; in ROS 1 it may begin with a slash."""
+    """The name of a frame, without the slash that it may begin with in ROS 1."""
     return frame.lstrip("/")

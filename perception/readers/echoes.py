@@ -1,14 +1,14 @@
-"""What the ranges of a log mean: which beams came back, which met nothing, and which failed.
+"""Finds out what the ranges of a log mean: which beams hit something, met nothing, or failed.
 
-Drivers say "nothing came back" in many ways: infinity, the laser's largest range, a constant below it,
-0, or NaN. A log rarely says which way is meant, so the whole log is surveyed:
+Drivers encode "nothing came back" in many ways: infinity, the largest range of the laser, a
+constant below it, 0, or NaN. A log rarely says which. So the whole log is surveyed:
 
-- A range that repeats at many poses, and beyond which nothing is seen, is no wall. It means that
+- A range that repeats at many poses, with hardly anything beyond it, is no wall. It means that
   nothing came back.
-- Beams of 0 or NaN mean that nothing came back if the beams beside them are long. If these are like
-  all others, the laser failed there, and nothing is known.
+- Beams of 0 or NaN mean that nothing came back if their neighbours are long. If their neighbours
+  have usual lengths, the laser failed there, and nothing is known.
 
-Notes say what was found out. `Told` holds what the user knows better.
+Notes say what was found. `Told` holds what the user knows better.
 """
 
 from __future__ import annotations
@@ -29,43 +29,46 @@ from ssh_abduction.data.odometry import Pose, between
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-# What a beam that measured nothing means: that nothing is near, or that nothing is known.
+# Meaning of a beam without a measurement: nothing is near, or nothing is known.
 MEANINGS = ("free", "unknown")
-# Kinds of beams that measured nothing, as notes name them. Minus infinity is none of them: it says
-# that something was too near to be measured (REP 117).
+# Kinds of beams without a measurement, as notes name them. Minus infinity is not among them: it
+# means that something was too near to be measured (REP 117).
 KINDS = ("0", "NaN", "below 0", "below the laser's least range")
-# A laser sits within so many metres of the robot's middle.
+# Largest distance in metres from the robot's middle to a laser.
 FARTHEST_MOUNT = 100.0
-# A robot that stands sees each range again. So scans are surveyed if the robot has moved by so many
-# metres or radians since the last one. So many of them are enough.
+# A standing robot sees the same ranges again. So only scans after a motion of this many metres or
+# radians are surveyed, and at most MOST_SURVEYED of them.
 APART, TURNED, MOST_SURVEYED = 0.3, math.radians(20), 500
-# A range that repeats comes in this share of these scans, in so many of them at least, and in this
-# share of their beams. A wall is as far as that from few poses only.
+# A repeated range that means "nothing" occurs in this share of these scans, in at least LEAST_SCANS
+# of them, and in this share of their beams. A wall has the same distance from few poses only.
 SCANS, LEAST_SCANS, BEAMS = 0.1, 5, 0.005
-# It may be noisy: its values differ by such a share at most.
+# Noise of the repeated range, as shares of it, to try in turn.
 NOISES = (1e-5, 0.001, 0.004, 0.016)
-# It is a spike at the end of all ranges: this share of the ranges that are as long lie in it, and it
-# has so many times the ranges of an equal band just below it.
+# The repeated range is a spike at the end of all ranges: it holds this share of the ranges that are
+# as long, and SPIKE times the ranges of an equal band just below.
 NEARLY_ALL, SPIKE = 0.9, 10
-# Beams that measured nothing are worth a note if they are this share of all.
+# Share of all beams from which a kind of beam without a measurement is worth a note.
 WORTH_A_NOTE = 0.01
-# Beams beside beams that met nothing are longer than this share of all beams. Beside beams that
-# failed at random they are as long as others are (0.5).
+# Neighbours of beams that met nothing are longer than this share of all beams. Neighbours of beams
+# that failed at random have usual lengths (0.5).
 LONG = 0.8
 
 
 @dataclass(frozen=True)
 class Told:
-    """What the user says of the laser. None: as the log says, or as it seems.
+    """What the user says about the laser. None means as the log says, or as it seems.
 
-    fov        degrees from the first beam to the last, counterclockwise, around the same middle as in
-               the log; negative if they go clockwise, as of a laser that hangs upside down
-    mount      the laser's place on the robot: metres ahead, metres to the left, degrees to the left
-    no_return  metres from which on a range means that nothing came back
-    zero_is    what a range of 0, below 0, below the laser's least range, or NaN means: "free"
-               (nothing came back) or "unknown" (nothing is known)
+    Attributes:
+        fov: Degrees from the first beam to the last, counterclockwise, around the same middle as in
+            the log. Negative for clockwise beams, as of a laser that hangs upside down.
+        mount: Position of the laser on the robot: metres ahead, metres to the left, degrees to the
+            left.
+        no_return: Metres from which a range means that nothing came back.
+        zero_is: Meaning of a range of 0, below 0, below the laser's least range, or NaN: "free"
+            (nothing came back) or "unknown" (nothing is known).
 
-    Raises LogError for any other value.
+    Raises:
+        LogError: A value is out of range.
     """
 
     fov: float | None = None
@@ -76,7 +79,8 @@ class Told:
     def __post_init__(self) -> None:
         if self.fov is not None and not (is_finite(self.fov) and 0 < abs(self.fov) <= 360):
             raise LogError(
-                f"fov: expected degrees from -360 to 360 other than 0, got {brief(self.fov)}; name the angle that the beams cover"
+                f"fov: expected degrees from -360 to 360 other than 0, got {brief(self.fov)}; "
+                "name the angle that the beams cover"
             )
         if self.mount is not None:
             values = tuple(self.mount) if isinstance(self.mount, Sequence | np.ndarray) else ()
@@ -86,19 +90,22 @@ class Told:
                 or max(map(abs, values[:2])) > FARTHEST_MOUNT
             ):
                 raise LogError(
-                    f"mount: expected metres ahead, metres to the left, and degrees, got {brief(self.mount)}; name these three"
+                    "mount: expected metres ahead, metres to the left, and degrees, got "
+                    f"{brief(self.mount)}; name these three"
                 )
         if self.no_return is not None and not (is_finite(self.no_return) and self.no_return > 0):
             raise LogError(
-                f"no_return: expected metres above 0, got {brief(self.no_return)}; name the range that means nothing came back"
+                f"no_return: expected metres above 0, got {brief(self.no_return)}; name the "
+                "range that means nothing came back"
             )
         if self.zero_is is not None and self.zero_is not in MEANINGS:
             raise LogError(
-                f"zero_is: expected {' or '.join(MEANINGS)}, got {brief(self.zero_is)}; name one of these"
+                f"zero_is: expected {' or '.join(MEANINGS)}, got {brief(self.zero_is)}; name "
+                "one of these"
             )
 
     def placed(self, scan: Scan) -> Scan:
-        """A scan whose laser looks where the user says."""
+        """The scan with a laser that points as the user says."""
         laser = scan.laser
         if self.fov is not None:
             middle, fov = laser.first + laser.step * laser.steps / 2, math.radians(self.fov)
@@ -109,22 +116,23 @@ class Told:
         return scan if laser is scan.laser else replace(scan, laser=laser)
 
     def reach(self, reach: float) -> float:
-        """How far a laser reaches, of which the log says how far it does."""
+        """The reach of a laser in metres, by the user or else by the log."""
         # The ranges may have been rounded to single precision.
         return reach if self.no_return is None else self.no_return * (1 - 1e-6)
 
     @property
     def free(self) -> frozenset[str]:
-        """The kinds of beams that met nothing, as the user says."""
+        """The kinds of beams that met nothing, according to the user."""
         return frozenset(KINDS if self.zero_is == "free" else ())
 
 
 @dataclass(frozen=True)
 class Meaning:
-    """What the ranges of a laser mean.
+    """Meaning of the ranges of a laser.
 
-    reach  metres from which on a range says that nothing came back
-    free   the kinds of beams without a measurement that say the same, of KINDS
+    Attributes:
+        reach: Metres from which a range means that nothing came back.
+        free: Kinds of beams without a measurement, of KINDS, that mean the same.
     """
 
     reach: float
@@ -136,21 +144,22 @@ def understood(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], tup
 
     Args:
         scans: The scans, with ranges as the driver wrote them.
-        told: What the user says. What it leaves open is surveyed.
+        told: What the user says. The survey finds the rest.
 
     Returns:
-        The scans with ranges as `Scan` describes them, and notes on what was found out.
+        The scans with ranges as `Scan` describes them, and notes on what was found.
 
     Raises:
-        LogError: The user says where the laser sits, but the scans are those of several lasers.
+        LogError: The user gives one mount, but the scans come from several lasers.
     """
     lasers = len({scan.laser.mount for scan in scans})
     if told.mount is not None and lasers > 1:
         raise LogError(
-            f"mount: expected the scans of one laser, got those of {lasers}; leave it out (--mount), or read the topic of one laser (--scan-topic)"
+            f"mount: expected the scans of one laser, got those of {lasers}; leave it out "
+            "(--mount), or read the topic of one laser (--scan-topic)"
         )
     placed = [told.placed(scan) for scan in scans]
-    # A log may have several lasers. The number of beams of one may differ from scan to scan.
+    # A log may have several lasers. The number of beams of a laser may change from scan to scan.
     groups: dict[tuple[float, float, Pose], list[int]] = defaultdict(list)
     for i, scan in enumerate(placed):
         groups[scan.laser.reach, scan.laser.nearest, scan.laser.mount].append(i)
@@ -168,7 +177,7 @@ def understood(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], tup
 
 
 def as_told(scan: Scan, told: Told) -> Scan:
-    """Read the ranges of a single scan, of whose log nothing else is known.
+    """Interpret the ranges of a single scan without its log.
 
     Args:
         scan: The scan, with ranges as the driver wrote them.
@@ -182,7 +191,7 @@ def as_told(scan: Scan, told: Told) -> Scan:
 
 
 def moving(scans: Iterable[Scan]) -> list[Scan]:
-    """The scans before which the robot moved since the one before, by odometry."""
+    """The scans before which the robot moved, by odometry."""
     kept: list[Scan] = []
     for scan in scans:
         dx, dy, turned = between(kept[-1].odometry, scan.odometry) if kept else (APART, 0.0, 0.0)
@@ -192,7 +201,7 @@ def moving(scans: Iterable[Scan]) -> list[Scan]:
 
 
 def _measured(scan: Scan, meaning: Meaning) -> Scan:
-    """A scan whose ranges are infinite where nothing came back, and NaN where nothing is known."""
+    """The scan with infinite ranges where nothing came back, and NaN where nothing is known."""
     ranges, kinds = scan.ranges.copy(), _kinds(scan)
     with np.errstate(invalid="ignore"):
         ranges[scan.ranges >= meaning.reach] = np.inf
@@ -208,7 +217,7 @@ def _measured(scan: Scan, meaning: Meaning) -> Scan:
 
 
 def _kinds(scan: Scan) -> dict[str, Bools]:
-    """Which beams are of each of KINDS."""
+    """Masks of the beams of each of KINDS."""
     ranges = scan.ranges
     with np.errstate(invalid="ignore"):
         near = (ranges > 0) & (ranges <= scan.laser.nearest)
@@ -217,7 +226,7 @@ def _kinds(scan: Scan) -> dict[str, Bools]:
 
 
 def _surveyed(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
-    """What the ranges of a laser mean, and what is to be said of that."""
+    """The meaning of the ranges of one laser, and notes on it."""
     laser, notes = scans[0].laser, list[str]()
     reach = told.reach(laser.reach)
     if told.no_return is None and (repeated := _repeated(scans)) is not None:
@@ -228,12 +237,13 @@ def _surveyed(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
             else ""
         )
         notes.append(
-            f"Ranges of {reach:.4g} m repeat in {_percent(share)} of the beams, and hardly any are longer{but}. "
+            f"Ranges of {reach:.4g} m repeat in {_percent(share)} of the beams, and hardly any are "
+            f"longer{but}. "
             "They are taken to mean that nothing came back. If they are walls, "
             "say how far the laser reaches: --no-return METRES."
         )
     if not math.isfinite(reach):
-        # The largest range itself was measured.
+        # The largest range itself was measured, so the reach lies just above it.
         most = max(
             (float(r.max()) for scan in scans if len(r := scan.ranges[np.isfinite(scan.ranges)])),
             default=0.0,
@@ -241,7 +251,8 @@ def _surveyed(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
         reach = float(np.nextafter(most, math.inf)) if most > 0 else math.inf
         if most > 0:
             notes.append(
-                f"The log does not say how far the laser reaches. By its largest range it is {most:.4g} m. "
+                "The log does not say how far the laser reaches. By its largest range it is "
+                f"{most:.4g} m. "
                 "If it reaches farther, or less far, say so: --no-return METRES."
             )
     if told.zero_is is not None:
@@ -251,9 +262,10 @@ def _surveyed(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
 
 
 def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
-    """The range that means "nothing came back", and its share of all beams.
+    """Find the range that means "nothing came back".
 
-    None if no range repeats as this one would.
+    Returns:
+        The range, and its share of all beams; None if there is no such range.
     """
     laser = scans[0].laser
     with np.errstate(invalid="ignore"):
@@ -267,7 +279,7 @@ def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
     if len(ranges) < few:
         return None
     for noise in NOISES:
-        # A few stray ranges may be longer. The middle of the spike is found from its upper part.
+        # A few stray ranges may be longer, so the middle of the spike is found from below them.
         middle = float(ranges[-few])
         width = noise * middle
         for _ in range(5):
@@ -286,7 +298,7 @@ def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
 
 
 def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset[str], list[str]]:
-    """The kinds of beams that met nothing, and what is to be said of beams without a measurement."""
+    """Find the kinds of beams that met nothing, and describe beams without a measurement."""
     counts = dict.fromkeys(KINDS, 0)
     beside: dict[str, list[Array]] = {kind: [] for kind in KINDS}
     lengths: list[Array] = []
@@ -298,7 +310,7 @@ def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset
         for kind, is_of_kind in _kinds(scan).items():
             counts[kind] += int(is_of_kind.sum())
             if len(good) and is_of_kind.any():
-                # The longer one of the next measured beams on both sides.
+                # The longer of the next measured beams on both sides.
                 after = np.searchsorted(good, np.flatnonzero(is_of_kind))
                 before, behind = np.maximum(after - 1, 0), np.minimum(after, len(good) - 1)
                 beside[kind].append(np.maximum(ranges[before], ranges[behind]))
@@ -321,8 +333,10 @@ def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset
             ("nothing came back", "unknown") if is_free else ("nothing is known there", "free")
         )
         notes.append(
-            f"{_percent(count / beams)} of the beams are {kind}. The beams beside them are {typical:.2g} m long, where "
-            f"{usual:.2g} m is usual. So they are taken to mean that {taken}. If that is wrong, say --zero-is {other}."
+            f"{_percent(count / beams)} of the beams are {kind}. The beams beside them are "
+            f"{typical:.2g} m long, where "
+            f"{usual:.2g} m is usual. So they are taken to mean that {taken}. If that is wrong, "
+            f"say --zero-is {other}."
         )
     return frozenset(free), notes
 

@@ -1,4 +1,4 @@
-"""A graph of poses, as g2o and TORO keep it: vertices with corrected poses, and edges with the relative motions from which these were computed.
+"""A pose graph of g2o or TORO: vertices with corrected poses, and edges with relative motions.
 
 >>> from perception.readers.graphs import Graph
 >>> graph = Graph()
@@ -23,17 +23,20 @@ from numpy.typing import NDArray
 
 from ssh_abduction.data.odometry import Pose, between, moved
 
-# Two poses are the same up to such a difference in metres and radians: numbers in a log are rounded.
+# Equal poses differ by at most this, in metres and radians, since numbers in a log are rounded.
 ROUNDED = 2e-3
-# From a vertex to the next in the file there may be no edge, as the line of one between them is damaged: so many may be between them.
+# Between two vertices that follow each other in the file, at most this many may be missing because
+# their lines are damaged.
 MOST_BETWEEN = 100
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Odometry at each vertex, in the order of the file: the edges from each vertex to the next, one behind the other.
+    """Odometry at each vertex, in the order of the file, chained from the edges.
 
-    gaps  the vertices before which no edge tells how the robot moved, so that it seems to have stood still
+    Attributes:
+        poses: Pose at each vertex.
+        gaps: Vertices before which no edge tells the motion; the robot seems to have stood still.
     """
 
     poses: tuple[Pose, ...]
@@ -42,7 +45,14 @@ class Chain:
 
 @dataclass
 class Graph:
-    """Vertices, each a number and a pose, in the order of the file, and edges, by the numbers of their ends. Complete once it is asked for anything else."""
+    """Vertices in the order of the file, and edges by the numbers of their ends.
+
+    Add all vertices and edges before using the methods, which cache their results.
+
+    Attributes:
+        vertices: Number and pose of each vertex.
+        edges: Motion along each edge.
+    """
 
     vertices: list[tuple[int, Pose]] = field(default_factory=list)
     edges: dict[tuple[int, int], Pose] = field(default_factory=dict)
@@ -59,7 +69,7 @@ class Graph:
         return Chain(tuple(poses), tuple(gaps))
 
     def _motion(self, start: int, end: int) -> Pose | None:
-        """The motion from one vertex to another, over those between where there is no edge."""
+        """The motion between vertices, over the vertices between if there is no edge."""
         if (motion := self.edges.get((start, end))) is not None:
             return motion
         if (back := self.edges.get((end, start))) is not None:
@@ -74,7 +84,7 @@ class Graph:
         return motion
 
     def is_corrected(self, farthest: float) -> bool:
-        """Whether the poses of the vertices are others than odometry, somewhere by more than so many metres."""
+        """Whether a vertex differs from odometry by more than this many metres."""
         first = self.vertices[0][1]
         return any(
             math.dist(between(first, pose)[:2], odometry[:2]) > farthest
@@ -82,14 +92,14 @@ class Graph:
         )
 
     def index_at(self, pose: Pose, guess: int | None = None) -> int | None:
-        """The index of the vertex that has a pose, first the one that is guessed; None where none has it."""
+        """The index of the vertex with this pose, trying the guess first; None if there is none."""
         if guess is not None and same_pose(self.vertices[guess][1], pose):
             return guess
         near: list[int] = self._tree.query_ball_point(pose[:2], 2 * ROUNDED)
         return next((i for i in sorted(near) if same_pose(self.vertices[i][1], pose)), None)
 
     def share_at_vertices(self, poses: Sequence[float]) -> float:
-        """Of some poses, whose numbers follow each other, the share that vertices have."""
+        """Share of the poses, given as consecutive numbers, that are poses of vertices."""
         table: NDArray[np.float64] = np.reshape(poses, (-1, 3))
         last = len(self.vertices) - 1
         at = sum(

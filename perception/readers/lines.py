@@ -1,6 +1,7 @@
-"""The lines of a log, plain or packed, one at a time: a log of hours is never in memory as a whole, and a line without an end is not either.
+"""Reads the lines of a log, plain or packed, one at a time.
 
-A packed file is known by its first bytes, whatever its name: gzip, bzip2, xz or zstd.
+Neither a log of hours nor a line without an end is ever in memory as a whole. A packed file is
+recognised by its first bytes: gzip, bzip2, xz or zstd.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from typing import IO, Any, cast
 from perception.errors import LogError
 from ssh_abduction.data.errors import named
 
-# What is longer is no line of a log: a scan of 10,000 beams is 100 kB.
+# Longer lines are skipped: a scan of 10,000 beams is 100 kB.
 LONGEST_LINE = 2**20
-# How packed files begin, what packs them, and what unpacks them.
+# First bytes of packed files, with the packer and the command that unpacks them.
 PACKERS = {
     b"\x1f\x8b": ("gzip", "zcat"),
     b"BZh": ("bzip2", "bzcat"),
@@ -36,15 +37,16 @@ PACKERS = {
 
 @contextmanager
 def opened(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
-    """The bytes of a file that can be read more than once. A pipe is copied to a temporary file, as it can be read only once.
+    """Open a file so that it can be read more than once. A pipe is copied to a temporary file.
 
-    Raises LogError.
+    Raises:
+        LogError: The file cannot be read.
     """
     try:
         file = Path(path).open("rb")  # noqa: SIM115 - it is closed below
     except OSError as error:
         raise _unreadable(path, error) from None
-    except ValueError as error:  # a null character in the path
+    except ValueError as error:  # A null character in the path.
         raise LogError(f"{named(path)}: expected the path of a log: {error}") from None
     try:
         with file:
@@ -68,9 +70,9 @@ def copied(file: IO[bytes], copy: IO[bytes], source: str) -> None:
     """Copy a file to a temporary one.
 
     Args:
-        file: The file, from where it is now.
+        file: The file, from its current position.
         copy: The temporary file.
-        source: The name of the file, for errors.
+        source: Name of the file, for errors.
 
     Raises:
         LogError: The disk of temporary files is full.
@@ -86,12 +88,13 @@ def no_room(source: str) -> LogError:
     """The error that there is no room for temporary files."""
     where = tempfile.gettempdir()
     return LogError(
-        f"{source}: expected room for a temporary copy in {where}, got a full disk; free some, or name another folder (TMPDIR=FOLDER)"
+        f"{source}: expected room for a temporary copy in {where}, got a full disk; free "
+        "some, or name another folder (TMPDIR=FOLDER)"
     )
 
 
 def is_full(error: BaseException) -> bool:
-    """Whether an error, SQLite's too, says that a disk is full."""
+    """Whether an error, also of SQLite, means that a disk is full."""
     return (
         getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
         or type(error).__name__ == "FullError"
@@ -106,17 +109,17 @@ def packer(file: IO[bytes]) -> str | None:
 
 
 def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
-    """The bytes of a file from its beginning, unpacked where it is packed.
+    """Read a file from its beginning, unpacking it if necessary.
 
     Args:
         file: The file.
         source: Its name, for errors.
 
     Returns:
-        A stream, which raises one of `damages()` where packed data are cut or damaged.
+        A stream that raises one of `damages()` if packed data are cut or damaged.
 
     Raises:
-        LogError: The file was packed by zstd, and the package that unpacks it is missing.
+        LogError: The package that unpacks zstd is missing.
     """
     found = packer(file)
     file.seek(0)
@@ -130,14 +133,15 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
     if found == "zstd":
         if (zstd := zstd_module()) is None:
             raise LogError(
-                f"{source}: expected the package backports.zstd to unpack it with (zstd), got none; pip install 'ssh-abduction[ros]', or unpack it with zstd -d"
+                f"{source}: expected the package backports.zstd to unpack it with (zstd), got "
+                "none; pip install 'ssh-abduction[ros]', or unpack it with zstd -d"
             )
         openers["zstd"] = zstd.ZstdFile
     return cast(IO[bytes], openers[found](file))
 
 
 def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
-    """The errors by which the streams of `unpacked` say that packed data are cut (EOFError) or damaged, and some others."""
+    """The errors of the streams of `unpacked` for cut (EOFError) and damaged data, and others."""
     zstd = zstd_module()
     return (
         EOFError,
@@ -150,7 +154,7 @@ def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
 
 
 def zstd_module() -> Any:
-    """Python's module for zstd, or the package of the same content for Pythons before 3.14; None where there is neither."""
+    """Python's zstd module, or its backport for Python before 3.14; None if there is neither."""
     for name in ("compression.zstd", "backports.zstd"):
         try:
             return importlib.import_module(name)
@@ -160,9 +164,18 @@ def zstd_module() -> Any:
 
 
 def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
-    """The lines of a file from its beginning, unpacked if it is packed, whatever its name, each with its number, counted from 1.
+    """Read the lines of a file from its beginning, unpacking it if necessary.
 
-    None stands for a line that is longer than LONGEST_LINE bytes. Raises LogError where packed data are cut or damaged, which says up to where they can be read.
+    Args:
+        file: The file.
+        source: Its name, for errors.
+
+    Yields:
+        The number of the line, from 1, and the line; None for one longer than LONGEST_LINE bytes.
+
+    Raises:
+        LogError: Packed data are cut or damaged; the message says up to which line they can be
+            read.
     """
     found = packer(file)
     stream = unpacked(file, source)
@@ -182,5 +195,6 @@ def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
         what = "they end too early" if isinstance(error, EOFError) else str(error)
         tool = dict(PACKERS.values())[found]
         raise LogError(
-            f"{source}: expected whole data of {found}, but after line {number} {what}; get the file again, or unpack what there is ({tool} FILE > PART) and read that"
+            f"{source}: expected whole data of {found}, but after line {number} {what}; get "
+            f"the file again, or unpack what there is ({tool} FILE > PART) and read that"
         ) from None

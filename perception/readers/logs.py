@@ -1,4 +1,4 @@
-"""From the file of a robot's log to its scans, whatever its format."""
+"""Reads the scans of a robot's log in any of the known formats."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ssh_abduction.data.odometry import Pose
 
 _log = log_of("ssh_abduction.perception.readers")
 
-# The formats of logs, and what each is.
+# Formats of logs, with descriptions.
 LINES = {
     "carmen": "lines of CARMEN: FLASER, ROBOTLASER1 or RAWLASER1, and ODOM",
     "g2o": "lines of g2o or TORO: VERTEX2, EDGE2 and ROBOTLASER1",
@@ -30,7 +30,7 @@ BAGS = {
     "mcap": "a file of MCAP",
 }
 FORMATS = {**LINES, **BAGS}
-# So many bytes at the beginning of a file tell its format.
+# Number of first bytes that tell the format of a file.
 HEAD = 2**16
 
 
@@ -45,13 +45,27 @@ def read_log(
     no_return: float | None = None,
     zero_is: str | None = None,
 ) -> RobotLog:
-    """A robot's log.
+    """Read a robot's log.
 
-    format                  one of FORMATS; where it is None it is guessed from what the file holds, never from its name
-    scan_topic, odom_topic  the topics of a bag that are to be read, where it has several of scans or of odometry. Scans may be those of several topics, in a sequence
-    fov, mount, no_return, zero_is  what the log does not say of the laser, or says wrongly, as in `perception.readers.echoes.Told`
+    Args:
+        path: The file, or the folder of a ROS 2 bag.
+        format: One of FORMATS; None finds it by the content of the file, not by its name.
+        scan_topic: Topic of the scans in a bag, or a sequence of topics; needed if there are
+            several.
+        odom_topic: Topic of the odometry in a bag; needed if there are several.
+        fov: Degrees from the first beam to the last, counterclockwise, if the log lacks it or is
+            wrong. See `perception.readers.echoes.Told` for this and the following arguments.
+        mount: Position of the laser on the robot: metres ahead, metres to the left, degrees to the
+            left.
+        no_return: Metres from which a range means that nothing came back.
+        zero_is: Meaning of ranges that are no measurement: "free" or "unknown".
 
-    What the reader assumed or found out stands in the log's `notes`. A damaged part is skipped, and stands in the log's `damaged`. Raises LogError where the file cannot be read, is of no known format, or holds no scan or no odometry.
+    Returns:
+        The log. Its `notes` say what the reader assumed or found out, and its `damaged` lists
+        skipped parts.
+
+    Raises:
+        LogError: The file cannot be read, has no known format, or holds no scan or no odometry.
     """
     told = Told(fov, mount, no_return, zero_is)
     with _reading(path, format, scan_topic, odom_topic) as reading:
@@ -64,7 +78,8 @@ def read_log(
                 damaged.append(item)
     if not scans:
         raise LogError(
-            f"{named(path)}: expected scans, got none that can be read; {len(damaged)} are damaged, first: {damaged[0].what if damaged else 'none'}"
+            f"{named(path)}: expected scans, got none that can be read; {len(damaged)} are "
+            f"damaged, first: {damaged[0].what if damaged else 'none'}"
         )
     meant, found_out = understood(scans, told)
     assumed = (note for option, note in reading.assumed.items() if getattr(told, option) is None)
@@ -91,9 +106,14 @@ def stream_log(
     no_return: float | None = None,
     zero_is: str | None = None,
 ) -> Iterator[Scan | Damage]:
-    """The scans of a robot's log one after another, and what was skipped, in the order of the file. Arguments and errors as for `read_log`.
+    """Read the scans of a robot's log one at a time, in the order of the file.
 
-    What only the whole log can tell is not found out: a range that repeats is a wall unless `no_return` says otherwise, and zeros are unknown unless `zero_is` does.
+    Arguments and errors are those of `read_log`. The log is not surveyed as a whole: a repeated
+    range is a wall unless `no_return` says otherwise, and zeros are unknown unless `zero_is` says
+    otherwise.
+
+    Yields:
+        Scans, and the parts that were skipped.
     """
     told = Told(fov, mount, no_return, zero_is)
     with _reading(path, format, scan_topic, odom_topic) as reading:
@@ -108,13 +128,15 @@ def _reading(
     scan_topic: str | Sequence[str] | None,
     odom_topic: str | None,
 ) -> Iterator[Reading]:
+    """Open a log of any format."""
     topics = [scan_topic] if isinstance(scan_topic, str) else list(scan_topic or ())
     if format is not None and format not in FORMATS:
         raise LogError(f"format: expected one of {', '.join(FORMATS)}, got {brief(format)}")
     if _is_folder(path):
         if format in LINES:
             raise LogError(
-                f"{named(path)}: expected a file of the format {format}, got a folder; name the file"
+                f"{named(path)}: expected a file of the format {format}, got a folder; name "
+                "the file"
             )
         with bags.opened(path, "ros2") as bag:
             yield bags.read(bag, topics, odom_topic)
@@ -124,7 +146,8 @@ def _reading(
         if found in LINES:
             if topics or odom_topic is not None:
                 raise LogError(
-                    f"{named(path)}: expected a bag, as a topic is named, got the format {found}; leave the topics out"
+                    f"{named(path)}: expected a bag, as a topic is named, got the format "
+                    f"{found}; leave the topics out"
                 )
             yield carmen.read(file, named(path), format)
             return
@@ -135,12 +158,12 @@ def _reading(
 def _is_folder(path: str | os.PathLike[str]) -> bool:
     try:
         return Path(path).is_dir()
-    except ValueError:  # a null character: opening the file says so
+    except ValueError:  # A null character in the path; opening the file reports it.
         return False
 
 
 def _format(file: IO[bytes], source: str) -> str:
-    """The format of a file by what it holds. Raises LogError where it is none of FORMATS."""
+    """The format of a file by its content. Raises LogError if it is none of FORMATS."""
     formats = "; ".join(f"{name} ({what})" for name, what in FORMATS.items())
     head, longest = b"", 0
     for _, line in lines(file, source):
@@ -156,5 +179,6 @@ def _format(file: IO[bytes], source: str) -> str:
     if carmen.looks_like(head):
         return "carmen"
     raise LogError(
-        f"{source}: expected a robot's log, got a file that begins with {brief(head[:40].decode('utf-8', 'replace'))}; formats: {formats}"
+        f"{source}: expected a robot's log, got a file that begins with "
+        f"{brief(head[:40].decode('utf-8', 'replace'))}; formats: {formats}"
     )

@@ -1,4 +1,4 @@
-"""What the lines of CARMEN's, g2o's and TORO's logs say, a line at a time. What a line means for others is no matter of this module."""
+"""Parses single lines of the logs of CARMEN, g2o and TORO."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from perception.readers.lines import LONGEST_LINE
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.odometry import Pose
 
-# Kinds of scans, the best first, as many logs hold each scan more than once: those that say how the laser is made and where it was, then those that lack one of these.
+# Kinds of scans. Many logs hold each scan several times, so the most informative kind comes first:
+# with the geometry of the laser and a pose, without the geometry, without a pose.
 KINDS = ("ROBOTLASER1", "FLASER", "RAWLASER1")
-# The lines of a graph of poses.
+# The lines of a pose graph.
 VERTICES, EDGES = (b"VERTEX2", b"VERTEX_SE2"), (b"EDGE2", b"EDGE_SE2")
-# A scan has at most so many beams.
+# Largest number of beams of a scan.
 MOST_BEAMS = 100_000
-# Poses beyond this, in metres, are no poses of a robot in a building.
+# Poses beyond this, in metres, are not poses of a robot in a building.
 FARTHEST = 1e6
 NAME = re.compile(rb"[A-Za-z][A-Za-z0-9_]*$")
 _PARAMETERS = {
@@ -32,12 +33,21 @@ _PARAMETERS = {
 
 
 class Damaged(Exception):  # noqa: N818 - becomes a Damage
-    """A line of a known kind that cannot be read."""
+    """A line or message of a known kind that cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanLine:
-    """A line that holds a scan. `first` and `second` are its poses, the laser's or a corrected one and the robot's, if it has any."""
+    """A line that holds a scan.
+
+    Attributes:
+        kind: One of KINDS.
+        ranges: (n,) metres.
+        shape: First bearing, step and reach of the laser, if the line has them.
+        first: First pose: that of the laser, or a corrected one, if the line has poses.
+        second: Second pose: that of the robot.
+        time: Seconds.
+    """
 
     kind: str
     ranges: NDArray[np.float64]
@@ -48,7 +58,7 @@ class ScanLine:
 
 
 def words(raw: bytes | None) -> list[bytes]:
-    """The words of a line; none where it is empty or a comment. Raises Damaged for what is no message."""
+    """The words of a line; none for a comment. Raises Damaged if it is no message."""
     if raw is None:
         raise Damaged(f"expected a line of at most {LONGEST_LINE // 2**20} MiB, got a longer one")
     tokens = raw.split()
@@ -60,10 +70,11 @@ def words(raw: bytes | None) -> list[bytes]:
 
 
 def scan_line(tokens: list[bytes]) -> ScanLine | None:
-    """The scan that a line holds; None where the line is of another kind. Raises Damaged."""
+    """The scan in a line; None for another kind of line. Raises Damaged."""
     kind = tokens[0].decode("ascii")
     if kind not in KINDS:
         return None
+    # FLASER has ranges and poses only. The others begin with the geometry of the laser.
     if kind == "FLASER":
         beams, after = _ranges(tokens, 1)
         poses = after
@@ -85,7 +96,8 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
         end = poses if kind == "RAWLASER1" else poses + 11
     if not end <= len(tokens) <= end + 3:
         raise Damaged(
-            f"expected {end} to {end + 3} words in a {kind} of {len(beams)} beams, got {len(tokens)}"
+            f"expected {end} to {end + 3} words in a {kind} of {len(beams)} beams, got "
+            f"{len(tokens)}"
         )
     first, second = (
         (None, None)
@@ -96,7 +108,7 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
 
 
 def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
-    """The ranges whose number stands at a position, and the position after them."""
+    """The ranges whose number is at this position, and the position after them."""
     count = _whole(tokens[at] if at < len(tokens) else b"", "beams")
     if count == 0:
         raise Damaged("expected at least one beam, got none")
@@ -112,6 +124,7 @@ def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
 
 
 def pose_at(tokens: list[bytes], at: int) -> Pose:
+    """The pose at a position. Raises Damaged."""
     if len(tokens) < at + 3:
         raise Damaged(
             f"expected a pose of three numbers after word {at}, got {max(0, len(tokens) - at)}"
@@ -123,24 +136,26 @@ def pose_at(tokens: list[bytes], at: int) -> Pose:
 
 
 def vertex_of(tokens: list[bytes]) -> tuple[int, Pose]:
+    """The number and pose of a vertex. Raises Damaged."""
     return _whole(tokens[1] if len(tokens) > 1 else b"", "vertex"), pose_at(tokens, 2)
 
 
 def edge_of(tokens: list[bytes]) -> tuple[tuple[int, int], Pose]:
+    """The ends and the motion of an edge. Raises Damaged."""
     if len(tokens) < 3:
         raise Damaged("expected an edge between two vertices, got fewer words")
     return (_whole(tokens[1], "vertex"), _whole(tokens[2], "vertex")), pose_at(tokens, 3)
 
 
 def parameters_of(tokens: list[bytes]) -> dict[str, float]:
-    """What a PARAM line says, if it says something of the laser."""
+    """The parameter of the laser in a PARAM line, if there is one."""
     if len(tokens) < 2 or tokens[1] not in _PARAMETERS:
         return {}
     return {_PARAMETERS[tokens[1]]: number_of(tokens[2] if len(tokens) > 2 else b"")}
 
 
 def time_at(tokens: list[bytes], at: int) -> float | None:
-    """The time at a position, if there is one: nothing depends on it, so a time that cannot be read is none."""
+    """The time at a position; None if it is missing or unreadable, as nothing depends on it."""
     if at >= len(tokens) or not _is_number(tokens[at]):
         return None
     time = float(tokens[at])
@@ -148,7 +163,7 @@ def time_at(tokens: list[bytes], at: int) -> float | None:
 
 
 def number_of(word: bytes, may_be_infinite: bool = False) -> float:
-    """A finite number, or any that is written as one. Raises Damaged."""
+    """A number, finite unless `may_be_infinite`. Raises Damaged."""
     if not _is_number(word) or not (math.isfinite(value := float(word)) or may_be_infinite):
         raise Damaged(f"expected a finite number, got {_quoted(word)}")
     return value

@@ -1,6 +1,6 @@
-"""Poses over time, of which each has two times: that of its header, and that at which it was recorded.
+"""Poses over time with two clocks: the time in the header, and the time of recording.
 
-Which of the two clocks can be used, and whose poses they are where two programs publish at once, is told from the messages themselves.
+The messages themselves tell which clock is usable, and whether two programs published at once.
 """
 
 from __future__ import annotations
@@ -18,21 +18,28 @@ from ssh_abduction.data.odometry import Pose
 
 Array = NDArray[np.float64]
 
-# Odometry that ends, or begins, so many seconds beside a scan still tells where the scan was taken.
+# Seconds beyond the ends of the odometry at which a scan still gets a pose.
 BESIDE = 1.0
-# Clocks that differ by more seconds are different clocks.
+# Clocks that differ by more than this many seconds are different clocks.
 SAME_CLOCK = 1.0
-# Clocks are compared once in so many seconds, and at most so many times in a drive: a message may be late by itself.
+# Clocks are compared at intervals of at least COMPARED seconds, at most TIMES times in a drive, by
+# medians, since a single message may be late.
 COMPARED, TIMES = 2.0, 100
-# Poses are those of several sources if they change from one to another at such a share of the messages, and each source has such a share of them.
+# Poses come from several sources if the source changes at this share of the messages and each
+# source has this share of them.
 ALTERNATING = 0.1
-# At most so many sources are told apart.
+# Largest number of sources to distinguish.
 SOURCES = 4
 
 
 @dataclass
 class Track:
-    """Poses over time, which come one after another. A stamp is the time of a header, 0 where there is none."""
+    """Poses over time, in the order of arrival.
+
+    Attributes:
+        numbers: Five numbers for each pose: stamp (0 if the header has none), time of recording, x,
+            y, heading.
+    """
 
     numbers: array[float] = field(default_factory=lambda: array("d"))
 
@@ -46,7 +53,12 @@ class Track:
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses over time, (n,) and (n, 3), in the order of time and with headings that do not jump."""
+    """Poses in the order of time, with continuous headings.
+
+    Attributes:
+        times: (n,) seconds.
+        poses: (n, 3) metres and radians.
+    """
 
     times: Array
     poses: Array
@@ -69,13 +81,16 @@ class Poses:
 
 
 def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
-    """Which times can be used: those of the headers, unless they contradict themselves or each other and those of recording do not.
+    """Choose a clock: the headers, unless they contradict themselves or each other.
+
+    If both clocks are bad, the time of recording is used.
 
     Args:
-        topics: By what they are called, the stamps and the times of recording of the messages, (n, 2) in seconds, in the order of the bag.
+        topics: For each topic, (n, 2) stamps and times of recording in seconds, in the order of the
+            bag.
 
     Returns:
-        Whether the times of the headers are to be used, and what is to be said of the clocks.
+        Whether to use the times of the headers, and notes on the clocks.
     """
     wrong = [text for name, times in topics.items() if (text := _wrong_stamps(name, times[:, 0]))]
     held = [
@@ -89,47 +104,63 @@ def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
         return True, ()
     if not wrong:
         return True, (
-            f"The times of recording are of no use: {'; '.join(held)}. The times in the headers are used.",
+            (
+                f"The times of recording are of no use: {'; '.join(held)}. The times in the "
+                "headers are used."
+            ),
         )
     said = f"The times in the headers contradict themselves: {'; '.join(wrong)}."
     if held:
         return False, (
-            f"{said} The times of recording are no better: {'; '.join(held)}. They are used, but what is made of them may be wrong.",
+            (
+                f"{said} The times of recording are no better: {'; '.join(held)}. They are used, "
+                "but what is made of them may be wrong."
+            ),
         )
     return False, (f"{said} The times of recording are used.",)
 
 
 def _wrong_stamps(name: str, stamps: Array) -> str | None:
-    """What is wrong with the stamps of one topic, in themselves."""
+    """What is wrong with the stamps of one topic; None if nothing is."""
     none = int((stamps == 0).sum())
-    if none == len(stamps) or none > 2:  # a simulated clock may begin at 0
+    if none == len(stamps) or none > 2:  # A simulated clock may begin at 0.
         return f"{none} of {len(stamps)} messages of {name} have none"
     if len(stamps) > 1 and np.ptp(stamps) == 0:
         return f"those of {name} are the same in all {len(stamps)} messages"
     back = np.diff(stamps)
     if len(back) and back.min() < -SAME_CLOCK:
-        return f"those of {name} run back by {-back.min():.1f} s, {int((back < -SAME_CLOCK).sum())} times in {len(stamps)} messages"
+        return (
+            f"those of {name} run back by {-back.min():.1f} s, {int((back < -SAME_CLOCK).sum())} "
+            f"times in {len(stamps)} messages"
+        )
     return None
 
 
 def _wrong_recording(name: str, times: Array, stamps_are_wrong: bool) -> str | None:
-    """What is wrong with the times at which the messages of one topic were recorded: they are held, while those of the headers go on."""
+    """What is wrong with the times of recording of one topic; None if nothing is.
+
+    They are wrong if they stand still while the times of the headers go on.
+    """
     stamps, recorded = times.T
     if len(times) < 3:
         return None
     if np.ptp(recorded) == 0 and (stamps_are_wrong or np.ptp(stamps) > SAME_CLOCK):
         return f"the {len(times)} messages of {name} were all recorded at one time"
+    # Messages that were recorded at once form a group.
     groups = np.flatnonzero(np.concatenate([[True], np.diff(recorded) > 1e-3]))
     spans = np.maximum.reduceat(stamps, groups) - np.minimum.reduceat(stamps, groups)
     late = (spans > SAME_CLOCK) & (spans < np.ptp(recorded) + SAME_CLOCK)
     sizes = np.diff([*groups, len(times)])
     if sizes[late].sum() > len(times) / 2:
-        return f"{sizes[late].sum()} of {len(times)} messages of {name} were recorded in {late.sum()} bursts, each of up to {spans[late].max():.1f} s of the drive"
+        return (
+            f"{sizes[late].sum()} of {len(times)} messages of {name} were recorded in "
+            f"{late.sum()} bursts, each of up to {spans[late].max():.1f} s of the drive"
+        )
     return None
 
 
 def _apart(topics: Mapping[str, Array]) -> list[str]:
-    """What is to be said of topics whose clocks part from that of the first one, or never were the same."""
+    """Describe topics whose clock differs from that of the first topic."""
     begin = min(times[:, 1].min() for times in topics.values())
     every = max(COMPARED, (max(times[:, 1].max() for times in topics.values()) - begin) / TIMES)
     (first, reference), *others = (
@@ -142,13 +173,19 @@ def _apart(topics: Mapping[str, Array]) -> list[str]:
         if abs(off[worst]) > SAME_CLOCK:
             since = when[int(np.argmax(np.abs(off) > SAME_CLOCK))]
             said.append(
-                f"beside those of {first}, those of {name} are {off[0]:+.1f} s off at first and {off[-1]:+.1f} s at last, at most {off[worst]:+.1f} s, and more than {SAME_CLOCK:g} s from {since:.0f} s on"
+                f"beside those of {first}, those of {name} are {off[0]:+.1f} s off at first "
+                f"and {off[-1]:+.1f} s at last, at most {off[worst]:+.1f} s, and more than "
+                f"{SAME_CLOCK:g} s from {since:.0f} s on"
             )
     return said
 
 
 def _ahead(times: Array, begin: float, every: float) -> tuple[Array, Array]:
-    """By how many seconds stamps are ahead of recording, once in so many seconds: when, (k,), and the median of each, (k,)."""
+    """By how many seconds stamps are ahead of recording, in intervals of `every` seconds.
+
+    Returns:
+        Mean time, (k,), and median lead, (k,), of each interval.
+    """
     recorded = times[:, 1] - begin
     ahead = times[:, 0] - times[:, 1]
     part = (recorded / every).astype(int)
@@ -159,15 +196,19 @@ def _ahead(times: Array, begin: float, every: float) -> tuple[Array, Array]:
 
 
 def sources_of(track: Track) -> list[NDArray[np.intp]]:
-    """The messages of each source, where several alternate, as where two programs publish one transform; one source where none do.
+    """Separate the messages of alternating sources, as of two programs with one transform.
 
-    Each message is put behind the one before it that is nearest, and is the first of another source where none is near.
+    Each message is appended to the source whose last pose is nearest. If none is near, it starts
+    another source.
+
+    Returns:
+        Indices of the messages of each source, the largest first; one source if none alternate.
     """
     poses = track.table()[:, 2:]
     if len(poses) < 10:
         return [np.arange(len(poses))]
     over = np.abs(poses[2:] - poses[:-2])
-    # A quarter of these steps at least is within one source, even where two come at random.
+    # At least a quarter of these steps stays within one source, even if two come in random order.
     near = 0.05 + 4 * float(np.percentile(np.hypot(over[:, 0], over[:, 1]), 25))
     heads: list[list[float]] = []
     of: list[int] = []

@@ -1,6 +1,7 @@
-"""What is whole of a bag that rosbags cannot open: one that was cut, or never closed, so that its index is missing.
+"""Reads the intact part of a bag without an index, which rosbags cannot open.
 
-Records are read from the beginning, one after another, up to the first that is not whole. Of a packed chunk that was cut, the messages before the cut are read, too.
+Such a bag was cut or never closed. Records are read from the beginning up to the first damaged one.
+Messages before the cut in a packed chunk are read, too.
 """
 
 from __future__ import annotations
@@ -21,13 +22,23 @@ from urllib.parse import quote
 from perception.readers.lines import damages, zstd_module
 
 NANO = 1_000_000_000
-# The kinds of records that hold something: of MCAP (https://mcap.dev/spec), and of ROS 1 (http://wiki.ros.org/Bags/Format/2.0).
+# Kinds of records with content: of MCAP (https://mcap.dev/spec), and of ROS 1
+# (http://wiki.ros.org/Bags/Format/2.0).
 SCHEMA, CHANNEL, MCAP_MESSAGE, MCAP_CHUNK = 3, 4, 5, 6
 ROS1_MESSAGE, ROS1_CHUNK, CONNECTION = 2, 5, 7
 
 
 class Message(NamedTuple):
-    """A message: of which connection, its topic and kind, who sent it, nanoseconds at which it was recorded, and its bytes."""
+    """A message.
+
+    Attributes:
+        connection: Number of its connection.
+        topic: Its topic.
+        msgtype: Its kind.
+        sender: Who sent it.
+        time: Time of recording in nanoseconds.
+        data: Its bytes.
+    """
 
     connection: int
     topic: str
@@ -39,14 +50,14 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class _Sender:
-    """Who sent the messages of a connection, as rosbags says it of bags of ROS 1."""
+    """The sender of a connection, as rosbags gives it for bags of ROS 1."""
 
     callerid: str
 
 
 @dataclass(frozen=True)
 class Connection:
-    """The messages of one sender to one topic, with the fields of rosbags' connections that are read."""
+    """The messages of one sender to one topic, with the fields of rosbags' connections."""
 
     id: int
     topic: str
@@ -56,16 +67,16 @@ class Connection:
 
 
 class Salvage:
-    """The whole messages of a bag, read as by a reader of rosbags.
+    """The intact messages of a bag, with the interface of a reader of rosbags.
 
     Args:
         path: The file.
         format: `ros1`, `ros2` (SQLite) or `mcap`.
 
     Attributes:
-        connections: What can be read of.
-        count: How many whole messages there are.
-        seconds: From the first of them to the last.
+        connections: The connections with intact messages.
+        count: Number of intact messages.
+        seconds: Time from the first to the last.
     """
 
     def __init__(self, path: Path, format: str) -> None:
@@ -87,19 +98,20 @@ class Salvage:
     def messages(
         self, connections: Collection[Connection]
     ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Read the messages of some connections: connection, nanoseconds, bytes."""
         asked = {connection.id: connection for connection in connections}
         for message in self._messages():
             if message.connection in asked:
                 yield asked[message.connection], message.time, message.data
 
     def close(self) -> None:
-        """Nothing is open between two calls."""
+        """Do nothing, as no file is open between two calls."""
 
     def _messages(self) -> Iterator[Message]:
         try:
             yield from self._read(self._path)
         except damages(OSError, struct.error, LookupError, ValueError, RuntimeError, sqlite3.Error):
-            return  # here the whole part ends
+            return  # The intact part ends here.
 
 
 def _mcap(path: Path) -> Iterator[Message]:
@@ -122,7 +134,7 @@ def _mcap(path: Path) -> Iterator[Message]:
 
 
 def _mcap_records(stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
-    """The whole records of a stream of so many bytes, those within chunks, too: kind and content."""
+    """The intact records of a stream of `size` bytes, also those in chunks: kind and content."""
     while len(head := stream.read(9)) == 9:
         kind, length = struct.unpack("<BQ", head)
         data = stream.read(min(length, size))
@@ -159,10 +171,10 @@ def _ros1(path: Path) -> Iterator[Message]:
 
 
 def _ros1_records(stream: IO[bytes], size: int) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
-    """The whole records of a stream of so many bytes, those within chunks, too: the fields of the header, and content."""
+    """The intact records of a stream of `size` bytes, also those in chunks: header and content."""
 
     def part() -> tuple[bytes, bool]:
-        """The next part of a record, and whether it is whole."""
+        """The next part of a record, and whether it is complete."""
         length = int.from_bytes(head, "little") if len(head := stream.read(4)) == 4 else size + 1
         data = stream.read(min(length, size))
         return data, len(data) == length
@@ -185,9 +197,8 @@ def _sqlite(path: Path) -> Iterator[Message]:
     with closing(
         sqlite3.connect(f"file:{quote(str(path))}?mode=ro&immutable=1", uri=True)
     ) as database:
-        database.execute(
-            "PRAGMA writable_schema=ON"
-        )  # else SQLite refuses a file that is shorter than its first page says
+        # Without this, SQLite refuses a file that is shorter than its first page says.
+        database.execute("PRAGMA writable_schema=ON")
         topics = {
             number: (topic, kind)
             for number, topic, kind in database.execute("SELECT id, name, type FROM topics")
@@ -207,14 +218,14 @@ READERS: dict[str, Callable[[Path], Iterator[Message]]] = {
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
-    """A text behind its length, and where it ends."""
+    """A text that follows its length, and the position after it."""
     (length,) = struct.unpack_from("<I", data, at)
     end = at + 4 + length
     return data[at + 4 : end].decode(), end
 
 
 def _fields(data: bytes) -> dict[bytes, bytes]:
-    """The fields of a header of ROS 1, by their names."""
+    """The fields of a header of ROS 1 by name."""
     found: dict[bytes, bytes] = {}
     at = 0
     while at < len(data):
@@ -225,7 +236,7 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
 
 
 def _unpacked(packed: str, data: bytes) -> bytes:
-    """The content of a chunk as far as it is there. Raises KeyError for a packer that is not known."""
+    """The content of a chunk as far as it exists. Raises KeyError for an unknown packer."""
     if packed in ("", "none"):
         return data
     from lz4.frame import LZ4FrameDecompressor

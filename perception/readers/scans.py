@@ -1,4 +1,4 @@
-"""What a robot's log holds, whatever its format: laser scans in the order in which they were taken, and where the odometer was at each.
+"""The content of a robot's log in any format: laser scans with the pose of the odometer.
 
 >>> import math
 >>> from perception.readers.scans import Laser
@@ -6,7 +6,8 @@
 >>> [round(math.degrees(bearing)) for bearing in laser.bearings]
 [-90, 0, 90]
 
-Angles are radians counterclockwise, lengths metres; a pose is (x, y, heading). In the frame of the robot x is ahead and y to its left.
+Angles are radians counterclockwise and lengths metres. A pose is (x, y, heading). In the frame of
+the robot, x is ahead and y to the left.
 """
 
 from __future__ import annotations
@@ -26,13 +27,15 @@ __all__ = ["Damage", "Laser", "Pose", "Reading", "RobotLog", "Scan"]
 
 @dataclass(frozen=True)
 class Laser:
-    """A laser scanner: where its beams go.
+    """A laser scanner.
 
-    first, step  bearing of the first beam, and from each beam to the next, in radians counterclockwise from straight ahead
-    beams        how many beams a scan has
-    reach        metres beyond which a range says only that nothing was nearer
-    mount        the pose of the scanner in the frame of the robot
-    nearest      metres up to which a range is no measurement
+    Attributes:
+        first: Bearing of the first beam, in radians counterclockwise from straight ahead.
+        step: Angle from each beam to the next, in radians.
+        beams: Number of beams of a scan.
+        reach: Metres from which a range only means that nothing is nearer.
+        mount: Pose of the scanner in the frame of the robot.
+        nearest: Metres up to which a range is no measurement.
     """
 
     first: float
@@ -44,27 +47,33 @@ class Laser:
 
     @property
     def steps(self) -> int:
-        """How many steps from beam to beam the field of view has.
+        """Number of steps between beams in the field of view.
 
-        A laser whose beams are even in number is taken to leave out the last one, as a SICK does and as scanners all around do.
+        If the number of beams is even, the last beam is missing, as for a SICK and for scanners of
+        a full circle.
         """
         return max(1, self.beams - self.beams % 2)
 
     @cached_property
     def bearings(self) -> NDArray[np.float64]:
-        """The bearing of each beam in the frame of the scanner, (beams,), radians."""
+        """(beams,) bearing of each beam in the frame of the scanner, in radians."""
         return self.first + self.step * np.arange(self.beams, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One scan, and where the robot was when it was taken.
+    """One scan, with the pose of the robot.
 
-    ranges     (beams,), metres; infinite where nothing came back, or only from beyond the laser's reach; NaN where a range is no measurement
-    odometry   pose by the odometer, which starts anywhere and drifts; only its increments mean anything
-    corrected  pose by whoever corrected the log, for pictures and evaluation only: nothing that infers reads it
-    time       seconds, by the clock of the log, which may be cut, wrapped or missing
-    line       where the scan is in the log: its line, or the number of its message, counted from 1
+    Attributes:
+        ranges: (beams,) metres. Infinite if nothing came back or only from beyond the reach; NaN if
+            the range is no measurement.
+        laser: The scanner.
+        odometry: Pose by the odometer, which starts anywhere and drifts. Only its increments
+            matter.
+        corrected: Pose by whoever corrected the log, for pictures and evaluation. No inference
+            reads it.
+        time: Seconds by the clock of the log, which may be cut, wrapped or missing.
+        line: Line of the scan in the log, or number of its message, from 1.
     """
 
     ranges: NDArray[np.float64]
@@ -77,10 +86,11 @@ class Scan:
 
 @dataclass(frozen=True)
 class Damage:
-    """A part of a log that cannot be read, and was skipped.
+    """A part of a log that cannot be read and was skipped.
 
-    line  its line, or the number of its message, counted from 1
-    what  what was expected there, and what came
+    Attributes:
+        line: Its line, or the number of its message, from 1.
+        what: What was expected there, and what came.
     """
 
     line: int
@@ -89,13 +99,15 @@ class Damage:
 
 @dataclass(frozen=True, eq=False)
 class RobotLog:
-    """All that was read of a log.
+    """The content of a log.
 
-    scans    in the order of the file
-    damaged  what was skipped, in the order of the file
-    format   the name of the format, as the readers call it
-    source   the file
-    notes    what a reader has to know of this log, in sentences, such as that its odometry was pieced together
+    Attributes:
+        scans: Scans in the order of the file.
+        damaged: Skipped parts in the order of the file.
+        format: Name of the format.
+        source: The file.
+        notes: Sentences about the log that a user should know, such as that its odometry was
+            reconstructed.
     """
 
     scans: tuple[Scan, ...]
@@ -109,22 +121,30 @@ class RobotLog:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The notes, and a sentence on the parts that were skipped."""
+        """The notes, and a sentence on the skipped parts."""
         if not self.damaged:
             return self.notes
         first, were = self.damaged[0], "was" if len(self.damaged) == 1 else "were"
         return (
             *self.notes,
-            f"{counted(len(self.damaged), 'damaged parts')} of the log {were} skipped; the first is {first.line}: {first.what}",
+            (
+                f"{counted(len(self.damaged), 'damaged parts')} of the log {were} skipped; the "
+                f"first is {first.line}: {first.what}"
+            ),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """A log whose format and meaning are known, and whose scans can now be read, once.
+    """A log whose format and meaning are known; its scans can be read once.
 
-    items    scans with ranges as the driver wrote them, and what was skipped, in the order of the file
-    assumed  notes on what the log does not say and the reader assumed, by the field of `perception.readers.echoes.Told` that says it
+    Attributes:
+        format: Name of the format.
+        notes: Sentences about the log.
+        items: Scans with ranges as the driver wrote them, and skipped parts, in the order of the
+            file.
+        assumed: Notes on what the reader assumed, by the field of `perception.readers.echoes.Told`
+            that would tell it.
     """
 
     format: str

@@ -1,4 +1,4 @@
-"""Scans with odometry, as a simulated robot takes them, written as logs of the kinds that real robots write.
+"""Writes scans with odometry, such as those of a simulated robot, as logs of real robots.
 
 >>> import math, tempfile
 >>> import numpy as np
@@ -6,15 +6,16 @@
 >>> from perception.readers.scans import Laser, Scan
 >>> from perception.readers.writers import write_carmen
 >>> laser = Laser(first=-math.pi / 2, step=math.pi / 2, beams=3, reach=8.0)
->>> scan = Scan(np.array([1.0, np.inf, 2.5]), laser, odometry=(1.0, 0.0, 0.0), corrected=(1.1, 0.0, 0.0), time=0.5)
+>>> ranges, odometry, corrected = np.array([1.0, np.inf, 2.5]), (1.0, 0.0, 0.0), (1.1, 0.0, 0.0)
+>>> scan = Scan(ranges, laser, odometry, corrected, time=0.5)
 >>> with tempfile.TemporaryDirectory() as folder:
 ...     write_carmen(f"{folder}/drive.log", [scan])
 ...     read = read_log(f"{folder}/drive.log").scans[0]
 >>> read.ranges.tolist(), read.odometry, read.corrected
 ([1.0, inf, 2.5], (1.0, 0.0, 0.0), (1.1, 0.0, 0.0))
 
-Lengths are metres and angles radians, in all formats. The true pose, a scan's `corrected`, is written where the format has a place for it that no reader takes for odometry.
-A scan without a time gets its index as one, in seconds.
+Lengths are metres and angles radians in all formats. The true pose, `corrected`, is written where
+readers do not take it for odometry. A scan without a time gets its index in seconds.
 """
 
 from __future__ import annotations
@@ -40,13 +41,15 @@ from ssh_abduction.data.odometry import Pose, between, moved
 HEADER = (
     "# message formats defined: PARAM ODOM TRUEPOS ROBOTLASER1\n"
     "# ODOM x y theta tv rv accel timestamp hostname logger_timestamp\n"
-    "# TRUEPOS true_x true_y true_theta odom_x odom_y odom_theta timestamp hostname logger_timestamp\n"
-    "# ROBOTLASER1 type start fov step reach accuracy remission n ranges 0 laser_pose robot_pose tv rv forward side axis timestamp hostname logger_timestamp\n"
+    "# TRUEPOS true_x true_y true_theta odom_x odom_y odom_theta timestamp hostname "
+    "logger_timestamp\n"
+    "# ROBOTLASER1 type start fov step reach accuracy remission n ranges 0 laser_pose robot_pose "
+    "tv rv forward side axis timestamp hostname logger_timestamp\n"
 )
-# The frames of a bag, by the names that REP 105 gives them.
+# Frames of a bag, named as in REP 105.
 MAP, ODOM, BASE, LASER = "map", "odom", "base_link", "laser"
 NANO = 1_000_000_000
-# Where x, y and the turn about z are in a covariance of ROS.
+# Positions of x, y and the rotation about z in a covariance of ROS.
 PLANAR = (0, 1, 5)
 
 
@@ -55,12 +58,20 @@ def write_carmen(
     scans: Iterable[Scan],
     parameters: Mapping[str, float] | None = None,
 ) -> None:
-    """Write scans as a log of CARMEN, gzipped where the file's name ends in .gz. The file appears whole or not at all.
+    """Write scans as a log of CARMEN, completely or not at all.
 
-    parameters  numbers by their names, such as the noise of the odometry, for lines PARAM at the head of the log
+    Each scan is a ROBOTLASER1 line, with the geometry and mount of the laser, after an ODOM line
+    and, if the true pose is known, a TRUEPOS line, as CARMEN's simulator writes. Ranges beyond the
+    reach are written as the reach, ranges that are no measurement as 0.
 
-    A scan is a line ROBOTLASER1, which says how the laser is made and mounted, behind a line ODOM and, where its true pose is known, a line TRUEPOS, as CARMEN's simulator writes.
-    Ranges beyond the laser's reach are written as its reach, those that are no measurement as 0. Raises LogError.
+    Args:
+        path: The file; it is gzipped if its name ends in .gz.
+        scans: Scans to write.
+        parameters: Numbers by name, such as the noise of the odometry, for PARAM lines at the
+            beginning.
+
+    Raises:
+        LogError: There is no scan, or the file cannot be written.
     """
     head = HEADER + "".join(
         f"PARAM {name} {value:g} 0 localhost 0\n" for name, value in (parameters or {}).items()
@@ -71,7 +82,8 @@ def write_carmen(
         write_file(path, gzip.compress(data, mtime=0) if os.fspath(path).endswith(".gz") else data)
     except (OSError, ValueError) as error:
         raise LogError(
-            f"{named(path)}: expected a file that can be written: {getattr(error, 'strerror', None) or error}; check the path"
+            f"{named(path)}: expected a file that can be written: "
+            f"{getattr(error, 'strerror', None) or error}; check the path"
         ) from None
 
 
@@ -80,39 +92,53 @@ def write_bag(
     scans: Iterable[Scan],
     covariances: NDArray[np.float64] | None = None,
 ) -> None:
-    """Write scans as a ROS bag: a file of ROS 1 where the name ends in .bag, a file of MCAP where it ends in .mcap, else a folder of ROS 2. What is written appears whole or not at all.
+    """Write scans as a ROS bag, completely or not at all.
 
-    Topics: /scan (LaserScan), /odom (Odometry), /tf (from odom to base_link and, where the true poses are known, from map to odom) and /tf_static (from base_link to laser).
-    covariances  for each scan that of its odometry, (n, 3, 3): x, y, heading; zeros, which mean that it is not known, where it is missing
-    Raises LogError, also for a folder that is there already, and where the extra `ros` is missing.
+    The topics are /scan (LaserScan), /odom (Odometry), /tf (from odom to base_link and, if the true
+    poses are known, from map to odom) and /tf_static (from base_link to laser).
+
+    Args:
+        path: A name in .bag makes a file of ROS 1, one in .mcap a file of MCAP, and any other a
+            folder of ROS 2.
+        scans: Scans to write.
+        covariances: (n, 3, 3) covariance of the odometry of each scan: x, y, heading. None writes
+            zeros, which mean unknown.
+
+    Raises:
+        LogError: There is no scan, the folder exists, the bag cannot be written, or the extra `ros`
+            is missing.
     """
     target = Path(path)
     if target.is_dir():
         raise LogError(
-            f"{named(path)}: expected a folder that is not there yet, got one that is; name another, or remove it"
+            f"{named(path)}: expected a folder that is not there yet, got one that is; name "
+            "another, or remove it"
         )
     try:
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".bag-") as draft:
             written = _write_bag(Path(draft) / target.name, scans, covariances)
             if target.is_file() and written.is_dir():
                 raise LogError(
-                    f"{named(path)}: expected the name of a folder, got that of a file; name another, or end it in .bag or .mcap"
+                    f"{named(path)}: expected the name of a folder, got that of a file; name "
+                    "another, or end it in .bag or .mcap"
                 )
             shutil.move(written, target)
     except LogError:
         raise
     except OSError as error:
         raise LogError(
-            f"{named(path)}: expected a bag that can be written: {error.strerror or error}; check the path"
+            f"{named(path)}: expected a bag that can be written: {error.strerror or error}; "
+            "check the path"
         ) from None
-    except Exception as error:  # whatever SQLite, which rosbags writes with, runs into
+    except Exception as error:  # rosbags writes with SQLite, which raises errors of its own.
         raise LogError(
-            f"{named(path)}: expected a bag that can be written: {error}; check the disk and the path"
+            f"{named(path)}: expected a bag that can be written: {error}; check the disk and "
+            "the path"
         ) from None
 
 
 def _numbered(scans: Iterable[Scan]) -> tuple[list[Scan], list[float]]:
-    """The scans, and the time of each. Raises LogError where there are none."""
+    """The scans, and the time of each. Raises LogError if there are none."""
     listed = list(scans)
     if not listed:
         raise LogError("scans: expected at least one to write, got none")
@@ -138,7 +164,8 @@ def _carmen_lines(scan: Scan, time: float) -> str:
     )
     return (
         f"{truth}ODOM {odometry} 0 0 0 {stamp}"
-        f"ROBOTLASER1 0 {shape} {laser.beams} {ranges} 0 {_numbers(moved(scan.odometry, laser.mount))} {odometry} 0 0 0 0 0 {stamp}"
+        f"ROBOTLASER1 0 {shape} {laser.beams} {ranges} 0 "
+        f"{_numbers(moved(scan.odometry, laser.mount))} {odometry} 0 0 0 0 0 {stamp}"
     )
 
 
@@ -147,7 +174,7 @@ def _numbers(pose: Pose) -> str:
 
 
 def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float64] | None) -> Path:
-    """Write a bag, and say which file or folder of it is to be kept."""
+    """Write a bag; return the file or folder of it to keep."""
     try:
         from rosbags import rosbag1, rosbag2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -193,7 +220,8 @@ def _messages(
         time = round(seconds * NANO)
         if time < 0:
             raise LogError(
-                f"scan {number}: expected a time from 0 on, as bags count it, got {seconds:g}; shift the times"
+                f"scan {number}: expected a time from 0 on, as bags count it, got "
+                f"{seconds:g}; shift the times"
             )
         make = _Maker(
             types,
@@ -201,10 +229,12 @@ def _messages(
             {"seq": number} if is_ros1 else {},
         )
         laser = scan.laser
+        # The mount of the laser is static: it is written once.
         if laser.mount not in mounted:
             if mounted:
                 raise LogError(
-                    f"scan {number}: expected one mount of the laser in a bag, got another; write two bags"
+                    f"scan {number}: expected one mount of the laser in a bag, got another; "
+                    "write two bags"
                 )
             mounted.add(laser.mount)
             yield "/tf_static", time, make.transform(BASE, LASER, laser.mount)
@@ -228,7 +258,13 @@ def _messages(
 
 
 class _Maker:
-    """Makes messages of one time."""
+    """Makes messages of one time.
+
+    Args:
+        types: Message classes by name.
+        stamp: The time.
+        numbering: Sequence number of the header, for ROS 1.
+    """
 
     def __init__(self, types: Any, stamp: Any, numbering: dict[str, int]) -> None:
         self.types, self.stamp, self.numbering = types, stamp, numbering
