@@ -1,1 +1,1 @@
-"""A trace as integers, and what follows from it alone."""
+"""A trace as integers, and facts about its steps that hold in every map."""

@@ -1,17 +1,23 @@
-"""Which steps cannot be one dstate, whatever the map: a lower bound on dstates that anybody can check.
+"""Find steps that are different dstates in every map, and a clique of them as a lower bound.
 
-Two steps are *apart* if some actions, done from both, lead to different views: as a dstate has one view and actions are
-deterministic, they are different dstates. On a trace, what was done from a step is how the trace goes on; so the steps are apart if
-their continuations show different views before, or when, the actions differ. Steps that are pairwise apart, a *clique*, need as many
-dstates as they are, in every theory that holds the axioms functional_view and deterministic. A `Certificate` is such a clique.
+Two steps are *apart* if the same actions, done from both, lead to different views. As a dstate has
+one view and actions are deterministic, such steps are different dstates. In a trace, what was done
+from a step is how the trace continues. So two steps are apart if their continuations differ first
+in a view, not in an action. A *clique* is a set of steps that are pairwise apart. It needs as many
+dstates as it has steps, in every theory with the axioms functional_view and deterministic. A
+`Certificate` contains such a clique.
 
-*Claim.* The graph of the steps that are apart is a cograph (Corneil, Lerchs, Stewart Burlingham 1981), so a largest clique takes no search.
-*Proof.* Write down what was seen and done from each step on, a view and an action by turns, and put steps in groups by how that begins.
-Where the steps of a group next differ in views, those of different subgroups are all apart: a largest clique is one of each subgroup,
-together. Where they differ in actions, none of them are: it is the largest of those of the subgroups. ∎
+*Claim.* The graph of steps that are apart is a cograph (Corneil, Lerchs, Stewart Burlingham 1981),
+so a largest clique is found without search.
+*Proof.* Write the continuation of each step as a sequence of views and actions in turn. Group the
+steps by common prefixes. If the steps of a group next differ in views, then all steps of different
+subgroups are apart, and the union of largest cliques of the subgroups is a largest clique. If they
+next differ in actions, then no steps of different subgroups are apart, and the largest clique of
+any subgroup is a largest clique. ∎
 
-Steps are sorted by how the trace goes on from them, as in a suffix array. The groups of the proof are then stretches of that order, so
-there is no matrix of all pairs: one row of it takes a pass over the sorted steps.
+The steps are sorted by their continuations, as in a suffix array. The groups of the proof are then
+intervals of the sorted order. No matrix of all pairs is needed: one row takes a pass over the
+sorted steps.
 
 >>> from ssh_abduction.solver.steps.apart import Continuations
 >>> Continuations([0, 1, 0, 2, 0], [0, 0, 0, 0]).clique()
@@ -26,21 +32,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-# Up to this many steps, the pairs that evidence excludes are spread to earlier steps in a matrix of steps x steps, which takes 64 MB then. In a longer trace
-# only the pairs that evidence names are excluded.
+# Up to this many steps, excluded pairs are spread to earlier steps in a matrix of steps x steps, of
+# 64 MB at most. In longer traces, only the pairs that evidence names are excluded.
 COMPARED = 8000
-# A greedy clique of one view is improved by at most this many swaps, and by an eighth as many as steps show the view, if these are fewer: each swap takes as
-# long as growing a clique anew, and the clique has to be there before clingo is asked anything.
+# The most swaps to improve the greedy clique of one view; an eighth of the steps with the view, if
+# that is less. A swap takes as long as growing a clique, and clingo has to wait for the clique.
 SWAPS = 60
 
 Matrix = NDArray[np.bool_]
 
 
 class Continuations:
-    """How a trace goes on from each of its steps.
+    """How a trace continues from each of its steps.
 
-    Steps are sorted by that, as in a suffix array (Manber, Myers 1993), in n log² n: what two steps have in common is the least that
-    any two neighbours from the one to the other have.
+    Steps are sorted by their continuations, as in a suffix array (Manber, Myers 1993), in
+    n log² n. The common prefix of two steps is the shortest common prefix of neighbours between
+    them.
     """
 
     def __init__(
@@ -49,24 +56,25 @@ class Continuations:
         actions: Sequence[int],
         excluded: Collection[tuple[int, int]] = (),
     ) -> None:
-        """
-        seen      what was seen at each step
-        actions   what was done after each step but the last, numbered from 0
-        excluded  pairs of steps that evidence keeps from being one dstate. Steps from which the same actions lead to such a pair are not one either
+        """Sort the steps of a trace.
+
+        Args:
+            seen: The view at each step, as a number.
+            actions: The action after each step but the last, numbered from 0.
+            excluded: Pairs of steps that evidence says are different dstates. If the same actions
+                lead from two steps to such a pair, then these two are different dstates, too.
         """
         shown, done = np.asarray(seen), np.append(np.asarray(actions, dtype=int), -1) + 1
         steps = len(shown)
         self._seen = seen
         self._excluded = _spread(excluded, done) if excluded and steps <= COMPARED else None
-        self._partners: dict[
-            int, list[int]
-        ] = {}  # the excluded steps of each step, where the trace is too long for a matrix
+        # The excluded steps of each step, if the trace is too long for a matrix.
+        self._partners: dict[int, list[int]] = {}
         for i, j in excluded if self._excluded is None else ():
             self._partners.setdefault(i, []).append(j)
             self._partners.setdefault(j, []).append(i)
-        ranks = [
-            _ranked(shown * (done.max() + 1) + done)
-        ]  # the order of the steps by their first 1, 2, 4, … views and actions
+        # The order of the steps by their first 1, 2, 4, … views and actions.
+        ranks = [_ranked(shown * (done.max() + 1) + done)]
         while ranks[-1].max() < steps - 1:
             then = np.zeros(steps, dtype=int)
             ahead = 1 << (len(ranks) - 1)
@@ -75,28 +83,32 @@ class Continuations:
         self._place = ranks[-1]  # the position of each step in the sorted order
         self._sorted = np.argsort(self._place)
         here, there = self._sorted[:-1], self._sorted[1:]
-        for level in range(
-            len(ranks) - 2, -1, -1
-        ):  # both neighbours go on, by halving strides, to where they differ
+        # Advance both neighbours by halving strides to where they differ.
+        for level in range(len(ranks) - 2, -1, -1):
             ahead = (ranks[level][here] == ranks[level][there]) * (1 << level)
             here, there = here + ahead, there + ahead
-        self._shared = 2 * (here - self._sorted[:-1]) + (
-            shown[here] == shown[there]
-        )  # views and actions that neighbours have in common
+        # The length of the common prefix of neighbours, in views and actions.
+        self._shared = 2 * (here - self._sorted[:-1]) + (shown[here] == shown[there])
 
     def apart_from(self, step: int, actions: int = 0) -> Matrix:
-        """Which steps are apart from this one, and show it only after at least this many actions. With 0 it is the step's row of `apart`."""
+        """The steps that are apart from this one, as a row of `apart`.
+
+        Args:
+            step: The step.
+            actions: Only the steps whose views differ after at least this many actions.
+        """
         place, steps = self._place[step], len(self._place)
         shared = np.empty(steps, dtype=int)
         shared[:place] = np.minimum.accumulate(self._shared[:place][::-1])[::-1]
         shared[place + 1 :] = np.minimum.accumulate(self._shared[place:])
-        differ = (shared % 2 == 0) & (shared >= 2 * actions)  # views are the first to differ
+        # After an even number of common views and actions, the next to differ is a view.
+        differ = (shared % 2 == 0) & (shared >= 2 * actions)
         differ[place] = False
         row: Matrix = differ[self._place] | self.excluded_from(step)
         return row
 
     def excluded_from(self, step: int) -> Matrix:
-        """Which steps are apart from this one because evidence says so."""
+        """The steps that evidence says are apart from this one."""
         if self._excluded is not None:
             row: Matrix = self._excluded[step]
             return row
@@ -105,7 +117,7 @@ class Continuations:
         return row
 
     def apart(self) -> Matrix:
-        """Which pairs of steps are apart: steps x steps."""
+        """The pairs of steps that are apart, as a matrix of steps x steps."""
         steps = len(self._place)
         apart = np.empty((steps, steps), dtype=bool)
         for step in range(steps):
@@ -113,11 +125,14 @@ class Continuations:
         return apart
 
     def clique(self) -> list[int]:
-        """A largest clique of steps, in order; among the largest, one whose steps are apart from most.
+        """A largest clique of steps, in order.
 
-        Evidence leaves no tree of groups: with it, the clique is the larger one of that and of one that is found greedily.
+        Of several largest cliques, this is one whose steps are apart from the most others. With
+        evidence, the graph is no cograph any more. Then the result is the larger of that clique and
+        a greedily grown one.
         """
-        # The groups that the current step is in, each within the one before: how much its steps have in common, and its largest clique so far.
+        # The nested groups that the current step is in: the length of the common prefix of their
+        # steps, and a largest clique so far.
         begun: list[tuple[int, _Clique]] = []
         for step, shared in zip(self._sorted.tolist(), [*self._shared.tolist(), -1], strict=True):
             so_far = _Clique((step,), 0, 1)
@@ -132,7 +147,7 @@ class Continuations:
 
 
 def _spread(excluded: Collection[tuple[int, int]], done: NDArray[np.int_]) -> Matrix:
-    """Pairs of steps that are not one dstate, and those from which the same actions lead to such a pair: steps x steps."""
+    """Excluded pairs, and pairs from which the same actions lead to them, as steps x steps."""
     found = np.zeros((len(done), len(done)), dtype=bool)
     first, second = np.array(list(excluded)).T
     found[first, second] = found[second, first] = True
@@ -143,10 +158,12 @@ def _spread(excluded: Collection[tuple[int, int]], done: NDArray[np.int_]) -> Ma
 
 @dataclass(frozen=True, slots=True)
 class _Clique:
-    """A largest clique of some group of steps.
+    """A largest clique of a group of steps.
 
-    apart  the sum, over the steps of the clique, of how many steps of the group each is apart from
-    group  the number of steps in the group
+    Attributes:
+        steps: The clique.
+        apart: The sum, over the steps of the clique, of the steps of the group apart from each.
+        group: The number of steps in the group.
     """
 
     steps: tuple[int, ...]
@@ -154,7 +171,12 @@ class _Clique:
     group: int
 
     def joined(self, other: _Clique, *, apart: bool) -> _Clique:
-        """A largest clique of two groups together. Either all steps of one group are apart from all of the other (`apart`), or none are."""
+        """A largest clique of the union of two groups.
+
+        Args:
+            other: The clique of the other group.
+            apart: Whether all steps of one group are apart from all of the other; else none are.
+        """
         group = self.group + other.group
         if apart:
             more = len(self.steps) * other.group + len(other.steps) * self.group
@@ -166,12 +188,15 @@ class _Clique:
 
 
 def _ranked(keys: NDArray[np.int_]) -> NDArray[np.int_]:
-    """The rank of each key: keys are numbered by size, and equal keys share a number."""
+    """The rank of each key. Equal keys share a rank."""
     return np.unique(keys, return_inverse=True)[1]
 
 
 def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
-    """A large clique of nodes, in order. Nodes with different views are always apart, so it is put together from one clique for each view."""
+    """A large clique of nodes, in order.
+
+    Nodes with different views are always apart, so this is the union of one clique per view.
+    """
     shown = np.asarray(seen)
     found: list[int] = []
     for view in range(int(shown.max()) + 1):
@@ -181,7 +206,7 @@ def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
 
 
 def large_clique(apart: Matrix) -> list[int]:
-    """A large clique of few nodes: from each node a clique is grown greedily, and the largest of these is returned."""
+    """The largest of the cliques that grow greedily from each node; for few nodes."""
     random = np.random.default_rng(0)
     found = [_grown(apart, [node], random) for node in range(len(apart))]
     largest: list[int] = max(found, key=len, default=[])
@@ -189,7 +214,10 @@ def large_clique(apart: Matrix) -> list[int]:
 
 
 def _greedy_clique(apart: Matrix) -> list[int]:
-    """A clique grown greedily, then improved by swaps: some of its nodes are taken out, it is grown again, and kept unless it is smaller."""
+    """A greedy clique, improved by swaps.
+
+    A swap removes some nodes and grows the clique again. It is kept unless the clique is smaller.
+    """
     random = np.random.default_rng(0)
     best = _grown(apart, [], random)
     for _ in range(min(SWAPS, len(apart) // 8) if 1 < len(best) < len(apart) else 0):
@@ -200,18 +228,20 @@ def _greedy_clique(apart: Matrix) -> list[int]:
 
 
 def _grown(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:
-    """A clique grown from these nodes, until no node can be added. The next node is always one that is apart from most of those left."""
+    """A maximal clique that contains these nodes.
+
+    The next node is always one of those that are apart from the most candidates left.
+    """
     left = np.flatnonzero(apart[kept].all(axis=0)) if kept else np.arange(len(apart))
     found = list(kept)
     inner = apart[np.ix_(left, left)]
     degree = inner.sum(axis=0)
-    free = np.arange(len(left))  # the nodes that are apart from all nodes found so far
+    free = np.arange(len(left))  # nodes that are apart from all nodes of the clique
     while len(free):
         best = free[int((degree[free] + random.random(len(free))).argmax())]
         found.append(int(left[best]))
         stay = inner[best, free]
-        degree -= inner[free[~stay]].sum(
-            axis=0
-        )  # each node drops out once, so a clique takes no longer than reading the matrix
+        # Each node drops out once, so all updates take no longer than to read the matrix.
+        degree -= inner[free[~stay]].sum(axis=0)
         free = free[stay]
     return found

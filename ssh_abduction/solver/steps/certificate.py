@@ -1,4 +1,4 @@
-"""Why no map has fewer dstates, for anybody to check (`judge/proof.py`).
+"""A certificate that no map has fewer dstates; `checker/proof.py` checks it without a solver.
 
 >>> from ssh_abduction import Trace, solve
 >>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
@@ -22,20 +22,21 @@ from ssh_abduction.data.trace import Trace, View, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.solver.steps.noise import Noise, noise_in
 
-RESTS_ON = frozenset(
-    {"functional_view", "deterministic"}
-)  # the axioms that make apart steps different dstates
-# A certificate in a file has its words only if they have at most this many actions in all, some megabytes. Where steps look alike for long, words grow with
-# the cube of the trace; and whoever checks the certificate can find them anew.
+# The axioms by which steps that are apart are different dstates.
+RESTS_ON = frozenset({"functional_view", "deterministic"})
+# A certificate is written with its words only if they have at most this many actions, which take
+# some megabytes. Words may grow with the cube of the trace, and a checker can compute them again.
 WRITTEN = 500_000
 
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """Why no map has fewer dstates.
+    """A certificate that no map has fewer dstates.
 
-    clique   steps that are pairwise apart, so that each is a dstate of its own; proof.check_bound checks it, without a solver
-    refuted  numbers of dstates, from the size of the clique up, for which clingo found that there is no map
+    Attributes:
+        clique: Steps that are pairwise apart, so each is a dstate of its own.
+        refuted: Numbers of dstates, from the size of the clique upwards, for which clingo found
+            that there is no map.
     """
 
     clique: tuple[int, ...]
@@ -45,20 +46,32 @@ class Certificate:
         refuted = (
             f", and clingo refuted {counted(len(self.refuted), 'sizes')}" if self.refuted else ""
         )
-        return f"<Certificate: at least {counted(self.bound, 'dstates')}; {counted(len(self.clique), 'steps')} are pairwise apart{refuted}>"
+        bound, steps = counted(self.bound, "dstates"), counted(len(self.clique), "steps")
+        return f"<Certificate: at least {bound}; {steps} are pairwise apart{refuted}>"
 
     @property
     def bound(self) -> int:
-        """The number of dstates that every map has at least."""
+        """The least number of dstates that a map can have."""
         return len(self.clique) + len(self.refuted)
 
     def words(self, trace: Trace) -> dict[tuple[int, int], tuple[str, ...]]:
-        """For each pair of steps of the clique the common actions that lead from them to different views. Raises SolverError."""
+        """The words that distinguish the steps of the clique.
+
+        Returns:
+            For each pair of steps, the common actions that lead from them to different views.
+
+        Raises:
+            SolverError: If two steps of the clique are not apart in this trace.
+        """
         checked_trace(trace)
         return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
 
     def to_dict(self, trace: Trace | None) -> dict[str, Any]:
-        """Plain data. Pairs that show different views at once need no word and are left out. Words of more than WRITTEN actions in all are left out, too, and so are all words where the trace is not at hand."""
+        """The certificate as plain data.
+
+        Words are left out for pairs of steps with different views, which need none; for all pairs,
+        if there are more than WRITTEN actions in them; and if there is no trace.
+        """
         if trace is None:
             return {"clique": list(self.clique), "refuted": list(self.refuted)}
         checked_trace(trace)
@@ -73,7 +86,10 @@ class Certificate:
         return {"clique": list(self.clique), "words": words, "refuted": list(self.refuted)}
 
     def _pairs_alike(self, trace: Trace) -> Iterator[tuple[int, int]]:
-        """The pairs of steps of the clique that show one view, in order. All other pairs, of which there may be millions, need no word."""
+        """The pairs of steps of the clique that show one view, in order.
+
+        All other pairs need no word. There may be millions of them.
+        """
         alike: dict[View | None, list[int]] = {}
         for step in self.clique:
             alike.setdefault(trace.steps[step].view, []).append(step)
@@ -84,11 +100,14 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Basis:
-    """What a certificate is made of, once somebody asks for it: to make it takes as long as to solve a short trace.
+    """The data for a certificate, which is made when it is first used.
 
-    views    what was seen at the first steps of the trace, as numbers
-    actions  what was done there, as numbers
-    bound    the proven least number of dstates
+    To make a certificate takes as long as to solve a short trace.
+
+    Attributes:
+        views: The views of the first steps of the trace, as numbers.
+        actions: The actions there, as numbers.
+        bound: The proven lower bound on dstates.
     """
 
     views: tuple[int, ...]
@@ -97,9 +116,8 @@ class Basis:
 
     @cached_property
     def certificate(self) -> Certificate:
-        from ssh_abduction.solver.steps.apart import (
-            Continuations,
-        )  # loads numpy, which takes longer than to solve a short trace
+        # Imported here, as loading numpy takes longer than solving a short trace.
+        from ssh_abduction.solver.steps.apart import Continuations
 
         clique = tuple(Continuations(self.views, self.actions).clique())
         return Certificate(clique, tuple(range(len(clique), self.bound)))

@@ -1,14 +1,17 @@
-"""What the steps of a trace are to an engine that settles dstates by themselves: nodes, the links between them, and which nodes are apart.
+"""The graph of a trace: nodes, links between them, and which nodes are apart.
 
-To the causal theory each step is a node, and each action a link to the next. In a theory where places have frames (star=frame), a turn
-rotates by known quarters: so the steps between two travels, a *visit*, are at one place, and those of a visit that face the same way are
-one node, linked by rotations both ways. Nodes are apart if that follows from what was seen and done, as in `steps/apart.py`.
+Engines that find dstates before places work on it. In the causal theory each step is a node, and
+each action is a link to the next node. With frames (star=frame), a turn rotates the robot by known
+quarters. So the steps between two travels, a *visit*, are at one place. The steps of a visit that
+face the same way are one node, and rotations link the nodes of a visit both ways. Nodes are apart
+if what was seen and done shows that they are different dstates, as in `steps/apart.py`.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.solver.steps.chart import Chart
 >>> from ssh_abduction.solver.steps.log import Log
 >>> star = [0, 0, 1, 0], [1, 0, 0, 0]
->>> trace = Trace.from_steps(["a", "b", "a"], ["around", "around"], stars=[star[0], star[1], star[0]])
+>>> stars = [star[0], star[1], star[0]]
+>>> trace = Trace.from_steps(["a", "b", "a"], ["around", "around"], stars=stars)
 >>> chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
 >>> chart.node_of, chart.links
 ((0, 1, 0), ((0, -2, 1), (1, -2, 0)))
@@ -38,12 +41,13 @@ QUARTERS: dict[TurnDirection | None, int] = {"right": 1, "around": 2, "left": 3}
 
 @dataclass(frozen=True)
 class Chart:
-    """Nodes, numbered by the first step at them, and links.
+    """Nodes, numbered by their first steps, and links between them.
 
-    seen      the observation at each node
-    links     node, action, node. A rotation by J quarters is the action -J
-    node_of   the node of each step
-    excluded  pairs of nodes that are not one dstate, as evidence says
+    Attributes:
+        seen: The observation at each node.
+        links: Triples (node, action, node). A rotation by J quarters is the action -J.
+        node_of: The node of each step.
+        excluded: Pairs of nodes that evidence says are different dstates.
     """
 
     seen: tuple[int, ...]
@@ -53,7 +57,7 @@ class Chart:
 
     @staticmethod
     def of_steps(log: Log, size: int) -> Chart:
-        """The chart of the first steps, each a node."""
+        """The chart of the first `size` steps, each of them a node."""
         links = tuple((t, log.actions[t], t + 1) for t in range(size - 1))
         return Chart(
             tuple(log.seen[:size]),
@@ -63,20 +67,21 @@ class Chart:
         )
 
     def apart(self) -> NDArray[np.bool_]:
-        """Which pairs of nodes are apart: nodes x nodes."""
+        """The pairs of nodes that are apart, as a matrix of nodes x nodes."""
         return self.continuations.apart()
 
     @cached_property
     def continuations(self) -> Continuations:
-        """How the trace goes on from each node."""
+        """How the trace continues from each node."""
         from ssh_abduction.solver.steps.apart import Continuations  # loads numpy
 
         return Continuations(self.seen, [action for _, action, _ in self.links], self.excluded)
 
     def is_map(self, labels: Sequence[int]) -> bool:
-        """Whether the labels of all nodes are those of a map: each dstate shows one view, and each action leads to one dstate.
+        """Whether the labels of all nodes make a map.
 
-        Nor is any pair of nodes one dstate that evidence excludes.
+        Each dstate has to show one view, each action has to lead to one dstate, and no excluded
+        pair may have one label.
         """
         view: dict[int, int] = {}
         leads: dict[tuple[int, int], int] = {}
@@ -95,20 +100,26 @@ class Chart:
 
     @staticmethod
     def turned(trace: Trace, log: Log, size: int) -> FramedChart | None:
-        """The chart of the first steps, as if places had frames. What is seen ahead, right, back and left takes the place of stars.
+        """The chart of the first `size` steps, as if places had frames.
 
-        This is a guess, as the causal theory does not say that turns rotate. None where some action is neither turn nor travel, or where
-        what is seen after a turn does not follow from what was seen before.
+        The views ahead, right, back and left replace the star. This is a guess, as in the causal
+        theory turns need not rotate.
+
+        Returns:
+            The chart; None if some action is neither turn nor travel, or if the view after a turn
+            does not follow from the view before it.
         """
         around = Chart.around(trace, log, size)
         return None if around is None else Chart.framed(trace, log, size, around)
 
     @staticmethod
     def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]] | None:
-        """For each observation, what is seen ahead, right, back and left of where it is seen ahead, as turns show. None as `turned` says."""
-        after: dict[
-            tuple[int, int], int
-        ] = {}  # what is seen after a turn, by what was seen before it and the quarters to the right
+        """What each observation has ahead, right, back and left of it.
+
+        None under the conditions that `turned` names.
+        """
+        # The observation after a turn, by the one before it and the quarters clockwise.
+        after: dict[tuple[int, int], int] = {}
         for action, before, then in zip(
             trace.actions[: size - 1], log.seen, log.seen[1:], strict=False
         ):
@@ -136,23 +147,28 @@ class Chart:
         size: int | None = None,
         around: Mapping[int, Sequence[int]] | None = None,
     ) -> FramedChart | None:
-        """The chart of the first steps (default all), where places have frames. None where some visit fits no frame: then there is no map.
+        """The chart of the first steps, where places have frames.
 
-        around  in the place of stars: for each observation, what is seen ahead, right, back and left of where it is seen ahead
+        Args:
+            trace: The trace.
+            log: The same trace as integers.
+            size: The number of steps; all by default.
+            around: For each observation, the ones seen ahead, right, back and left of where it is
+                seen ahead. They replace the stars of the trace.
+
+        Returns:
+            The chart; None if some visit contradicts every frame, so that there is no map.
         """
         size = len(trace) if size is None else size
         node: dict[tuple[int, int], int] = {}
         seen: list[int] = []
         node_of: list[int] = []
-        stars: list[
-            tuple[int, ...]
-        ] = []  # of each visit, in a frame whose slot 0 the robot faces as it arrives
+        stars: list[tuple[int, ...]] = []  # of each visit, from the heading of its arrival
         travels: list[tuple[int, int, int]] = []
         visit = slot = 0
         for t in range(size):
-            if (
-                t and (action := trace.actions[t - 1]).kind != "turn"
-            ):  # a travel, or nothing is known of where it led
+            if t and (action := trace.actions[t - 1]).kind != "turn":
+                # A travel, or an action of which it is not known where it led.
                 visit, slot = visit + 1, 0
             elif t:
                 slot = (slot + QUARTERS[action.turn]) % 4
@@ -198,11 +214,14 @@ class Chart:
 class FramedChart(Chart):
     """A chart of visits.
 
-    facing     the visit and the slot of each node; a slot counts quarters clockwise from how the robot faced as it arrived
-    stars      what is open at each visit, by slot; or what is seen there, by slot
-    travels    the links that are travels, in order: travel V leads from visit V to visit V + 1. An action that slipped stands among them, as one that is done once
-    elsewhere  pairs of nodes known to be at different places
-    away       those of these pairs that evidence names
+    Attributes:
+        facing: The visit and the slot of each node. Slots count quarters clockwise from the
+            heading in which the robot arrived.
+        stars: The openings of each visit by slot, or the observations by slot.
+        travels: The links that are travels, in order: travel V leads from visit V to visit V + 1.
+            An action that slipped is among them, as an action that occurs only once.
+        elsewhere: Pairs of nodes that are known to be at different places.
+        away: Those of these pairs that evidence names.
     """
 
     facing: tuple[tuple[int, int], ...]
@@ -212,20 +231,23 @@ class FramedChart(Chart):
     away: frozenset[tuple[int, int]] = frozenset()
 
     def with_elsewhere(self, more: Iterable[tuple[int, int]]) -> FramedChart:
-        """The same chart, where these nodes, too, are known to be at different places."""
+        """The same chart, with more pairs of nodes known to be at different places."""
         return replace(self, elsewhere=self.elsewhere | frozenset(more))
 
     def __getstate__(self) -> dict[str, object]:
-        """What is sent to another process: the fields, without the large arrays that are computed from them."""
+        """The fields, without the large arrays computed from them, to send to another process."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def apart(
         self, most: int | None = None, others: Sequence[int] | None = None
     ) -> NDArray[np.bool_]:
-        """Which pairs of nodes are apart: nodes x others. Two nodes are apart if their visits misfit when turned so that the two nodes face one slot.
+        """The pairs of nodes that are apart, as a matrix of nodes x others.
 
-        most    only the first so many nodes (default all)
-        others  the nodes that they are compared with (default the same ones)
+        Two nodes are apart if their visits misfit when both nodes face one slot.
+
+        Args:
+            most: Only the first `most` nodes; all by default.
+            others: The nodes to compare them with; the same nodes by default.
         """
         import numpy as np
 
@@ -245,19 +267,19 @@ class FramedChart(Chart):
 
     @cached_property
     def leaves(self) -> dict[int, tuple[int, int]]:
-        """For each visit but the last, the slot that it ends at, and the action there, which leads to the next visit."""
+        """The slot and action at which each visit but the last ends."""
         return {
             visit: (self.facing[node][1], action)
             for visit, (node, action, _) in enumerate(self.travels)
         }
 
     def turns(self, trace: Trace) -> list[tuple[int, str, int]]:
-        """The turns of the trace from node to node, as (node, direction, node), each once, in the order of the trace."""
+        """The distinct turns of the trace in order, as (node, direction, node)."""
         steps = zip(pairwise(self.node_of), trace.actions, strict=False)
         return list(dict.fromkeys((s, action.turn, x) for (s, x), action in steps if action.turn))
 
     def beginning(self, visits: int) -> FramedChart:
-        """The chart of the first so many visits."""
+        """The chart of the first `visits` visits."""
         nodes = next(
             (node for node, (visit, _) in enumerate(self.facing) if visit == visits),
             len(self.facing),
@@ -283,22 +305,30 @@ class FramedChart(Chart):
         )
 
     def visits_with(self, pairs: int) -> int:
-        """The most visits, from the first on, among which at most so many pairs may be at one place."""
+        """The most first visits among which at most `pairs` pairs may be at one place."""
         import numpy as np
 
         return int(np.searchsorted(self.fitting, pairs, side="right")) - 1
 
     @cached_property
     def fitting(self) -> NDArray[np.int_]:
-        """For each number of visits, from 0 to all: how many pairs `fits` would list of that many first visits. There may be too many to list them."""
+        """The number of pairs that `fits` would list, for each number of first visits.
+
+        There may be too many pairs to list them.
+        """
         import numpy as np
 
         return np.cumsum([0, *np.count_nonzero(np.triu(~self.misfits, 1), axis=(0, 1))])
 
     def fits(self, visits: Sequence[int]) -> list[tuple[int, int, int]]:
-        """The pairs of these visits that may be at one place, as (I, J, R) with I < J: slot 0 of visit I is then slot R of visit J.
+        """The pairs of these visits that may be at one place.
 
-        visits  in order
+        Args:
+            visits: Visits, in order.
+
+        Returns:
+            Triples (I, J, R) with I < J: visits I and J may be at one place, with slot 0 of I at
+            slot R of J.
         """
         import numpy as np
 
@@ -308,10 +338,12 @@ class FramedChart(Chart):
 
     @cached_property
     def misfits(self) -> NDArray[np.bool_]:
-        """R x I x J, for R in 0 to 3 and visits I and J: whether they cannot be at one place so that slot 0 of I is slot R of J.
+        """Which visits cannot be at one place, as an array of R x I x J.
 
-        Two visits misfit where they show different things, where evidence says so, or where the same action, done facing the same way, leads to visits that
-        misfit as they arrive. So this is worked out from the last visit to the first.
+        True if visits I and J cannot be at one place with slot 0 of I at slot R of J, for R from 0
+        to 3. Two visits misfit if they show different things, if evidence says so, or if one
+        action, done facing the same way, leads to visits that misfit as they arrive. So visits are
+        compared from the last to the first.
         """
         import numpy as np
 
@@ -320,12 +352,12 @@ class FramedChart(Chart):
         for (visit, slot), seen in zip(self.facing, self.seen, strict=True):
             views[visit, slot] = seen
         number: dict[tuple[int, ...], int] = {}
-        # stars[r] numbers the star of each visit as it looks from slot r of the visit
+        # stars[r] has the star of each visit as seen from its slot r, as a number.
         stars = [
             np.array([number.setdefault(star[r:] + star[:r], len(number)) for star in self.stars])
             for r in range(4)
         ]
-        leaves = np.full(visits, -1)  # the slot that a visit ends at, none for the last
+        leaves = np.full(visits, -1)  # the slot at which a visit ends; -1 for the last
         action = np.full(visits, -1)
         for visit, (slot, done) in self.leaves.items():
             leaves[visit], action[visit] = slot, done
@@ -352,20 +384,25 @@ class FramedChart(Chart):
 
 
 def _pairs_within(earlier: Earlier, size: int) -> list[tuple[int, int]]:
-    """The pairs both steps of which are among the first `size`, the earlier step first."""
+    """The pairs of steps among the first `size`, the earlier step first."""
     return [(i, t) for t, others in earlier.items() if t < size for i in others]
 
 
 def numbered(labels: Iterable[Hashable]) -> list[int]:
-    """Labels, numbered by the first step at each."""
+    """Labels renumbered in the order in which they first occur."""
     number: dict[Hashable, int] = {}
     return [number.setdefault(label, len(number)) for label in labels]
 
 
 def _views_around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int] | None:
-    """What is seen ahead, right, back and left of where this is seen ahead. None where turns do not tell, or contradict each other.
+    """The observations ahead, right, back and left of where `seen` is seen ahead.
 
-    after  what is seen after a turn, by what was seen before it and by how many quarters to the right it turned
+    Args:
+        seen: An observation.
+        after: The observation after a turn, by the one before it and the quarters clockwise.
+
+    Returns:
+        Four observations; None if turns do not tell them all, or contradict each other.
     """
     views = {0: seen}
     waiting = [0]

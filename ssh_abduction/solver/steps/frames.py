@@ -1,8 +1,10 @@
-"""How the stars of a trace may be turned to each other: what the axioms of gateways.lp read, worked out before any map is sought.
+"""How the stars of a trace fit each other when turned: the input of gateways.lp.
 
-A step sees one of few *frames*: its star, where each gateway that was not observed is there, or is not. At a place all frames have equally many slots. Slot K of a frame is slot (K+C) mod N of
-an earlier one, for some *shift* C. That fixes by how much the robot has turned, up to the spreads of the bearings: a set of rotations, in whole degrees. No rotation at all means that the
-two frames are not one place's, shifted so.
+A star is what a step sees. A *frame* is a star in which each unobserved gateway has been decided to
+be there or not. All frames seen at a place have the same number N of slots. Slot K of a frame is
+slot (K+C) mod N of an earlier frame, for some *shift* C. The shift and the spreads of the bearings
+limit by how much the robot has turned: a set of rotations in whole degrees. If the set is empty,
+the two frames are not seen at one place with this shift.
 
 >>> from ssh_abduction.data.star import Star
 >>> from ssh_abduction.solver.steps.frames import members, rotations
@@ -21,19 +23,21 @@ from functools import lru_cache
 from ssh_abduction.data.star import SPREAD, Frame, Star
 from ssh_abduction.data.trace import Action, Trace
 
-# A set of rotations is a number: its bit R says whether R degrees clockwise are in the set.
+# A set of rotations is an integer: bit R tells whether R degrees clockwise are in the set.
 FULL = (1 << 360) - 1
-# A turn right or left goes on by more degrees than this, and stops as many short of a turn around: two bearings may differ by so much and be those of one gateway.
+# The least degrees of a turn right or left, and by how much it has to fall short of a turn around:
+# bearings that differ by less may belong to one gateway.
 LEAST_TURN = int(2 * SPREAD)
-WAYS = {"alike": 0, "opposite": 180}  # by how many degrees the robot has turned
+WAYS = {"alike": 0, "opposite": 180}  # the rotation of each way, in degrees
 
 
 class Frames:
     """The frames of a trace, numbered by the first step that may see them.
 
-    stars   for each step, the number of its star
-    looks   for each star, the frames that it may be
-    frames  all of them
+    Attributes:
+        stars: The number of the star of each step.
+        looks: The frames that each star may be.
+        frames: All frames.
     """
 
     def __init__(self, trace: Trace, stop: int | None = None) -> None:
@@ -50,7 +54,7 @@ class Frames:
         self.frames: tuple[Frame, ...] = tuple(numbers)
 
     def fits(self, x: int, y: int) -> Iterator[int]:
-        """The shifts at which frame y, seen later, may be frame x."""
+        """The shifts with which frame y, seen later, may be frame x."""
         first, then = self.frames[x], self.frames[y]
         if first.slots == then.slots:
             yield from (
@@ -60,7 +64,16 @@ class Frames:
 
 @lru_cache(maxsize=2**16)
 def rotations(first: Frame, then: Frame, shift: int) -> int:
-    """The rotations by which the robot may have turned, if slot K of `then` is slot K + shift of `first`. Both have equally many slots."""
+    """The rotations by which the robot may have turned between two frames.
+
+    Args:
+        first: The earlier frame.
+        then: The later frame, with as many slots.
+        shift: Slot K of `then` is slot K + shift of `first`.
+
+    Returns:
+        A set of rotations.
+    """
     n = first.slots
     found = FULL
     for k in range(n):
@@ -73,7 +86,10 @@ def rotations(first: Frame, then: Frame, shift: int) -> int:
 
 
 def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
-    """Whether the robot may face the same way in both (alike), or the opposite way; or leave along the same path so."""
+    """The ways that the robot may face in the later frame: alike, opposite, or both.
+
+    It may also leave along the same path in this direction.
+    """
     found = rotations(first, then, shift)
     return [
         way
@@ -83,7 +99,7 @@ def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
 
 
 def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
-    """Which of these ways it faces, as far as bearings can tell."""
+    """The ways that the robot has to face in the later frame, as far as bearings tell."""
     found = rotations(first, then, shift)
     return [
         way
@@ -93,12 +109,15 @@ def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
 
 
 def may_turn(action: Action, first: Frame, then: Frame, shift: int) -> bool:
-    """Whether a turn may lead from what is seen first to what is seen then."""
+    """Whether a turn may lead from one frame to the other."""
     return bool(rotations(first, then, shift) & _turned_by(action, first))
 
 
 def ends(frame: Frame) -> list[str]:
-    """Where no gateway leads on along the robot's path: ahead, behind. It may be off straight ahead, or straight behind, by twice its spread."""
+    """The directions in which no gateway continues the robot's path: ahead, behind.
+
+    A gateway continues the path if it is straight ahead, or behind, within twice its spread.
+    """
     if _way(frame) is not None:
         return []
     near = [
@@ -112,12 +131,15 @@ def ends(frame: Frame) -> list[str]:
 
 
 def heading(first: Frame, then: Frame, shift: int) -> int:
-    """The heading in what is seen then, in whole degrees clockwise from the heading in what was seen first; 0 where bearings do not tell."""
+    """The heading in the later frame, in whole degrees clockwise from the heading in the first.
+
+    0 if bearings do not tell.
+    """
     return middle(rotations(first, then, shift)) if first.slots == then.slots else 0
 
 
 def middle(found: int) -> int:
-    """The rotation in the middle of a set of rotations; 0 where it holds all rotations or none."""
+    """The middle of the longest interval of a set of rotations; 0 if the set is full or empty."""
     starts = [r for r in members(found) if not found >> (r - 1) % 360 & 1]
     lengths = {
         start: next(length for length in range(1, 361) if not found >> (start + length) % 360 & 1)
@@ -128,12 +150,12 @@ def middle(found: int) -> int:
 
 
 def members(found: int) -> list[int]:
-    """The degrees in a set of rotations."""
+    """The rotations in a set, in degrees."""
     return [r for r in range(360) if found >> r & 1]
 
 
 def _turned_by(action: Action, first: Frame) -> int:
-    """The rotations that a turn may be."""
+    """The rotations that a turn may make, from a frame."""
     if action.bearing is not None:
         return _about(round(action.bearing), int(SPREAD))
     if action.gateway is not None:
@@ -153,7 +175,10 @@ def _turned_by(action: Action, first: Frame) -> int:
 
 
 def _declared(first: Frame, then: Frame, shift: int) -> str | None:
-    """Whether slots that are declared opposite say that the robot goes along its path in the same direction, or in the opposite one."""
+    """The direction along the robot's path in the later frame, by slots declared opposite.
+
+    "alike", "opposite", or None if they do not tell.
+    """
     here, there = _way(first), _way(then)
     if here is None or there is None or not rotations(first, then, shift):
         return None
@@ -162,7 +187,7 @@ def _declared(first: Frame, then: Frame, shift: int) -> str | None:
 
 
 def _way(frame: Frame) -> tuple[int, int] | None:
-    """The slots ahead and behind on the robot's path, where it faces one that has a declared opposite, or has its opposite behind it."""
+    """The slots ahead and behind on the robot's path, if it leads through declared opposites."""
     for ahead, behind in enumerate(frame.opposite):
         if behind is not None and (frame.faces(ahead) or frame.has_behind(behind)):
             return ahead, behind
@@ -170,20 +195,26 @@ def _way(frame: Frame) -> tuple[int, int] | None:
 
 
 def _surely(found: int, towards: int) -> bool:
-    """Whether a set of rotations holds one direction, and is narrow: no gateways, or unknown ones, leave nearly all rotations, which says nothing."""
+    """Whether a set of rotations is narrow and contains this direction.
+
+    Stars without known gateways leave nearly all rotations, which tells nothing.
+    """
     return bool(found >> towards & 1) and not found >> 90 & 1 and not found >> 270 & 1
 
 
 @lru_cache(maxsize=2**14)
 def _about(degrees: int, spread: int) -> int:
+    """The rotations within a spread of some degrees."""
     return _of((degrees + d) % 360 for d in range(-spread, spread + 1))
 
 
 def _between(least: int, most: int) -> int:
+    """The rotations in a closed interval of degrees."""
     return _of(range(least, most + 1))
 
 
 def _of(degrees: Iterable[int]) -> int:
+    """The set of these rotations."""
     found = 0
     for r in degrees:
         found |= 1 << r

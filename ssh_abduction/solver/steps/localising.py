@@ -1,9 +1,11 @@
-"""Finds the visits that clingo was not told of in a map of those that it was told of.
+"""Localise the visits of a trace in a map of some of them.
 
-Of a long trace in a small world clingo need not be told of each visit: a map of some of them says where the others are. That is Markov
-localisation with beliefs that are all or nothing. From all states where the last visit may be, the map says where its action leads, and there is the
-next visit. The map has to know a visit better in three cases: no such state fits the visit, the map does not know the action, or the visit faces a slot that
-no other visit to its place faced. Then it is *missed*, with as many visits before it as it takes to know where it is.
+For a long trace in a small world, clingo need not be given every visit: a map of some visits tells
+where the others are. This is Markov localisation with beliefs that are sets of states. From all
+states at which a visit may be, the map tells where its action leads, and there is the next visit.
+A visit is *missed* if no such state fits it, if the map does not know the action, or if the visit
+faces a slot that no visit of the map faced. The map then needs to know this visit, and as many
+visits before it as it takes to localise it.
 """
 
 from __future__ import annotations
@@ -17,25 +19,35 @@ from numpy.typing import NDArray
 
 from ssh_abduction.solver.steps.chart import FramedChart
 
-# At most this many stretches of missed visits are found before clingo is told of them and asked again. The answer to that may explain the stretches after these,
-# and each visit that clingo is told of makes its next question larger.
+# The most stretches of missed visits to find before clingo is given them and solves again. Its
+# answer may explain later stretches, and each further visit makes the problem larger.
 STRETCHES = 10
 
-State: TypeAlias = int  # 4 times the number of a place, 0 and up without gaps, and the slot of the place that slot 0 of a visit is
+# 4 times the number of a place, plus the slot of the place that is slot 0 of the visit. Places are
+# numbered from 0 without gaps.
+State: TypeAlias = int
 
 
 @dataclass(frozen=True)
 class Located:
-    """The state of each visit. Where the map does not tell all of them there are no states, and `missed` are visits that it has to know first."""
+    """The result of localising.
+
+    Attributes:
+        states: The state of each visit; empty if the map does not tell all of them.
+        missed: Otherwise, visits that the map has to know first.
+    """
 
     states: tuple[State, ...]
     missed: tuple[int, ...] = ()
 
 
 def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
-    """Where all visits are, by the states of some.
+    """Localise all visits by the states of some.
 
-    states  of some visits, the first one among them. Visits at one state are not apart, and the same action there leads to one state
+    Args:
+        chart: The visits.
+        states: The states of some visits, the first visit among them. Visits at one state are not
+            apart, and an action leads from it to one state.
     """
     if len(states) == len(chart.stars):
         return Located(tuple(states[visit] for visit in range(len(states))))
@@ -43,12 +55,12 @@ def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
 
 
 def tracked(chart: FramedChart, states: Mapping[int, State]) -> list[State]:
-    """The state of each visit, as far as the map of these states tells: -1 where it is not known where a visit is."""
+    """The state of each visit; -1 where the map does not tell it."""
     return _Localiser(chart, states).tracked()
 
 
 def states_of(chart: FramedChart, labels: Sequence[int]) -> list[State]:
-    """The state of each visit. Visits that share a label are at one place."""
+    """The state of each visit, if visits that share a label are at one place."""
     at: dict[int, list[tuple[int, int]]] = {}  # the visits and slots that have each label
     labelled: dict[int, list[tuple[int, int]]] = {}  # the slots of each visit and their labels
     for (visit, slot), label in zip(chart.facing, labels, strict=True):
@@ -72,7 +84,7 @@ def states_of(chart: FramedChart, labels: Sequence[int]) -> list[State]:
 
 
 class _Localiser:
-    """Localises visits in the map that the states of some visits make: where actions lead from these states, and which states fit other visits."""
+    """Localises visits in the map that the states of some visits make."""
 
     def __init__(self, chart: FramedChart, states: Mapping[int, State]) -> None:
         self._leaves = chart.leaves
@@ -91,6 +103,7 @@ class _Localiser:
         self._fits = _fitting(chart, states)
 
     def tracked(self) -> list[State]:
+        """The state of each visit; -1 where it is ambiguous."""
         possible = self._anywhere(0)
         found = [possible]
         for visit in range(1, len(self._slots)):
@@ -99,6 +112,7 @@ class _Localiser:
         return [next(iter(states)) if len(states) == 1 else -1 for states in found]
 
     def located(self) -> Located:
+        """The states of all visits, or the visits that are missed."""
         possible = self._anywhere(0)
         found = [possible]
         missed: set[int] = set()
@@ -119,7 +133,10 @@ class _Localiser:
         )
 
     def _stretch_up_to(self, visit: int) -> Iterable[int]:
-        """A stretch of visits, up to this one, that is long enough to show that the map does not explain it, whatever came before."""
+        """The shortest tried stretch of visits up to this one that the map cannot explain.
+
+        The map cannot explain it from any state of its first visit.
+        """
         back = 1
         while True:
             start = max(visit - back, 0)
@@ -133,11 +150,14 @@ class _Localiser:
             back *= 2
 
     def _anywhere(self, visit: int) -> set[State]:
-        """The states that a visit may be at, if nothing is known of the visits before it."""
+        """The states that a visit may be at if the visits before it are unknown."""
         return set(np.flatnonzero(self._fits[visit]).tolist())
 
     def _after(self, possible: set[State], visit: int) -> set[State]:
-        """The states that the next visit may be at, if this one is at one of these. Any that fits, where the map does not know the action everywhere."""
+        """The states that the next visit may be at, if this one is at one of `possible`.
+
+        These are all states that fit, if the map does not know the action from each possible state.
+        """
         slot, action = self._leaves[visit]
         there = {self._leads.get((faced(state, slot), action)) for state in possible}
         if not there or None in there:
@@ -145,14 +165,14 @@ class _Localiser:
         return {state for state in there if state is not None and self._fits[visit + 1, state]}
 
     def _is_unknown(self, possible: set[State], visit: int) -> bool:
-        """Whether it is known where a visit is, but not where its action leads."""
+        """Whether the state of a visit is known, but not where its action leads."""
         slot, action = self._leaves[visit]
         return len(possible) == 1 and not any(
             (faced(state, slot), action) in self._leads for state in possible
         )
 
     def _is_new(self, possible: set[State], visit: int) -> bool:
-        """Whether it is known where a visit is, and it faces a slot there that no visit of the map faced."""
+        """Whether the state of a visit is known, and no visit of the map faced one of its slots."""
         return len(possible) == 1 and any(
             faced(state, slot) not in self._faced
             for state in possible
@@ -161,12 +181,23 @@ class _Localiser:
 
 
 def faced(state: State, slot: int) -> State:
-    """The slot of its place that a visit at this state faces when it faces `slot` of its own: as 4 times the place's number plus the slot."""
+    """The slot of its place that a visit faces.
+
+    Args:
+        state: The state of the visit.
+        slot: The slot of the visit that it faces.
+
+    Returns:
+        4 times the number of the place, plus the slot.
+    """
     return state - state % 4 + (state + slot) % 4
 
 
 def _fitting(chart: FramedChart, states: Mapping[int, State]) -> NDArray[np.bool_]:
-    """Visits x states: whether a visit may be at a state, as it is apart from no visit that is known to be at that place."""
+    """Whether each visit may be at each state, as a matrix of visits x states.
+
+    A visit may not be at a place if it is apart from a visit known to be there.
+    """
     fits = np.empty((len(chart.stars), 4 * (max(states.values()) // 4 + 1)), dtype=bool)
     at: dict[int, list[int]] = {}
     for visit, state in states.items():

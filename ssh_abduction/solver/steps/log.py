@@ -1,8 +1,9 @@
-"""Run a trace over a map in linear time: what the map predicts holds, is contradicted, or is unknown to it.
+"""A trace as integers, replayed over maps in linear time.
 
-A map made for the first steps of a trace says of each action tried in a dstate where it leads, and of each dstate what was
-seen there. Replay follows the rest of the trace through these links. It restates no axiom: where it meets an action never
-tried in the dstate, or something never seen there, it stops and leaves the judgement to the solver.
+A map of the first steps of a trace says where each tried action leads, and what was seen at each
+dstate. A replay follows the rest of the trace along these links. It checks no axioms: it stops at
+an action that was not tried in a dstate, or at an observation that was not made there, and leaves
+the decision to the solver.
 """
 
 from __future__ import annotations
@@ -15,38 +16,43 @@ from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.theory import Theory
 
-# Where the greedy map does not know an action, at most this many dstates of the view that is seen are tried as its end, those found first: so a view that is seen
-# nearly everywhere does not use up all predictions at once.
+# The most dstates to try as the end of an unknown action, first ones first. So a view that is seen
+# nearly everywhere does not use up all predictions.
 TRIED = 100
-# To make a greedy map at most this many steps are predicted, which takes about a second. From then on what is unknown leads to new dstates: a map that takes more
-# predictions is large anyway.
+# The most steps to predict for a greedy map, which takes about a second. Then unknown actions lead
+# to new dstates: a map that needs more predictions is large anyway.
 STEPS_TRIED = 3_000_000
-# Or this many predictions for each step of the trace, if that is more, so that a long trace is not cut short.
+# For long traces, this many predictions for each step instead.
 EACH = 20
 
 
 class Outcome(Enum):
     """How a replay ended."""
 
-    PREDICTED = "predicted"  # every step of the trace is explained
-    CONTRADICTED = "contradicted"  # the dstate reached shows something else, or evidence says that the step is not there
+    PREDICTED = "predicted"  # the map explains every step
+    CONTRADICTED = "contradicted"  # the observation or evidence contradicts the dstate reached
     UNKNOWN = "unknown"  # the action was never tried in the dstate
 
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """The `labels` of the steps that the map explains, and the `outcome`. Where that is not PREDICTED, step len(labels) is the one that failed."""
+    """The result of a replay.
+
+    Attributes:
+        labels: The dstates of the steps that the map explains.
+        outcome: How the replay ended. Unless it is PREDICTED, step len(labels) failed.
+    """
 
     labels: tuple[int, ...]
     outcome: Outcome
 
 
 def observation(step: Step, theory: Theory) -> tuple[object, object]:
-    """What the axioms read at a step: the view, and the star where the theory uses stars. Where the theory does not say how stars are turned
-    (star=pattern), all four rotations of a star are the same observation. Where stars agree in tolerance only (star=gateways), none tells two dstates apart
-    by itself.
+    """What the axioms read at a step: the view, and the star if the theory uses stars.
 
-    By functional_view and the axioms of the stars, a dstate has one observation.
+    By functional_view and the axioms of stars, a dstate has one observation. If the theory does not
+    say how stars are turned (star=pattern), all four rotations of a star are one observation. If
+    stars need to agree only within tolerance (star=gateways), they are left out.
     """
     star = step.openings if theory.star in ("pattern", "frame") else None
     if star is None or theory.star == "frame":
@@ -55,11 +61,12 @@ def observation(step: Step, theory: Theory) -> tuple[object, object]:
 
 
 class Log:
-    """A trace as integers, made once and replayed over many maps.
+    """A trace as integers, to be replayed over many maps.
 
-    actions   which action was done at each step
-    seen      which observation was made
-    pairs     what evidence says of pairs of steps
+    Attributes:
+        actions: The action at each step.
+        seen: The observation at each step.
+        pairs: Evidence about pairs of steps.
     """
 
     def __init__(self, trace: Trace, theory: Theory) -> None:
@@ -77,8 +84,11 @@ class Log:
     ) -> Replay:
         """Replay the trace over the map that `labels` make of its first steps.
 
-        known     how many of these steps make the links of the map (default all)
-        place_of  the place of each dstate of the map, if it has places: evidence may say that two steps are at different places
+        Args:
+            labels: The dstate of each of the first steps.
+            known: The number of these steps whose links make the map; all by default.
+            place_of: The place of each dstate, if the map has places. Evidence may say that two
+                steps are at different places.
         """
         actions, seen = self.actions, self.seen
         known = len(labels) if known is None else known
@@ -106,11 +116,13 @@ class Log:
         return Replay(tuple(found), outcome)
 
     def merged(self) -> tuple[int, ...]:
-        """Labels of a map of the whole trace, made greedily: it is consistent and found at once, but need not be minimal.
+        """Labels of a consistent map of the whole trace, found greedily. It need not be minimal.
 
-        Where the map does not know an action, each known dstate that shows what is seen is tried as its end: from there the map either predicts the trace
-        until it meets another unknown action, or is contradicted before. Of those not contradicted, the one that predicts most steps is taken; if there is
-        none, the action leads to a new dstate. So a link, once made, is never wrong. Once STEPS_TRIED is used up, all that is unknown leads to new dstates.
+        Where the map does not know an action, each known dstate with the next observation is tried
+        as its end. The map then predicts the trace up to the next unknown action, or is
+        contradicted before. The dstate that predicts the most steps without contradiction is taken;
+        if there is none, a new dstate is. So a link, once made, is never wrong. After STEPS_TRIED
+        predictions, all unknown actions lead to new dstates.
         """
         actions, seen = self.actions, self.seen
         shows = [seen[0]]
