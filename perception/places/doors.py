@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from perception.places.distinctive import Visit, Way
 from perception.places.local_map import LocalMaps, Patch
 from perception.places.scale import Scale
 from perception.places.track import Array, Track
-from perception.places.visits import Visit, Way
 from perception.readers.scans import RobotLog
 
 # The width is measured once every STRIDE metres, since a door may be as thin as a wall. One local

@@ -20,11 +20,11 @@ import numpy as np
 from perception.errors import ImageWarning, LogError
 from perception.places import jumps
 from perception.places.agreement import disagreement
+from perception.places.distinctive import Visit, find_visits
 from perception.places.doors import are_frequent, find_doors, is_wide, visits_of
 from perception.places.scale import Scale, suggested
 from perception.places.tracing import to_trace
 from perception.places.track import Track, follow, turned_wrongly
-from perception.places.visits import Visit, find_visits
 from perception.readers.scans import RobotLog
 from perception.reciprocal import ReciprocalTransformer
 from perception.views import ViewClusterer

@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from perception.places.distinctive import Visit, Way
 from perception.places.gateways import apart
 from perception.places.local_map import CELL, LocalMaps, Patch
 from perception.places.scale import Scale
 from perception.places.track import Array, Track, wrapped
-from perception.places.visits import Visit, Way
 from perception.readers.scans import Pose, RobotLog
 from ssh_abduction.data.odometry import Covariance, Odometry, between, moved
 from ssh_abduction.data.star import Gateway
