@@ -1,4 +1,4 @@
-"""What notebooks show of maps and traces, and the parts of it: headings, tables and pictures as HTML.
+"""Notebook cards of maps and traces, and their parts: headings, tables and pictures as HTML.
 
 All text is escaped, as views and names may hold anything.
 

@@ -1,0 +1,162 @@
+"""Headings of dstates on a page, from the turns between them.
+
+Each course (a path or a part of one, which is drawn straight) gets the heading that agrees best
+with all turns. This is angular synchronisation (Singer 2011, "Angular synchronization by
+eigenvectors and semidefinite programming").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple, TypeAlias
+
+import networkx as nx
+import numpy as np
+from scipy.sparse import coo_array
+
+from ssh_abduction.data.maps import DState, SSHMap
+from ssh_abduction.output.turns import SURE
+
+# What has a heading: a path, a part of one, or a dstate that is along no path.
+Course: TypeAlias = tuple[int, ...]
+
+# Radians: a turn that a drawing misses by more may go to the wrong side. The first is for turns by
+# known degrees, the second for turns of which only the side is known.
+WRONG, WRONG_GUESS = math.radians(46), math.radians(61)
+# Sweeps of averaging, and how often the turns get new weights.
+SWEEPS, REWEIGHTED = 60, 15
+LEAST_MISSED = 0.02  # radians: turns that are missed by less all get the same weight
+EXACT = 1e-6  # radians by which headings may miss turns that they agree with
+
+
+class Turn(NamedTuple):
+    """The angle between two dstates.
+
+    Attributes:
+        a: The first dstate.
+        b: The second one.
+        angle: Radians counterclockwise from the heading of a to that of b.
+        weight: SURE or GUESSED.
+    """
+
+    a: DState
+    b: DState
+    angle: float
+    weight: float
+
+
+def turns_between(
+    ssh_map: SSHMap, degrees: Mapping[str, tuple[float, float]], spot: Sequence[int]
+) -> Iterator[Turn]:
+    """The turns between dstates: by their headings in the frames of places, and by actions.
+
+    Args:
+        ssh_map: The map.
+        degrees: For each action's name the degrees clockwise, and the weight of that.
+        spot: Where each dstate is. Dstates with one spot are at one place.
+    """
+    dstates = ssh_map.dstates
+    in_slots = max((s.heading or 0 for s in dstates), default=0) < 4
+    unit = 90 if in_slots else 1
+    members: dict[int, list[DState]] = {}
+    for s in dstates:
+        if s.place is not None and s.heading is not None:
+            members.setdefault(s.place, []).append(s)
+    for facing in members.values():
+        for a, b in pairwise(facing):
+            yield Turn(a, b, -math.radians(((b.heading or 0) - (a.heading or 0)) * unit), SURE)
+    for source, action, target in ssh_map.links:
+        s, x = dstates[source], dstates[target]
+        if action in degrees:
+            # Headings in the frame of a place say more than an action at this place.
+            if s.heading is None or x.heading is None or s.place != x.place:
+                turn, weight = degrees[action]
+                yield Turn(s, x, -math.radians(turn), weight)
+        elif s.path is None and spot[source] != spot[target]:
+            yield Turn(s, x, 0.0, SURE)
+
+
+def in_quarters(turns: Sequence[Turn]) -> bool:
+    """Whether all turns are multiples of a quarter turn."""
+    return all(abs(math.remainder(turn.angle, math.pi / 2)) < EXACT for turn in turns)
+
+
+def headings_by(
+    turns: Sequence[Turn], courses: Mapping[int, tuple[Course, float]], robust: bool
+) -> tuple[dict[int, float], int]:
+    """The heading of each dstate. The first dstate of each connected part faces right.
+
+    Args:
+        turns: The turns between dstates.
+        courses: For each dstate its course, and the radians by which it faces another way.
+        robust: Whether to keep most of the turns that contradict each other as they are, instead
+            of making all of them a little wrong.
+
+    Returns:
+        The headings in radians counterclockwise from x, and how many turns may go to a wrong side.
+    """
+    graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
+    graph.add_nodes_from(course for course, _ in courses.values())
+    for a, b, turn, weight in turns:
+        (course, off), (other, other_off) = courses[a.id], courses[b.id]
+        if course != other:
+            graph.add_edge(course, other, turn=turn + off - other_off, weight=weight)
+    angles: dict[Course, float] = {}
+    for part in nx.weakly_connected_components(graph):
+        first, ahead = next((course, off) for course, off in courses.values() if course in part)
+        found = _synchronised(graph.subgraph(part), first, robust)
+        angles |= {course: angle - ahead for course, angle in found.items()}
+    if robust and in_quarters(turns):
+        quarter = math.pi / 2
+        angles = {course: round(angle / quarter) * quarter for course, angle in angles.items()}
+    headings = {
+        s: math.remainder(angles[course] + off, math.tau) for s, (course, off) in courses.items()
+    }
+    wrong = 0
+    for a, b, turn, weight in turns:
+        missed = abs(math.remainder(headings[a.id] + turn - headings[b.id], math.tau))
+        wrong += missed > (WRONG if weight == SURE else WRONG_GUESS)
+    return headings, wrong
+
+
+def _synchronised(graph: nx.MultiDiGraph[Any], first: Course, robust: bool) -> dict[Course, float]:
+    """The heading of each course of a connected part; that of the first is 0.
+
+    With `robust` a missed turn counts by its size and not by its square. This is done by averaging
+    again and again, with weights that fall with what was missed the last time.
+    """
+    # Begin with headings along a tree of turns.
+    angles = {first: 0.0}
+    for a, b in nx.bfs_edges(graph.to_undirected(as_view=True), first):
+        turn = graph[a][b][0]["turn"] if graph.has_edge(a, b) else -graph[b][a][0]["turn"]
+        angles[b] = angles[a] + turn
+    courses = list(angles)
+    number = {course: i for i, course in enumerate(courses)}
+    turns = [
+        (number[a], number[b], data["turn"], data["weight"])
+        for a, b, data in graph.edges(data=True)
+    ]
+    found = np.array([angles[course] for course in courses])
+    if turns:
+        source, target, turn, weight = (np.array(column) for column in zip(*turns, strict=True))
+        rows, columns = np.concatenate([target, source]), np.concatenate([source, target])
+        for _ in range(REWEIGHTED):
+            missed = np.abs(np.angle(np.exp(1j * (found[source] + turn - found[target]))))
+            if missed.max() < EXACT:
+                break
+            now = weight / np.maximum(missed, LEAST_MISSED) if robust else weight
+            factors = np.concatenate([now * np.exp(1j * turn), now * np.exp(-1j * turn)])
+            # Keep half of the old value, so that the sweeps do not oscillate.
+            own = 0.5 * np.bincount(rows, np.abs(factors), len(courses))
+            matrix = coo_array((factors, (rows, columns)), (len(courses), len(courses))).tocsr()
+            z = np.exp(1j * found)
+            for _ in range(SWEEPS):
+                z = matrix @ z + own * z
+                z /= np.maximum(np.abs(z), 1e-12)
+            found = np.angle(z)
+    return {
+        course: round(math.remainder(angle - found[number[first]], math.tau), 9)
+        for course, angle in zip(courses, found.tolist(), strict=True)
+    }

@@ -1,0 +1,203 @@
+"""Positions of spots along streets of given headings, by a linear program.
+
+A street is at least one unit long. It is expensive for it to leave its heading, and streets are as
+short as that allows. If two streets lie on each other or cross, the program is solved again with
+one street on some side of the other, if that costs less than the crossing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+from scipy.sparse import coo_array
+
+Point: TypeAlias = tuple[float, float]
+# For the street from one spot to another: its heading in radians, and its share of the costs.
+Streets: TypeAlias = Mapping[tuple[int, int], tuple[float, float]]
+# A sum of variables with these factors, and its least value.
+_Condition: TypeAlias = tuple[dict[int, float], float]
+_Points: TypeAlias = NDArray[np.float64]
+
+# Costs in units of length of a street: for each unit that a street leaves its heading, for each
+# unit that it is too short, and for two streets that lie on each other or cross.
+ASTRAY, SHORT, CROSSING = 300.0, 600.0, 60.0
+LOOSE = 0.001  # the share of the costs of a street that nobody travelled
+CROOKED = 0.1  # a street that leaves its heading by more looks bent
+NEAR, APART = 0.5, 1.0  # streets nearer than the first are put as far apart as the second
+PARALLEL = 0.1  # radians by which the headings of parallel streets may differ
+# The program is solved WORK / streets times at most, but FEWEST times at least. Counts and not
+# seconds limit it, so that a map has one drawing.
+WORK, FEWEST = 6000, 12
+BEAM = 3
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """A drawing in the search that puts streets apart.
+
+    Attributes:
+        value: What it costs.
+        at: Where the spots are, (spots, 2).
+        conditions: What was added to the program.
+        left_alone: Pairs of streets that stay as they are.
+    """
+
+    value: float
+    at: _Points
+    conditions: tuple[_Condition, ...]
+    left_alone: frozenset[tuple[int, int]]
+
+
+class StreetProgram:
+    """The linear program that puts spots along the headings of streets and keeps streets apart.
+
+    Its variables are x and y of each spot, then for each street how far it leaves its heading, and
+    then how much it is too short.
+
+    Args:
+        spots: The ids of the spots.
+        streets: The streets between them.
+    """
+
+    def __init__(self, spots: Sequence[int], streets: Streets) -> None:
+        self.spots = list(spots)
+        number = {spot: i for i, spot in enumerate(spots)}
+        self.ends = np.array([(number[p], number[q]) for p, q in streets], dtype=int).reshape(-1, 2)
+        ways = [(math.cos(way), math.sin(way)) for way, _ in streets.values()]
+        self.along = np.round(np.array(ways).reshape(-1, 2), 12)
+        self.across = self.along[:, ::-1] * (-1, 1)
+        self.share = np.array([share for _, share in streets.values()])
+        # The pairs of travelled streets without a common end: these are kept apart.
+        e, f = np.triu_indices(len(streets), 1)
+        common = (self.ends[e][:, :, None] == self.ends[f][:, None, :]).any(axis=(1, 2))
+        both = (self.share[e] == 1.0) & (self.share[f] == 1.0)
+        self.pairs = np.column_stack((e, f))[both & ~common]
+        self.rows: list[_Condition] = []
+        self.cost = self._cost()
+        self.at, self.value = self._solved([])
+
+    @property
+    def bent(self) -> int:
+        """How many travelled streets leave their headings, or are too short."""
+        way = self.at[self.ends[:, 1]] - self.at[self.ends[:, 0]]
+        astray = np.maximum(
+            np.abs(np.sum(way * self.across, axis=1)), 1 - np.sum(way * self.along, axis=1)
+        )
+        return int(np.sum((astray > CROOKED) & (self.share == 1.0)))
+
+    def put_apart(self) -> dict[int, Point]:
+        """Where each spot is, with streets apart.
+
+        A search with a narrow beam: each pair of streets that are too near each other is left
+        alone, or put apart to either side.
+        """
+        best = _State(self.value, self.at, (), frozenset())
+        beam, left = [best], max(FEWEST, WORK // (len(self.ends) + 1))
+        while beam and left > 0:
+            children = []
+            for state in beam:
+                near = (pair for pair in self._near(state.at) if pair not in state.left_alone)
+                if (pair := next(near, None)) is None:
+                    continue
+                children.append(replace(state, left_alone=state.left_alone | {pair}))
+                for condition in self._ways_apart(*pair):
+                    conditions = (*state.conditions, *condition)
+                    at, value = self._solved(conditions)
+                    children.append(_State(value, at, conditions, state.left_alone))
+                    left -= 1
+            beam = sorted(children, key=lambda state: state.value)[:BEAM]
+            best = min([best, *beam], key=lambda state: state.value)
+        return {
+            spot: (round(float(x), 9) + 0.0, round(float(y), 9) + 0.0)  # + 0.0 turns -0.0 into 0.0
+            for spot, (x, y) in zip(self.spots, best.at, strict=True)
+        }
+
+    def _cost(self) -> NDArray[np.float64]:
+        """The cost of each variable. It also adds the conditions of all streets to `rows`."""
+        n, m = len(self.spots), len(self.ends)
+        cost = np.concatenate([np.zeros(2 * n), ASTRAY * self.share, SHORT * self.share])
+        for e, (p, q) in enumerate(self.ends):
+            ahead, aside = _difference(p, q, self.along[e]), _difference(p, q, self.across[e])
+            self.rows.append((ahead | {2 * n + m + e: 1.0}, 1.0))
+            self.rows.append((aside | {2 * n + e: 1.0}, 0.0))
+            self.rows.append(({k: -v for k, v in aside.items()} | {2 * n + e: 1.0}, 0.0))
+            for variable, factor in ahead.items():  # the length of the street
+                cost[variable] += factor * self.share[e]
+        return cost
+
+    def _solved(self, more: Sequence[_Condition]) -> tuple[_Points, float]:
+        """The best positions with more conditions, and their cost with that of all crossings."""
+        n = len(self.spots)
+        if not len(self.ends):
+            return np.zeros((n, 2)), 0.0
+        rows = [*self.rows, *more]
+        entries = [
+            (i, variable, -factor)
+            for i, (factors, _) in enumerate(rows)
+            for variable, factor in factors.items()
+        ]
+        i, variables, factors = zip(*entries, strict=True)
+        fixed, free, positive = (0.0, 0.0), (None, None), (0.0, None)  # the first spot is fixed
+        answer = linprog(
+            self.cost,
+            A_ub=coo_array((factors, (i, variables)), (len(rows), len(self.cost))).tocsr(),
+            b_ub=[-least for _, least in rows],
+            bounds=[fixed] * 2 + [free] * (2 * n - 2) + [positive] * (len(self.cost) - 2 * n),
+            method="highs-ds",
+        )
+        if answer.x is None:  # conditions that contradict each other
+            return np.zeros((n, 2)), math.inf
+        at = np.asarray(answer.x[: 2 * n], dtype=float).reshape(n, 2)
+        return at, float(answer.fun) + CROSSING * len(self._near(at))
+
+    def _ways_apart(self, e: int, f: int) -> Iterator[list[_Condition]]:
+        """Conditions under which two streets are apart.
+
+        One is on a side of the other or, if both are parallel, ahead of it or behind it.
+        """
+        parallel = abs(float(self.across[e] @ self.along[f])) < PARALLEL
+        for normal in (self.across[e], self.along[e] if parallel else self.across[f]):
+            for sign in (1.0, -1.0):
+                yield [
+                    (_difference(p, q, sign * normal), APART)
+                    for p in self.ends[e]
+                    for q in self.ends[f]
+                ]
+
+    def _near(self, at: _Points) -> list[tuple[int, int]]:
+        """Pairs of streets without a common end that are too near each other."""
+        e, f = self.ends[self.pairs[:, 0]], self.ends[self.pairs[:, 1]]
+        a, b, c, d = at[e[:, 0]], at[e[:, 1]], at[f[:, 0]], at[f[:, 1]]
+        far = np.min(
+            (_distance(a, c, d), _distance(b, c, d), _distance(c, a, b), _distance(d, a, b)), axis=0
+        )
+        crossing = (_side(a, b, c) * _side(a, b, d) < 0) & (_side(c, d, a) * _side(c, d, b) < 0)
+        return [(int(i), int(j)) for i, j in self.pairs[(far < NEAR) | crossing]]
+
+
+def _difference(p: int, q: int, way: NDArray[np.float64]) -> dict[int, float]:
+    """How far spot q is ahead of spot p along a way, as factors of variables."""
+    x, y = float(way[0]), float(way[1])
+    return {2 * int(q): x, 2 * int(q) + 1: y, 2 * int(p): -x, 2 * int(p) + 1: -y}
+
+
+def _side(a: _Points, b: _Points, c: _Points) -> NDArray[np.float64]:
+    """The side of the line from a to b that c is on: above 0 to the left."""
+    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    side: NDArray[np.float64] = ux * vy - uy * vx
+    return side
+
+
+def _distance(p: _Points, a: _Points, b: _Points) -> NDArray[np.float64]:
+    """The distance of points from the streets from a to b."""
+    way = b - a
+    length = np.maximum(np.sum(way * way, axis=1), 1e-12)
+    share = np.clip(np.sum((p - a) * way, axis=1) / length, 0, 1)
+    far: NDArray[np.float64] = np.linalg.norm(p - a - share[:, None] * way, axis=1)
+    return far
