@@ -1,1 +1,1 @@
-"""Maps made without clingo. Nothing in here has to be right: what comes of it passes the checker or an encoding."""
+"""Guesses at maps without clingo. They may be wrong: the checker or an encoding tests them."""

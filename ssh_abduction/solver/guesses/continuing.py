@@ -1,19 +1,23 @@
-"""Finds where the steps of a long trace are by a map of its first steps, even if that map lacks links.
+"""Localise the steps of a long trace in a map of its first steps, and add links that it lacks.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.solver.guesses.continuing import followed
 >>> from ssh_abduction.solver.steps.log import Log
->>> trace = Trace.from_steps("abcabca" + "cab" * 4, ["go"] * 6 + ["back"] + ["go"] * 11)
+>>> actions = ["go"] * 6 + ["back"] + ["go"] * 11
+>>> trace = Trace.from_steps("abcabca" + "cab" * 4, actions)
 >>> followed(Log(trace, Theory.causal()), [0, 1, 2, 0])
 [0, 1, 2, 0, 1, 2, 0, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1]
 
-The trace is walked along the links of the map. Where the map does not say where an action leads, it must lead to a dstate that shows what is seen next. Of these
-dstates, the one that predicts the following steps longest is taken, if it is clearly ahead of all others and is not contradicted at the end of its prediction. If
-no dstate is, the robot is lost until what it sees and does tells where it is: Markov localisation, with beliefs that are all or nothing. A link that one walk
-does not settle may be settled by the next walk, as more of the map is known by then. A link that no walk settles leads to a new dstate in the end.
+The trace is walked along the links of the map. An unknown action must lead to a dstate with the
+next observation. Of these dstates, the walk takes the one that predicts the following steps
+longest, if it leads the others clearly and its prediction does not end in a contradiction. If there
+is none, the robot is lost until its observations and actions tell where it is: Markov localisation
+with beliefs that are sets. Links that one walk leaves open may be settled by the next, as the map
+has grown by then. Links that stay open lead to new dstates in the end.
 
-So a link may be wrong, and the map that was given may be. Then the trace contradicts it sooner or later, and the dstate where it does is forgotten, or more of the
-dstates before it where that does not help. The result has more dstates than it needs, as some of them could be one: `guesses/merging.py` merges them.
+A link may therefore be wrong, and so may the given map. Then the trace contradicts it sooner or
+later. The walk forgets the dstate where this happens, and more of the dstates before it if that
+does not help. The result may have dstates that could be one; `guesses/merging.py` merges them.
 """
 
 from __future__ import annotations
@@ -23,17 +27,18 @@ from typing import TypeAlias
 
 from ssh_abduction.solver.steps.log import Log
 
-# At most this many steps are predicted from a dstate, to tell whether the robot is there.
+# The most steps to predict from a dstate, to find out whether the robot is there.
 LOOKED = 300
-# A link leads to a dstate only if that predicts at least this many steps.
+# The fewest steps that a dstate has to predict to become the end of a link.
 SETTLED = 10
-# A robot that is lost is at a dstate only if that predicts at least this many steps: more than for a link, as here nothing is known of where it comes from.
+# The fewest steps that a dstate has to predict if the robot is lost. This is more than for a link,
+# as nothing is known of where the robot comes from.
 FOUND = 20
-# And in both cases only if it predicts this many steps more than any other dstate.
+# In both cases it has to predict this many steps more than any other dstate.
 AHEAD = 2
-# After this many walks the map is given up. After half of them the robot may be lost no longer: what is not settled by then is a new dstate.
+# Give the map up after this many walks. After half of them, open links lead to new dstates.
 WALKS = 100
-# The map is also given up once it has this many times as many dstates as it had to begin with.
+# Also give the map up when the number of dstates has grown by this factor.
 MANY = 10
 
 _Link: TypeAlias = tuple[int, int]  # dstate, action
@@ -42,10 +47,15 @@ _Link: TypeAlias = tuple[int, int]  # dstate, action
 def followed(
     log: Log, labels: Sequence[int], check: Callable[[], None] = lambda: None
 ) -> list[int] | None:
-    """Labels of all steps of a trace, which make a map near the given one; None where too much of that one is contradicted.
+    """Labels of all steps of a trace, in a map near the given one.
 
-    labels  of a map of the first steps, numbered from 0
-    check   called now and then; may raise
+    Args:
+        log: The trace.
+        labels: The dstate of each of the first steps in a map, numbered from 0.
+        check: Called now and then; may raise.
+
+    Returns:
+        The labels; None if the trace contradicts too much of the given map.
     """
     known = _Map(log, labels, check)
     may_be_lost, furthest, back = True, 0, 1
@@ -55,6 +65,7 @@ def followed(
         if known.is_too_large:
             return None
         if len(found) < len(log.seen):
+            # Forget twice as many dstates if forgetting the last ones did not help.
             furthest, back = max(furthest, len(found)), 2 * back if len(found) <= furthest else 1
             known.forget(found[-back:])
         elif -1 not in found:
@@ -65,19 +76,20 @@ def followed(
 
 
 class _Map:
-    """A map of the first steps, to which links and dstates are added.
+    """A map that grows by links and dstates.
 
-    leads  where actions lead, by dstate and action
+    Attributes:
+        leads: Where actions lead, by dstate and action.
     """
 
     def __init__(self, log: Log, labels: Sequence[int], check: Callable[[], None]) -> None:
         self._check = check
         self._seen, self._actions = log.seen, log.actions
-        self._shows = dict(zip(labels, log.seen, strict=False))  # what is seen at each dstate
+        self._shows = dict(zip(labels, log.seen, strict=False))  # the observation of each dstate
         self.leads = {(labels[t], log.actions[t]): labels[t + 1] for t in range(len(labels) - 1)}
         self._start: int | None = labels[0]
         self._most = MANY * len(self._shows)
-        self._like: dict[int, list[int]] = {}  # for each observation, the dstates that show it
+        self._like: dict[int, list[int]] = {}  # the dstates that have each observation
         for dstate, seen in self._shows.items():
             self._like.setdefault(seen, []).append(dstate)
 
@@ -86,13 +98,16 @@ class _Map:
         return len(self._shows) > self._most
 
     def walked(self, *, may_be_lost: bool) -> list[int]:
-        """Labels of the steps, up to the first one that contradicts the map. Links that become clear on the way are added to the map.
+        """Labels of the steps up to the first that contradicts the map. Adds links to the map.
 
-        may_be_lost  where it is not clear where the robot is, the label is -1; else the robot is at a new dstate there
+        Args:
+            may_be_lost: If it is unclear where the robot is, whether the label is -1, or else a new
+                dstate.
         """
         labels: list[int] = []
         for t, seen in enumerate(self._seen):
             link = (labels[-1], self._actions[t - 1]) if t and labels[-1] >= 0 else None
+            # Follow a known link; else look for the dstate that predicts the next steps.
             there = self.leads.get(link) if link else None if t else self._start
             if there is None:
                 there = self._predicting(t, SETTLED if link else FOUND, link)
@@ -108,7 +123,7 @@ class _Map:
         return labels
 
     def forget(self, dstates: Iterable[int]) -> None:
-        """Take these dstates and all links to and from them out of the map."""
+        """Remove these dstates, and all links to and from them."""
         forgotten = {dstate for dstate in dstates if dstate >= 0}
         for dstate in forgotten:
             self._like[self._shows[dstate]].remove(dstate)
@@ -121,16 +136,23 @@ class _Map:
             self._start = None
 
     def _new(self, seen: int) -> int:
-        """A new dstate that shows this."""
+        """Add a dstate with this observation."""
         dstate = len(self._shows)
         self._shows[dstate] = seen
         self._like.setdefault(seen, []).append(dstate)
         return dstate
 
     def _predicting(self, step: int, least: int, link: _Link | None = None) -> int | None:
-        """The dstate that predicts at least so many steps from this one on, and AHEAD more than any other; None if there is no such dstate.
+        """The dstate at a step that predicts the following steps longest.
 
-        link  is taken to lead to each dstate while that is tried
+        Args:
+            step: The step.
+            least: The least number of steps that it has to predict.
+            link: An unknown link, taken to lead to each dstate that is tried.
+
+        Returns:
+            The dstate; None if it does not predict AHEAD steps more than any other, or is
+            contradicted at the end of its prediction.
         """
         self._check()
         best, most, next_most = None, 0, 0
@@ -151,7 +173,7 @@ class _Map:
         )
 
     def _predicted(self, dstate: int, step: int) -> tuple[int, bool]:
-        """How many steps are predicted if this one is at that dstate, this step counted, and whether the next one contradicts the map."""
+        """How many steps a dstate predicts from a step on, and whether this ends in contradiction."""
         for t in range(step + 1, min(step + LOOKED, len(self._seen))):
             there = self.leads.get((dstate, self._actions[t - 1]))
             if there is None:

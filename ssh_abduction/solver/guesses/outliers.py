@@ -1,11 +1,14 @@
-"""Which displacements of a trace are wrong altogether, by labels that are nearly right.
+"""Find displacements that are outliers, by labels that are nearly right.
 
-Where a robot comes back to a dstate or to a place, the displacements since should take it there, as far as their covariance says. Each such return votes on all the
-displacements between, by how much likelier it is if one of them is wrong than if none is: the logarithm of the ratio of the two densities of what the loop closes off by, where a
-displacement that is wrong moves the robot by about FAR metres and turns it anyhow. The displacement with most votes is taken to be wrong, the returns across it vote no more, and so on
-while any has votes left.
+When a robot comes back to a dstate or a place, the displacements in between have to close the loop
+within their covariance. Each such return votes on all displacements in between. Its vote is the log
+likelihood ratio of the residual of the loop, if one of the displacements is wrong versus if none
+is. A wrong displacement moves the robot by about FAR metres and turns it arbitrarily. The
+displacement with the most votes is taken to be wrong, and returns across it vote no more. This
+repeats as long as any displacement has votes.
 
-It is a guess: labels that are wrong vote, too, so that each vote is bounded, and a map has to pay for what it disbelieves.
+The result is a guess. Wrong labels vote, too, so each vote is bounded, and a map has to pay for
+what it disbelieves.
 """
 
 from __future__ import annotations
@@ -18,21 +21,25 @@ import numpy as np
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares
 
-# A displacement that is wrong takes the robot so many metres away, about, as the standard deviation in each direction; and it turns it anyhow, for which that many radians stand.
+# Standard deviations of a wrong displacement: metres in each direction, and radians of a uniformly
+# distributed heading.
 FAR, ANYHOW = 15.0, math.pi / math.sqrt(3)
-# A return for which none of the displacements can be right votes for a wrong one by so much at most: it may be that its labels are wrong.
+# The largest vote of a return, as its labels may be wrong instead.
 MOST_VOTES = 15.0
-# Votes below this are chance: e to this is how much likelier the returns have to be.
+# Fewer votes than this are chance: a wrong displacement has to make the returns e**3 times
+# likelier.
 FEWEST_VOTES = 3.0
 
 
 def wrong_displacements(
     trace: Trace, labels: Sequence[int], places: Sequence[int | None]
 ) -> tuple[int, ...]:
-    """The steps to which displacements lead that are wrong, those first that have most votes.
+    """The steps that wrong displacements lead to, those with the most votes first.
 
-    labels  the dstate of each step, nearly right
-    places  the place of each step; None where none is known
+    Args:
+        trace: A trace with displacements.
+        labels: The dstate of each step, nearly right.
+        places: The place of each step; None if unknown.
     """
     loops = Reckoning(trace).loops_of_unknown_drift()
     voters: list[tuple[int, int, float]] = []
@@ -46,6 +53,7 @@ def wrong_displacements(
             (i, j, votes)
             for (i, j), votes in zip(known, _votes(loops, known, with_heading), strict=True)
         ]
+    # Greedily remove the displacement with the most votes, and the returns that it explains.
     found: list[int] = []
     while True:
         votes = np.zeros(len(trace) + 1)
@@ -62,7 +70,7 @@ def wrong_displacements(
 
 
 def _returns(sites: Sequence[int | None]) -> Iterator[tuple[int, int]]:
-    """Pairs of steps at one site between which the robot is at others."""
+    """Pairs of successive steps at one site with other sites in between."""
     last: dict[int, int] = {}
     for t, site in enumerate(sites):
         if site is None:
@@ -73,7 +81,13 @@ def _returns(sites: Sequence[int | None]) -> Iterator[tuple[int, int]]:
 
 
 def _votes(loops: Loops, pairs: Sequence[tuple[int, int]], with_heading: bool) -> list[float]:
-    """How much likelier each return is if one of its displacements is wrong than if none is, as a logarithm."""
+    """The votes of returns: log likelihood ratios of a wrong displacement, up to MOST_VOTES.
+
+    Args:
+        loops: The displacements of the trace.
+        pairs: The first and last step of each return.
+        with_heading: Whether the robot comes back to a dstate, so that headings have to agree.
+    """
     if not pairs:
         return []
     closing, covariance = loops.closings([i for i, _ in pairs], [j for _, j in pairs])

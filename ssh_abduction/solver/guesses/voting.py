@@ -1,11 +1,15 @@
-"""Which views and stars of a trace are wrong: visits to places are merged robustly, so that a few wrong ones are outvoted.
+"""Find wrong views and stars: merge visits robustly, so that right observations outvote them.
 
-Where places have frames, the steps between two travels are a visit, and a merged group of visits, each turned by some quarters, is a place. A group costs what its
-dstates cost, and what it costs to disbelieve each view and star that is not the one that most of its steps show. Groups are merged as long as that makes all of them
-cheaper, those first that gain most. Where two visits of a group leave by the same action, the next visits are merged with them, as actions are deterministic: that is
-evidence-driven state merging (Lang, Pearlmutter & Price 1998), with votes in the place of contradictions. Evidence, such as displacements, is obeyed.
+Where places have frames, the steps between two travels are a visit. A place is a group of visits,
+each turned by some quarters. The cost of a group is the cost of its dstates, plus the cost of
+disbelieving each view and star that differs from what most of its steps show. Groups are merged
+while that lowers the total cost, those with the largest gain first. If two visits of a group leave
+by the same action, the next visits are merged, too, as actions are deterministic. This is
+evidence-driven state merging (Lang, Pearlmutter & Price 1998) with votes instead of contradictions.
+Evidence such as displacements is obeyed.
 
-The groups are a guess, and no map: the axioms of paths know nothing of them. What is wrong by their votes is mended in the trace, and the mended trace is solved.
+The groups are a guess, not a map: they ignore the axioms of paths. Outvoted views and stars are
+replaced in the trace, and the mended trace is solved.
 """
 
 from __future__ import annotations
@@ -24,21 +28,22 @@ from ssh_abduction.solver.steps.chart import QUARTERS
 from ssh_abduction.theory.pairs import Pairs, pairs_in
 from ssh_abduction.theory.theory import Theory
 
-# So many pairs of visits are compared at most; those that are furthest apart in the trace are left out first.
+# The most pairs of visits to compare; those furthest apart in the trace are left out first.
 MOST_PAIRS = 60_000
-DSTATE = 10  # What a dstate costs, in tenths.
+DSTATE = 10  # cost of a dstate, in tenths
 
-_Turned = tuple[
-    int, int
-]  # a visit or group, and a quarter: slot K of the visit is slot K + quarter of the place
+# A visit or group, and a number of quarters: slot K of the visit is slot K + quarters of the place.
+_Turned = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class _Visit:
     """The steps between two travels.
 
-    steps   each with the slot that it faces; slot 0 is the one that the robot faces as it arrives
-    leaves  the slot and the name of the action that ends the visit; None for the last one, or where that action slipped
+    Attributes:
+        steps: The steps, each with the slot that it faces. The robot faces slot 0 as it arrives.
+        leaves: The slot and the name of the action that ends the visit; None for the last visit,
+            and if that action slipped.
     """
 
     steps: tuple[tuple[int, int], ...]
@@ -46,11 +51,12 @@ class _Visit:
 
 
 class _Group:
-    """Visits that are one place, each turned by some quarters, and how the steps vote there.
+    """Visits that are one place, each turned by some quarters, and the votes of their steps.
 
-    members  visits, with the quarters by which they are turned
-    views    for each slot, what it costs to disbelieve all steps that show a view, by view
-    stars    what it costs to disbelieve all steps that show a star, by star as seen from slot 0
+    Attributes:
+        members: For each visit, the quarters by which it is turned.
+        views: For each slot and view, the cost of disbelieving all steps that show it.
+        stars: For each star as seen from slot 0, the cost of disbelieving all steps that show it.
     """
 
     def __init__(
@@ -64,7 +70,7 @@ class _Group:
 
     @staticmethod
     def joined(parts: Iterable[tuple[_Group, int]]) -> _Group:
-        """The groups as one, each turned by some quarters more."""
+        """The union of groups, each turned by some more quarters."""
         members: dict[int, int] = {}
         views: dict[int, Counter[View]] = {}
         stars: Counter[Openings] = Counter()
@@ -78,10 +84,13 @@ class _Group:
 
 
 class Merging:
-    """The visits of a trace as groups.
+    """The visits of a trace, as groups that are merged.
 
-    trace   its theory has frames
-    check   called now and then, and may raise
+    Args:
+        trace: The trace; its theory has frames.
+        theory: The theory.
+        pairs: Evidence about pairs of steps.
+        check: Called now and then; may raise.
     """
 
     def __init__(
@@ -96,7 +105,8 @@ class Merging:
     def start_from(self, places: Sequence[tuple[int, int] | None]) -> None:
         """Merge the visits that a map has at one place.
 
-        places  the place of each step, and the slot of the place that it faces; None where the map does not tell
+        Args:
+            places: The place of each step and the slot of the place that it faces; None if unknown.
         """
         first: dict[int, _Turned] = {}
         for number, visit in enumerate(self.visits):
@@ -112,7 +122,7 @@ class Merging:
                 )
 
     def merge(self) -> None:
-        """Merge groups as long as that makes them cheaper."""
+        """Merge groups while that lowers the total cost, those with the largest gain first."""
         while True:
             waiting = [
                 (-gain, pair) for pair in self._candidates() if (gain := self._gain(*pair)[0]) > 0
@@ -126,6 +136,7 @@ class Merging:
                 gain, joined = self._gain(*pair)
                 if gain <= 0:
                     continue
+                # The gain may have dropped since the pair was queued.
                 if waiting and gain < -waiting[0][0]:
                     heapq.heappush(waiting, (-gain, pair))
                     continue
@@ -137,7 +148,7 @@ class Merging:
                 return
 
     def mended(self) -> Trace:
-        """The trace with the views and stars that are outvoted replaced by those that won."""
+        """The trace with outvoted views and stars replaced by those of the majority."""
         steps = list(self._trace.steps)
         for group in self._groups.values():
             star = _winner(group.stars)
@@ -150,7 +161,7 @@ class Merging:
         return replace(self._trace, steps=tuple(steps))
 
     def labels(self) -> list[int]:
-        """A number for the place and the slot that each step faces, as the groups have it."""
+        """The place and slot that each step faces, as one number."""
         return [
             4 * self._group_of[number] + (slot + self._turn(number)) % 4
             for number, visit in enumerate(self.visits)
@@ -158,11 +169,11 @@ class Merging:
         ]
 
     def places(self) -> list[int]:
-        """A number for the place of each step, as the groups have it."""
+        """The place of each step, as a number."""
         return [label // 4 for label in self.labels()]
 
     def _turn(self, visit: int) -> int:
-        """By how many quarters a visit is turned in its group."""
+        """The quarters by which a visit is turned in its group."""
         return self._groups[self._group_of[visit]].members[visit]
 
     def _of_visit(self, number: int) -> _Group:
@@ -178,7 +189,10 @@ class Merging:
         return _Group({number: 0}, views, stars)
 
     def _misfitting(self, pairs: Pairs) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """R x I x J: whether groups I and J cannot be one place so that slot K of I is slot K + R of J."""
+        """Which groups cannot be one place, as an array of R x I x J.
+
+        True if groups I and J cannot be one place with slot K of I at slot K + R of J.
+        """
         count = len(self.visits)
         misfits = np.zeros((4, count, count), dtype=bool)
         at = {
@@ -187,9 +201,8 @@ class Merging:
         for number in range(count):
             misfits[1:, number, number] = True
             if self.visits[number].leaves is not None:
-                misfits[:, number, number + 1] = misfits[:, number + 1, number] = (
-                    True  # a travel leads to another place
-                )
+                # A travel leads to another place.
+                misfits[:, number, number + 1] = misfits[:, number + 1, number] = True
         for i, t in pairs_in(pairs.elsewhere):
             a, b = at[i][0], at[t][0]
             misfits[:, a, b] = misfits[:, b, a] = True
@@ -199,7 +212,7 @@ class Merging:
         return misfits
 
     def _candidates(self) -> list[tuple[int, int, int]]:
-        """Pairs of groups that may be one place, as (I, J, R)."""
+        """Pairs of groups that may be one place, as triples (I, J, R)."""
         some = np.array(sorted(self._groups))
         turns, first, second = np.nonzero(
             ~self._misfits[:, some[:, None], some]
@@ -211,19 +224,38 @@ class Merging:
         return list(zip(some[first].tolist(), some[second].tolist(), turns.tolist(), strict=True))
 
     def _beside(self, visit: int, other: int, turn: int) -> list[_Turned]:
-        """The group of another visit, turned so that slot K of this visit is slot K + turn of the other one; in quarters of the group of this visit."""
+        """The group of another visit, and the quarters to turn it to join the group of this visit.
+
+        Args:
+            visit: This visit.
+            other: The other visit.
+            turn: Slot K of this visit is to be slot K + turn of the other.
+
+        Returns:
+            A list with the group, or an empty one if the two are in one group.
+        """
         mine, its = self._group_of[visit], self._group_of[other]
         if mine == its:
             return []
-        # Slot K of the visit is slot K + here of its group, and slot K + turn of the other visit, which is slot K + turn + there of that group.
+        # Slot K of the visit is slot K + here of its group. It is slot K + turn of the other visit,
+        # and so slot K + turn + there of the other group.
         here, there = self._groups[mine].members[visit], self._groups[its].members[other]
         return [(its, (here - turn - there) % 4)]
 
     def _gain(self, first: int, second: int, turn: int) -> tuple[int, list[list[_Turned]]]:
-        """What is gained where two visits, and so their groups, are one place, with all that follows from it; and the groups that are then one. Nothing where they cannot be."""
-        together: dict[
-            int, dict[int, int]
-        ] = {}  # for a group: all groups that are one place with it, each with its turn
+        """The gain of merging the groups of two visits, and all groups that follow from it.
+
+        Args:
+            first: A visit.
+            second: Another visit.
+            turn: Slot K of the first visit is to be slot K + turn of the second.
+
+        Returns:
+            The gain in tenths of dstates, and the groups to merge. Zero and none if they cannot be
+            one.
+        """
+        # For each group, all groups that become one place with it, and their turns.
+        together: dict[int, dict[int, int]] = {}
         work = [(first, second, turn)]
         while work:
             i, j, r = work.pop()
@@ -237,7 +269,7 @@ class Merging:
                 continue
             for x, t in mine.items():
                 for y, u in its.items():
-                    # Slot K of x is slot K + t, and that of y slot K + u + shift.
+                    # Slot K of x is slot K + t of the place, and slot K of y is slot K + u + shift.
                     if self._misfits[(t - u - shift) % 4, x, y]:
                         return 0, []
             work += self._follow(mine, its, shift)
@@ -255,7 +287,7 @@ class Merging:
     def _follow(
         self, mine: Mapping[int, int], its: Mapping[int, int], shift: int
     ) -> list[tuple[int, int, int]]:
-        """The next visits that are one, too, where two groups are: those to which the same action leads from the same slot."""
+        """The visits to merge next: those that the same action leads to from the same slot."""
         leads = dict(self._leads(mine, 0))
         return [(leads[key], there, 0) for key, there in self._leads(its, shift) if key in leads]
 
@@ -266,11 +298,11 @@ class Merging:
                     yield ((leaves[0] + turn + t + shift) % 4, leaves[1]), visit + 1
 
     def _merge(self, parts: Sequence[_Turned]) -> None:
-        """Make one group of these."""
+        """Merge these groups into the first."""
         (kept, by), *others = parts
         whole = _Group.joined([(self._groups[x], (t - by) % 4) for x, t in parts])
         for x, t in others:
-            r = (by - t) % 4  # slot K of the kept group is slot K + r of the other one
+            r = (by - t) % 4  # slot K of the kept group is slot K + r of the other
             rows = self._misfits[:, x].copy()
             self._misfits[:, kept] |= np.roll(rows, r, axis=0)
             self._misfits[:, :, kept] |= np.roll(self._misfits[:, :, x].copy(), -r, axis=0)
@@ -281,6 +313,7 @@ class Merging:
 
 
 def _visits(trace: Trace) -> Iterator[_Visit]:
+    """The visits of a trace, in order."""
     steps: list[tuple[int, int]] = [(0, 0)]
     for t, action in enumerate(trace.actions):
         slot = steps[-1][1]
@@ -293,15 +326,16 @@ def _visits(trace: Trace) -> Iterator[_Visit]:
 
 
 def _outvoted(votes: Counter[Any]) -> int:
+    """The votes against the majority."""
     return sum(votes.values()) - max(votes.values())
 
 
 def _winner(votes: Counter[Any]) -> Any:
-    """What has most votes; of several, what had one first."""
+    """The option with the most votes; of several, the first."""
     return max(votes, key=lambda what: votes[what])
 
 
 def _turned(star: Openings, quarters: int) -> Openings:
-    """The star as it is seen from a heading that is so many quarters to the left."""
+    """The star as seen from a heading some quarters to the left."""
     ahead, right, back, left = (star[(k - quarters) % 4] for k in range(4))
     return ahead, right, back, left
