@@ -19,6 +19,7 @@ from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp import facts
@@ -293,7 +294,9 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
                     True,
                 )
                 assert set(answer.maps) == set(expected.maps)
-            engine = mapper._search and mapper._search._prefixes.engine
+            assert isinstance(mapper._keeper, MapKeeper)
+            search = mapper._keeper.solver.search
+            engine = search and search._prefixes.engine
             if isinstance(engine, FramedEngine):
                 paths.add((engine._visits.batch, len(engine._sides._said)))
     assert max(paths)[0] > 5

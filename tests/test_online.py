@@ -24,7 +24,8 @@ from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Action, Odometry, Step, TheoryError, TraceError
 from ssh_abduction.online import background_guess as guessing
-from ssh_abduction.online import mapper as online
+from ssh_abduction.online import guesser
+from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.guesses import annealing
@@ -68,6 +69,26 @@ def observed(mapper: OnlineMapper, action: Action, step: Step) -> Solution:
         displacement=step.displacement,
         covariance=step.covariance,
     )
+
+
+def limit_steps(mapper: OnlineMapper, limit: float | None) -> None:
+    """Give each further step so many seconds."""
+    keeper = mapper._keeper
+    assert isinstance(keeper, MapKeeper)
+    for part in (keeper.solver, keeper.guesser):
+        part.options = replace(part.options, time_limit=limit)
+
+
+def guess_of(mapper: OnlineMapper) -> guessing.MapGuess | None:
+    """The guess that is under way."""
+    assert isinstance(mapper._keeper, MapKeeper)
+    return mapper._keeper.guesser.guess
+
+
+def sketched(mapper: OnlineMapper) -> SSHMap:
+    """The first sketch of all steps."""
+    assert isinstance(mapper._keeper, MapKeeper)
+    return mapper._keeper.drafts._sketches[0].sketch.map()
 
 
 def agree(trace: Trace, theory: Theory) -> None:
@@ -248,7 +269,8 @@ def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) ->
         )
         for ssh_map in answer.maps:
             assert check(trace.prefix(i + 1), ssh_map, theory) == ()
-    mapper._limit, mapper._next_search = None, 0
+    limit_steps(mapper, None)
+    mapper._keeper.solver.make_due()
     action = trace.actions[0] if len(trace) > 1 else Action("travel", "travel")
     star = trace.steps[-1].star
     answer = mapper.observe(action, "a", star=star)
@@ -262,7 +284,7 @@ def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
     theory = Theory.topological().resolve(trace)
     half = len(trace) // 2
     mapper, _ = follow(trace.prefix(half), theory)
-    mapper._limit = NO_TIME
+    limit_steps(mapper, NO_TIME)
     bound = 0
     for i in range(half, len(trace)):
         answer = mapper.observe(
@@ -296,14 +318,15 @@ def test_maps_are_guessed_while_the_robot_drives() -> None:
     trace = walk.trace
     with (
         patch.object(guessing, "has_processors", lambda _: True),
-        patch.object(online, "GUESSED", 120),
+        patch.object(guesser, "GUESSED", 120),
     ):
         mapper = OnlineMapper(
             trace.steps[0].view or "", star=trace.steps[0].star, time_limit=NO_TIME
         )
         explore(trace.prefix(125), mapper)
-        assert mapper._guess is not None
-        assert mapper._guess.map() is not None  # waits for it
+        guess = guess_of(mapper)
+        assert guess is not None
+        assert guess.result() is not None  # waits for it
         answers = explore(trace, mapper)
     for i, answer in enumerate(answers, 126):
         assert answer.status is Status.FEASIBLE
@@ -311,7 +334,7 @@ def test_maps_are_guessed_while_the_robot_drives() -> None:
     assert (
         len(answers[0].maps[0].dstates)
         <= 1.2 * len(set(walk.truth))
-        < len(mapper._sketches[0].sketch.map().dstates)
+        < len(sketched(mapper).dstates)
     )
 
 
@@ -346,7 +369,7 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
 @pytest.mark.parametrize("off", ["annealed", "threads", "processes"])
 def test_nothing_is_guessed_where_that_is_switched_off(off: str) -> None:
     trace = maze(2, 2, steps=60, seed=0, stars=True).trace
-    with patch.object(online, "GUESSED", 10):
+    with patch.object(guesser, "GUESSED", 10):
         mapper = OnlineMapper(
             trace.steps[0].view or "",
             star=trace.steps[0].star,
@@ -354,7 +377,7 @@ def test_nothing_is_guessed_where_that_is_switched_off(off: str) -> None:
             speedups=Speedups.without(off),
         )
         explore(trace, mapper)
-    assert mapper._guess is None
+    assert guess_of(mapper) is None
 
 
 def test_a_guess_ends_with_its_mapper_and_with_the_program() -> None:
@@ -377,7 +400,8 @@ assert threading.active_count() == 2
 del mapper
 assert threading.active_count() == 1
 mapper = begun()
-assert mapper._guess and not mapper._guess.done()
+guess = mapper._keeper.guesser.guess
+assert guess and not guess.done()
 """
     folder = Path(__file__).parent.parent / "benchmarks"
     done = subprocess.run(
@@ -545,7 +569,7 @@ def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
     with (
         patch.object(guessing, "has_processors", lambda _: True),
         patch.object(guessing, "in_process", at_once),
-        patch.object(online, "GUESSED", 25),
+        patch.object(guesser, "GUESSED", 25),
         patch.object(annealing, "ANNEALED", ((0.5, 50),)),
     ):
         mapper = OnlineMapper(
@@ -559,11 +583,11 @@ def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
             assert answer.status is Status.FEASIBLE
             if answer.steps % 10 == 1:
                 assert check(trace.prefix(answer.steps), answer.maps[0], mapper.theory) == ()
-            if mapper._guess:
-                mapper._guess.map()
+            if guess := guess_of(mapper):
+                guess.result()
     assert given
     assert all(seen.odometry == trace.odometry for seen in given)
-    assert len(answer.maps[0].dstates) < len(mapper._sketches[0].sketch.map().dstates)
+    assert len(answer.maps[0].dstates) < len(sketched(mapper).dstates)
 
 
 def test_the_first_step_settles_the_stars() -> None:

@@ -24,7 +24,7 @@ from ssh_abduction.checker.checker import unchecked
 from ssh_abduction.cli import main
 from ssh_abduction.data import TheoryError
 from ssh_abduction.explain.no_map import explain
-from ssh_abduction.online import mapper as mapper_module
+from ssh_abduction.online.replay import ReplayedMap
 from ssh_abduction.solver import Search, Status, judging, prefixes, search
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
@@ -527,14 +527,14 @@ def follow(mapper: OnlineMapper, views: str) -> None:
 def test_a_replayed_map_that_breaks_an_axiom_is_an_internal_error_while_a_robot_drives() -> None:
     """Replays are checked, too, as long as that takes a tenth of the time at most."""
     mapper = OnlineMapper("a", Theory.causal(), time_limit=None)
-    right = mapper_module._Replayed.map
+    right = ReplayedMap.map
 
-    def wrong(self: mapper_module._Replayed) -> SSHMap:
+    def wrong(self: ReplayedMap) -> SSHMap:
         found = right(self)
         return replace(found, labels=(0,) * len(found.labels))
 
     with (
-        patch.object(mapper_module._Replayed, "map", wrong),
+        patch.object(ReplayedMap, "map", wrong),
         pytest.raises(InternalError, match="internal error: a map that was found breaks"),
     ):
         follow(mapper, "bababa")

@@ -17,9 +17,11 @@ from test_faults import cheapest, small_traces, told
 from ssh_abduction import OnlineMapper, Solution, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import TheoryError, TraceError
-from ssh_abduction.online import Belief, recovery
-from ssh_abduction.online.background_solve import Meanwhile
+from ssh_abduction.online import Belief
+from ssh_abduction.online import background_solve as solving
+from ssh_abduction.online.background_solve import BackgroundSolve, Solved
 from ssh_abduction.online.hypotheses import Rival, Scale
+from ssh_abduction.online.recovery import Recovery
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.asp.process import _under_way
 from ssh_abduction.theory import Speedups
@@ -206,29 +208,29 @@ def test_without_time_there_is_a_map_and_a_belief() -> None:
         assert sum(hypothesis.weight for hypothesis in mapper.standing.hypotheses) == pytest.approx(
             1
         )
-    assert mapper._recovery is not None
-    assert mapper._recovery._meanwhile is None
+    assert isinstance(mapper._keeper, Recovery)
+    assert mapper._keeper.solver.background is None
 
 
 def one_of_the_maps(
     trace: Trace, theory: Theory, limit: float | None, maps: int, speedups: Speedups
-) -> recovery.Solved:
+) -> Solved:
     """As if there were time to prove one map minimal, but not to list all."""
     found = solve(trace, theory, max_maps=None)
-    return recovery.Solved(
+    return Solved(
         len(trace), found.status, found.maps[-1:], found.bound, complete=False, stopped="time limit"
     )
 
 
-@pytest.mark.parametrize("in_a_step", [recovery.solved, one_of_the_maps])
+@pytest.mark.parametrize("in_a_step", [solving.solved, one_of_the_maps])
 def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(
-    in_a_step: Callable[..., recovery.Solved],
+    in_a_step: Callable[..., Solved],
 ) -> None:
     """A second process is stood in for by what it would find, of steps that have been outgrown by then."""
-    trace, solved = circuit(30, wrong=17), recovery.solved
+    trace, solved = circuit(30, wrong=17), solving.solved
     begun = []
 
-    def begin(now: Trace, theory: Theory, maps: int, speedups: Speedups) -> Meanwhile:
+    def begin(now: Trace, theory: Theory, maps: int, speedups: Speedups) -> BackgroundSolve:
         found = solved(now, theory, None, maps, speedups)
         begun.append(len(now))
         ends = len(now) + 3
@@ -237,13 +239,13 @@ def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(
             def done(self) -> bool:
                 return mapper is None or len(mapper.trace) >= ends
 
-            def result(self) -> recovery.Solved:
+            def result(self) -> Solved:
                 return found
 
         return Stub()  # type: ignore[return-value]
 
     mapper = None
-    with patch.object(Meanwhile, "begun", begin), patch.object(recovery, "solved", in_a_step):
+    with patch.object(BackgroundSolve, "begun", begin), patch.object(solving, "solved", in_a_step):
         for mapper, solution in followed(trace, BOTH, NO_TIME):  # noqa: B007
             pass
     assert begun
@@ -265,8 +267,8 @@ class Busy:
 
 def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again() -> None:
     with (
-        patch.object(Meanwhile, "begun", lambda *told: Busy()),
-        patch.object(recovery, "OVERRUN", 0),
+        patch.object(BackgroundSolve, "begun", lambda *told: Busy()),
+        patch.object(solving, "OVERRUN", 0),
     ):
         answers = list(followed(circuit(30, wrong=17), BOTH, NO_TIME))
     assert {solution.status for _, solution in answers} == {Status.FEASIBLE}
@@ -275,13 +277,13 @@ def test_where_clingo_cannot_be_stopped_in_time_steps_do_not_wait_for_it_again()
 
 def test_a_process_of_its_own_solves_the_trace() -> None:
     trace = circuit(20, wrong=17)
-    meanwhile = Meanwhile(trace, BOTH, None, Speedups())
+    meanwhile = BackgroundSolve(trace, BOTH, None, Speedups())
     found = meanwhile.result()
     assert meanwhile.done()
     assert found is not None
     assert (found.status, found.complete, found.steps) == (Status.OPTIMAL, True, 21)
     assert found.maps == solve(trace, BOTH, max_maps=None).maps
-    ended = Meanwhile(circuit(2000, wrong=17), BOTH, None, Speedups())
+    ended = BackgroundSolve(circuit(2000, wrong=17), BOTH, None, Speedups())
     del ended  # and with it the process
     assert not _under_way
 

@@ -1,4 +1,4 @@
-"""Work that goes on in a process of its own while the robot drives."""
+"""Runs work in another process while the robot drives."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from ssh_abduction.solver import LimitError, Watch
 Result = TypeVar("Result")
 
 
-class Beside(Generic[Result]):
-    """Work beside the robot's own, which ends when this is no longer referred to, and with the program.
+class BackgroundTask(Generic[Result]):
+    """Work in the background. It ends when this object is garbage collected, or the program ends.
 
-    work  is given a watch that ends it, and does in a process of its own what takes long
+    Args:
+        work: Called in a thread. It starts a process for what takes long, and stops when its
+            watch is interrupted.
     """
 
     def __init__(self, work: Callable[[Watch], Result | None]) -> None:
@@ -30,7 +32,7 @@ class Beside(Generic[Result]):
         return self._found.done()
 
     def result(self) -> Result | None:
-        """What was found; None where there was nothing to find, or the work was ended. Waits until that is known."""
+        """Wait for the result; None where nothing was found or the work was interrupted."""
         return self._found.result()
 
 

@@ -1,8 +1,9 @@
-"""Maps of a trace that a robot is still driving: made of guesses, or mended, in no time or in a process of their own. For theories where places have frames.
+"""Makes maps of a growing trace from guesses, in another process. For places with frames.
 
-Consistent by the axioms of the theory (`engines/framed.py`), but not minimal for sure. A map that the trace contradicts is mended: dstates
-stay as far as they can, what does not fit is something new, and separate paths (`engines/paths.py`) say whether that is a map. Where that
-takes longer than a step may, it is done in the other process, in which else one guess after another is made a map.
+The maps are consistent by the axioms of the theory (`solver/engines/framed.py`), but perhaps not
+minimal. A map that the trace contradicts is *mended*: its dstates stay as far as possible, and
+what does not fit becomes new. Separate paths (`solver/engines/paths.py`) then decide whether the
+result is a map.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from functools import partial
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Step, Trace
-from ssh_abduction.online.background import Beside
+from ssh_abduction.online.background import BackgroundTask
 from ssh_abduction.solver import FramedEngine, Task, Watch, has_processors, in_process
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
@@ -28,19 +29,27 @@ def guessed_map(trace: Trace, theory: Theory, speedups: Speedups, watch: Watch) 
 def mended_map(
     trace: Trace, theory: Theory, known: SSHMap, speedups: Speedups, watch: Watch | None = None
 ) -> SSHMap | None:
-    """A map of a trace near one of its first steps that its later steps contradict, if there is one in which all that does not fit is new."""
+    """Mend a map of the first steps of a trace that the later steps contradict.
+
+    Returns:
+        A map of the trace with new dstates for whatever does not fit; None if there is none.
+    """
     watch = watch or Watch()
     found = FramedEngine(Task.of(trace, theory, watch, speedups)).map_mended_from(known.labels)
     return found.map if found else None
 
 
-class MapGuess(Beside[SSHMap]):
-    """A map of a trace that grows, made in a process of its own.
+class MapGuess(BackgroundTask[SSHMap]):
+    """A map of a growing trace, made in another process from a guess, or from a known map.
 
-    A map is made of a guess, unless one is known. As the trace has grown meanwhile, and may contradict it, it is mended at the end.
+    The trace grows meanwhile and may contradict the map, so the map is mended at the end.
 
-    steps     those of the trace so far; more may be appended
-    odometry  of the trace
+    Args:
+        steps: The steps of the trace so far. The caller may append more.
+        odometry: The odometry of the trace.
+        theory: The settled theory.
+        speedups: Which speed-ups are on.
+        known: A map of the first steps to mend; None makes one from a guess.
     """
 
     def __init__(
@@ -61,13 +70,9 @@ class MapGuess(Beside[SSHMap]):
         speedups: Speedups,
         known: SSHMap | None = None,
     ) -> MapGuess | None:
-        """None where there is no second processor, or guesses are not wanted."""
+        """Begin a guess; None without a second processor, or where guesses are switched off."""
         wanted = speedups.annealed and speedups.processes and has_processors(speedups)
         return MapGuess(steps, odometry, theory, speedups, known) if wanted else None
-
-    def map(self) -> SSHMap | None:
-        """The map of the first steps, if one was found. Waits until that is known."""
-        return self.result()
 
 
 def _make(

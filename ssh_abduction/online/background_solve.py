@@ -1,25 +1,32 @@
-"""Solves a trace with faults in a process of its own, while the robot drives and the trace grows."""
+"""Solves a trace with faults in the time of a step, or in another process."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import partial
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.online.background import Beside
+from ssh_abduction.online.background import BackgroundTask
+from ssh_abduction.online.options import StepOptions
 from ssh_abduction.solver import Bound, Status, Stop, Watch, has_processors, in_process, solve
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-MEANWHILE = (
-    60.0  # For so many seconds a trace is solved; what it has grown to since is more worth it then.
-)
+# A trace is solved in the background for this many seconds. Then the longer trace is worth more.
+MEANWHILE = 60.0
+# After a search that proved nothing, or did not list all, the trace grows by this factor, and by
+# this many steps at least, before the next one.
+RETRY = 1.05
+PAUSE = 2
+# A search was slow if it took this many times the time limit.
+OVERRUN = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """What solving a trace of so many steps has found, as in Solution: that much can be sent from a process to another."""
+    """What solving a trace of `steps` steps found, as in Solution. It can be sent to a process."""
 
     steps: int
     status: Status
@@ -44,8 +51,8 @@ def solved(
     return Solved(len(trace), found.status, found.maps, found.bound, found.complete, found.stopped)
 
 
-class Meanwhile(Beside[Solved]):
-    """Solves the steps so far in a process of its own."""
+class BackgroundSolve(BackgroundTask[Solved]):
+    """Solves the steps so far in another process."""
 
     def __init__(self, trace: Trace, theory: Theory, maps: int | None, speedups: Speedups) -> None:
         super().__init__(partial(_solve, trace, theory, maps, speedups))
@@ -53,16 +60,80 @@ class Meanwhile(Beside[Solved]):
     @staticmethod
     def begun(
         trace: Trace, theory: Theory, maps: int | None, speedups: Speedups
-    ) -> Meanwhile | None:
-        """None where there is no second processor, or processes are not wanted."""
-        return (
-            Meanwhile(trace, theory, maps, speedups)
-            if speedups.processes and has_processors(speedups)
-            else None
-        )
+    ) -> BackgroundSolve | None:
+        """Begin to solve; None without a second processor, or where processes are switched off."""
+        can_begin = speedups.processes and has_processors(speedups)
+        return BackgroundSolve(trace, theory, maps, speedups) if can_begin else None
 
 
 def _solve(
     trace: Trace, theory: Theory, maps: int | None, speedups: Speedups, watch: Watch
 ) -> Solved:
     return in_process(solved, trace, theory, MEANWHILE, maps, speedups, watch=watch)
+
+
+class FaultSolver:
+    """Solves a growing trace with faults anew when that is due.
+
+    Args:
+        options: What a step may use.
+        searches: How many searches there were before.
+
+    Attributes:
+        searches: How often the trace was solved in a step.
+        background: The search in the background, if one is under way.
+    """
+
+    def __init__(self, options: StepOptions, searches: int = 0) -> None:
+        self.searches = searches
+        self.background: BackgroundSolve | None = None
+        self._options = options
+        self._next_search = 0  # no search before the trace has this many steps
+        # clingo cannot be stopped while it grounds a step. Where that took too long once, later
+        # searches run in the background.
+        self._is_slow = False
+
+    def is_due(self, trace: Trace) -> bool:
+        """Whether the trace has grown enough since the last search."""
+        return len(trace) >= self._next_search
+
+    def make_due(self) -> None:
+        """Search at the next step: the cost was proven, so the next one may be soon."""
+        self._next_search = 0
+
+    def solve(self, trace: Trace, theory: Theory, has_map: bool) -> Solved | None:
+        """Solve the trace in the time of a step.
+
+        Args:
+            trace: The steps so far.
+            theory: The settled theory.
+            has_map: Whether some map is known. Then a slow search may run in the background.
+
+        Returns:
+            What was found; None where the search goes on in the background.
+        """
+        steps, options = len(trace), self._options
+        limit = options.time_limit
+        self._next_search = 0 if limit is None else max(steps + PAUSE, int(RETRY * steps))
+        if self._is_slow and has_map and self.begin_in_background(trace, theory):
+            return None
+        self.searches += 1
+        began = time.perf_counter()
+        found = solved(trace, theory, limit, options.max_maps, options.speedups)
+        if limit is not None and found.stopped == "time limit":
+            self._is_slow = time.perf_counter() - began > OVERRUN * limit
+        return found
+
+    def begin_in_background(self, trace: Trace, theory: Theory) -> bool:
+        """Solve the trace in another process, unless that is under way; False if it cannot be."""
+        self.background = self.background or BackgroundSolve.begun(
+            trace, theory, self._options.max_maps, self._options.speedups
+        )
+        return self.background is not None
+
+    def finished(self) -> Solved | None:
+        """What the background search found, if it is done. Its trace may lack the last steps."""
+        if self.background and self.background.done():
+            background, self.background = self.background, None
+            return background.result()
+        return None

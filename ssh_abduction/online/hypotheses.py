@@ -1,18 +1,24 @@
-"""What may be true of a trace with faults while it grows: explanations that rival each other, and how probable each is.
+"""Rival explanations of a trace with faults while it grows, and the probability of each.
 
-A rival is a map of all steps so far, with its faults. With a new step it goes on in one way where it predicts the step, and else in each way that it allows:
+A rival is a map of all steps so far, with its faults. Where it predicts a new step it goes on in
+one way. Where it does not, it goes on in each way that it allows:
 
-    contradicted  the observation is misread, and the robot is where the link leads; or the action slipped, to each dstate that looks like that, or to a new one
-    unknown       there is a link to each dstate that looks like that, or to a new one
+    contradicted  the observation is misread, and the robot is where the link leads; or the action
+                  slipped, to each dstate that looks like this, or to a new one
+    unknown       a new link leads to each dstate that looks like this, or to a new one
 
-Links to known dstates and new dstates are for the causal theory alone: where there are places and paths, only the axioms say what a new link may be.
+Links to known dstates and new dstates are for the causal theory alone. Where there are places and
+paths, only the axioms say what a new link may be.
 
-Rivals are weighed. The price of a fault says how it compares with a dstate, and the cheapest kind is as probable as `Chances` of the localiser take a fault to be. What a price does not say is
-how many ways there were: a link, and an action that slipped, leads to one of N dstates, and a view that is misread is one of V. So with λ for the logarithm of the odds that a dstate is worth,
+Rivals are weighed. The price of a fault says how it compares with a dstate, and the cheapest kind
+is as probable as `Chances` of the localiser take a fault to be. A price does not say how many ways
+there were: a link, and an action that slipped, leads to one of N dstates, and a misread view is one
+of V. Let λ be the logarithm of the odds that a dstate is worth. Then
 
     weight = exp(-λ cost) N^-(links and slips) V^-(misreadings)
 
-and what happens after a fault decides between its explanations: each link that one of them has to assume, where another one predicts, is evidence against it.
+What happens after a fault decides between its explanations: each link that one of them has to
+assume, where another one predicts, is evidence against it.
 """
 
 from __future__ import annotations
@@ -27,22 +33,23 @@ from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver import Cost, observation
 from ssh_abduction.theory.theory import Theory
 
-Seen = tuple[
-    object, object
-]  # as `observation` returns it: the view, and the star where the theory uses stars
-DSTATE = 10  # What a dstate costs, in tenths of dstates.
+# As `observation` returns it: the view, and the star where the theory uses stars.
+Seen = tuple[object, object]
+# What a dstate costs, in tenths of dstates.
+DSTATE = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Rival:
     """An explanation of all steps so far.
 
-    map     a map of the first steps, or of all
-    labels  the dstate of each step
-    shows   what each dstate looks like
-    links   where actions lead
-    faults  what is disbelieved
-    cost    the counts that the theory prefers, first to last
+    Attributes:
+        map: A map of the first steps, or of all.
+        labels: The dstate of each step.
+        shows: What each dstate looks like.
+        links: Where an action leads from a dstate.
+        faults: What is disbelieved.
+        cost: The counts that the theory prefers, first to last.
     """
 
     map: SSHMap
@@ -54,7 +61,7 @@ class Rival:
 
     @classmethod
     def of(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Rival:
-        """A map of the trace, or of its first steps, as a rival of others."""
+        """A map of the trace, or of its first steps, as a rival."""
         wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
         looks: dict[int, Seen] = {}
         for t, label in enumerate(ssh_map.labels):
@@ -78,13 +85,12 @@ class Rival:
 
     @property
     def places(self) -> list[int | None]:
-        """The place of each dstate, if it has one."""
-        return [s.place for s in self.map.dstates] + [None] * (
-            len(self.shows) - len(self.map.dstates)
-        )
+        """The place of each dstate; None where it has none."""
+        known = self.map.dstates
+        return [s.place for s in known] + [None] * (len(self.shows) - len(known))
 
     def explained(self) -> SSHMap:
-        """The map of all steps, and its faults."""
+        """The map of all steps, with its faults."""
         if len(self.map.labels) == len(self.labels):
             return self.map
         known = self.map.dstates
@@ -103,20 +109,24 @@ class Rival:
         )
 
     def contradiction(self, action: str, seen: Seen) -> int | None:
-        """The dstate that the action leads to, where that looks different; else None."""
+        """The dstate that an action leads to, if it looks different from `seen`; else None."""
         there = self.links.get((self.here, action))
         return None if there is None or self.shows[there] == seen else there
 
     def is_unknown(self, action: str) -> bool:
-        """Whether the action was never tried here."""
+        """Whether an action was never tried at the robot's dstate."""
         return (self.here, action) not in self.links
 
     def future(self) -> tuple[object, ...]:
-        """What the map predicts from here on. It is the same for two maps that have the same dstates and links and the robot in the same dstate, by whichever names, however they
-        explain what was; and it says nothing of dstates that cannot be reached from here but how many there are."""
+        """What the map predicts from here on, as a value that two maps can be compared by.
+
+        It is equal for maps that agree on dstates, links and where the robot is, up to renaming,
+        however they explain the past. Of unreachable dstates it holds only the number.
+        """
         ends: dict[int, list[tuple[str, int]]] = {}
         for (s, action), x in self.links.items():
             ends.setdefault(s, []).append((action, x))
+        # Number the dstates in the order in which a breadth-first search from here reaches them.
         number, reached = {self.here: 0}, [self.here]
         links = []
         for s in reached:
@@ -128,7 +138,14 @@ class Rival:
         return tuple(self.shows[s] for s in reached), tuple(links), len(self.shows)
 
     def ways_on(self, action: str, step: Step, seen: Seen, theory: Theory) -> Iterator[Rival]:
-        """The rivals of one step more that this one becomes, those that cost nothing first."""
+        """The rivals that this one becomes with one more step; those that cost nothing come first.
+
+        Args:
+            action: The name of the action before the step.
+            step: The step.
+            seen: What the step shows.
+            theory: The settled theory.
+        """
         t, there = len(self.labels), self.links.get((self.here, action))
         alike = [s for s, shown in enumerate(self.shows) if shown == seen]
         is_causal = theory.level == "causal"
@@ -144,8 +161,11 @@ class Rival:
         if theory.misread:
             view, star = self.shows[there]
             tenths = theory.fault_tenths("misread", step)
-            doubted = [Fault(t, "misread", step.view, view, tenths / 10)] if view != seen[0] else []  # type: ignore[arg-type]
-            doubted += [Fault(t, "misseen", cost=tenths / 10)] if star != seen[1] else []
+            doubted = []
+            if view != seen[0]:
+                doubted += [Fault(t, "misread", step.view, view, tenths / 10)]  # type: ignore[arg-type]
+            if star != seen[1]:
+                doubted += [Fault(t, "misseen", cost=tenths / 10)]
             yield self._to(there, faults=doubted, tenths=tenths * len(doubted))
         if theory.slipped:
             tenths = theory.fault_tenths("slipped", step)
@@ -164,7 +184,15 @@ class Rival:
         faults: Sequence[Fault] = (),
         tenths: int = 0,
     ) -> Rival:
-        """The rival whose next step is at a dstate, with a link there, or the dstate, if they are new."""
+        """The rival whose next step is at the dstate `there`.
+
+        Args:
+            there: The dstate of the step.
+            link: The action of a new link to it, if there is one.
+            new: What the dstate shows, if it is new.
+            faults: What is disbelieved besides.
+            tenths: What these faults cost, in tenths of dstates.
+        """
         tenths += DSTATE if new else 0
         return Rival(
             self.map,
@@ -178,12 +206,13 @@ class Rival:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """What rivals are weighed with.
+    """Weighs rivals.
 
-    odds     of a fault of the cheapest kind, as a logarithm: how improbable it is
-    price    of that, in tenths of dstates
-    dstates  how many there are, N
-    views    how many there are, V
+    Attributes:
+        odds: Negative logarithm of the probability of a fault of the cheapest kind, in nats.
+        price: What such a fault costs, in tenths of dstates.
+        dstates: Number N of dstates.
+        views: Number V of views.
     """
 
     odds: float
@@ -193,7 +222,7 @@ class Scale:
 
     @classmethod
     def of(cls, theory: Theory, chance: float, dstates: int, views: int) -> Scale:
-        """For a theory with faults, of which the cheapest kind has this probability at each step."""
+        """The scale for a theory whose cheapest fault has the probability `chance` at each step."""
         cheapest = min(round(10 * price) for price in (theory.misread, theory.slipped) if price)
         return cls(-math.log(chance), cheapest, max(dstates, 2), max(views, 2))
 
@@ -208,7 +237,7 @@ class Scale:
         )
 
     def shares(self, rivals: Sequence[Rival]) -> list[float]:
-        """How probable each of these is, if one of them is true. They sum to 1."""
+        """The probability of each rival, if one of them is true. They sum to 1."""
         improbable = [self.improbability(rival) for rival in rivals]
         least = min(improbable, default=0.0)
         weights = [math.exp(least - nats) for nats in improbable]

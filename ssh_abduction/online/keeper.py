@@ -1,0 +1,167 @@
+"""Keeps the minimal maps of a trace without faults current, for one settled theory."""
+
+from __future__ import annotations
+
+import time
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.online.drafts import DRAFTS, Drafts
+from ssh_abduction.online.guesser import Guesser
+from ssh_abduction.online.incremental import IncrementalSolver
+from ssh_abduction.online.options import StepOptions
+from ssh_abduction.online.replay import MinimalMaps
+from ssh_abduction.solver import Cost, Judging, Seconds, Solution, Status
+from ssh_abduction.theory.evidence import evidence_of, pairs_of, said_by
+from ssh_abduction.theory.theory import Theory
+
+
+class MapKeeper:
+    """Keeps the minimal maps current, or else the best map that can be had in time.
+
+    Args:
+        trace: The steps so far.
+        theory: The settled theory, without faults.
+        options: What a step may use.
+        before: The keeper that this one follows. Its theory was settled for fewer steps.
+    """
+
+    standing = None  # only a theory with faults has one
+
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory,
+        options: StepOptions,
+        before: MapKeeper | None = None,
+    ) -> None:
+        self.trace, self.theory, self._options = trace, theory, options
+        self._judging = Judging(trace, theory)
+        self._pairs = pairs_of(trace, theory)
+        self.minimal = MinimalMaps(trace, theory, self._judging)
+        self.drafts = Drafts(trace, theory, self._judging)
+        self.solver: IncrementalSolver = IncrementalSolver(
+            options, before.solver.searches if before else 0
+        )
+        self.guesser: Guesser = before.guesser if before else Guesser(trace, options)
+        self._previous: SSHMap | None = None  # the best map of the steps before the last
+        self._spent = 0.0  # seconds that all steps took
+
+    @property
+    def searches(self) -> int:
+        """How often clingo was asked."""
+        return self.solver.searches
+
+    def restarted(self, trace: Trace, theory: Theory) -> MapKeeper:
+        """A keeper for the theory as one more step settles it.
+
+        Minimal maps of fewer steps need not be minimal by that theory. They go on as drafts, if
+        they were judged by displacements, too.
+        """
+        keeper = MapKeeper(trace, theory, self._options, before=self)
+        keeper.guesser.follow(trace)
+        keeper._previous = self._best_known()
+        if self.theory.displacement == "use":
+            for ssh_map in [m.map() for m in self.minimal.maps[:DRAFTS]] + self.drafts.maps():
+                keeper.drafts.add(ssh_map, trace)
+        else:
+            keeper.guesser.guess = None
+        return keeper
+
+    def take(self, trace: Trace) -> None:
+        """Take in the last step of a trace: keep the maps that predict it."""
+        self._previous = self._best_known()
+        self.trace = trace
+        self.guesser.follow(trace)
+        action = trace.steps[-2].action
+        assert action
+        if self.minimal.is_impossible:
+            return
+        self._pairs = pairs_of(trace, self.theory)
+        was_proven = self.minimal.status is Status.OPTIMAL
+        untried = self.minimal.follow(action, trace, self._pairs)
+        self.drafts.follow(action, trace.steps[-1])
+        if was_proven and self.minimal.status is Status.UNKNOWN:
+            self.solver.make_due()
+        for replayed in untried[:DRAFTS]:
+            self.drafts.add(replayed.map(), trace)
+
+    def answer(self, began: float) -> Solution:
+        """Find what is not known of the steps so far, and say what is.
+
+        Args:
+            began: When the step began, by `time.perf_counter`.
+        """
+        if not self.minimal.is_impossible:
+            self._find(began)
+        return self._solution(began)
+
+    def _best_known(self) -> SSHMap | None:
+        """The first minimal map, or else the best draft."""
+        if self.minimal.maps:
+            return self.minimal.maps[0].map()
+        return self.drafts.first()
+
+    def _find(self, began: float) -> None:
+        """Ask clingo for the minimal maps; where it has no time for them, guess maps."""
+        if not self.minimal.is_settled(self._options.max_maps) and self.solver.is_due(self.trace):
+            self._ask()
+        guessed = self.guesser.finished()
+        if self.minimal.status is not Status.UNKNOWN:
+            return
+        if guessed:
+            self.drafts.add(guessed, self.trace)
+        if self.guesser.suits(self.theory):
+            contradicted = None if self.drafts else self._previous
+            mended = self.guesser.mend_or_guess(self.trace, self.theory, contradicted, began)
+            if mended:
+                self.drafts.add(mended, self.trace)
+
+    def _ask(self) -> None:
+        """Let clingo say what the minimal maps are, or the best map that it finds in time."""
+        known = self.minimal.maps[0].map() if self.minimal.status is Status.OPTIMAL else None
+        found = self.solver.maps(self.trace, self.theory, known)
+        said = self.solver.solution
+        assert said is not None
+        proves = said.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
+        if proves or not self.minimal.replays:
+            self.minimal.replace(found, said.status, said.complete, said.cost)
+            self.drafts.clear()
+        elif found:
+            self.drafts.add(found[0], self.trace)
+
+    def _solution(self, began: float) -> Solution:
+        """The answer for the steps so far: the minimal maps, or else one consistent map."""
+        asked = self.solver.solution
+        assert asked is not None
+        minimal, steps = self.minimal, len(self.trace)
+        status, cost = minimal.status, minimal.cost
+        maps = tuple(m.map() for m in minimal.maps)
+        if status is Status.UNKNOWN and (best := self.drafts.best(self.trace, self._pairs)):
+            maps, status, cost = (best,), Status.FEASIBLE, Cost.of(best)
+        self._spent += time.perf_counter() - began
+        if maps and self._judging.has_time_for(steps, self._spent):
+            self._judging.pass_grown_map(self.trace, maps[0])
+        was_asked = asked.steps == steps  # at this step
+        return Solution(
+            status=status,
+            maps=maps,
+            cost=cost if maps else None,
+            bound=asked.bound,
+            complete=minimal.complete,
+            theory=self.theory,
+            steps=steps,
+            prefix=asked.prefix,
+            basis=asked.basis,
+            seconds=Seconds(
+                time.perf_counter() - began,
+                asked.seconds.ground if was_asked else 0.0,
+                asked.seconds.solve if was_asked else 0.0,
+            ),
+            stopped=None if minimal.complete else asked.stopped,
+            evidence=said_by(
+                evidence_of(self.theory),
+                self.trace,
+                {name: said["refused"] for name, said in asked.evidence.items()},
+            ),
+        )

@@ -1,0 +1,50 @@
+"""Settles a theory for a trace that grows."""
+
+from __future__ import annotations
+
+from ssh_abduction.data.errors import TraceError
+from ssh_abduction.data.trace import Step, Trace
+from ssh_abduction.theory.evidence.displacement import count_returns
+from ssh_abduction.theory.theory import Theory
+
+
+class TheorySettler:
+    """Settles `star` by the first step, and `displacement` and `returns` by the steps so far.
+
+    Args:
+        theory: The theory as the user gave it.
+        first: A trace of the first step.
+
+    Raises:
+        TheoryError: The theory needs stars and the first step has none.
+        TraceError: The first step lacks something else that the theory needs.
+    """
+
+    def __init__(self, theory: Theory, first: Trace) -> None:
+        # The first step has no displacement, so its star is settled without displacements.
+        settled = theory.replace(displacement="none").resolve(first)
+        self._refuses_stars = theory.star == "auto" and settled.star == "none"
+        self._theory = theory.replace(star=settled.star)
+
+    def settled(self, trace: Trace) -> Theory:
+        """The theory settled for the steps so far."""
+        theory = self._theory
+        if theory.displacement == "auto":
+            theory = theory.replace(displacement="use" if trace.has_displacements else "none")
+        if theory.displacement == "use" and not theory.returns:
+            theory = theory.replace(returns=count_returns(trace, theory))
+        return theory.resolve(trace.prefix(1))
+
+    def is_settled(self, theory: Theory, trace: Trace) -> bool:
+        """Whether `theory`, which was settled for the steps but the last, is settled for all."""
+        if theory.displacement == "none":
+            return self._theory.displacement == "none" or trace.steps[-1].displacement is None
+        return bool(self._theory.returns) or theory.returns == count_returns(trace, theory)
+
+    def check_star(self, step: Step, number: int) -> None:
+        """Raise TraceError for a star after a first step that had none."""
+        if self._refuses_stars and step.star is not None:
+            raise TraceError(
+                f"step {number}: star: expected none, as the first step has none; "
+                "give all steps stars, or take star=none"
+            )
