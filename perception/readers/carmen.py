@@ -37,23 +37,28 @@ TRUEPOS lines, which CARMEN's simulator writes, give the true pose of the robot.
 from __future__ import annotations
 
 import math
-from array import array
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import IO, Literal, TypeAlias
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perception.errors import LogError
-from perception.readers.graphs import ROUNDED, Graph
+from perception.readers.carmen_survey import (
+    Found,
+    Meaning,
+    meaning_of,
+    mount_of,
+    reach_of,
+    survey_of,
+    without_codes,
+)
 from perception.readers.lines import lines
 from perception.readers.messages import (
     EDGES,
     KINDS,
-    NAME,
     VERTICES,
     Damaged,
     ScanLine,
@@ -69,24 +74,8 @@ from perception.readers.scans import Damage, Laser, Reading, Scan
 from ssh_abduction.data.files import LINE_OF_A_LOG
 from ssh_abduction.data.odometry import Pose, between, moved
 
-# Meaning of the poses of the scans, in the order of the docstring; `lines` if scans have no poses
-# but ODOM lines are between them.
-Meaning: TypeAlias = Literal["edges", "restarts", "first corrected", "raw", "lines"]
-# Share of the scans that must follow a rule, since lines may be damaged.
-MOST_SCANS = 0.9
-# The first pose is corrected if it is this far from the second, in metres or radians. A smaller
-# difference may come from reading it some milliseconds later.
-WANDERED = (0.5, 0.25)
-# The mount of the laser is the same in all scans up to this difference, since some logs have two
-# decimals.
-MOUNTED = 0.02
 # Poses of vertices within this many metres of the chain of the edges are not corrected.
 CORRECTED = 0.05
-# Ranges of a SICK LMS from here on, in metres, are codes such as "nothing came back" or "dazzled"
-# (SICK, Telegrams for LMS 200, values 8183 to 8191).
-SICK_REACH, SICK_MOST = 81.83, 81.92
-# No laser measures ranges beyond this, in metres.
-NO_RANGE = 1000.0
 # Lines of CARMEN that are ignored.
 OTHERS = (b"SYNC", b"RLASER", b"ROBOTLASER2", b"RAWLASER2", *(kind.encode() for kind in KINDS))
 # Numbers of beams of a FLASER that cover half a circle by convention: a SICK at 2, 1, 1/2 and 1/4
@@ -94,59 +83,6 @@ OTHERS = (b"SYNC", b"RLASER", b"ROBOTLASER2", b"RAWLASER2", *(kind.encode() for 
 HALF_A_CIRCLE = (90, 91, 180, 181, 360, 361, 720, 721)
 # Largest number of scans that wait for the next ODOM line.
 MOST_WAITING = 100
-
-
-@dataclass(slots=True)
-class _Survey:
-    """Findings of the first pass about one kind of scans.
-
-    Attributes:
-        scans: Number of scans.
-        beams: Number of beams of the first scan.
-        most: Largest range.
-        repeated: Number of times that it occurs.
-        mount: First pose in the frame of the second, at the first scan.
-        mounted: Number of scans with about the same mount.
-        wandered: Number of scans with a very different one.
-        same: Number of scans whose two poses are equal.
-        restarts: Number of scans whose pose the next ODOM line repeats, though the line before it
-            has the same time and another pose.
-        moves: Number of scans at which a restart could be seen.
-        unmoved: Lines of scans before which no ODOM line tells the motion.
-        poses: Second poses, three numbers each.
-    """
-
-    scans: int = 0
-    beams: int = 0
-    most: float = 0.0
-    repeated: int = 0
-    mount: Pose | None = None
-    mounted: int = 0
-    wandered: int = 0
-    same: int = 0
-    restarts: int = 0
-    moves: int = 0
-    unmoved: list[int] = field(default_factory=list)
-    poses: array[float] = field(default_factory=lambda: array("d"))
-
-
-@dataclass(slots=True)
-class _Found:
-    """Findings of the first pass.
-
-    Attributes:
-        kinds: Findings for each kind of scans.
-        parameters: Values of PARAM lines.
-        tags: Number of lines of each kind.
-        graph: Vertices and edges.
-        damage: Description of the first scan that cannot be read.
-    """
-
-    kinds: dict[str, _Survey] = field(default_factory=dict)
-    parameters: dict[str, float] = field(default_factory=dict)
-    tags: Counter[str] = field(default_factory=Counter)
-    graph: Graph = field(default_factory=Graph)
-    damage: str = ""
 
 
 def looks_like(head: bytes) -> bool:
@@ -165,7 +101,7 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
     Raises:
         LogError: The log holds no scan, or no odometry.
     """
-    found = _survey(file, source, format != "carmen")
+    found = survey_of(file, source, format != "carmen")
     if format == "g2o" and not found.graph.vertices:
         raise LogError(
             f"{source}: expected vertices in lines VERTEX2 or VERTEX_SE2, got none; leave the "
@@ -194,15 +130,15 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
         notes.append(
             f"The scans are those of the lines {kind}; those of {', '.join(others)} are not read."
         )
-    meaning = _meaning(found, survey, kind, source, notes)
+    meaning = meaning_of(found, survey, kind, source, notes)
     is_corrected = meaning != "edges" or found.graph.is_corrected(CORRECTED)
     if not is_corrected:
         notes.append(
             "The poses of the vertices have not been corrected: they are the chain of the edges."
         )
     assumed: dict[str, str] = {}
-    mount = _mount(found, survey, meaning, kind)
-    reach = _reach(found, survey, kind, assumed)
+    mount = mount_of(found, survey, meaning, kind)
+    reach = reach_of(found, survey, kind, assumed)
     if kind == "FLASER" and "fov" not in found.parameters and survey.beams not in HALF_A_CIRCLE:
         assumed["fov"] = (
             f"The log does not say how wide the laser looks: its {survey.beams} beams are "
@@ -210,194 +146,6 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
         )
     items = _scans(file, source, _Odometer(found, meaning, is_corrected), kind, mount, reach)
     return Reading("g2o" if found.graph.vertices else "carmen", tuple(notes), items, assumed)
-
-
-def _meaning(found: _Found, survey: _Survey, kind: str, source: str, notes: list[str]) -> Meaning:
-    """What the poses of the scans mean. Raises LogError if none are the odometer's."""
-    is_same = survey.same >= MOST_SCANS * survey.scans
-    if kind == "RAWLASER1":
-        # Scans without poses take theirs from the ODOM lines.
-        if not found.tags["ODOM"]:
-            raise LogError(
-                f"{source}: expected odometry, got neither ODOM lines nor poses in {kind}; "
-                "record the odometer, too"
-            )
-        return "lines"
-    if found.graph.vertices:
-        return _meaning_beside_graph(found.graph, survey, kind, source, notes)
-    if is_same and (found.tags["NEFF"] or 2 * survey.restarts > survey.moves > 0):
-        if not found.tags["ODOM"]:
-            raise LogError(
-                f"{source}: expected odometry, got corrected poses alone (NEFF lines, but no "
-                "ODOM); take the log before it was corrected"
-            )
-        notes.append(
-            f"The poses in {kind} are corrected ones, from which the ODOM lines start anew after "
-            "each scan, as GMapping writes them. Odometry was pieced together: it is the "
-            "chain of the increments of the ODOM lines between two scans, without the jumps of the "
-            "correction. It is no recorded odometry."
-        )
-        if survey.unmoved:
-            notes.append(
-                "No ODOM line tells how the robot moved before the scans in these lines, so "
-                f"that it seems to have stood still: {_listed(survey.unmoved)}."
-            )
-        return "restarts"
-    if survey.wandered > (1 - MOST_SCANS) * survey.scans:
-        notes.append(
-            f"The first pose in {kind} wanders from the second: the first is taken for a "
-            "corrected one, the second for odometry."
-        )
-        return "first corrected"
-    return "raw"
-
-
-def _meaning_beside_graph(
-    graph: Graph, survey: _Survey, kind: str, source: str, notes: list[str]
-) -> Meaning:
-    """What the poses of the scans mean if there are vertices. Raises LogError."""
-    if graph.share_at_vertices(survey.poses) < MOST_SCANS:
-        notes.append(
-            f"The poses in {kind} differ from those of VERTEX2: the former are taken for "
-            "odometry, the latter for corrected ones."
-        )
-        return "raw"
-    if not graph.edges:
-        raise LogError(
-            f"{source}: expected odometry, got corrected poses alone (VERTEX2, and the same "
-            f"in {kind}) and no EDGE2; take the log before it was corrected"
-        )
-    notes.append(
-        f"The robot's poses in {kind} are those of VERTEX2, and so corrected ones. Odometry "
-        "is the chain of the EDGE2 from each vertex to the next."
-    )
-    if gaps := graph.chain.gaps:
-        notes.append(
-            "No EDGE2 tells how the robot moved before these vertices, so that it seems to "
-            f"have stood still: {_listed(gaps)}."
-        )
-    return "edges"
-
-
-def _listed(numbers: list[int] | tuple[int, ...]) -> str:
-    """The first five numbers, and how many more there are."""
-    return ", ".join(map(str, numbers[:5])) + (
-        f" and {len(numbers) - 5} more" if len(numbers) > 5 else ""
-    )
-
-
-def _mount(found: _Found, survey: _Survey, meaning: Meaning, kind: str) -> Pose:
-    """The pose of the laser in the frame of the robot, by its poses or else by the parameters."""
-    own = survey.mount
-    if (
-        own is not None
-        and meaning in ("raw", "edges")
-        and max(map(abs, own)) > ROUNDED
-        and survey.mounted >= MOST_SCANS * survey.scans
-    ):
-        x, y, angle = own
-        return round(x, 4), round(y, 4), round(angle, 5)
-    if kind == "ROBOTLASER1" and meaning in ("raw", "edges"):
-        return (0.0, 0.0, 0.0)
-    parameters = found.parameters
-    return parameters.get("offset", 0.0), parameters.get("side", 0.0), parameters.get("angle", 0.0)
-
-
-def _reach(found: _Found, survey: _Survey, kind: str, assumed: dict[str, str]) -> float:
-    """The range that means that nothing is near; infinite if the lines of the scans tell it."""
-    if kind != "FLASER":
-        return math.inf
-    if (reach := found.parameters.get("reach", 0.0)) > 0:
-        return reach
-    reach = _without_codes(
-        survey.most if survey.repeated > 2 or survey.most > SICK_REACH else math.ceil(survey.most)
-    )
-    assumed["no_return"] = (
-        "The log does not say how far the laser reaches. By its largest range, "
-        f"{survey.most:g} m, which came {survey.repeated} times, it is {reach:g} m."
-    )
-    return reach
-
-
-def _survey(file: IO[bytes], source: str, with_graph: bool) -> _Found:
-    """Go through a log, and find what its poses and ranges mean."""
-    found = _Found()
-    odometer: tuple[Pose, float | None] | None = None  # Pose and time of the last ODOM line.
-    since: dict[str, int] = {}  # Number of ODOM lines since the last scan of each kind.
-    # A scan that waits for the next ODOM line, with the ODOM line before it.
-    waiting: tuple[_Survey, ScanLine, tuple[Pose, float | None] | None] | None = None
-    for number, raw in lines(file, source):
-        tokens = raw.split() if raw is not None else []
-        if not tokens or not NAME.match(tokens[0]):
-            continue
-        tag = tokens[0]
-        try:
-            if tag == b"ODOM":
-                pose, time = pose_at(tokens, 1), time_at(tokens, 7)
-                since = {kind: count + 1 for kind, count in since.items()}
-                if waiting is not None:
-                    _count_restart(*waiting, pose, time)
-                    waiting = None
-                odometer = pose, time
-            elif tag == b"PARAM":
-                found.parameters.update(parameters_of(tokens))
-            elif tag in VERTICES and with_graph:
-                found.graph.vertices.append(vertex_of(tokens))
-            elif tag in EDGES and with_graph:
-                ends, motion = edge_of(tokens)
-                found.graph.edges.setdefault(ends, motion)
-            elif (line := scan_line(tokens)) is not None:
-                survey = found.kinds.setdefault(line.kind, _Survey())
-                _count(survey, line)
-                if (
-                    since.get(line.kind, 2) < 2
-                ):  # The first one only repeats the pose of the scan before.
-                    survey.unmoved.append(number)
-                since[line.kind] = 0
-                waiting = survey, line, odometer
-        except Damaged as damage:
-            if tag.decode("ascii") in KINDS and not found.damage:
-                found.damage = f"the first is damaged, in line {number}: {damage}"
-            continue
-        if len(found.tags) < 100 or tag.decode("ascii") in found.tags:
-            found.tags[tag[:20].decode("ascii")] += 1
-    return found
-
-
-def _count_restart(
-    survey: _Survey,
-    line: ScanLine,
-    before: tuple[Pose, float | None] | None,
-    pose: Pose,
-    time: float | None,
-) -> None:
-    """Count whether an ODOM line that follows a scan repeats its pose."""
-    if line.second is None or before is None or before[0] == line.second:
-        return
-    survey.moves += 1
-    # The robot cannot have moved between two lines of the same time.
-    survey.restarts += pose == line.second and (before[1] == line.time or time != line.time)
-
-
-def _count(survey: _Survey, line: ScanLine) -> None:
-    """Count a scan: its ranges, and how its two poses compare."""
-    survey.scans += 1
-    survey.beams = survey.beams or len(line.ranges)
-    ranges = line.ranges[line.ranges <= NO_RANGE]
-    most = float(ranges.max(initial=0.0))
-    if most > survey.most:
-        survey.most, survey.repeated = most, 0
-    if most == survey.most:
-        survey.repeated += int(np.count_nonzero(ranges == most))
-    if line.first is None or line.second is None:
-        return
-    survey.poses.extend(line.second)
-    survey.same += line.first == line.second
-    mount = between(line.second, line.first)
-    survey.mount = survey.mount or mount
-    x, y, angle = between(survey.mount, mount)
-    survey.mounted += max(abs(x), abs(y), abs(angle)) <= MOUNTED
-    survey.wandered += math.hypot(x, y) > WANDERED[0] or abs(angle) > WANDERED[1]
 
 
 def _scans(
@@ -456,7 +204,7 @@ class _Odometer:
         news: A corrected pose that waits for the odometry of the next scan.
     """
 
-    found: _Found
+    found: Found
     meaning: Meaning
     is_corrected: bool
     chain: Pose = (0.0, 0.0, 0.0)
@@ -555,16 +303,11 @@ def _measured(
     """The ranges of a scan, and its laser."""
     beams = len(line.ranges)
     if line.shape is None:
-        laser = _conventional(beams, fov, _without_codes(reach), mount)
+        laser = _conventional(beams, fov, without_codes(reach), mount)
     else:
         first, step, reach = line.shape
-        laser = _described(first, step, _without_codes(reach), beams, mount)
+        laser = _described(first, step, without_codes(reach), beams, mount)
     return line.ranges, laser
-
-
-def _without_codes(reach: float) -> float:
-    """The reach of a laser, without the ranges that a SICK uses as codes."""
-    return SICK_REACH if SICK_REACH <= reach <= SICK_MOST else reach
 
 
 @lru_cache(maxsize=64)

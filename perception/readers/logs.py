@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO
 
 from perception.errors import LogError
-from perception.readers import bag_files, bags, carmen
+from perception.readers import bag_files, bag_topics, bags, carmen
 from perception.readers.echoes import Told, as_told, understood
 from perception.readers.lines import LONGEST_LINE, lines, opened
 from perception.readers.scans import Damage, Reading, RobotLog, Scan
@@ -138,7 +138,7 @@ def _reading(
                 f"{named(path)}: expected a file of the format {format}, got a folder; name "
                 "the file"
             )
-        with bags.opened(path, "ros2") as bag:
+        with bag_topics.opened(path, "ros2") as bag:
             yield bags.read(bag, topics, odom_topic)
         return
     with opened(path) as file:
@@ -151,7 +151,7 @@ def _reading(
                 )
             yield carmen.read(file, named(path), format)
             return
-    with bags.opened(path, found) as bag:
+    with bag_topics.opened(path, found) as bag:
         yield bags.read(bag, topics, odom_topic)
 
 

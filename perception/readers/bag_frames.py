@@ -1,0 +1,198 @@
+"""Reads the transforms between the frames of a robot from a bag."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perception.readers.bag_topics import NANO, TRANSFORMS, Bag
+from perception.readers.messages import Damaged
+from perception.readers.poses import Track
+from perception.readers.scans import Damage, Pose
+from ssh_abduction.data.odometry import between
+
+# Largest difference of the messages of a fixed transform, from rounding: metres and radians.
+FIXED = (0.01, 0.01)
+
+
+@dataclass
+class Frame:
+    """The transform from a parent frame to a frame.
+
+    Attributes:
+        parent: Name of the parent frame.
+        translation: (3,) last translation.
+        rotation: (3, 3) last rotation.
+        first: First transform in the plane.
+        track: Transforms over time in the plane; None for a static one.
+        count: Number of messages.
+        off: Largest difference from the first one, in metres and radians.
+    """
+
+    parent: str
+    translation: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    first: Pose
+    track: Track | None
+    count: int = 0
+    off: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def is_fixed(self) -> bool:
+        return self.off[0] <= FIXED[0] and self.off[1] <= FIXED[1]
+
+
+# The transforms to each frame, by parent. A frame should have one parent, but some have several.
+Frames = dict[str, dict[str, Frame]]
+
+
+def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
+    """Read the transforms. Only the ancestors of the scans' frames keep theirs over time.
+
+    A robot has many joints, whose transforms are not needed.
+    """
+    frames: Frames = {}
+    topics = set(bag.topics(*TRANSFORMS))
+    fixed = {topic for topic in topics if topic.endswith("tf_static")}
+    for group, is_static in ((fixed, True), (topics - fixed, False)):
+        for connection, number, recorded, message in bag.messages(group):
+            if isinstance(message, Damage):
+                damaged.append(message)
+                continue
+            for stamped in message.transforms:
+                child, parent = (
+                    frame_name(stamped.child_frame_id),
+                    frame_name(stamped.header.frame_id),
+                )
+                try:
+                    edge = _heard(frames, child, parent, stamped.transform, is_static)
+                except Damaged as damage:
+                    damaged.append(Damage(number, f"{connection.topic}: {child}: {damage}"))
+                    continue
+                if edge.track is not None and (
+                    edge.count == 1 or any(child in ancestors(frames, frame) for frame in seen)
+                ):
+                    edge.track.add(
+                        stamp_of(stamped.header),
+                        recorded,
+                        flat_pose(stamped.transform.translation, stamped.transform.rotation),
+                    )
+    return frames
+
+
+def _heard(frames: Frames, child: str, parent: str, transform: Any, is_static: bool) -> Frame:
+    """Record a message of the transform to a frame. Raises Damaged."""
+    move, turn = transform.translation, transform.rotation
+    flat = flat_pose(move, turn)
+    parents = frames.setdefault(child, {})
+    edge = parents.get(parent)
+    if edge is None or (edge.track is None) != is_static:
+        edge = Frame(parent, np.zeros(3), np.eye(3), flat, None if is_static else Track())
+    parents.pop(parent, None)
+    parents[parent] = edge  # The last parent comes last.
+    edge.translation = np.array([move.x, move.y, move.z])
+    if edge.track is None or edge.count == 0 or edge.off != (0.0, 0.0) or flat != edge.first:
+        edge.rotation = _rotation(turn)
+    edge.count += 1
+    x, y, angle = between(edge.first, flat)
+    edge.off = max(edge.off[0], math.hypot(x, y)), max(edge.off[1], abs(angle))
+    return edge
+
+
+def parent_of(frames: Frames, child: str) -> Frame:
+    """The transform to a frame from its parent.
+
+    With several parents, it is a frame of the odometry, or else the last one.
+    """
+    parents = list(frames[child].values())
+    return next((one for one in parents if "odom" in one.parent.rpartition("/")[2]), parents[-1])
+
+
+def ancestors(frames: Frames, frame: str) -> list[str]:
+    """The frame, its parent and so on, as far as transforms lead."""
+    chain: list[str] = []
+    while frame in frames and frame not in chain:
+        chain.append(frame)
+        frame = parent_of(frames, frame).parent
+    return chain
+
+
+def mount_of(
+    frames: Frames, odom: str, base: str, frame: str, notes: list[str], assumed: dict[str, str]
+) -> tuple[Pose, bool]:
+    """The pose of the laser in the frame of the robot, and whether it hangs upside down."""
+    if base == frame:
+        return (0.0, 0.0, 0.0), False
+    chain = ancestors(frames, frame)
+    parents = [parent_of(frames, child).parent for child in chain]
+    # If the robot's frame is unknown, the frame below the odometry's is the robot.
+    top = (
+        parents.index(base)
+        if base in parents
+        else parents.index(odom) - 1
+        if odom in parents
+        else None
+    )
+    if top is None:
+        assumed["mount"] = (f"{assumed['mount']} " if "mount" in assumed else "") + (
+            f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser "
+            f"({frame}): the laser is taken to sit in the robot's middle and to look ahead. "
+            "If it does not, say where it sits: --mount X,Y,DEGREES."
+        )
+        return (0.0, 0.0, 0.0), False
+    translation, rotation = np.zeros(3), np.eye(3)
+    for child in reversed(chain[: top + 1]):
+        edge = parent_of(frames, child)
+        translation = translation + rotation @ edge.translation
+        rotation = rotation @ edge.rotation
+        if not edge.is_fixed:
+            off, angle = edge.off[0], math.degrees(edge.off[1])
+            notes.append(
+                f"The {edge.count} transforms from {edge.parent} to {child}, by which the "
+                f"laser is mounted, contradict each other by up to {off:.2f} m and "
+                f"{angle:.0f} degrees: the last one is used."
+            )
+        if len(frames[child]) > 1:
+            others = ", ".join(
+                f"{one.parent} ({one.count} transforms)" for one in frames[child].values()
+            )
+            notes.append(
+                f"The frame {child} has several parents, {others}: that from {edge.parent} is "
+                "used for the laser's mount."
+            )
+    heading = math.atan2(rotation[1, 0], rotation[0, 0])
+    x, y, angle = (round(float(v), 6) for v in (translation[0], translation[1], heading))
+    return (x, y, angle), bool(rotation[2, 2] < 0)
+
+
+def flat_pose(position: Any, orientation: Any) -> Pose:
+    """The pose in the plane. Raises Damaged if the numbers are no pose."""
+    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
+    numbers = position.x, position.y, position.z, x, y, z, w
+    if not all(map(math.isfinite, numbers)) or x * x + y * y + z * z + w * w < 0.5:
+        raise Damaged(
+            "expected a position in metres and a quaternion, got "
+            f"{', '.join(f'{v:g}' for v in numbers)}"
+        )
+    return position.x, position.y, math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def _rotation(q: Any) -> NDArray[np.float64]:
+    """The rotation matrix of a quaternion, (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), dtype=np.float64)
+
+
+def stamp_of(header: Any) -> float:
+    """The time of a header in seconds; 0 if it is missing."""
+    return float(header.stamp.sec + header.stamp.nanosec * NANO)
+
+
+def frame_name(frame: str) -> str:
+    """The name of a frame, without the slash that it may begin with in ROS 1."""
+    return frame.lstrip("/")

@@ -1,0 +1,120 @@
+"""Gives access to the topics and messages of an open bag."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from perception.readers import bag_files
+from perception.readers.bag_files import cause
+from perception.readers.scans import Damage
+from ssh_abduction.data.errors import named
+
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+NANO = 1e-9
+
+
+class Bag:
+    """An open bag.
+
+    Attributes:
+        readers: Readers of rosbags, one for each part.
+        format: `ros1`, `ros2` or `mcap`.
+        notes: Notes on the files.
+        source: Name of the bag.
+        deserialize: Turns bytes of a message kind into a message.
+    """
+
+    def __init__(self, files: bag_files.Files, store: Any, source: str) -> None:
+        self.readers, self.format, self.notes, self.source = (
+            files.readers,
+            files.format,
+            files.notes,
+            source,
+        )
+        self.deserialize = (
+            store.deserialize_ros1 if files.format == "ros1" else store.deserialize_cdr
+        )
+
+    @property
+    def connections(self) -> list[Any]:
+        return [connection for reader in self.readers for connection in reader.connections]
+
+    def topics(self, *kinds: str) -> dict[str, int]:
+        """The topics of these kinds, or all topics, with the number of messages."""
+        counts: dict[str, int] = {}
+        for connection in self.connections:
+            if not kinds or connection.msgtype in kinds:
+                counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+        return counts
+
+    def listed(self) -> str:
+        """All topics with their kinds, for error messages."""
+        topics = dict.fromkeys(
+            f"{c.topic} ({c.msgtype.rpartition('/')[2]})" for c in self.connections
+        )
+        return (
+            ", ".join(list(topics)[:20]) + (", …" if len(topics) > 20 else "") if topics else "none"
+        )
+
+    def messages(self, topics: set[str]) -> Iterator[tuple[Any, int, float, Any]]:
+        """Read the messages of some topics.
+
+        Yields:
+            The connection, the number within the topic, the time of recording, and the message or
+            its Damage.
+        """
+        from rosbags.serde import SerdeError
+
+        numbers = dict.fromkeys(topics, 0)
+        for reader in self.readers:
+            connections = [c for c in reader.connections if c.topic in topics]
+            stored = reader.messages(connections=connections) if connections else iter(())
+            while True:
+                try:
+                    connection, time, raw = next(stored)
+                except StopIteration:
+                    break
+                except Exception as error:  # Damaged bytes can raise any error in the library.
+                    bag_files.check_room(error, self.source)
+                    number = sum(numbers.values()) + 1
+                    where = " and ".join(sorted(topics))
+                    what = (
+                        f"{where}: expected a message, got damaged data ({cause(error)}); what "
+                        "follows was not read"
+                    )
+                    yield connections[0], number, 0.0, Damage(number, what)
+                    break
+                topic = connection.topic
+                numbers[topic] += 1
+                try:
+                    yield (
+                        connection,
+                        numbers[topic],
+                        time * NANO,
+                        self.deserialize(raw, connection.msgtype),
+                    )
+                except (SerdeError, ValueError, IndexError) as error:
+                    what = (
+                        f"{topic}: expected a message {connection.msgtype.rpartition('/')[2]}, "
+                        f"got damaged data ({cause(error)})"
+                    )
+                    yield connection, numbers[topic], time * NANO, Damage(numbers[topic], what)
+
+
+@contextmanager
+def opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
+    """Open a bag of a format. Raises LogError."""
+    with bag_files.opened(Path(path), format) as files:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        store = get_typestore(Stores.ROS1_NOETIC if files.format == "ros1" else Stores.ROS2_HUMBLE)
+        for kind in TRANSFORMS:
+            if kind not in store.fielddefs:
+                store.register(
+                    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind)
+                )
+        yield Bag(files, store, named(path))
