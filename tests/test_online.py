@@ -240,6 +240,13 @@ def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> 
     )
 
 
+def test_a_map_whose_turns_lead_back_is_not_sure_to_go_on() -> None:
+    """Two turns to the right lead back, so that a new place ahead would lie on both sides of a path."""
+    trace = Trace.from_steps("aaaa", ["right", "right", "travel"])
+    theory = Theory(star="none", path_order="partial", all_on_paths=True).resolve(trace)
+    assert draft(trace, theory, 3, 0) == [True]
+
+
 @pytest.mark.parametrize("stars", [False, True])
 def test_a_map_goes_on_through_a_maze(stars: bool) -> None:
     doubts: list[bool] = []

@@ -21,8 +21,9 @@ so it may hold where another was given up.
 Where the theory asks for no frames, a sketch may still have them: that adds axioms, and leaves none out.
 
 A sketch may also begin with a map of some steps, and grow like a tree beyond it. What is new then lies on new paths, or on one known path, and contradicts
-nothing either. But there are two cases in which the sketch cannot say whether it is consistent: a turn may be the first to show how two known paths cross,
-which has to fit all their places; and without frames, a turn may lead from a dstate to itself, which then can be on no path.
+nothing either. But there are three cases in which the sketch cannot say whether it is consistent: a turn may be the first to show how two known paths cross,
+which has to fit all their places; and without frames, a turn may lead from a dstate to itself, which then can be on no path, and two turns to the right may lead
+back, so that a new place ahead would lie on both sides of a path.
 """
 
 from __future__ import annotations
@@ -206,6 +207,8 @@ class Sketch:
             if self._theory.next_place:
                 raise _Contradiction
         there = self._new_place(step)
+        if not self._framed:
+            self._doubt_if_grown_from_map()
         order.insert(position + (direction == 1), self._states[there].place)
         self._set_course(there, path, direction)
         return there
@@ -244,7 +247,7 @@ class Sketch:
         return s.path, s.direction
 
     def _doubt_if_grown_from_map(self) -> None:
-        """Note that the last action may be the first to join two paths of the map that the sketch began with. A sketch that is a tree stays certain."""
+        """Note that the last action may contradict the map that the sketch began with. A sketch that is a tree stays certain."""
         self.certain = self._tree
 
     def _set_course(self, here: int, path: int, direction: int) -> None:
