@@ -25,10 +25,10 @@ from functools import cached_property, partial
 from graphlib import CycleError, TopologicalSorter
 from typing import TypeAlias
 
-from ssh_abduction.checker.gateways import Clash, Sight, clashes, headings, may_show_the_same
 from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.errors import MapError, brief
+from ssh_abduction.data.gateways import Clash, Sight, clashes, headings, may_show_the_same
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import Openings, Star
 from ssh_abduction.data.trace import Action, Trace, View, checked_trace

@@ -26,8 +26,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from ssh_abduction.checker.gateways import Sight, headings
 from ssh_abduction.data.clock import look_at_clock
+from ssh_abduction.data.gateways import Sight, headings
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace

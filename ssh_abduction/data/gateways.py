@@ -1,6 +1,6 @@
 """Whether the stars seen at the places of a map can be those of one place each, where places have any number of gateways (star=gateways).
 
->>> from ssh_abduction.checker.gateways import rotations
+>>> from ssh_abduction.data.gateways import rotations
 >>> from ssh_abduction.data.star import Star
 >>> corner = Star.of((0, 120)).frames[0]
 >>> min(rotations(corner, corner, 0)), max(rotations(corner, corner, 0)), rotations(corner, corner, 1)
