@@ -13,8 +13,9 @@ from simulator.errors import SimulatorError
 from simulator.motion import moved
 from simulator.plans import APART, STRAIGHT, Plan, tour
 from ssh_abduction import Theory, Trace, evaluate, solve
-from ssh_abduction.checker.checker import check, turned
+from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry
+from ssh_abduction.data.gateways import turned
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.trace import Step
 
@@ -287,7 +288,7 @@ def test_directions_of_doors_tell_dstates_apart(tmp_path: Path) -> None:
         maps = solve(trace, theory, max_maps=None).maps
         assert all(evaluation.isomorphic for evaluation in evaluate(maps, trace).maps) == right
     general = Theory.topological().replace(star="gateways", boundary="none", displacement="none")
-    assert turned(trace, true_map(plan, trace), general) is not None
+    assert turned(trace, true_map(plan, trace), general.axioms) is not None
 
 
 @pytest.mark.parametrize(

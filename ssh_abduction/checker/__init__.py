@@ -1,4 +1,4 @@
-"""The judges of maps and bounds: plain Python that shares nothing with the encodings, so that it can catch them."""
+"""Judges of maps and bounds in plain Python, independent of the encodings and the solver."""
 
 from ssh_abduction.checker.checker import Violation, check
 from ssh_abduction.checker.proof import check_bound

@@ -1,44 +1,43 @@
-"""Whether the stars seen at the places of a map can be those of one place each, where places have any number of gateways (star=gateways).
+"""Fits the stars seen at each place of a map into one frame (star=gateways).
 
 >>> from ssh_abduction.data.gateways import rotations
 >>> from ssh_abduction.data.star import Star
 >>> corner = Star.of((0, 120)).frames[0]
->>> min(rotations(corner, corner, 0)), max(rotations(corner, corner, 0)), rotations(corner, corner, 1)
-(0, 359, frozenset())
+>>> min(rotations(corner, corner, 0)), max(rotations(corner, corner, 0))
+(0, 359)
+>>> rotations(corner, corner, 1)
+frozenset()
 
-A map shows for each dstate how it is turned, in degrees. Which gateway seen at one step is which one seen at another follows from that, but in tolerance only, and not where gateways were not
-observed. So this seeks, for each place, a frame and a shift of its slots for each sight, such that all axioms hold. A *sight* is a dstate together with a star seen there.
-Where there is none, a smallest set of sights without any is reported, under each axiom that has to be dropped to mend it.
+The heading of a dstate is in degrees. Headings match gateways across steps only up to the spreads
+of their bearings, and not where a gateway was not observed. So `fit` searches, at each place, for a
+frame and a shift of slots for each sight such that all axioms hold. A sight is a dstate together
+with a star that is seen there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from ssh_abduction.data.clock import look_at_clock
-from ssh_abduction.data.maps import DState
+from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import SPREAD, Frame, Star
-from ssh_abduction.data.trace import Action
-
-AXIOMS = (
-    "gateway_frame",
-    "gateway_heading",
-    "gateway_turn",
-    "gateway_dstate",
-    "gateway_path",
-    "gateway_end",
-)
+from ssh_abduction.data.trace import Action, Trace
 
 
 @dataclass(frozen=True)
 class Sight:
-    """A dstate, a star that is seen there, and the first step that sees it.
+    """A dstate and a star that is seen there.
 
-    shows  whether the heading of the dstate is that of this sight: the first one there
-    first  whether it is the first sight at its place, from whose heading all others there are counted
-    onward  degrees, clockwise from ahead, at which the path of the dstate goes on to another place: 0, 180
+    Attributes:
+        dstate: The dstate.
+        star: The star.
+        step: The first step with this dstate and star.
+        shows: Whether this is the first sight of its dstate, which fixes the dstate's heading.
+        first: Whether this is the first sight at its place, whose heading is 0.
+        onward: Bearings in degrees, 0 (ahead) or 180 (behind), at which the path goes on.
     """
 
     dstate: DState
@@ -49,54 +48,119 @@ class Sight:
     onward: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
-class Clash:
-    """Sights at a place that cannot all be of one place: their steps, and the axioms each of which forbids them."""
-
-    place: int
-    steps: tuple[int, ...]
-    axioms: tuple[str, ...]
-
-
 Turns = Mapping[tuple[Sight, Sight], Collection[Action]]
-_Turned = tuple[Frame, int]  # what a sight sees, and how far its slots are shifted
+_Turned = tuple[Frame, int]  # what a sight sees, and the shift of its slots
 
 
-def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> Iterator[Clash]:
-    """What is wrong at each place.
+def turned(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> SSHMap | None:
+    """Replace the headings of a map by headings that all stars of the trace allow.
 
-    sights  by the step that first has them
-    turns   the turns that lead from one sight to another
-    axioms  those that hold
+    Args:
+        trace: The trace, with stars.
+        ssh_map: A map of the trace. Its own headings are ignored.
+        axioms: Names of the axioms that hold.
+
+    Returns:
+        The map with new headings, or None if the stars of some place allow none.
     """
-    hard = [name for name in AXIOMS if name in axioms]
-    for place, seen in _by_place(sights).items():
-        if _reading(seen, turns, hard) is not None:
+    found = headings(*sights_of(trace, ssh_map, _onward_of(trace, ssh_map, axioms)), axioms)
+    if any(s.place is not None and s.id not in found for s in ssh_map.dstates):
+        return None
+    return replace(
+        ssh_map, dstates=tuple(replace(s, heading=found.get(s.id)) for s in ssh_map.dstates)
+    )
+
+
+def sights_of(
+    trace: Trace, ssh_map: SSHMap, onward: Callable[[DState], tuple[int, ...]]
+) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
+    """List the sights of a map, and the turns between sights at one place.
+
+    Args:
+        trace: The trace, with stars.
+        ssh_map: A map of the trace.
+        onward: Gives `Sight.onward` of a dstate.
+
+    Returns:
+        The sights by first step, and for each pair of sights the turns from one to the other.
+    """
+    states = {s.id: s for s in reversed(ssh_map.dstates)}
+    sights: dict[tuple[int, Star], Sight] = {}
+    seen: list[Sight | None] = []
+    shown: set[int] = set()
+    places: set[int | None] = set()
+    for i, (label, step) in enumerate(zip(ssh_map.labels, trace.steps, strict=False)):
+        s, star = states.get(label), step.gateways or Star(())
+        if s and (label, star) not in sights:
+            first = s.place not in places
+            sights[label, star] = Sight(s, star, i, label not in shown, first, onward(s))
+            shown.add(label)
+            places.add(s.place)
+        seen.append(sights.get((label, star)))
+    turns: dict[tuple[Sight, Sight], set[Action]] = defaultdict(set)
+    for a, b, action in zip(seen, seen[1:], trace.actions, strict=False):
+        if a and b and action.kind == "turn" and a.dstate.place == b.dstate.place:
+            turns[a, b].add(action)
+    return list(sights.values()), turns
+
+
+def _onward_of(
+    trace: Trace, ssh_map: SSHMap, axioms: Collection[str]
+) -> Callable[[DState], tuple[int, ...]]:
+    """A function that says in which directions the path of a dstate goes on to another place."""
+    kinds = {action.name: action.kind for action in trace.actions}
+    states = {s.id: s for s in ssh_map.dstates}
+    total = {"path_order_total", "on_path"} <= set(axioms)
+    listed = {h.id: h.order for h in ssh_map.paths} if total else {}
+    # the places that travels along a path reach from a place, in each direction
+    reached: dict[tuple[int, int, int], set[int]] = defaultdict(set)
+    for source, name, target in ssh_map.links if "travel_orders" in axioms else ():
+        s, p, q = states[source], states[source].place, states[target].place
+        if kinds.get(name) != "travel" or p is None or q is None or p == q:
             continue
-        core = list(seen)
-        for sight in reversed(seen):
-            rest = [other for other in core if other is not sight]
-            core = core if _reading(rest, turns, hard) is not None else rest
-        to_blame = [
-            name
-            for name in hard
-            if _reading(core, turns, [other for other in hard if other != name]) is not None
-        ]
-        yield Clash(place, tuple(sight.step for sight in core), tuple(to_blame or hard))
+        if s.path is not None and s.direction is not None:
+            reached[s.path, s.direction, p].add(q)
+            reached[s.path, -s.direction, q].add(p)
+
+    def goes_on(path: int, direction: int, place: int) -> bool:
+        if reached[path, direction, place]:
+            return True
+        order = listed.get(path, ())[::direction]
+        later = order[order.index(place) + 1 :] if place in order else ()
+        # a travel outweighs the order that the map lists
+        return any(place not in reached[path, direction, q] for q in later)
+
+    def onward(s: DState) -> tuple[int, ...]:
+        if s.path is None or s.direction is None or s.place is None:
+            return ()
+        ways = ((0, s.direction), (180, -s.direction))
+        return tuple(towards for towards, way in ways if goes_on(s.path, way, s.place))
+
+    return onward
 
 
 def headings(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> dict[int, int]:
-    """A heading of each dstate that the stars seen at its place allow, whatever headings the dstates show. Dstates at a place that cannot be are left out."""
+    """Find headings that the stars allow.
+
+    Args:
+        sights: The sights, by first step. The headings that their dstates show are ignored.
+        turns: The turns between sights at one place.
+        axioms: Names of the axioms that hold.
+
+    Returns:
+        The heading of each dstate in degrees, without the dstates of places that no frame fits.
+    """
     found: dict[int, int] = {}
-    for seen in _by_place(sights).values():
-        read = _reading(seen, turns, axioms, as_shown=False)
-        for sight, (frame, shift) in zip(seen, read, strict=True) if read else ():
-            if read and sight.shows:
-                found[sight.dstate.id] = _middle(rotations(read[0][0], frame, shift))
+    for seen in by_place(sights).values():
+        fitted = fit(seen, turns, axioms, as_shown=False)
+        for sight, (frame, shift) in zip(seen, fitted, strict=True) if fitted else ():
+            if fitted and sight.shows:
+                found[sight.dstate.id] = _middle(rotations(fitted[0][0], frame, shift))
     return found
 
 
-def _by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
+def by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
+    """Group sights by place."""
     there: dict[int, list[Sight]] = {}
     for sight in sights:
         if sight.dstate.place is not None:
@@ -104,12 +168,19 @@ def _by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
     return there
 
 
-def _reading(
+def fit(
     sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_shown: bool = True
 ) -> list[_Turned] | None:
-    """A frame and a shift for each sight such that all pairs of sights satisfy the axioms, or None.
+    """Find a frame and a shift for each sight at one place such that all pairs satisfy the axioms.
 
-    as_shown  whether the headings have to be those that the dstates show
+    Args:
+        sights: The sights at one place.
+        turns: The turns between sights.
+        axioms: Names of the axioms that hold.
+        as_shown: Whether the headings have to be those that the dstates show.
+
+    Returns:
+        A frame and a shift for each sight, or None if there are none.
     """
 
     def extended(chosen: list[_Turned]) -> list[_Turned] | None:
@@ -121,6 +192,7 @@ def _reading(
                 _leads(frame, towards) for towards in sight.onward
             ):
                 continue
+            # only shifts relative to the first sight matter
             for shift in range(max(frame.slots, 1)) if chosen else (0,):
                 look_at_clock()
                 here = (frame, shift)
@@ -138,7 +210,7 @@ def _reading(
 
 
 def _middle(found: Collection[int]) -> int:
-    """A rotation in the middle of an arc of rotations; 0 where there are all or none."""
+    """A rotation in the middle of the longest arc of rotations; 0 if there are all or none."""
     starts = [r for r in sorted(found) if (r - 1) % 360 not in found]
     ends = [next(d for d in range(1, 361) if (r + d) % 360 not in found) for r in starts]
     length, start = max(zip(ends, [-r for r in starts], strict=True), default=(1, 0))
@@ -154,7 +226,7 @@ def _allowed(
     axioms: Collection[str],
     as_shown: bool,
 ) -> bool:
-    """Whether the axioms allow two sights at one place, the first of which comes first, to see so."""
+    """Whether the axioms allow two sights at one place, the earlier one first, in these frames."""
     (first, back), (then, on) = seen_a, seen_b
     shift = (on - back) % max(first.slots, 1)
     found = rotations(first, then, shift)
@@ -169,25 +241,18 @@ def _allowed(
     ):
         return False
     alike, opposite = _ways(first, then, shift, found)
-    sure = not found & {90, 270}
+    sure = not found & {90, 270}  # a robot that may have turned a quarter is not sure of its way
     s, x = a.dstate, b.dstate
-    if "gateway_heading" in axioms and s.id == x.id and not alike:
-        return False
-    if (
-        "gateway_heading" in axioms
-        and as_shown
-        and a.first
-        and b.shows
-        and not _is_shown(x.heading, found)
-    ):
-        return False
+    if "gateway_heading" in axioms:
+        if s.id == x.id and not alike:
+            return False
+        if as_shown and a.first and b.shows and not _is_shown(x.heading, found):
+            return False
     if "gateway_dstate" in axioms and s.id != x.id and alike and (sure or 0 not in found):
         return False
     if "gateway_path" in axioms and s.path is not None and x.path is not None:
-        same, reverse = (
-            s.path == x.path and s.direction == x.direction,
-            s.path == x.path and s.direction != x.direction,
-        )
+        same = s.path == x.path and s.direction == x.direction
+        reverse = s.path == x.path and s.direction != x.direction
         for way, on_course, towards in ((alike, same, 0), (opposite, reverse, 180)):
             if (on_course and not way) or (
                 way and not on_course and (sure or towards not in found)
@@ -197,13 +262,22 @@ def _allowed(
 
 
 def _is_shown(heading: int | None, found: Collection[int]) -> bool:
-    """Whether a dstate shows a heading, and one that the bearings allow."""
+    """Whether a dstate shows a heading that the bearings allow."""
     return heading is not None and 0 <= heading < 360 and (heading in found or not found)
 
 
 @lru_cache(maxsize=2**14)
 def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
-    """By how many degrees the robot may have turned, if gateway K of `then` is gateway K + shift of `first`; empty if they cannot be so."""
+    """The rotations between two sights of a place.
+
+    Args:
+        first: What the robot saw first.
+        then: What it saw later.
+        shift: Gateway k of `then` is taken to be gateway k + shift of `first`.
+
+    Returns:
+        The degrees by which the robot may have turned; empty if the gateways do not match.
+    """
     n = first.slots
     if then.slots != n:
         return frozenset()
@@ -222,25 +296,6 @@ def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
     )
 
 
-def may_show_the_same(one: Star, other: Star) -> bool:
-    """Whether two stars may show the same gateways to a robot that has not turned: some pairs in tolerance take in all that are seen in either."""
-    import numpy as np
-    from scipy.optimize import linear_sum_assignment
-
-    bearings, spreads, seen = (
-        [np.array([getattr(g, name) for g in star.gateways], dtype=float) for star in (one, other)]
-        for name in ("bearing", "spread", "open")
-    )
-    seen = [np.nan_to_num(row) for row in seen]  # None, which is not observed, is 0
-    off = np.abs((bearings[0][:, None] - bearings[1] + 180) % 360 - 180)
-    near = off <= spreads[0][:, None] + spreads[1]
-    taken_in = np.where(near, seen[0][:, None] + seen[1], 0)
-    return bool(
-        taken_in[linear_sum_assignment(taken_in, maximize=True)].sum()
-        == sum(row.sum() for row in seen)
-    )
-
-
 def _between(a: float, b: float) -> float:
     """The angle between two bearings, 0 to 180 degrees."""
     return min((a - b) % 360, (b - a) % 360)
@@ -248,6 +303,7 @@ def _between(a: float, b: float) -> float:
 
 def _turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
     """Whether one of these rotations is what a turn does."""
+    # a bearing or a number of the gateway says more than right, left and around
     if action.bearing is not None:
         return any(_between(r, round(action.bearing)) <= SPREAD for r in found)
     if action.gateway is not None:
@@ -278,7 +334,10 @@ def _turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
 
 
 def _ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[bool, bool]:
-    """Whether the robot may face the same way in both, and the opposite way; or go along one path so, by gateways that are declared opposite."""
+    """Whether the robot may face the same way in both sights, and the opposite way.
+
+    Gateways that are declared opposite also count: they are on one path, which may bend.
+    """
     alike, opposite = 0 in found, 180 in found
     here, there = _passes(first), _passes(then)
     if found and here and there:
@@ -291,7 +350,7 @@ def _ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple
 
 
 def _leads(frame: Frame, towards: int) -> bool:
-    """Whether some gateway may be that of the robot's path, ahead (0) or behind (180)."""
+    """Whether the robot's path may leave by some gateway, ahead (0) or behind (180)."""
     return _passes(frame) is not None or any(
         _between(bearing, towards) <= 2 * spread
         for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
@@ -299,7 +358,10 @@ def _leads(frame: Frame, towards: int) -> bool:
 
 
 def _passes(frame: Frame) -> tuple[int, int] | None:
-    """The gateways ahead and behind on a path that bends, if the robot faces one of them, or came through the other."""
+    """The gateways ahead and behind on a path that bends.
+
+    None unless the robot faces the first one or came through the second one.
+    """
     for k, (bearing, spread, other) in enumerate(
         zip(frame.bearings, frame.spreads, frame.opposite, strict=True)
     ):

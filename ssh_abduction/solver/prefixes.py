@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 
-from ssh_abduction.checker.checker import turned
+from ssh_abduction.data.gateways import turned
 from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp import facts
@@ -259,7 +259,9 @@ class Prefixes:
             self._in_tolerance
             and replays
             and turned(
-                self._task.trace, replace(ssh_map, labels=replayed.labels), self._task.theory
+                self._task.trace,
+                replace(ssh_map, labels=replayed.labels),
+                self._task.theory.axioms,
             )
             is None
         ):
@@ -271,4 +273,4 @@ class Prefixes:
         whole = replace(ssh_map, labels=replayed.labels)
         if not self._in_tolerance or len(ssh_map.labels) == len(replayed.labels):
             return whole
-        return turned(self._task.trace, whole, self._task.theory) or whole
+        return turned(self._task.trace, whole, self._task.theory.axioms) or whole

@@ -1,0 +1,169 @@
+"""Checks that a map fits its trace, and that its numbers fit each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from ssh_abduction.checker.faults import faults_are_allowed
+from ssh_abduction.checker.moves import course_of, heading_of
+from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.checker.sides import is_pair
+from ssh_abduction.data.trace import View
+
+
+def labels_are_dstates(m: Reading) -> Found:
+    """Each step has a label, and each label is the id of a dstate."""
+    steps, labels = len(m.trace), len(m.map.labels)
+    if steps != labels:
+        yield (
+            [min(steps, labels)] if labels < steps else [],
+            f"The map labels {labels} steps, but the trace has {steps}.",
+        )
+    for label, i in m.first.items():
+        if label not in m.records:
+            yield [i], f"Step {i} is labelled {label}, but the map has no dstate {label}."
+
+
+def numbered_by_first_visit(m: Reading) -> Found:
+    """Dstates, places and paths are numbered 0, 1, 2, … by first visit.
+
+    Each of them is visited, and each path is first faced in direction +1.
+    """
+    yield from _numbered(
+        "dstates", [s.id for s in m.map.dstates], [(i, s.id) for i, s in m.visited]
+    )
+    if m.theory.level == "causal":
+        return
+    yield from _numbered("places", m.map.places, [(i, s.place) for i, s in m.visited])
+    yield from _numbered("paths", [h.id for h in m.map.paths], [(i, s.path) for i, s in m.visited])
+    faced: set[int] = set()
+    for i, s in m.visited:
+        if (course := course_of(s)) and course[0] not in faced:
+            faced.add(course[0])
+            if course[1] != 1:
+                yield (
+                    [i],
+                    f"Path {course[0]} is first faced at step {i}, in direction -1 instead of +1.",
+                )
+
+
+def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | None]]) -> Found:
+    if list(ids) != list(range(len(ids))):
+        yield [], f"The ids of the {what} are not 0, 1, 2, … in this order."
+    used = {x: i for i, x in reversed(list(visits)) if x is not None}
+    known = set(ids)
+    for x, i in used.items():
+        if x not in known:
+            yield [i], f"The map uses {x} at step {i}, but does not list it among its {what}."
+    for x in known - used.keys():
+        yield [], f"The map lists {x} among its {what}, but no step is there."
+    for number, (i, x) in enumerate(sorted((i, x) for x, i in used.items())):
+        if x != number:
+            yield (
+                [i],
+                f"The {what} are not numbered by first visit: {x} is number {number} to be "
+                f"visited, at step {i}.",
+            )
+            return
+
+
+def dstates_look_as_seen(m: Reading) -> Found:
+    """The view of a dstate is the first one there that is known and not misread.
+
+    The axiom functional_view covers the views of its other steps.
+    """
+    shown: dict[int, tuple[View | None, int]] = {}
+    for (label, view), i in m.views.items():
+        shown.setdefault(label, (view, i))
+    for first, s in m.visited:
+        view, i = shown.get(s.id, (None, first))
+        if s.view != view:
+            said = (
+                f"looks like {view!r} at step {i}"
+                if s.id in shown
+                else "is unknown or misread wherever it is visited"
+            )
+            yield [i], f"Dstate {s.id} has the view {s.view!r} in the map, but {said}."
+
+
+def links_are_those_of_the_trace(m: Reading) -> Found:
+    """The links of the map are those that its labels and the trace show."""
+    shown = set(m.map.links)
+    if len(shown) < len(m.map.links):
+        yield [], "The map lists a link twice."
+    for link, i in m.links.items():
+        if link not in shown:
+            yield (i, i + 1), f"The map has no link {link}, though this is done at step {i}."
+    for link in shown - m.links.keys():
+        yield [], f"The map has the link {link}, but the trace never does this."
+
+
+def has_what_the_theory_has(m: Reading) -> Found:
+    """The map has only the parts that the theory speaks of.
+
+    It has places and paths only at the topological level, headings only with frames, and excuses
+    only with boundary=defeasible.
+    """
+    causal = m.theory.level == "causal"
+    if causal and (m.map.places or m.map.paths):
+        yield [], "The map has places or paths, but the theory is causal."
+    for s in m.map.dstates:
+        if causal and (s.place, s.path, s.direction) != (None, None, None):
+            yield (
+                m.steps_of(s.id),
+                f"Dstate {s.id} has a place, path or direction, but the theory is causal.",
+            )
+        if m.theory.star not in ("frame", "gateways") and s.heading is not None:
+            yield (
+                m.steps_of(s.id),
+                f"Dstate {s.id} has a heading, but the places of the theory have no frames.",
+            )
+    if m.map.excused and m.theory.boundary != "defeasible":
+        yield [], "The map excuses pairs of paths, but the theory excuses none."
+
+
+def excused_are_pairs_of_paths(m: Reading) -> Found:
+    """The map excuses pairs of its own paths."""
+    paths = {h.id for h in m.map.paths}
+    for pair in m.map.excused:
+        if not is_pair(pair) or not set(pair) <= paths:
+            yield [], f"The map excuses {pair}, which is not a pair of its paths."
+
+
+def orders_list_places_once(m: Reading) -> Found:
+    """The order of a path lists places of the map, each once.
+
+    The axiom on_path covers whether they are the right places.
+    """
+    places = set(m.map.places)
+    for h in m.map.paths:
+        if len(set(h.order)) < len(h.order):
+            yield [], f"The order of path {h.id} lists a place twice."
+        for p in set(h.order) - places:
+            yield [], f"The order of path {h.id} lists place {p}, which the map does not have."
+
+
+def frames_start_at_first_visit(m: Reading) -> Found:
+    """The dstate at which a place is first visited has heading 0."""
+    if not {"one_heading", "gateway_heading"} & m.axioms:
+        return
+    for p, i in m.place_seen.items():
+        s = m.states[m.map.labels[i]]
+        if heading := s.heading if m.theory.star == "gateways" else heading_of(s):
+            yield (
+                [i],
+                f"Place {p} is first visited at step {i} with heading {heading} instead of 0.",
+            )
+
+
+CHECKS: tuple[Check, ...] = (
+    labels_are_dstates,
+    numbered_by_first_visit,
+    dstates_look_as_seen,
+    faults_are_allowed,
+    links_are_those_of_the_trace,
+    has_what_the_theory_has,
+    excused_are_pairs_of_paths,
+    orders_list_places_once,
+    frames_start_at_first_visit,
+)

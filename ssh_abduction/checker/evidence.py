@@ -1,0 +1,147 @@
+"""The axioms of evidence: stars of a dstate, asserted pairs, poses, and drawings in the plane."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ssh_abduction.checker.moves import Move, heading_of
+from ssh_abduction.checker.planarity import Edges
+from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.checker.stars import stars_of
+from ssh_abduction.data.star import Star
+
+
+def one_star(m: Reading) -> Found:
+    """The stars seen at a dstate show the same gateways, in the same directions."""
+    seen: dict[int, dict[Star, int]] = {}
+    for t, (label, step) in enumerate(zip(m.map.labels, m.trace.steps, strict=False)):
+        stars, star = seen.setdefault(label, {}), step.gateways or Star(())
+        for other, i in stars.items() if star not in stars else ():
+            if not _may_show_the_same(other, star):
+                yield (
+                    [i, t],
+                    f"Steps {i} and {t} are one dstate, {label}, but the gateways seen there are "
+                    "not in the same directions.",
+                )
+        stars.setdefault(star, t)
+
+
+def asserted(m: Reading) -> Found:
+    """Each assertion about a pair of steps holds in the map."""
+    labels, theory = m.map.labels, m.theory
+    told = [
+        ("one dstate", theory.same),
+        ("different dstates", theory.different),
+        ("at different places", theory.elsewhere),
+    ]
+    for said, (i, j) in (
+        (said, pair) for said, pairs in told for pair in pairs if max(pair) < len(labels)
+    ):
+        here, there = labels[i], labels[j]
+        places = {m.states[label].place for label in (here, there) if label in m.states}
+        if said == "one dstate" and here != there:
+            yield (
+                [i, j],
+                f"Steps {i} and {j} are dstates {here} and {there}, but are said to be one dstate.",
+            )
+        elif said != "one dstate" and here == there:
+            yield [i, j], f"Steps {i} and {j} are one dstate, {here}, but are said to be {said}."
+        elif said == "at different places" and len(places) == 1 and None not in places:
+            yield (
+                [i, j],
+                f"Steps {i} and {j} are at one place, {min(places, key=str)}, but are said to be "
+                f"{said}.",
+            )
+
+
+def one_pose(m: Reading) -> Found:
+    """The displacements agree with one pose a dstate and one position a place."""
+    from ssh_abduction.checker.geometry import refused_returns  # loads numpy
+
+    trusted = m.trace.without_displacements_at(
+        [fault.step for fault in m.map.faults if fault.kind == "jumped"]
+    )
+    for refused in refused_returns(trusted, m.map, m.theory):
+        said = " and ".join(
+            f"steps {i} and {j} are at one {'place' if freedom == 2 else 'dstate'}"
+            for i, j, freedom in refused.returns
+        )
+        steps = [t for i, j, _ in refused.returns for t in (i, j)]
+        yield (
+            steps,
+            f"By the displacements it cannot be that {said}: {refused} (chi-square "
+            f"{refused.square:.0f}, and at most {refused.most:.0f} is allowed).",
+        )
+
+
+def planar(m: Reading) -> Found:
+    """The map can be drawn in the plane without a crossing, with right turns to the right."""
+    place_of = {s.id: s.place for s in m.states.values() if s.place is not None}
+    headings = {s: heading for s in place_of if (heading := heading_of(m.states[s])) is not None}
+    turns = [
+        (t.source.id, t.action.turn, t.target.id)
+        for t in m.turns
+        if t.action.turn and {t.source.id, t.target.id} <= place_of.keys()
+    ]
+    stars = (
+        {s: [star for state, star, _ in stars_of(m) if state.id == s] for s in place_of}
+        if "star_frame" in m.axioms
+        else {}
+    )
+
+    def cross(travels: Sequence[Move]) -> bool:
+        edges = Edges([(t.source.id, t.target.id) for t in travels], turns, place_of)
+        if m.theory.star != "frame":
+            return not edges.can_be_drawn(crossing=m.theory.symmetric_sides)
+        if headings.keys() == place_of.keys() and edges.can_be_drawn_by(headings):
+            return False
+        turned = {"turn_rotates", "one_heading"} <= m.axioms
+        distinct = "one_dstate_per_heading" in m.axioms
+        return not edges.can_be_drawn_in_frames(stars, turned=turned, distinct=distinct)
+
+    kept = [t for t in m.travels if {t.source.id, t.target.id} <= place_of.keys()]
+    if not cross(kept):
+        return
+    # report only travels that are needed for the crossing
+    for t in list(kept):
+        if cross(fewer := [other for other in kept if other is not t]):
+            kept = fewer
+    ways = ", ".join(f"{t.source.place} to {t.target.place} (step {t.step})" for t in kept)
+    yield (
+        [step for t in kept for step in t.steps],
+        "However it is drawn, paths cross where there is no place; travels lead along them from "
+        f"place {ways}.",
+    )
+
+
+def _may_show_the_same(one: Star, other: Star) -> bool:
+    """Whether two stars may show the same gateways to a robot that has not turned.
+
+    They may if a matching of bearings within their spreads covers all gateways seen in either.
+    """
+    import numpy as np
+    from scipy.optimize import linear_sum_assignment
+
+    bearings, spreads, seen = (
+        [np.array([getattr(g, name) for g in star.gateways], dtype=float) for star in (one, other)]
+        for name in ("bearing", "spread", "open")
+    )
+    seen = [np.nan_to_num(row) for row in seen]  # None, which is not observed, is 0
+    off = np.abs((bearings[0][:, None] - bearings[1] + 180) % 360 - 180)
+    near = off <= spreads[0][:, None] + spreads[1]
+    taken_in = np.where(near, seen[0][:, None] + seen[1], 0)
+    return bool(
+        taken_in[linear_sum_assignment(taken_in, maximize=True)].sum()
+        == sum(row.sum() for row in seen)
+    )
+
+
+AXIOMS: dict[str, Check] = {
+    check.__name__: check
+    for check in (
+        one_star,
+        asserted,
+        one_pose,
+        planar,
+    )
+}

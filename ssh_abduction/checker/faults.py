@@ -1,0 +1,63 @@
+"""Checks the faults of a map: the views, stars, actions and displacements it disbelieves."""
+
+from __future__ import annotations
+
+from ssh_abduction.checker.reading import Found, Reading
+from ssh_abduction.data.maps import Fault
+
+
+def faults_are_allowed(m: Reading) -> Found:
+    """The theory allows each fault, and the map names it once, as the trace shows it."""
+    steps, named = m.trace.steps, set[tuple[str, int]]()
+    for fault in m.map.faults:
+        i, kind = fault.step, fault.kind
+        if what := _what_is_wrong(m, fault):
+            yield [i] if 0 <= i < len(steps) else [], what
+        elif (kind, i) in named:
+            yield [i], f"The map names the fault of step {i} ({kind}) twice."
+        if _is_allowed(m, kind) and 0 <= i < len(steps):
+            price = m.theory.fault_tenths(kind, steps[i])
+            if round(10 * fault.cost) != price:
+                yield (
+                    [i],
+                    f"The fault of step {i} ({kind}) costs {fault.cost:g} dstates in the map, and "
+                    f"{price / 10:g} by the theory.",
+                )
+        named.add((kind, i))
+
+
+def _is_allowed(m: Reading, kind: str) -> bool:
+    """Whether the theory has a price for faults of this kind."""
+    prices = {
+        "misread": m.theory.misread,
+        "misseen": m.theory.misread,
+        "slipped": m.theory.slipped,
+        "jumped": m.theory.jumped,
+    }
+    return bool(prices.get(kind))
+
+
+def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
+    """A sentence if a fault is not allowed, or is not what the trace and the map show."""
+    i, kind = fault.step, fault.kind
+    without_stars = kind == "misseen" and m.theory.star not in ("pattern", "frame")
+    if not _is_allowed(m, kind) or without_stars:
+        return f"The map disbelieves step {i} ({kind}), which the theory does not allow."
+    step = m.trace.steps[i] if 0 <= i < min(len(m.trace), len(m.map.labels)) else None
+    if (
+        step is None
+        or (kind == "misread" and step.view is None)
+        or (kind == "slipped" and step.action is None)
+        or (kind == "jumped" and step.displacement is None)
+    ):
+        return f"The map disbelieves step {i} ({kind}), where there is nothing to disbelieve."
+    if kind == "misread":
+        s, seen = m.states.get(m.map.labels[i]), step.view
+        if fault.seen != seen or (s and fault.expected != s.view) or seen == fault.expected:
+            return (
+                f"The map says that {fault}, but the trace has {seen!r} there, and the dstate "
+                f"{s.view if s else None!r}."
+            )
+    if kind == "slipped" and step.action and fault.seen != step.action.name:
+        return f"The map says that {fault}, but the trace has another action there."
+    return None

@@ -1,0 +1,146 @@
+"""The axioms of the sides of paths (B1 to B4).
+
+A turn puts a branch on a side of a path, the places ahead on the branch are on that side, and the
+sides exclude each other. A map does not show sides. So a place that the axioms put where it cannot
+be is reported under each axiom that helps to put it there: dropping any of them resolves it.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+from ssh_abduction.checker.moves import Course, Move, along, course_of, opposite
+from ssh_abduction.checker.reading import Check, Found, Reading
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A course that leaves to the right of another course at a place.
+
+    Attributes:
+        place: The place.
+        course: The course whose right side is meant.
+        branch: The course that leaves there.
+        turn: The turn that shows it.
+        mirrored: Whether it follows from the turn by symmetric_sides only.
+    """
+
+    place: int
+    course: Course
+    branch: Course
+    turn: Move
+    mirrored: bool
+
+    def __str__(self) -> str:
+        where = f"leaves to the right of {along(self.course)} at place {self.place}"
+        return f"ahead on {along(self.branch)}, which {where} by {self.turn}"
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """A place that the axioms of the sides put where another axiom says it is not."""
+
+    axiom: str
+    branches: tuple[Branch, ...]
+    steps: tuple[int, ...]
+    message: str
+
+    @property
+    def axioms(self) -> set[str]:
+        """The axioms that take part."""
+        mirrored = {"symmetric_sides"} if any(b.mirrored for b in self.branches) else set()
+        return {self.axiom, "branch_side", "side_of_branch"} | mirrored
+
+
+# The places to the right of each course, with the branch that each is ahead on. Places to the left
+# are to the right of the opposite course.
+_Right = Mapping[Course, Mapping[int, Branch]]
+
+
+def _branches(m: Reading) -> list[Branch]:
+    """The branches that turns show, then those that symmetry adds."""
+    if "branch_side" not in m.axioms:
+        return []
+    found: dict[tuple[int, Course, Course], Branch] = {}
+    for move in m.turns:
+        p, here, there = move.source.place, course_of(move.source), course_of(move.target)
+        if p is None or not here or not there or here[0] == there[0]:
+            continue
+        if move.action.turn in ("right", "left"):
+            course = here if move.action.turn == "right" else opposite(here)
+            found.setdefault((p, course, there), Branch(p, course, there, move, mirrored=False))
+    if "symmetric_sides" in m.axioms:
+        for b in list(found.values()):
+            back, away = opposite(b.course), opposite(b.branch)
+            for course, branch in ((back, away), (b.branch, back), (away, b.course)):
+                mirrored = Branch(b.place, course, branch, b.turn, mirrored=True)
+                found.setdefault((b.place, course, branch), mirrored)
+    return list(found.values())
+
+
+def _right_of(m: Reading) -> dict[Course, dict[int, Branch]]:
+    """The places to the right of each course."""
+    excused = {frozenset(pair) for pair in m.map.excused if is_pair(pair)}
+    if m.theory.boundary != "defeasible":
+        excused = set()
+    found: dict[Course, dict[int, Branch]] = defaultdict(dict)
+    for b in _branches(m) if "side_of_branch" in m.axioms else ():
+        path, direction = b.branch
+        if frozenset((b.course[0], path)) not in excused and path in m.orders:
+            for q in m.orders[path].after(b.place, direction):
+                found[b.course].setdefault(q, b)
+    return found
+
+
+def _conflicts(m: Reading) -> list[Conflict]:
+    """The places that the axioms of the sides put where they cannot be."""
+    right = _right_of(m)
+    disjoint = _both_sides(m, right) if "sides_disjoint" in m.axioms else ()
+    between = _on_and_beside(m, right) if "path_between_sides" in m.axioms else ()
+    return [*disjoint, *between]
+
+
+def _both_sides(m: Reading, right: _Right) -> Iterator[Conflict]:
+    """Places both to the right and to the left of a path."""
+    for (h, direction), places in right.items():
+        other = right.get((h, -direction), {}) if direction == 1 else {}
+        for q in places.keys() & other.keys():
+            b, c = places[q], other[q]
+            steps = (*b.turn.steps, *c.turn.steps, *m.steps_at(q))
+            message = f"Place {q} would lie both right and left of path {h}: it is {b}, and {c}."
+            yield Conflict("sides_disjoint", (b, c), steps, message)
+
+
+def _on_and_beside(m: Reading, right: _Right) -> Iterator[Conflict]:
+    """Places both on a path and beside it."""
+    for (h, _direction), places in right.items():
+        for q in places.keys() & m.on(h):
+            b = places[q]
+            there = [m.along[h][q]] if q in m.along.get(h, ()) else []
+            steps = (*b.turn.steps, *m.steps_at(q), *m.steps_of(*there))
+            message = f"Place {q} is on path {h} and would lie beside it: it is {b}."
+            yield Conflict("path_between_sides", (b,), steps, message)
+
+
+def is_pair(pair: object) -> bool:
+    """Whether a value is a tuple of two."""
+    return isinstance(pair, tuple) and len(pair) == 2
+
+
+def _sides(name: str, m: Reading) -> Found:
+    for conflict in m.once(_conflicts):
+        if name in conflict.axioms:
+            yield conflict.steps, conflict.message
+
+
+_NAMES = (
+    "branch_side",
+    "symmetric_sides",
+    "side_of_branch",
+    "sides_disjoint",
+    "path_between_sides",
+)
+AXIOMS: dict[str, Check] = {name: partial(_sides, name) for name in _NAMES}

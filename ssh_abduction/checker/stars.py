@@ -1,0 +1,140 @@
+"""The axioms of local topology: the stars and headings of a place with a frame of four slots.
+
+Slots are numbered 0 to 3 clockwise. Turning right adds 1 to the heading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from ssh_abduction.checker.moves import Course, along, course_of, heading_of, opposite
+from ssh_abduction.checker.planarity import QUARTERS
+from ssh_abduction.checker.reading import Check, Found, Reading
+from ssh_abduction.data.maps import DState
+from ssh_abduction.data.star import Openings
+
+
+def star_pattern(m: Reading) -> Found:
+    """All stars seen at a place are rotations of one star."""
+    yield from _one_star(
+        ((s, min(_rotated(star, k) for k in range(4)), i) for s, star, i in stars_of(m)),
+        "however turned",
+    )
+
+
+def star_frame(m: Reading) -> Found:
+    """The stars seen at a place agree when each is turned by its heading."""
+    framed = (
+        (s, _rotated(star, heading), i)
+        for s, star, i in stars_of(m)
+        if (heading := heading_of(s)) is not None
+    )
+    yield from _one_star(framed, "turned by their headings")
+
+
+def stars_of(m: Reading) -> Iterator[tuple[DState, Openings, int]]:
+    """Each dstate with each star seen there, and the first step that sees it."""
+    return ((m.states[s], star, i) for (s, star), i in m.stars.items() if s in m.states)
+
+
+def _rotated(star: Openings, quarters: int) -> Openings:
+    """The star in the frame, as seen by a robot with this heading."""
+    ahead, right, back, left = (star[(slot - quarters) % 4] for slot in range(4))
+    return ahead, right, back, left
+
+
+def _one_star(seen: Iterable[tuple[DState, Openings, int]], how: str) -> Found:
+    known: dict[int, tuple[Openings, int]] = {}
+    for s, star, i in seen:
+        if s.place is not None:
+            first, at = known.setdefault(s.place, (star, i))
+            if star != first:
+                yield (
+                    (at, i),
+                    f"The stars seen at place {s.place} at steps {at} and {i} differ, {how}.",
+                )
+
+
+def one_heading(m: Reading) -> Found:
+    """A dstate has one heading."""
+    for s, records in m.records.items():
+        if len({r.heading for r in records}) > 1:
+            yield m.steps_of(s), f"Dstate {s} has several headings."
+        for r in records:
+            if heading_of(r) is None:
+                yield (
+                    m.steps_of(s),
+                    f"Dstate {s} has the heading {r.heading}, which is none of the slots 0 to 3.",
+                )
+
+
+def turn_rotates(m: Reading) -> Found:
+    """A turn right, around or left adds one, two or three quarters to the heading."""
+    for t in m.turns:
+        before, after = heading_of(t.source), heading_of(t.target)
+        if (
+            before is None
+            or after is None
+            or t.action.turn is None
+            or t.source.place != t.target.place
+        ):
+            # two places have two frames, and turn_stays reports a turn between places
+            continue
+        if (before + QUARTERS[t.action.turn]) % 4 != after:
+            yield (
+                t.steps,
+                f"{t} is a turn {t.action.turn}, but leads from heading {before} to heading "
+                f"{after}.",
+            )
+
+
+def one_dstate_per_heading(m: Reading) -> Found:
+    """At a place, at most one dstate faces a slot."""
+    known: dict[tuple[int, int], int] = {}
+    for s in m.states.values():
+        heading = heading_of(s)
+        if s.place is not None and heading is not None:
+            first = known.setdefault((s.place, heading), s.id)
+            if first != s.id:
+                yield (
+                    m.steps_of(first, s.id),
+                    f"Dstates {first} and {s.id} both face slot {heading} of place {s.place}.",
+                )
+
+
+def path_goes_straight(m: Reading) -> Found:
+    """A path leaves a place through opposite slots, and a slot belongs to one path."""
+    slots: dict[tuple[int, int], tuple[Course, int]] = {}
+    ways: dict[tuple[int, Course], tuple[int, int]] = {}
+    for s in m.states.values():
+        heading, course, p = heading_of(s), course_of(s), s.place
+        if heading is None or course is None or p is None:
+            continue
+        for slot, way in ((heading, course), ((heading + 2) % 4, opposite(course))):
+            other, a = slots.setdefault((p, slot), (way, s.id))
+            if other != way:
+                yield (
+                    m.steps_of(a, s.id),
+                    f"By dstates {a} and {s.id}, both {along(other)} and {along(way)} leave place "
+                    f"{p} through slot {slot}.",
+                )
+            through, b = ways.setdefault((p, way), (slot, s.id))
+            if through != slot:
+                yield (
+                    m.steps_of(b, s.id),
+                    f"By dstates {b} and {s.id}, {along(way)} leaves place {p} through both slots "
+                    f"{through} and {slot}.",
+                )
+
+
+AXIOMS: dict[str, Check] = {
+    check.__name__: check
+    for check in (
+        star_pattern,
+        star_frame,
+        one_heading,
+        turn_rotates,
+        one_dstate_per_heading,
+        path_goes_straight,
+    )
+}

@@ -1,0 +1,226 @@
+"""The axioms of places, paths and the order of places along a path (T1 to T11, TOT, ADJ)."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+from ssh_abduction.checker.moves import Course, along, course_of, going, opposite
+from ssh_abduction.checker.reading import Check, Found, Reading
+
+
+def one_place(m: Reading) -> Found:
+    """A dstate is at one place (T1, T10)."""
+    for s, records in m.records.items():
+        places = {r.place for r in records}
+        if None in places:
+            yield m.steps_of(s), f"Dstate {s} is at no place."
+        if len(places - {None}) > 1:
+            yield m.steps_of(s), f"Dstate {s} is at several places."
+
+
+def turn_stays(m: Reading) -> Found:
+    """A turn stays at its place (T2)."""
+    for t in m.turns:
+        if t.source.place != t.target.place:
+            yield (
+                t.steps,
+                f"{t} is a turn, but leads from place {t.source.place} to place {t.target.place}.",
+            )
+
+
+def travel_leaves(m: Reading) -> Found:
+    """A travel leads to another place (T3)."""
+    for t in m.travels:
+        if t.source.place == t.target.place and t.source.place is not None:
+            yield t.steps, f"{t} is a travel, but stays at place {t.source.place}."
+
+
+def travel_follows_path(m: Reading) -> Found:
+    """A travel starts and ends along the same path in the same direction (T4)."""
+    for t in m.travels:
+        if course_of(t.source) is None or course_of(t.source) != course_of(t.target):
+            yield (
+                t.steps,
+                f"{t} is a travel, but starts along {going(t.source)} and ends along "
+                f"{going(t.target)}.",
+            )
+
+
+def one_course(m: Reading) -> Found:
+    """A dstate is along at most one path, in one direction (T5, T10)."""
+    for s, records in m.records.items():
+        if len({(r.path, r.direction) for r in records}) > 1:
+            yield m.steps_of(s), f"Dstate {s} is along several paths or directions."
+        for r in records:
+            if (r.path, r.direction) != (None, None) and course_of(r) is None:
+                yield (
+                    m.steps_of(s),
+                    f"Dstate {s} has path {r.path} and direction {r.direction}, which is not one "
+                    "path in one direction.",
+                )
+
+
+def turn_around_reverses(m: Reading) -> Found:
+    """A turn around keeps the path and reverses the direction (T6)."""
+    for t in m.turns:
+        course, other = course_of(t.source), course_of(t.target)
+        if t.action.turn == "around" and other != (course and opposite(course)):
+            yield (
+                t.steps,
+                f"{t} is a turn around, but leads from {going(t.source)} to {going(t.target)}.",
+            )
+
+
+def turn_changes_path(m: Reading) -> Found:
+    """A turn right or left leads from one path to another (T7)."""
+    for t in m.turns:
+        course, other = course_of(t.source), course_of(t.target)
+        if t.action.turn in ("right", "left") and course and other and course[0] == other[0]:
+            yield (
+                t.steps,
+                f"{t} is a turn {t.action.turn}, but both dstates are along path {course[0]}.",
+            )
+
+
+def one_dstate_per_course(m: Reading) -> Found:
+    """At a place, at most one dstate is along a path in a direction (T8)."""
+    known: dict[tuple[int, Course], int] = {}
+    for s in m.states.values():
+        if s.place is not None and (course := course_of(s)):
+            first = known.setdefault((s.place, course), s.id)
+            if first != s.id:
+                yield (
+                    m.steps_of(first, s.id),
+                    f"Dstates {first} and {s.id} are both at place {s.place} along "
+                    f"{along(course)}.",
+                )
+
+
+def on_path(m: Reading) -> Found:
+    """A place is on a path if a dstate at the place is along the path (T11)."""
+    for h, order in m.orders.items():
+        there = m.along.get(h, {})
+        for p in set(order.listed) - there.keys():
+            yield m.steps_at(p), f"Path {h} lists place {p}, but no dstate there is along the path."
+        for p in there.keys() - set(order.listed):
+            yield (
+                m.steps_of(there[p]),
+                f"Dstate {there[p]} at place {p} is along path {h}, but the path does not list "
+                "the place.",
+            )
+
+
+def travel_orders(m: Reading) -> Found:
+    """A travel puts the place it leaves before the place it reaches (T9)."""
+    for h, order in m.orders.items():
+        for p, q in order.backward if order.can_be_listed else ():
+            if {p, q} <= order.position.keys():
+                t = order.travels[p, q]
+                yield (
+                    t.steps,
+                    f"Path {h} lists place {q} before place {p}, but {t} along {going(t.source)} "
+                    "says the reverse.",
+                )
+
+
+def order_asymmetric(m: Reading) -> Found:
+    """No two places of a path come before each other (T9)."""
+    for h, order in m.orders.items():
+        for ring in order.rings:
+            if not order.allows(ring):
+                yield (
+                    order.ring_steps(ring),
+                    f"On path {h} the travels make places {ring[0]} and {ring[-1]} come before "
+                    "each other.",
+                )
+
+
+def order_transitive(m: Reading) -> Found:
+    """If p comes before q and q before r, p comes before r (T9)."""
+    for h, order in m.orders.items():
+        for ring in order.rings:
+            if not order.allows(ring) and len(ring) > 2:
+                way = ", ".join(map(str, ring))
+                yield (
+                    order.ring_steps(ring),
+                    f"On path {h} the travels lead through places {way}, but the last comes "
+                    "before the first.",
+                )
+
+
+def path_order_total(m: Reading) -> Found:
+    """Of two places on a path, one comes before the other (TOT)."""
+    for h, order in m.orders.items():
+        places = m.on(h)
+        for p in sorted(places - order.position.keys(), key=str):
+            if apart := places - {p, *order.after(p, 1), *order.after(p, -1)}:
+                q = min(apart, key=str)
+                yield (
+                    [*m.steps_at(p), *m.steps_at(q)],
+                    f"Places {p} and {q} are on path {h}, but neither comes before the other.",
+                )
+                break
+
+
+def next_place(m: Reading) -> Found:
+    """A travel leads to the next place of the path: none lies between (ADJ)."""
+    for t, (h, direction), p, q in m.along_travels:
+        if h in m.orders and (between := m.orders[h].between(p, q, direction)):
+            r = min(between, key=str)
+            yield (
+                [*t.steps, *m.steps_at(r)],
+                f"{t} leads from place {p} to place {q}, but place {r} lies between them on path "
+                f"{h}.",
+            )
+
+
+def all_on_paths(m: Reading) -> Found:
+    """Every dstate is along a path (T5tot)."""
+    for s in m.states.values():
+        if course_of(s) is None:
+            yield m.steps_of(s.id), f"Dstate {s.id} is along no path."
+
+
+def course_needs_travel(m: Reading) -> Found:
+    """A dstate along a path ends a travel, or turns around link it to one that does (T5)."""
+    linked: dict[int, list[int]] = defaultdict(list)
+    for t in m.turns:
+        if t.action.turn == "around":
+            linked[t.source.id].append(t.target.id)
+            linked[t.target.id].append(t.source.id)
+    queue = [s.id for t in m.travels for s in (t.source, t.target)]
+    supported = set(queue)
+    while queue:
+        new = set(linked[queue.pop()]) - supported
+        supported |= new
+        queue.extend(new)
+    for s in m.states.values():
+        if course_of(s) and s.id not in supported:
+            yield (
+                m.steps_of(s.id),
+                f"Dstate {s.id} is along {going(s)}, but no travel starts or ends at it, nor "
+                "where turning around leads.",
+            )
+
+
+AXIOMS: dict[str, Check] = {
+    check.__name__: check
+    for check in (
+        one_place,
+        turn_stays,
+        travel_leaves,
+        travel_follows_path,
+        one_course,
+        turn_around_reverses,
+        turn_changes_path,
+        one_dstate_per_course,
+        on_path,
+        travel_orders,
+        order_asymmetric,
+        order_transitive,
+        path_order_total,
+        next_place,
+        all_on_paths,
+        course_needs_travel,
+    )
+}
