@@ -173,7 +173,7 @@ class _Map:
         )
 
     def _predicted(self, dstate: int, step: int) -> tuple[int, bool]:
-        """How many steps a dstate predicts from a step on, and whether this ends in contradiction."""
+        """How many steps a dstate predicts from a step on, and whether it ends contradicted."""
         for t in range(step + 1, min(step + LOOKED, len(self._seen))):
             there = self.leads.get((dstate, self._actions[t - 1]))
             if there is None:

@@ -1,23 +1,27 @@
-"""Makes a consistent map without a search where places have gateways at any angles, as `guesses/tree.py` does where they have none.
+"""A greedy consistent map, as in `guesses/tree.py`, for places with gateways at any angles.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.solver.guesses.gated import gated_map
 >>> stars = [[0, 120], [180, 300], [0, 240], [180, 300]]
 >>> trace = Trace.from_steps("abcb", ["travel", "right", "travel"], stars=stars)
 >>> gated_map(trace, Theory.topological().resolve(trace), homing=True)
->>> straight = Trace.from_steps("abab", ["travel", "around", "travel"], stars=[[0], [180], [0], [180]])
+>>> stars = [[0], [180], [0], [180]]
+>>> straight = Trace.from_steps("abab", ["travel", "around", "travel"], stars=stars)
 >>> gated_map(straight, Theory.topological().resolve(straight), homing=True).labels
 (0, 1, 2, 3)
 
-Stars say of each place which steps can be there: there have to be one frame and a shift of each star with which all axioms of gateways hold. So the map grows by one
-step at a time. Where an action leads is open. What may be is tried in order, and the first that the stars of the place allow is kept:
+Stars tell which steps can be at a place: there has to be one frame, and a shift for each star, that
+satisfy all axioms of gateways. The map grows by one step at a time. If the end of an action is
+unknown, the options are tried in order, and the first that the stars of the place allow is kept:
 
-- a turn leads to a dstate of the place that shows the view, or to a new one;
-- a travel goes along the reverse of a course at the place, or along a new path; it leads to the next place on the path, to a new place before that, to a place
-  beyond, or to a new place at the end.
+- a turn leads to a dstate of the place with the right view, or to a new dstate;
+- a travel goes along the reverse of a course at the place, or along a new path; it leads to the
+  next place on the path, to a new place before that, to a place beyond, or to a new place at the
+  end.
 
-A star asks for a gateway wherever a path goes on. So where the robot turned at a dead end and drives back, there can be no new place on the way: whether known
-places or new ones are tried first is a matter of order only.
+A star has a gateway wherever a path goes on. So when the robot turned at a dead end and drives
+back, there can be no new place on the way. Whether known or new places are tried first only changes
+the order of the options.
 """
 
 from __future__ import annotations
@@ -34,13 +38,15 @@ from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 from ssh_abduction.theory.theory import Theory
 
-_Seen = tuple[int, Star]  # a dstate, and a star that is seen there
+_Seen = tuple[int, Star]  # a dstate and a star seen there
 
 
 def gated_map(
     trace: Trace, theory: Theory, *, homing: bool, pairs: Pairs = NO_PAIRS
 ) -> SSHMap | None:
-    """A map of a trace in which stars agree in tolerance, or None if the first choices lead to none. The caller has to check it.
+    """A map of a trace whose stars agree within tolerance. The caller has to check it.
+
+    None if the first choices lead to no map.
 
     Args:
         trace: The trace.
@@ -73,11 +79,16 @@ def gated_map(
 class _Growing:
     """A map of the steps so far.
 
-    orders    for each path, its places in the order in which direction 1 meets them
-    reverse   pairs of dstates that a turn around links
-    sideways  pairs of dstates that a turn right or left links
-    sights    for each place, what is seen there, with the first step that sees it
-    turns     the turns from one sight to another
+    Attributes:
+        labels: The dstate of each step.
+        dstates: The dstates.
+        sights: For each place, the dstates and stars seen there, with their first steps.
+        star: The star of the last step.
+        links: Where actions lead, by dstate and action.
+        orders: For each path, its places in the order of direction 1.
+        reverse: Pairs of dstates that a turn around links.
+        sideways: Pairs of dstates that a turn right or left links.
+        turns: The turns from one sight to another.
     """
 
     labels: list[int]
@@ -113,7 +124,7 @@ class _Growing:
     def options(
         self, action: Action, step: Step, homing: bool
     ) -> Iterator[Callable[[_Growing], int]]:
-        """The ways to go on: each changes a copy, and says which dstate the action leads to."""
+        """The options for the next step. Each changes a copy, and returns the next dstate."""
         here = self.labels[-1]
         known = self.links.get((here, action.name))
         if known is not None:
@@ -137,13 +148,16 @@ class _Growing:
 
     @staticmethod
     def _may_turn(s: DState, x: DState, around: bool) -> bool:
-        """Whether a turn may link two dstates, as far as their courses say."""
+        """Whether the courses of two dstates allow a turn between them."""
         if s.path is None or x.path is None or x.direction is None:
             return not around or s.id != x.id
         return (s.path, s.direction) == (x.path, -x.direction) if around else s.path != x.path
 
     def _courses(self, here: int) -> Iterator[tuple[int, int]]:
-        """The courses that a dstate may have: its own; or the reverse of others at its place, and a new path."""
+        """The courses that a dstate may have.
+
+        These are its own course, or else the reverse of others at its place, and a new path.
+        """
         s = self.dstates[here]
         if s.path is not None and s.direction is not None:
             yield s.path, s.direction
@@ -169,6 +183,7 @@ class _Growing:
         assert place is not None
         order = self.orders[path] if path < len(self.orders) else (place,)
         ahead = (order if direction == 1 else order[::-1])[order[::direction].index(place) + 1 :]
+        # Try the places ahead from near to far, with a new place before each.
         for number in range(len(ahead) + 1):
             known = [self._homing(here, course, ahead[number], step)] if number < len(ahead) else []
             new = [self._leaving(here, course, number, step)]
@@ -178,7 +193,11 @@ class _Growing:
     def _homing(
         self, here: int, course: tuple[int, int], place: int, step: Step
     ) -> Iterator[Callable[[_Growing], int]]:
-        """To a known place ahead: to the dstate that goes on there, or to one that shows the view and has no course, or to a new one."""
+        """Options to travel to a known place ahead.
+
+        They lead to the dstate that goes on there, to one with the right view and without a course,
+        or to a new one.
+        """
         there = [x for x in self.dstates if x.place == place]
         onward = [x.id for x in there if (x.path, x.direction) == course]
         shown = [
@@ -194,7 +213,7 @@ class _Growing:
     def _leaving(
         self, here: int, course: tuple[int, int], number: int, step: Step
     ) -> Iterator[Callable[[_Growing], int]]:
-        """To a new place, behind so many places ahead."""
+        """An option to travel to a new place, behind `number` known places."""
 
         def leave(other: _Growing) -> int:
             place = len(other.sights)
@@ -212,11 +231,13 @@ class _Growing:
         yield leave
 
     def add(self, step: Step, place: int | None) -> int:
+        """Add a dstate at a place, and return its number."""
         assert step.view is not None
         self.dstates.append(DState(len(self.dstates), step.view, place=place))
         return len(self.dstates) - 1
 
     def turned(self, here: int, there: int, around: bool) -> int:
+        """Add a turn between two dstates, and return the second."""
         (self.reverse if around else self.sideways).append((here, there))
         if around:
             for s in (self.dstates[here], self.dstates[there]):
@@ -226,16 +247,18 @@ class _Growing:
         return there
 
     def travelled(self, here: int, there: int, course: tuple[int, int]) -> int:
+        """Add a travel between two dstates along a course, and return the second."""
         for s in (here, there):
             self._set(s, course)
             self._set_reverse(s)
         return there
 
     def _set(self, s: int, course: tuple[int, int]) -> None:
+        """Give a dstate its course."""
         self.dstates[s] = replace(self.dstates[s], path=course[0], direction=course[1])
 
     def _set_reverse(self, s: int) -> None:
-        """Give the dstates that turns around link to one the reverse of its course, and so on."""
+        """Give the dstates that turns around link to this one the reverse course, and so on."""
         queue = [s]
         while queue:
             here = self.dstates[queue.pop()]
@@ -248,7 +271,7 @@ class _Growing:
                     queue.append(other)
 
     def arrive(self, action: Action, there: int, step: Step, t: int) -> None:
-        """Note where the action leads, and what is seen."""
+        """Add the end of an action and what is seen there."""
         here = self.labels[-1]
         star = step.gateways or Star(())
         place = self.dstates[there].place
@@ -263,12 +286,16 @@ class _Growing:
         self.star = star
 
     def fits(self, place: int, axioms: frozenset[str]) -> bool:
-        """Whether the courses at a place are different and agree with the turns there, and the stars can be read as those of one place."""
+        """Whether a place is consistent.
+
+        Its courses have to differ and agree with its turns, and its stars have to fit one frame.
+        """
         course = {
             s.id: None if s.path is None or s.direction is None else (s.path, s.direction)
             for s in self.dstates
             if s.place == place
         }
+        # No two dstates have one course, and turns agree with the courses that they link.
         known = [found for found in course.values() if found is not None]
         if len(set(known)) < len(known):
             return False
@@ -305,7 +332,7 @@ class _Growing:
         return list(sights.values()), turns
 
     def _onward(self, s: DState) -> tuple[int, ...]:
-        """Where the path of a dstate goes on to another place: ahead (0), behind (180)."""
+        """Where the path of a dstate goes on to another place: 0 for ahead, 180 for behind."""
         if s.path is None or s.place is None:
             return ()
         order = self.orders[s.path][:: s.direction]
@@ -317,10 +344,11 @@ class _Growing:
         )
 
     def map(self, axioms: frozenset[str]) -> SSHMap | None:
-        """The map, numbered by first visit, with headings that all stars allow."""
+        """The map, numbered by first visit, with headings that fit all stars."""
         facing: dict[int, int] = {}
         for place in range(len(self.sights)):
             facing |= headings(*self._seen_at(place), axioms)
+        # Renumber dstates, places and paths by first visit; a path is first faced in direction 1.
         first = {s: i for i, s in enumerate(dict.fromkeys(self.labels))}
         paths: dict[int, tuple[int, int]] = {}
         places: dict[int, int] = {}
@@ -359,5 +387,5 @@ class _Growing:
 
 
 def _stay(known: int, _: _Growing) -> int:
-    """The option where it is known where the action leads."""
+    """The option to follow a known link."""
     return known

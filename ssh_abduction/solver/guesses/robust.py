@@ -1,9 +1,12 @@
-"""Small maps of the causal theory where some steps may be disbelieved, without a search: nothing proves them.
+"""Small maps of the causal theory with faults, without a search and without a proof.
 
-A hidden Markov model is trained on the trace (Baum, Petrie, Soules, Weiss 1970). Each of its states shows one view, and several show the same (cloned hidden Markov models:
-George et al. 2021), but for a small chance that a view is misread, and that an action slips. From its most probable states a map is read off: a dstate shows what is mostly seen
-there, and an action leads where it mostly leads. What fewest faults that map has on the whole trace, a Viterbi pass tells (Viterbi 1967), which gives other labels; and so on, as long as it
-gets cheaper. In between, dstates are merged that can be one, and dropped where that costs less than they do.
+A hidden Markov model is trained on the trace (Baum, Petrie, Soules, Weiss 1970). Each state shows
+one view, and several states show the same view (cloned hidden Markov models: George et al. 2021),
+apart from small probabilities that a view is misread and that an action slips. The most probable
+states give labels, and a map is read off the labels: a dstate shows the majority view of its steps,
+and an action leads where it leads most often. A Viterbi pass (Viterbi 1967) finds labels with the
+fewest faults for that map. These two steps repeat while the cost falls. In between, dstates are
+merged if they can be one, and dropped if they cost more than the faults without them.
 
 >>> seen = [t % 4 for t in range(60)]
 >>> seen[30] = 0
@@ -27,39 +30,32 @@ from numpy.typing import NDArray
 from ssh_abduction.solver.guesses.merging import thinned_map
 from ssh_abduction.solver.steps.chart import Link, numbered
 
-CLONES = (
-    4,
-    10,
-    16,
-    10,
-    16,
-    10,
-    16,
-    10,
-)  # So many states each view has, from one start of EM to the next: with more than are needed it finds better optima.
-AGREE = 2  # So many starts that end at the cheapest map known are enough.
-ROUNDS = 100  # Steps of EM from each start, at most.
-ENOUGH = (
-    1e-4  # EM ends where a round gains less than this in log-likelihood, per step of the trace.
-)
-PSEUDOCOUNT = 2e-3  # Added to all counts, as George et al. do.
-MISREAD, SLIPPED = 0.01, 0.01  # The chances that the model is given.
-RARE = 4  # A dstate that is visited so many times at most may be dropped.
-TRIED = (
-    20  # So many of these are tried in a round, and so many pairs of dstates that are nearly one.
-)
-DEARER = (
-    4 / 3
-)  # So many times as much as one that may be, a fault of a kind that may not be costs while a map is refined: few of them can be mended in the end.
-NEVER = 1_000_000  # What the Viterbi pass pays for faults of a kind that may not be.
-UNKNOWN = 0.5  # What it pays, in tenths of dstates, where the map does not know where an action leads: less than any fault.
+# The states of each view, for each start of EM. More states than needed lead to better optima.
+CLONES = (4, 10, 16, 10, 16, 10, 16, 10)
+AGREE = 2  # stop after this many starts that reach the cheapest map
+ROUNDS = 100  # the most EM steps of a start
+ENOUGH = 1e-4  # stop EM below this gain in log-likelihood per step of the trace
+PSEUDOCOUNT = 2e-3  # added to all counts, as by George et al.
+MISREAD, SLIPPED = 0.01, 0.01  # probabilities of faults in the model
+RARE = 4  # a dstate with at most this many visits may be dropped
+TRIED = 20  # the most dropped dstates, and merged pairs, to try in a round
+# The cost of a forbidden fault while a map is refined, relative to an allowed one: a few forbidden
+# faults can be mended at the end.
+DEARER = 4 / 3
+NEVER = 1_000_000  # the cost of a forbidden fault in the final Viterbi pass
+UNKNOWN = 0.5  # the cost of an unknown link, in tenths of a dstate: less than any fault
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Dstates, numbered from 0: the view of each, and where actions lead from it, as far as that is known."""
+    """Dstates and links, which need not cover all actions.
+
+    Attributes:
+        shows: The view of each dstate.
+        goes: The dstate to which an action leads, by dstate and action.
+    """
 
     shows: Sequence[int]
     goes: Mapping[tuple[int, int], int]
@@ -69,8 +65,12 @@ class Machine:
         return frozenset(action for _, action in self.goes)
 
     def folded(self, s: int, x: int) -> tuple[int, list[int]]:
-        """What becomes of dstates where two are merged, and all that the same actions lead to from there and show the same; and by how much that contradicts the links,
-        beside what it spares: first those merges are worth a trial for which that is least."""
+        """The labels after merging two dstates, and their equal successors, and so on.
+
+        Returns:
+            The net cost: links contradicted minus dstates merged; and the new label of each dstate.
+            Try the cheapest merges first.
+        """
         root = list(range(len(self.shows)))
         members = {dstate: [dstate] for dstate in root}
         contradicted, merges, work = 0, 0, [(s, x)]
@@ -95,7 +95,7 @@ class Machine:
         return contradicted - merges, root
 
     def without(self, dropped: int) -> Machine:
-        """The machine that lacks a dstate."""
+        """The machine without a dstate."""
         number = {s: s - (s > dropped) for s in range(len(self.shows)) if s != dropped}
         goes = {
             (number[s], a): number[x]
@@ -107,7 +107,16 @@ class Machine:
 
 @dataclass(frozen=True)
 class Explained:
-    """The labels of all steps by a machine, and its faults; the steps at which it does not know where the action leads; and tenths of dstates that it costs."""
+    """An explanation of a trace by a machine.
+
+    Attributes:
+        machine: The machine.
+        labels: The dstate of each step.
+        misread: The steps whose views are disbelieved.
+        slips: The steps whose actions are disbelieved.
+        unknown: The steps whose actions the machine does not know.
+        tenths: The cost of dstates and faults, in tenths of a dstate.
+    """
 
     machine: Machine
     labels: Sequence[int]
@@ -123,11 +132,14 @@ class Explained:
 
 @dataclass(frozen=True)
 class Explainer:
-    """A trace as integers, and what faults cost there.
+    """A trace as integers, and the costs of faults.
 
-    seen, actions  what is seen at each step, and which action is done there, numbered from 0
-    price          tenths of dstates for each kind of fault that may be (misread, slipped), at each step
-    check          called now and then; may raise
+    Attributes:
+        seen: The view of each step, numbered from 0.
+        actions: The action after each step but the last, numbered from 0.
+        price: For each allowed kind of fault (misread, slipped), its cost at each step, in tenths
+            of a dstate.
+        check: Called now and then; may raise.
     """
 
     seen: Sequence[int]
@@ -136,7 +148,10 @@ class Explainer:
     check: Callable[[], None] = field(default=lambda: None)
 
     def explained(self, machine: Machine) -> Explained:
-        """The labels with the fewest faults that a machine gives to the trace. Where it does not know where an action leads, that may be anywhere."""
+        """The labels with the cheapest faults for a machine, by a Viterbi pass.
+
+        An action that the machine does not know may lead anywhere.
+        """
         steps, count = len(self.seen), len(machine.shows)
         slip, misread = (
             np.array(self.price.get(kind, [NEVER] * steps), dtype=float)
@@ -155,7 +170,8 @@ class Explainer:
             if t % 500 == 0:
                 self.check()
             action = self.actions[t - 1]
-            # From the cheapest dstate the action slips to any other, from the cheapest of which nothing is known it leads to any; else it leads where it is known to.
+            # A dstate is reached by a slip from the cheapest dstate, by an unknown link from the
+            # cheapest dstate that has one, or by a known link.
             cheapest = int(spent.argmin())
             now = np.full(count, spent[cheapest] + slip[t - 1])
             came[t] = cheapest
@@ -163,9 +179,8 @@ class Explainer:
                 begin = int(free[action][spent[free[action]].argmin()])
                 better = spent[begin] + UNKNOWN < now
                 came[t][better], now[better] = begin, spent[begin] + UNKNOWN
-            order = led[action][
-                np.argsort(-spent[led[action]], kind="stable")
-            ]  # the last one written is the cheapest
+            # If several links lead to one dstate, the cheapest one is written last.
+            order = led[action][np.argsort(-spent[led[action]], kind="stable")]
             best = np.full(count, np.inf)
             source = np.zeros(count, dtype=np.int32)
             best[target[action, order]], source[target[action, order]] = spent[order], order
@@ -179,7 +194,10 @@ class Explainer:
         return self._told(machine, labels)
 
     def completed(self, machine: Machine) -> Explained:
-        """The same, where what the machine does not know leads where the labels take it to lead most often, so that nothing is unknown."""
+        """The explanation by a machine, completed so that it knows all actions of the trace.
+
+        An unknown action leads where the labels take it most often.
+        """
         explained = self.explained(machine)
         while explained.unknown:
             votes: dict[tuple[int, int], Counter[int]] = {}
@@ -193,7 +211,11 @@ class Explainer:
         return explained
 
     def read_off(self, labels: Sequence[int]) -> Machine:
-        """The machine of labels: a dstate shows what is mostly seen there, and an action leads where it mostly leads, by what it costs to disbelieve that."""
+        """The machine that labels make.
+
+        A dstate shows the view that is most expensive to disbelieve, and an action leads where it
+        leads most often.
+        """
         labels = numbered(labels)
         views: list[Counter[int]] = [Counter() for _ in range(max(labels) + 1)]
         ends: dict[tuple[int, int], Counter[int]] = {}
@@ -208,8 +230,10 @@ class Explainer:
         )
 
     def refined(self, labels: Sequence[int]) -> Explained:
-        """The cheapest explanation near these labels: the map is read off, and laid over the trace anew, as long as that gets cheaper; so are those in which dstates are
-        merged that can be one, or without a dstate that is hardly visited.
+        """The cheapest explanation near these labels, by local search.
+
+        A machine is read off the labels, and explains the trace anew, while the cost falls. So do
+        machines with dstates merged that can be one, or without a rarely visited dstate.
         """
         best = self._settled(labels)
         while True:
@@ -219,6 +243,8 @@ class Explainer:
             best = better
 
     def _near(self, best: Explained) -> Iterator[Explained]:
+        """Explanations by machines near the one of an explanation."""
+        # Merge dstates that can be one, drop rare dstates, then merge dstates that are nearly one.
         machine = self.read_off(best.labels)
         labels = numbered(best.labels)
         visits = Counter(labels)
@@ -242,13 +268,14 @@ class Explainer:
             yield self._settled([root[label] for label in labels])
 
     def _settled(self, labels: Sequence[int]) -> Explained:
-        """The explanation by the machine of these labels, by the machine of the labels of that, and so on, as long as that gets cheaper."""
+        """Read off a machine and explain the trace by it, again and again while the cost falls."""
         best = self.completed(self.read_off(labels))
         while (better := self.completed(self.read_off(best.labels))).tenths < best.tenths:
             best = better
         return best
 
     def _told(self, machine: Machine, labels: Sequence[int]) -> Explained:
+        """The explanation by these labels, with its faults and costs."""
         misread = [t for t, s in enumerate(labels) if machine.shows[s] != self.seen[t]]
         leads = [
             machine.goes.get((s, action)) for s, action in zip(labels, self.actions, strict=False)
@@ -268,11 +295,15 @@ class Explainer:
         )
 
     def _cost(self, kind: str, step: int) -> int:
+        """The cost of a fault, in tenths of a dstate."""
         return self.price[kind][step] if kind in self.price else NEVER
 
 
 def robust_maps(explainer: Explainer, seed: int = 0) -> Iterator[Explained | None]:
-    """Explanations of a trace, each cheaper than the one before; None where a start of EM led to none. Whoever asks for the next one waits for another start."""
+    """Explanations of a trace, each cheaper than the one before.
+
+    Each item takes one start of EM. It is None if that start led to no cheaper explanation.
+    """
     rng = np.random.default_rng(seed)
     dearer = [round(DEARER * max(found)) for found in zip(*explainer.price.values(), strict=True)]
     soft = replace(explainer, price={"misread": dearer, "slipped": dearer, **explainer.price})
@@ -291,7 +322,10 @@ def robust_maps(explainer: Explainer, seed: int = 0) -> Iterator[Explained | Non
 
 
 class _Model:
-    """A cloned hidden Markov model of one trace. Chances have the shape (actions, states, states): from, and to."""
+    """A cloned hidden Markov model of one trace.
+
+    The transition probabilities have the shape (actions, from states, to states).
+    """
 
     def __init__(self, explainer: Explainer, clones: int, rng: np.random.Generator) -> None:
         self._explainer = explainer
@@ -308,7 +342,7 @@ class _Model:
         )
 
     def labels(self) -> list[int]:
-        """The most probable state of each step, once the model is trained."""
+        """Train the model, and return the most probable state of each step."""
         before = -np.inf
         for _ in range(ROUNDS):
             likelihood = self._train()
@@ -318,12 +352,13 @@ class _Model:
         return self._most_probable()
 
     def _train(self) -> float:
-        """A step of EM. Returns the log-likelihood before it."""
+        """Do a step of EM. Returns the log-likelihood before it."""
         steps, states = self._sees.shape
         ahead = np.ones((steps, states)) / states
         behind = np.ones((steps, states))
         scale = np.ones(steps)
         matrices = list(self._chances)
+        # Forward and backward messages, each scaled by the probability of its observation.
         for t in range(steps):
             message = (
                 ahead[t - 1] @ matrices[self._actions[t - 1]] if t else ahead[0]
@@ -347,6 +382,7 @@ class _Model:
         return float(np.log(scale).sum())
 
     def _most_probable(self) -> list[int]:
+        """The most probable sequence of states, by a Viterbi pass."""
         with np.errstate(divide="ignore"):
             matrices, sees = list(np.log(self._chances)), np.log(self._sees)
         spent = sees[0]
@@ -361,7 +397,7 @@ class _Model:
         return labels[::-1]
 
     def _normal(self, counts: Floats) -> Floats:
-        """Counts as chances, where the action slips now and then."""
+        """Counts as transition probabilities, mixed with the probability of a slip."""
         chances: Floats = counts / counts.sum(axis=2, keepdims=True)
         slipping: Floats = (1 - self._slip) * chances + self._slip / counts.shape[2]
         return slipping

@@ -1,29 +1,34 @@
-"""Makes a consistent map without a search: each step leads somewhere new, unless the axioms say where it leads.
+"""A greedy consistent map: each step leads somewhere new unless the axioms say where it leads.
 
 >>> from ssh_abduction import Theory
 >>> from ssh_abduction.data import Action, Step
 >>> from ssh_abduction.solver.guesses.tree import Sketch
 >>> sketch = Sketch(Step("end"), Theory(star="none"))
 >>> travel, around = Action("travel", "travel"), Action("around", "turn", "around")
->>> [sketch.extend(action, Step(view)) for action, view in [(travel, "hall"), (around, "hall"), (travel, "end"), (around, "end")]]
+>>> done = [(travel, "hall"), (around, "hall"), (travel, "end"), (around, "end")]
+>>> [sketch.extend(action, Step(view)) for action, view in done]
 [True, True, True, True]
 >>> sketch.map().labels
 (0, 1, 2, 3, 0)
 
-A sketch is a tree of paths. A travel leads to a new place, or back along the same path to the place that it came from. So two paths share one place at most,
-and the places ahead on a branch lie on no path that the branch leaves: the axioms of order and sides hold. Within a place the axioms of turns, courses and
-headings decide which dstates are one.
+A sketch is a tree of paths. A travel leads to a new place, or back along its path to the place that
+it came from. So two paths share at most one place, and the places ahead on a branch lie on no path
+that the branch leaves. The axioms of order and sides therefore hold. Within a place, the axioms of
+turns, courses and headings decide which dstates are one.
 
-Where the place that a travel would come back to does not show what was seen there before, the travel leads to a new place. Where the trace later contradicts
-that a step was at a known place, the sketch is given up. A sketch without `homing` takes no place for one seen before, unless the axiom next_place asks for it,
-so it may hold where another was given up.
+If the place that a travel comes back to contradicts what was seen there, the travel leads to a new
+place instead. If the trace later contradicts a step at a known place, the sketch fails. A sketch
+without `homing` never comes back to a place, unless the axiom next_place demands it, so it may hold
+where another fails.
 
-Where the theory asks for no frames, a sketch may still have them: that adds axioms, and leaves none out.
+A sketch may have frames even if the theory has none: that only adds axioms.
 
-A sketch may also begin with a map of some steps, and grow like a tree beyond it. What is new then lies on new paths, or on one known path, and contradicts
-nothing either. But there are three cases in which the sketch cannot say whether it is consistent: a turn may be the first to show how two known paths cross,
-which has to fit all their places; and without frames, a turn may lead from a dstate to itself, which then can be on no path, and two turns to the right may lead
-back, so that a new place ahead would lie on both sides of a path.
+A sketch may also begin with a map of some steps, and grow like a tree from there. New dstates lie
+on new paths, or on one known path, and contradict nothing. In three cases the sketch cannot tell
+whether it is consistent. A turn may be the first to show how two known paths cross, which has to
+fit all their places. Without frames, a turn may lead from a dstate to itself, which then can be on
+no path. Also without frames, two turns to the right may lead back, so that a new place ahead would
+lie on both sides of a path.
 """
 
 from __future__ import annotations
@@ -38,12 +43,22 @@ from ssh_abduction.theory.theory import Theory
 
 
 class _Contradiction(Exception):  # noqa: N818 - not an error
-    """The axioms ask for what was not seen."""
+    """The axioms contradict what was seen."""
 
 
 @dataclass(slots=True)
 class _Known:
-    """What is known of a dstate so far."""
+    """What is known of a dstate so far.
+
+    Attributes:
+        view: Its view.
+        seen: Its observation.
+        place: Its place.
+        heading: Its heading in the frame of the place, in quarters clockwise.
+        path: Its path, if known.
+        direction: Its direction along the path, 1 or -1.
+        reverse: The dstates that a turn around links it to.
+    """
 
     view: View
     seen: object
@@ -57,9 +72,18 @@ class _Known:
 class Sketch:
     """A map of the steps so far, which grows with each step.
 
-    homing   whether a travel may lead back to where it came from, even if the theory has no axiom next_place
-    framed   whether places have frames, even if the theory asks for none: then most turns lead to known dstates
-    certain  whether the map is known to be consistent. If not, the caller has to check it, and may set this then
+    Args:
+        first: The first step.
+        theory: The theory.
+        homing: Whether a travel may lead back to where it came from, even without the axiom
+            next_place.
+        framed: Whether places have frames, even if the theory has none. Then most turns lead to
+            known dstates.
+
+    Attributes:
+        labels: The dstate of each step.
+        certain: Whether the map is known to be consistent. If not, the caller has to check it, and
+            may then set this.
     """
 
     def __init__(
@@ -72,16 +96,11 @@ class Sketch:
         self._states: list[_Known] = []
         self._links: dict[tuple[int, str], int] = {}
         self._stars: list[object] = []  # for each place, its star
-        self._orders: list[
-            list[int]
-        ] = []  # for each path, its places in the order in which direction 1 meets them
+        self._orders: list[list[int]] = []  # for each path, its places in the order of direction 1
         self._along: dict[tuple[int, int, int], int] = {}  # place, path, direction: dstate
-        self._facing: dict[
-            tuple[int, int], int
-        ] = {}  # place, heading: dstate; only where places have frames
-        self._slots: dict[
-            tuple[int, int], tuple[int, int]
-        ] = {}  # place, heading: path, direction; only where places have frames
+        # With frames only: the dstate, and the path and direction, by place and heading.
+        self._facing: dict[tuple[int, int], int] = {}
+        self._slots: dict[tuple[int, int], tuple[int, int]] = {}
         self._excused: tuple[tuple[int, int], ...] = ()  # pairs of paths
         self._map: SSHMap | None = None
         self._tree = self.certain = True
@@ -91,7 +110,7 @@ class Sketch:
 
     @classmethod
     def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
-        """All kinds of sketches of a trace that begins with this step. Those that become smaller, if they are not given up, come first."""
+        """All kinds of sketches that begin with this step, those with smaller maps first."""
         framed = (
             [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
         )
@@ -99,7 +118,7 @@ class Sketch:
 
     @classmethod
     def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Sketch:
-        """A sketch that begins with a map of a trace. The map satisfies all axioms of the theory."""
+        """A sketch that begins with a map of a trace. The map has to satisfy all axioms."""
         sketch = cls(trace.steps[0], theory)
         sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.labels)
         sketch._links = {(s, action): x for s, action, x in ssh_map.links}
@@ -107,6 +126,7 @@ class Sketch:
         sketch._orders = [list(path.order) for path in ssh_map.paths]
         sketch._states, sketch._along, sketch._facing, sketch._slots = [], {}, {}, {}
         stars: dict[int, object] = {}
+        # The first step at each dstate tells its observation.
         seen = dict(zip(reversed(ssh_map.labels), reversed(trace.steps), strict=True))
         for s in ssh_map.dstates:
             place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
@@ -131,7 +151,11 @@ class Sketch:
         return sketch
 
     def extend(self, action: Action, step: Step) -> bool:
-        """Go on with an action and what is seen after it. Returns False where that contradicts the sketch, which is of no use from then on."""
+        """Add an action and the step after it.
+
+        Returns:
+            Whether the sketch allows them. If not, it cannot be used any more.
+        """
         here = self.labels[-1]
         there = self._links.get((here, action.name))
         try:
@@ -151,7 +175,7 @@ class Sketch:
         return self._map
 
     def _untried(self, here: int, action: Action, step: Step) -> int:
-        """Where an action leads that was never tried in a dstate."""
+        """The dstate to which an action leads that was not tried before."""
         if self._theory.level == "causal":
             return self._new(step, 0, 0)
         if action.slipped:
@@ -161,11 +185,12 @@ class Sketch:
         return self._turn(here, action, step)
 
     def _turn(self, here: int, action: Action, step: Step) -> int:
-        """The dstate that a turn leads to which was never tried in this one."""
+        """The dstate to which a turn leads that was not tried before."""
         s = self._states[here]
         around = action.turn == "around"
         heading = (s.heading + QUARTERS[action.turn]) % 4
         there: int | None = None
+        # Look for a known dstate that the axioms demand.
         if self._framed:
             there = self._facing.get((s.place, heading))
         elif around and s.path is not None:
@@ -186,7 +211,7 @@ class Sketch:
         return there
 
     def _turned_around(self, here: int, there: int) -> None:
-        """Note that a turn around links two dstates: if one of them has a course, the other has its reverse."""
+        """Add a turn around. If one of its dstates has a course, the other has the reverse."""
         self._states[here].reverse.append(there)
         self._states[there].reverse.append(here)
         for s in (self._states[here], self._states[there]):
@@ -196,7 +221,7 @@ class Sketch:
                     self._set_course(x, s.path, -s.direction)
 
     def _travel(self, here: int, step: Step) -> int:
-        """The dstate that a travel leads to which was never tried in this one."""
+        """The dstate to which a travel leads that was not tried before."""
         path, direction = self._find_course(here)
         place, order = self._states[here].place, self._orders[path]
         position = order.index(place)
@@ -214,7 +239,10 @@ class Sketch:
         return there
 
     def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
-        """The dstate at which a travel along a path would end at a known place; None if what is seen does not fit the place."""
+        """The dstate at which a travel ends at a known place.
+
+        None if the step contradicts what was seen at the place.
+        """
         there = self._along.get((place, path, direction))
         heading = 0
         if there is None and self._framed:
@@ -232,12 +260,14 @@ class Sketch:
         return there
 
     def _find_course(self, here: int) -> tuple[int, int]:
-        """The path and direction of a dstate. A dstate that has none gets the path that leaves through its slot, or a new path."""
+        """The path and direction of a dstate.
+
+        A dstate without a path gets the path that leaves through its slot, or a new one.
+        """
         s = self._states[here]
         if s.path is None:
-            path, direction = self._slots.get(
-                (s.place, s.heading), (len(self._orders), 1)
-            )  # without frames there are no slots
+            # Without frames there are no slots, so this is a new path.
+            path, direction = self._slots.get((s.place, s.heading), (len(self._orders), 1))
             if path < len(self._orders) or not self._framed:
                 self._doubt_if_grown_from_map()
             if path == len(self._orders):
@@ -247,11 +277,14 @@ class Sketch:
         return s.path, s.direction
 
     def _doubt_if_grown_from_map(self) -> None:
-        """Note that the last action may contradict the map that the sketch began with. A sketch that is a tree stays certain."""
+        """Note that the last action may contradict the map that the sketch began with.
+
+        A sketch that is a tree stays certain.
+        """
         self.certain = self._tree
 
     def _set_course(self, here: int, path: int, direction: int) -> None:
-        """Give a dstate its course, and the reverse of it to all dstates that turns around link it to."""
+        """Give a dstate its course, and the reverse to all dstates that turns around link to it."""
         s = self._states[here]
         if (s.path, s.direction) == (path, direction):
             return
@@ -280,27 +313,29 @@ class Sketch:
         return len(self._states) - 1
 
     def _star(self, step: Step, heading: int) -> object:
-        """The star of a place at which this is seen with this heading, in the frame of the place if it has one."""
+        """The star of a place, by a step that sees it with this heading.
+
+        If the place has a frame, the star is turned into it.
+        """
         star = step.openings if self._theory.star in ("pattern", "frame") else None
         if self._framed and star is not None:
             return tuple(star[(slot - heading) % 4] for slot in range(4))
         return observation(step, self._theory)[1]
 
     def _must_show(self, there: int, step: Step) -> None:
-        """Raises _Contradiction where a step does not show what was seen at this dstate before."""
+        """Raise _Contradiction if a step contradicts the observation of its dstate."""
         if self._states[there].seen != observation(step, self._theory):
             raise _Contradiction
 
     def _made(self, labels: tuple[int, ...]) -> SSHMap:
-        """The sketch as a map, made anew."""
+        """Build the map."""
         links = tuple(sorted((s, action, x) for (s, action), x in self._links.items()))
         if self._theory.level == "causal":
             return SSHMap(
                 labels, tuple(DState(i, s.view) for i, s in enumerate(self._states)), links
             )
-        first: dict[
-            int, tuple[int, int]
-        ] = {}  # for each path, its number in the map, and the direction that is faced first
+        # For each path, its number in the map, and the direction that is faced first.
+        first: dict[int, tuple[int, int]] = {}
         for s in self._states:
             if s.path is not None:
                 first.setdefault(s.path, (len(first), s.direction))
