@@ -1,7 +1,8 @@
-"""A map drawn where its dstates are, in metres. The first dstate faces right on the page.
+"""A map with poses as an SVG picture, in metres. The first dstate faces right on the page.
 
-Round each place is an ellipse of uncertainty, of two standard deviations, as seen from the first dstate. Labels that would lie on other labels or on arrows are left
-out where no room is found for them; what they say is also in the title of the arrow, which browsers show under the pointer.
+Around each place is an ellipse of two standard deviations, relative to the first dstate. Labels for
+which there is no room are left out. The title of a dstate's arrow, which browsers show under the
+pointer, says the same.
 """
 
 from __future__ import annotations
@@ -11,30 +12,41 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
-from typing import TYPE_CHECKING
 
-from ssh_abduction.output.drawing import COLOURS, Point, escaped, fault_mark, page, text
+from ssh_abduction.data.maps import DState, Pose, SSHMap
+from ssh_abduction.output.drawing import (
+    COLOURS,
+    Point,
+    at,
+    element,
+    fault_mark,
+    faults_of,
+    line,
+    links_of,
+    page,
+    placed,
+    text,
+    titled,
+)
 from ssh_abduction.output.layout import travelled
 
-if TYPE_CHECKING:
-    from ssh_abduction.data.maps import DState, Pose, SSHMap
-
-# In units of the page: the two nearest places are drawn this far apart, unless the other limits forbid it; places are at most so far from their nearest, as a rule;
-# and the whole map is at most so large.
+# In units of the page: the distance of the two nearest places, unless the other limits forbid it;
+# the largest usual distance of a place from its nearest; and the largest size of the whole map.
 NEAREST, APART, LARGEST = 110.0, 240.0, 1600.0
-# In units of the page, where there is room: the radius of the dot of a place, and how far from its middle the arrow of a dstate begins and ends.
+# In units of the page, where there is room: the radius of the dot of a place, and how far from its
+# middle the arrow of a dstate begins and ends.
 DOT, BEGIN, END = 4.5, 8.0, 27.0
 MARGIN = 24.0
-SMALLEST = 0.6  # where places are near each other all marks are smaller, down to this share
-WIDEST = (
-    LARGEST / 4
-)  # half axes of ellipses that are longer are not drawn: the page would hold little else
+SMALLEST = 0.6  # the size of marks where places are near each other
+WIDEST = LARGEST / 4  # half axes of ellipses that are drawn: larger ones would fill the page
 DEVIATIONS = 2.0  # the half axes of ellipses, in standard deviations
-TURNS = 0.1  # dstates of a causal map that are nearer than this share of its longest link are drawn as if the robot only turned between them
+# In a map without places, dstates nearer than this share of the longest link are drawn as if the
+# robot only turned between them.
+TURNS = 0.1
 
 
 def metric_svg(ssh_map: SSHMap, poses: Sequence[Pose]) -> str:
-    """The map as SVG text, with each dstate at its pose."""
+    """A map as SVG text, with each dstate at its pose."""
     return _Picture.of(ssh_map, poses).svg()
 
 
@@ -42,10 +54,13 @@ def metric_svg(ssh_map: SSHMap, poses: Sequence[Pose]) -> str:
 class _Picture:
     """The page while it is drawn.
 
-    scale   units of the page a metre
-    unit    the size of marks, as a share of the size where there is room
-    points  what the page has to hold
-    boxes   what labels keep clear of, as (left, top, right, bottom)
+    Attributes:
+        map: The map.
+        poses: The poses of its dstates.
+        scale: Units of the page in a metre.
+        unit: The size of marks, as a share of their size where there is room.
+        points: What the page has to hold.
+        boxes: What labels keep clear of, as (left, top, right, bottom).
     """
 
     map: SSHMap
@@ -57,173 +72,173 @@ class _Picture:
 
     @classmethod
     def of(cls, ssh_map: SSHMap, poses: Sequence[Pose]) -> _Picture:
-        return cls(
-            ssh_map,
-            poses,
-            *_scale(_spots(ssh_map, poses), NEAREST if ssh_map.places else 1.4 * NEAREST),
-        )
+        """An empty page for a map."""
+        nearest = NEAREST if ssh_map.places else 1.4 * NEAREST
+        return cls(ssh_map, poses, *_scale(_spots(ssh_map, poses), nearest))
 
     def svg(self) -> str:
+        """Draw the map."""
         sites = _sites(self.map)
-        at = {site: self.on_page(self.poses[members[0].id]) for site, members in sites.items()}
-        for x, y in at.values():
-            self.keep_clear(
-                x - DOT * self.unit, y - DOT * self.unit, x + DOT * self.unit, y + DOT * self.unit
-            )
+        spots = {site: self.on_page(self.poses[members[0].id]) for site, members in sites.items()}
+        dot = DOT * self.unit
+        for x, y in spots.values():
+            self.keep_clear(x - dot, y - dot, x + dot, y + dot)
         ellipses = [
             mark
             for site, members in sites.items()
-            for mark in self.ellipse(at[site], self.poses[members[0].id].spread)
+            for mark in self.ellipse(spots[site], self.poses[members[0].id].spread)
         ]
         arrows = [self.arrow(s) for s in self.map.dstates]
-        lines = self.paths(at) if self.map.places else self.links()
+        lines = self.paths(spots) if self.map.places else self.links()
+        # The first place comes last, on top of the others.
         first = _site(self.map.dstates[self.map.labels[0]])
-        dots = [self.dot(*at[site], site) for site in sorted(at, key=lambda site: site == first)]
-        labels = (
-            self.place_labels(at)
-            + self.dstate_labels()
-            + (self.path_labels(at) if self.map.places else self.link_labels())
-        )
+        dots = [
+            self.dot(*spots[site], site) for site in sorted(spots, key=lambda site: site == first)
+        ]
+        labels = self.place_labels(spots) + self.dstate_labels()
+        labels += self.path_labels(spots) if self.map.places else self.link_labels()
+        faults = [
+            fault_mark(*self.along(self.map.dstates[s], END), said, self.unit)
+            for s, said in faults_of(self.map).items()
+        ]
         return page(
-            [*lines, *ellipses, *arrows, *dots, *labels, *self.faults(), *self.scale_bar()],
+            [*lines, *ellipses, *arrows, *dots, *labels, *faults, *self.scale_bar()],
             self.points,
             MARGIN,
         )
 
     def on_page(self, pose: Pose) -> Point:
+        """Where a pose is on the page."""
         return pose.x * self.scale, -pose.y * self.scale
 
+    def along(self, s: DState, ahead: float, left: float = 0.0) -> Point:
+        """The point on the page that is ahead of a dstate, and to its left."""
+        pose, u = self.poses[s.id], self.unit
+        x, y = self.on_page(pose)
+        cos, sin = math.cos(pose.heading) * u, math.sin(pose.heading) * u
+        return x + ahead * cos - left * sin, y - ahead * sin - left * cos
+
     def keep_clear(self, left: float, top: float, right: float, bottom: float) -> None:
+        """Let no label lie on this box."""
         self.boxes.append((left, top, right, bottom))
         self.points += [(left, top), (right, bottom)]
 
     def dot(self, x: float, y: float, site: int) -> str:
-        first = self.map.dstates[self.map.labels[0]]
-        colour = "white" if site == _site(first) else "#222"
-        title = f"place {site}" if site >= 0 else f"dstate {-1 - site}"
-        return (
-            f'<g><title>{title}</title><circle cx="{x:.1f}" cy="{y:.1f}" r="{DOT * self.unit:.1f}" fill="{colour}" '
-            f'stroke="#222" stroke-width="{1.8 * self.unit:.1f}"/></g>'
+        """The dot of a place, or of a dstate without one. That of the first dstate is white."""
+        is_first = site == _site(self.map.dstates[self.map.labels[0]])
+        circle = element(
+            "circle",
+            cx=f"{x:.1f}",
+            cy=f"{y:.1f}",
+            r=f"{DOT * self.unit:.1f}",
+            fill="white" if is_first else "#222",
+            stroke="#222",
+            stroke_width=f"{1.8 * self.unit:.1f}",
         )
+        return titled(f"place {site}" if site >= 0 else f"dstate {-1 - site}", circle)
 
-    def ellipse(self, at: Point, spread: tuple[float, float, float]) -> list[str]:
-        """Two standard deviations round a place, unless they are very large, as where hardly anything is known."""
+    def ellipse(self, spot: Point, spread: tuple[float, float, float]) -> list[str]:
+        """The ellipse of two standard deviations, unless it is too small or too large to draw."""
         (major, minor), angle = axes(spread)
         rx, ry = DEVIATIONS * major * self.scale, DEVIATIONS * minor * self.scale
         if rx < 0.5 or rx > WIDEST:
             return []
         across = math.hypot(rx * math.cos(angle), ry * math.sin(angle))
         upright = math.hypot(rx * math.sin(angle), ry * math.cos(angle))
-        self.points += [(at[0] - across, at[1] - upright), (at[0] + across, at[1] + upright)]
-        return [
-            f'<ellipse cx="{at[0]:.1f}" cy="{at[1]:.1f}" rx="{rx:.2f}" ry="{ry:.2f}" transform="rotate({-math.degrees(angle):.2f} {at[0]:.1f} {at[1]:.1f})" '
-            f'fill="#000" fill-opacity="0.04" stroke="#777" stroke-width="1" stroke-dasharray="4 3"/>'
-        ]
+        x, y = spot
+        self.points += [(x - across, y - upright), (x + across, y + upright)]
+        mark = element(
+            "ellipse",
+            cx=f"{x:.1f}",
+            cy=f"{y:.1f}",
+            rx=f"{rx:.2f}",
+            ry=f"{ry:.2f}",
+            transform=f"rotate({-math.degrees(angle):.2f} {x:.1f} {y:.1f})",
+            fill="#000",
+            fill_opacity=0.04,
+            stroke="#777",
+            stroke_width=1,
+            stroke_dasharray="4 3",
+        )
+        return [mark]
 
     def arrow(self, s: DState) -> str:
-        """A dstate: an arrow from its place in the direction of its heading. The first dstate is black."""
+        """The arrow of a dstate in the direction of its heading. The first dstate is black."""
         pose, colour = self.poses[s.id], "#000" if s.id == self.map.labels[0] else _colour(s)
-        (ax, ay), (bx, by) = self.along(s, BEGIN), self.along(s, END)
         u = self.unit
-        title = f"dstate {s.id}: {s.shown}, at {pose.x:.1f}, {pose.y:.1f} m, heading {math.degrees(pose.heading):.0f}°"
+        (ax, ay), (bx, by) = self.along(s, BEGIN), self.along(s, END)
         for share in (0.0, 0.5, 1.0):
             x, y = ax + (bx - ax) * share, ay + (by - ay) * share
             self.keep_clear(x - 4 * u, y - 4 * u, x + 4 * u, y + 4 * u)
-        return (
-            f'<g><title>{escaped(title)}</title><path d="M{BEGIN * u:.1f},0 H{END * u - 6 * u:.1f} M{END * u:.1f},0 l{-9 * u:.1f},{-5 * u:.1f} v{10 * u:.1f} Z" fill="{colour}" '
-            f'stroke="{colour}" stroke-width="{2.2 * u:.1f}" stroke-linejoin="round" '
-            f'transform="translate({pose.x * self.scale:.1f},{-pose.y * self.scale:.1f}) rotate({-math.degrees(pose.heading):.1f})"/></g>'
+        degrees = math.degrees(pose.heading)
+        shaft = f"M{BEGIN * u:.1f},0 H{END * u - 6 * u:.1f}"
+        head = f"M{END * u:.1f},0 l{-9 * u:.1f},{-5 * u:.1f} v{10 * u:.1f} Z"
+        mark = element(
+            "path",
+            d=f"{shaft} {head}",
+            fill=colour,
+            stroke=colour,
+            stroke_width=f"{2.2 * u:.1f}",
+            stroke_linejoin="round",
+            transform=placed(self.on_page(pose), -degrees),
         )
+        where = f"at {pose.x:.1f}, {pose.y:.1f} m, heading {degrees:.0f}°"
+        return titled(f"dstate {s.id}: {s.shown}, {where}", mark)
 
-    def faults(self) -> list[str]:
-        """What the map disbelieves, at the ends of the arrows of the dstates where it does."""
-        faults: dict[int, list[str]] = {}
-        for fault in self.map.faults:
-            faults.setdefault(self.map.labels[fault.step], []).append(str(fault))
-        return [
-            fault_mark(*self.along(self.map.dstates[s], END), "; ".join(said), self.unit)
-            for s, said in faults.items()
-        ]
+    def paths(self, spots: Mapping[int, Point]) -> list[str]:
+        """Paths: broad where the robot travelled, dotted where only their order of places leads.
 
-    def along(self, s: DState, far: float, aside: float = 0.0) -> Point:
-        """A point so far ahead of a dstate, and so far to its left."""
-        pose, u = self.poses[s.id], self.unit
-        x, y = self.on_page(pose)
-        cos, sin = math.cos(pose.heading) * u, math.sin(pose.heading) * u
-        return x + far * cos - aside * sin, y - far * sin - aside * cos
-
-    def paths(self, at: Mapping[int, Point]) -> list[str]:
-        """Paths through their places in order: broad where the robot travelled, and dotted where only the order of the places leads.
-
-        The order is a witness. A robot that does not know which places lie between two others may travel past some of them, so dotted lines need not be straight.
+        Dotted lines need not be straight. The order is one of several that fit, as the robot may
+        have travelled past places without noticing them.
         """
         orders, travels = [], []
+        u = self.unit
         for path in self.map.paths:
-            colour, u, streets = (
-                COLOURS[path.id % len(COLOURS)],
-                self.unit,
-                travelled(self.map, path),
-            )
+            colour, streets = COLOURS[path.id % len(COLOURS)], travelled(self.map, path)
             for p, q in pairwise(path.order):
                 if (min(p, q), max(p, q)) not in streets:
-                    orders.append(
-                        f'<path d="{_line(at[p], at[q])}" stroke="{colour}" stroke-width="{2 * u:.1f}" stroke-dasharray="2 5" opacity="0.7"/>'
-                    )
+                    dotted = {"stroke_dasharray": "2 5", "opacity": 0.7}
+                    orders.append(_line(spots[p], spots[q], colour, 2 * u, **dotted))
             for p, q in streets:
-                travels.append(
-                    f'<path d="{_line(at[p], at[q])}" stroke="{colour}" stroke-width="{8 * u:.1f}" stroke-linecap="round" opacity="0.4"/>'
-                )
+                broad = {"stroke_linecap": "round", "opacity": 0.4}
+                travels.append(_line(spots[p], spots[q], colour, 8 * u, **broad))
         return orders + travels
 
     def curves(self) -> list[tuple[Point, Point, Point, str]]:
-        """The links of a causal map: where each begins, bends and ends, and the actions."""
-        actions: dict[tuple[int, int], list[str]] = {}
-        for source, action, target in self.map.links:
-            if source != target:
-                actions.setdefault((source, target), []).append(action)
+        """For each link of a causal map its start, bend, end and the actions."""
         curves = []
-        for (source, target), names in actions.items():
+        for (source, target), names in links_of(self.map).items():
             a, b = self.map.dstates[source], self.map.dstates[target]
-            turned = (
-                math.dist(self.on_page(self.poses[source]), self.on_page(self.poses[target]))
-                < 2 * END * self.unit
-            )
+            x, y = self.on_page(self.poses[source])
+            turned = math.dist((x, y), self.on_page(self.poses[target])) < 2 * END * self.unit
             start, end = self.along(a, END + 2), self.along(b, END + 2 if turned else -BEGIN)
             bend = math.dist(start, end) * (0.35 if turned else 0.08)
             mx, my = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
-            if turned:  # away from where the robot turns
-                x, y = self.on_page(self.poses[source])
-                away = (mx - x, my - y)
-            else:  # links to and fro are beside each other
-                away = (start[1] - end[1], end[0] - start[0])
+            # Bend a turn away from the robot, and links to and fro away from each other.
+            away = (mx - x, my - y) if turned else (start[1] - end[1], end[0] - start[0])
             far = math.hypot(*away) or 1.0
-            curves.append(
-                (
-                    start,
-                    (mx + away[0] / far * bend, my + away[1] / far * bend),
-                    end,
-                    ", ".join(names),
-                )
-            )
+            middle = (mx + away[0] / far * bend, my + away[1] / far * bend)
+            curves.append((start, middle, end, names))
         return curves
 
     def links(self) -> list[str]:
+        """The links of a causal map as arrows."""
         marks = []
-        for (ax, ay), (mx, my), (bx, by), _ in self.curves():
-            u, angle = self.unit, math.degrees(math.atan2(by - my, bx - mx))
-            self.points += [(mx, my), (ax, ay), (bx, by)]
-            marks.append(
-                f'<path d="M{ax:.1f},{ay:.1f} Q{mx:.1f},{my:.1f} {bx:.1f},{by:.1f}" fill="none" stroke="#999" stroke-width="{1.4 * u:.1f}"/>'
-            )
-            marks.append(
-                f'<path d="M0,0 l{-8 * u:.1f},{-3.5 * u:.1f} v{7 * u:.1f} Z" fill="#999" transform="translate({bx:.1f},{by:.1f}) rotate({angle:.1f})"/>'
-            )
+        for start, bend, end, _ in self.curves():
+            u = self.unit
+            self.points += [bend, start, end]
+            curve = f"M{at(start)} Q{at(bend)} {at(end)}"
+            width = f"{1.4 * u:.1f}"
+            marks.append(element("path", d=curve, fill="none", stroke="#999", stroke_width=width))
+            head = f"M0,0 l{-8 * u:.1f},{-3.5 * u:.1f} v{7 * u:.1f} Z"
+            turned = placed(end, math.degrees(math.atan2(end[1] - bend[1], end[0] - bend[0])))
+            marks.append(element("path", d=head, fill="#999", transform=turned))
         return marks
 
     def label(
         self, label: str, spots: Iterable[Point], colour: str, size: float, weight: str = "normal"
     ) -> list[str]:
-        """A label at the first of these spots that is clear, if any is."""
+        """A label at the first clear spot, if there is one."""
         w, h = self.half(label, size)
         for x, y in spots:
             if all(
@@ -235,18 +250,19 @@ class _Picture:
         return []
 
     def size(self, size: float) -> float:
-        """The size of text that is of this size where there is room."""
+        """The size of text that has this size where there is room."""
         return max(size * self.unit, 9.0)
 
     def half(self, label: str, size: float) -> tuple[float, float]:
         """Half the width and half the height of a label."""
         return 0.31 * self.size(size) * len(label) + 1, 0.55 * self.size(size)
 
-    def place_labels(self, at: Mapping[int, Point]) -> list[str]:
+    def place_labels(self, spots: Mapping[int, Point]) -> list[str]:
+        """The numbers of places, around their dots."""
         marks = []
         for place in self.map.places:
-            x, y = at[place]
-            spots = [
+            x, y = spots[place]
+            around = [
                 (
                     x + far * self.unit * math.cos(k * math.pi / 4),
                     y + far * self.unit * math.sin(k * math.pi / 4),
@@ -254,63 +270,56 @@ class _Picture:
                 for far in (17, 22, 30)
                 for k in (-1, 1, 3, 5, 0, 2, 4, 6)
             ]
-            marks += self.label(str(place), spots, "#000", 15, "bold")
+            marks += self.label(str(place), around, "#000", 15, "bold")
         return marks
 
     def dstate_labels(self) -> list[str]:
+        """The numbers of dstates, beside or ahead of their arrows. The first dstate comes first."""
         marks = []
+        u = self.unit
         for s in sorted(self.map.dstates, key=lambda s: s.id != self.map.labels[0]):
-            first = s.id == self.map.labels[0]
-            label = f"x{s.id} start" if first else f"x{s.id}"
+            is_first = s.id == self.map.labels[0]
+            label = f"x{s.id} start" if is_first else f"x{s.id}"
             w, h = self.half(label, 11)
-            sin, cos = (
-                abs(math.sin(self.poses[s.id].heading)),
-                abs(math.cos(self.poses[s.id].heading)),
-            )
-            aside, beyond = (
-                4.5 + (w * sin + h * cos) / self.unit,
-                END + 5 + (w * cos + h * sin) / self.unit,
-            )
+            heading = self.poses[s.id].heading
+            sin, cos = abs(math.sin(heading)), abs(math.cos(heading))
+            aside, beyond = 4.5 + (w * sin + h * cos) / u, END + 5 + (w * cos + h * sin) / u
             sides = [(far, side * aside) for far in (20.0, 27.0, 34.0) for side in (-1, 1)]
-            ahead = [(beyond, side * h / self.unit) for side in (0, -1, 1)]
-            spots = [
-                self.along(s, *spot)
-                for spot in (sides + ahead if self.map.places else ahead + sides)
-            ]
-            marks += self.label(
-                label, spots, "#000" if first else "#444", 11, "bold" if first else "normal"
-            )
+            ahead = [(beyond, side * h / u) for side in (0, -1, 1)]
+            order = sides + ahead if self.map.places else ahead + sides
+            spots = [self.along(s, *spot) for spot in order]
+            style = ("#000", 11, "bold") if is_first else ("#444", 11, "normal")
+            marks += self.label(label, spots, *style)
         return marks
 
-    def path_labels(self, at: Mapping[int, Point]) -> list[str]:
+    def path_labels(self, spots: Mapping[int, Point]) -> list[str]:
+        """The names of paths, beside their longest streets."""
         marks = []
         for path in self.map.paths:
-            stretches = sorted(
-                ((at[p], at[q]) for p, q in travelled(self.map, path)),
+            streets = sorted(
+                ((spots[p], spots[q]) for p, q in travelled(self.map, path)),
                 key=lambda ends: -math.dist(*ends),
             )
-            spots = []
-            for (ax, ay), (bx, by) in stretches:
+            beside = []
+            for (ax, ay), (bx, by) in streets:
                 far = math.dist((ax, ay), (bx, by)) or 1.0
                 ux, uy = (bx - ax) / far, (by - ay) / far
                 for share in (0.5, 0.6, 0.4):
                     for side in (1, -1):
                         away = side * (12 + 18 * abs(uy)) * self.unit
-                        spots.append(
+                        beside.append(
                             (ax + (bx - ax) * share - uy * away, ay + (by - ay) * share + ux * away)
                         )
-            marks += self.label(f"path {path.id}", spots, COLOURS[path.id % len(COLOURS)], 12)
+            marks += self.label(f"path {path.id}", beside, COLOURS[path.id % len(COLOURS)], 12)
         return marks
 
     def link_labels(self) -> list[str]:
+        """The actions of links, at the middle of their curves."""
         return [
             mark
-            for start, bend, end, names in self.curves()
+            for (ax, ay), (mx, my), (bx, by), names in self.curves()
             for mark in self.label(
-                names,
-                [((start[0] + 2 * bend[0] + end[0]) / 4, (start[1] + 2 * bend[1] + end[1]) / 4)],
-                "#777",
-                10,
+                names, [((ax + 2 * mx + bx) / 4, (ay + 2 * my + by) / 4)], "#777", 10
             )
         ]
 
@@ -320,25 +329,35 @@ class _Picture:
         metres = _round_length(120 / self.scale)
         right = left + metres * self.scale
         self.points += [(left, below - 6), (max(right, left + 60), below + 20)]
-        bar = f'<path d="M{left:.1f},{below - 5:.1f} v10 m0,-5 H{right:.1f} m0,-5 v10" fill="none" stroke="#222" stroke-width="1.5"/>'
-        return [bar, text((left + right) / 2, below + 14, f"{metres:g} m", "#222")]
+        bar = f"M{left:.1f},{below - 5:.1f} v10 m0,-5 H{right:.1f} m0,-5 v10"
+        return [
+            element("path", d=bar, fill="none", stroke="#222", stroke_width=1.5),
+            text((left + right) / 2, below + 14, f"{metres:g} m", "#222"),
+        ]
 
 
 def axes(spread: tuple[float, float, float]) -> tuple[tuple[float, float], float]:
-    """The standard deviations along the two axes of a covariance, the greater first, and the angle of the first, in radians counterclockwise from x."""
+    """The axes of a covariance.
+
+    Args:
+        spread: The covariance (xx, xy, yy).
+
+    Returns:
+        The standard deviations along both axes, the larger first, and the angle of the first in
+        radians counterclockwise from x.
+    """
     xx, xy, yy = spread
     mean, half = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
-    return (math.sqrt(max(0.0, mean + half)), math.sqrt(max(0.0, mean - half))), math.atan2(
-        2 * xy, xx - yy
-    ) / 2
+    angle = math.atan2(2 * xy, xx - yy) / 2
+    return (math.sqrt(max(0.0, mean + half)), math.sqrt(max(0.0, mean - half))), angle
 
 
-def _line(a: Point, b: Point) -> str:
-    return f"M{a[0]:.1f},{a[1]:.1f} L{b[0]:.1f},{b[1]:.1f}"
+def _line(a: Point, b: Point, colour: str, width: float, **style: object) -> str:
+    return element("path", d=line(a, b), stroke=colour, stroke_width=f"{width:.1f}", **style)
 
 
 def _site(s: DState) -> int:
-    """What is drawn as one dot: a place or, without one, a dstate (as a negative number)."""
+    """What is drawn as one dot: a place or, as a negative number, a dstate without one."""
     return s.place if s.place is not None else -1 - s.id
 
 
@@ -350,15 +369,13 @@ def _sites(ssh_map: SSHMap) -> dict[int, list[DState]]:
 
 
 def _colour(s: DState) -> str:
-    return (
-        (COLOURS[0] if s.place is None else "#555")
-        if s.path is None
-        else COLOURS[s.path % len(COLOURS)]
-    )
+    if s.path is not None:
+        return COLOURS[s.path % len(COLOURS)]
+    return COLOURS[0] if s.place is None else "#555"
 
 
 def _spots(ssh_map: SSHMap, poses: Sequence[Pose]) -> list[Point]:
-    """Where the places are, in metres. Dstates without places that are hardly a link apart count as one."""
+    """Where the places are, in metres. Dstates without places count as one if they are near."""
     spots = [
         (poses[members[0].id].x, poses[members[0].id].y) for members in _sites(ssh_map).values()
     ]
@@ -373,7 +390,15 @@ def _spots(ssh_map: SSHMap, poses: Sequence[Pose]) -> list[Point]:
 
 
 def _scale(spots: Sequence[Point], nearest: float) -> tuple[float, float]:
-    """How many units of the page a metre is, and how large marks are, so that the spots are apart and the page is not too large."""
+    """Choose the scale so that spots are apart and the page is not too large.
+
+    Args:
+        spots: Where the places are, in metres.
+        nearest: The distance of the two nearest places, in units of the page.
+
+    Returns:
+        Units of the page in a metre, and the size of marks.
+    """
     extent = max((max(numbers) - min(numbers) for numbers in zip(*spots, strict=True)), default=0.0)
     if extent < 1e-3:  # one place, or all in one spot
         return nearest, 1.0
@@ -387,6 +412,6 @@ def _scale(spots: Sequence[Point], nearest: float) -> tuple[float, float]:
 
 
 def _round_length(metres: float) -> float:
-    """The largest of 1, 2, 5, 10, 20, 50, … (or 0.1, 0.2, 0.5, …) that is no longer."""
+    """The largest of …, 0.1, 0.2, 0.5, 1, 2, 5, 10, … that is no longer."""
     ten = 10.0 ** math.floor(math.log10(metres))
     return max(ten * k for k in (1, 2, 5) if ten * k <= metres * (1 + 1e-9))

@@ -1,4 +1,4 @@
-"""Maps for other programs: a module a format, and the table of them."""
+"""Maps for other programs: one module for each format, and the table of formats."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""Route graphs of Nav2: GeoJSON, as docs.nav2.org describes it ("Navigation2 Route Graph File Formats").
+"""Route graphs of Nav2, in GeoJSON (docs.nav2.org, "Navigation2 Route Graph File Formats").
 
-The loader takes points for nodes and lines for edges. Ids are unsigned, edges are directed, and metadata are numbers, texts, truth values or objects of these: no null, no list of objects.
+Nodes are points and edges are lines. Ids are unsigned, and edges are directed. Metadata are
+numbers, texts, truth values, or objects of these. Nav2 reads no null and no list of objects there.
 """
 
 from __future__ import annotations
@@ -14,7 +15,14 @@ DIGITS = 4  # of coordinates, in metres
 
 
 def nav2(roads: Roads, name: str, frame: str) -> str:
-    """The GeoJSON text of a route graph. Ids of edges go on where those of nodes end, as Nav2 wants all ids to be different."""
+    """The GeoJSON text of a route graph.
+
+    Args:
+        roads: The map.
+        name: What it is called.
+        frame: The coordinate frame of the positions.
+    """
+    # Nav2 wants all ids to be different, so edges are numbered after nodes.
     first = max(stop.id for stop in roads.stops) + 1
     at = {stop.id: [round(stop.x, DIGITS), round(stop.y, DIGITS)] for stop in roads.stops}
     nodes = [_feature("Point", at[stop.id], _node(stop, roads, frame)) for stop in roads.stops]

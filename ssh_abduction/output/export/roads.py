@@ -1,29 +1,36 @@
-"""What navigation programs want of a map: stops with positions, and directed roads between them."""
+"""A map for navigation programs: stops with positions, and directed roads between them."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, View
-from ssh_abduction.output.layout import layout, travelled
+from ssh_abduction.output.layout import Layout, layout, travelled
 from ssh_abduction.output.turns import Turns
 
-# What an edge costs at least, in metres. A turn on the spot costs as much as half a metre: a robot that drives 0.5 m/s turns by 90° in a second or two.
+# Costs in metres: the least of an edge, and that of a turn on the spot. A robot that drives 0.5 m/s
+# turns by 90 degrees in about a second.
 LEAST, TURN = 0.01, 0.5
+# The action of a road, the path that it is along, and which way.
+Way: TypeAlias = tuple[str | None, int | None, int | None]
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
     """Where a robot can be sent.
 
-    id        the number of the place or of the dstate
-    x, y      metres, or units of the layout
-    heading   radians counterclockwise from x; of a place that of its first dstate, 0 where none is known
-    views     what is seen there, in the order of the dstates
+    Attributes:
+        id: The number of the place or of the dstate.
+        x: Metres, or units of the layout.
+        y: The same.
+        heading: Radians counterclockwise from x; 0 if it is unknown. A place has the heading of its
+            first dstate with a known one.
+        views: The views there, in the order of the dstates.
     """
 
     id: int
@@ -37,10 +44,15 @@ class Stop:
 class Road:
     """A directed edge between two stops.
 
-    length     in a straight line, in metres or units of the layout; of a turn on the spot 0
-    action     what the robot did there; None where it only drove the other way
-    path, direction  along which path, and which way; None where it is along none
-    turns      whether it is a turn on the spot: it stays at a place, or where places are unknown at a point
+    Attributes:
+        start: The id of the stop where it begins.
+        end: The id of the stop where it ends.
+        length: The straight distance, in metres or units of the layout.
+        action: The action of the robot; None if it travelled the other way only.
+        path: The path that the road is along; None if there is none.
+        direction: Which way it is along the path, +1 or -1.
+        turns: Whether it is a turn on the spot: both stops are at one place or, if places are
+            unknown, at one point.
     """
 
     start: int
@@ -53,7 +65,7 @@ class Road:
 
     @property
     def cost(self) -> float:
-        """What a planner is to take for the length: above 0, as Nav2's planner refuses edges that cost nothing, and more for a turn on the spot."""
+        """The length for a planner: above 0, as Nav2 refuses edges that cost nothing."""
         return self.length + TURN if self.turns else max(self.length, LEAST)
 
 
@@ -61,8 +73,11 @@ class Road:
 class Roads:
     """A map as stops and directed roads.
 
-    level   what stops are: places or dstates
-    metric  whether positions are metres, of displacements; elsewhere they are of a layout
+    Attributes:
+        level: What stops are: "places" or "dstates".
+        metric: Whether positions are metres. Otherwise they are those of a layout.
+        stops: The stops.
+        roads: The roads.
     """
 
     level: str
@@ -72,9 +87,16 @@ class Roads:
 
     @classmethod
     def of(cls, ssh_map: SSHMap, level: str, turns: Trace | Turns | None = None) -> Roads:
-        """The stops and roads of a map. Raises MapError where there are none.
+        """The stops and roads of a map.
 
-        level  places: a place a stop, and a road each way along each street that was travelled, as a path leads both ways; dstates: a link a road
+        Args:
+            ssh_map: The map.
+            level: "dstates": each link is a road. "places": each street that the robot travelled is
+                a road each way, as a path leads both ways.
+            turns: How actions turn, as in `to_svg`.
+
+        Raises:
+            MapError: If there are no places or no roads.
         """
         drawn = layout(ssh_map, turns)
         if level == "places":
@@ -82,31 +104,17 @@ class Roads:
                 raise MapError(
                     "level: expected dstates, got places: the map has no places; export its dstates"
                 )
-            members = {p: [s for s in ssh_map.dstates if s.place == p] for p in ssh_map.places}
-            stops = tuple(
-                Stop(
-                    p,
-                    *drawn.places[p],
-                    next((h for s in ds if (h := drawn.dstates[s.id][2]) is not None), 0.0),
-                    tuple(s.view for s in ds if s.view is not None),
-                )
-                for p, ds in members.items()
-            )
-            ends = _streets(ssh_map)
+            stops, ends = _places(ssh_map, drawn), _streets(ssh_map)
         else:
             stops = tuple(
                 Stop(s.id, x, y, heading or 0.0, () if s.view is None else (s.view,))
                 for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
             )
+            # In reverse order, so that the first action of several between two dstates is kept.
             ends = {
-                (s, x): (
-                    action,
-                    here.path if here.path == there.path else None,
-                    here.direction if here.path == there.path else None,
-                )
+                (s, x): _way(ssh_map, s, action, x)
                 for s, action, x in sorted(ssh_map.links, reverse=True)
                 if s != x
-                for here, there in [(ssh_map.dstates[s], ssh_map.dstates[x])]
             }
         at = {stop.id: (stop.x, stop.y) for stop in stops}
         place = {s.id: s.place for s in ssh_map.dstates} if level == "dstates" else {}
@@ -128,7 +136,7 @@ class Roads:
 
     @property
     def together(self) -> int:
-        """How many stops are where another stop is, too."""
+        """How many stops share their position with another one."""
         counts = Counter((round(stop.x, 2), round(stop.y, 2)) for stop in self.stops)
         return sum(count for count in counts.values() if count > 1)
 
@@ -138,21 +146,35 @@ def _is_turn(here: int | None, there: int | None, length: float) -> bool:
     return length < LEAST if here is None or there is None else here == there
 
 
-def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], tuple[str | None, int | None, int | None]]:
-    """From one place to another: the action that was done there, or None, and along which path that is, and which way."""
-    ends: dict[tuple[int, int], tuple[str | None, int | None, int | None]] = {}
+def _places(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
+    """A stop for each place."""
+    stops = []
+    for p in ssh_map.places:
+        members = [s for s in ssh_map.dstates if s.place == p]
+        headings = (drawn.dstates[s.id][2] for s in members)
+        heading = next((h for h in headings if h is not None), 0.0)
+        views = tuple(s.view for s in members if s.view is not None)
+        stops.append(Stop(p, *drawn.places[p], heading, views))
+    return tuple(stops)
+
+
+def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
+    """The way from each place to another, where the robot travelled one way or the other."""
+    ends: dict[tuple[int, int], Way] = {}
     for path in ssh_map.paths:
         index = {place: i for i, place in enumerate(path.order)}
         for p, q in travelled(ssh_map, path):
-            way = 1 if index.get(p, 0) < index.get(q, 0) else -1
-            ends.setdefault((p, q), (None, path.id, way))
-            ends.setdefault((q, p), (None, path.id, -way))
+            direction = 1 if index.get(p, 0) < index.get(q, 0) else -1
+            ends.setdefault((p, q), (None, path.id, direction))
+            ends.setdefault((q, p), (None, path.id, -direction))
     for s, action, x in sorted(ssh_map.links, reverse=True):
-        here, there = ssh_map.dstates[s], ssh_map.dstates[x]
-        if here.place is not None and there.place is not None and here.place != there.place:
-            ends[here.place, there.place] = (
-                action,
-                here.path if here.path == there.path else None,
-                here.direction if here.path == there.path else None,
-            )
+        here, there = ssh_map.dstates[s].place, ssh_map.dstates[x].place
+        if here is not None and there is not None and here != there:
+            ends[here, there] = _way(ssh_map, s, action, x)
     return ends
+
+
+def _way(ssh_map: SSHMap, source: int, action: str, target: int) -> Way:
+    """How a link leads from one dstate to another."""
+    here, there = ssh_map.dstates[source], ssh_map.dstates[target]
+    return (action, here.path, here.direction) if here.path == there.path else (action, None, None)

@@ -1,8 +1,9 @@
-"""Topological maps of LCAS's topological_navigation: tmap2, in YAML, as its schema describes them.
+"""Topological maps of LCAS's topological_navigation: tmap2, in YAML.
 
-Two generations of its navigation read these maps, and both can drive them. The one of ROS 2 Humble imports the `action` of an edge
-from nav2_msgs.action, and takes the `goal` of the edge, in which "$node.pose" stands for the pose of the node that the edge leads to.
-The later one, a graph of networkx, looks the action up in the `actions` of the map, and takes `properties.weight` for the cost of an edge.
+Two generations of its navigation read these maps. That of ROS 2 Humble imports the `action` of an
+edge from nav2_msgs.action and sends the `goal` of the edge, in which "$node.pose" stands for the
+pose of the node that the edge leads to. The later one looks the action up in the `actions` of the
+map, and takes `properties.weight` for the cost of an edge.
 """
 
 from __future__ import annotations
@@ -18,16 +19,21 @@ from ssh_abduction.output.export.roads import Road, Roads, Stop
 
 ACTION = "NavigateToPose"
 DIGITS = 4  # of coordinates, in metres
-# Tolerances of goals in metres and radians: those of the programs' own examples. A dstate has a heading, and a place has any.
+# Tolerances of goals in metres and radians, from the program's own examples. A dstate has a
+# heading; at a place any heading will do.
 NEAR, FACING = 0.3, {"dstates": 0.1, "places": 6.28}
-# The octagon around a node in which a robot is at the node has this radius, in metres.
+# The radius in metres of the octagon in which a robot is at a node.
 RADIUS = 0.75
 
 
 def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) -> str:
     """The YAML text of a topological map.
 
-    updated  when the map was made; None for now
+    Args:
+        roads: The map.
+        name: What it is called.
+        frame: The coordinate frame of the positions.
+        updated: When the map was made; None for now.
     """
     title = {"places": "place", "dstates": "dstate"}[roads.level]
     names = {stop.id: f"{title}-{stop.id}" for stop in roads.stops}
@@ -59,7 +65,7 @@ def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) 
 
 
 def _action() -> dict[str, Any]:
-    """What the action of all edges is, for the navigation that looks it up in the map."""
+    """The action of all edges, for the navigation that looks it up in the map."""
     return {
         "action_type": f"nav2_msgs.action.{ACTION}",
         "action_server": "/navigate_to_pose",
@@ -135,7 +141,7 @@ def _rotation(heading: float) -> dict[str, float]:
 
 
 def _rounded(number: float, digits: int = DIGITS) -> float:
-    """A number with so many decimals; a zero has no sign."""
+    """A rounded number. A zero gets no sign."""
     return round(number, digits) + 0.0
 
 
