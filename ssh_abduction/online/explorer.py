@@ -1,31 +1,41 @@
-"""A robot that explores: it does what tells its rival maps apart, until one map is left, nothing in it is untried, and no return in it is in doubt.
+"""Drives a robot by experiments until one map is left that is closed and beyond doubt.
 
     see  ->  minimal maps of all that was seen  ->  next experiment  ->  do its actions  ->  see …
 
-The maps are kept by `OnlineMapper`. A new experiment is sought when the last one is done, and when clingo was asked or rivals were refuted:
+`OnlineMapper` keeps the maps. A new experiment is sought when the last one is done, when clingo was
+asked, and when rivals were refuted:
 
-1. Where known links tell minimal maps apart, the actions that do (explore.py).
-2. Else the shortest tour through all that is untried in the first of them (tour.py), which looks around where it comes back to and not at once.
-3. Else what minimal maps say something different of.
-4. Else what tells the map from one in which a return is none.
+1. Where known links tell minimal maps apart, the actions that do (`rivals/explore.py`).
+2. Else the shortest tour through all that is untried in the first map (`rivals/tour.py`). It looks
+   around where it comes back to, and not at once.
+3. Else an untried action of which minimal maps say something different.
+4. Else what tells the map from one without one of its returns (`return_doubts.py`).
 
 When it is done
 ---------------
-1. *Unique.* All minimal maps have the same dstates and the same places; they differ in paths at most.
-2. *Closed.* At each dstate that it can get to, each action that the robot can do there was tried, or the axioms imply its end.
-3. *Beyond doubt.* A minimal map may still have too few dstates, as it takes for one whatever may be one. So each return of the map is doubted: the best map in which the two visits are not at one place, or,
-   by the causal theory, the two steps are not one dstate, is a rival too if it has up to `margin` dstates more. An experiment tells it from the minimal map, and then the doubt is weighed again. What such a map
-   costs at least can only grow with the trace, so a doubt that was dispelled stays so until the minimal maps themselves have more dstates.
+1. *Unique.* All minimal maps have the same dstates and the same places. They may differ in paths.
+2. *Closed.* At each dstate that the robot can get to, each action that it can do there was tried,
+   or the axioms imply where it leads.
+3. *Beyond doubt.* A minimal map may still have too few dstates, as it merges whatever may be one.
+   So each return of the map is doubted. The best map in which the two visits are not at one place
+   (by the causal theory: the two steps are not one dstate) is a rival if it has at most `margin`
+   dstates more. An experiment tells it from the minimal map, and then the doubt is weighed again.
+   The cost of such a map can only grow with the trace, so a dispelled doubt stays dispelled until
+   the minimal maps themselves have more dstates.
 
-Where no experiment tells such a rival from the minimal map, either both are the same map from here on, and differ in where the robot was at first: that is no doubt. Or the rival is another map, as closed as the minimal
-one, which predicts the same for ever: a symmetric world has such maps. Then the exploration ends as `inseparable`, and not as `done`.
+Where no experiment tells such a rival from the minimal map, there are two cases. Both may be the
+same map from here on and differ in where the robot was at first; that is no doubt. Or the rival is
+another map, as closed as the minimal one, that predicts the same for ever: a symmetric world has
+such maps. Then the exploration ends as `inseparable`, and not as `done`.
 
-That is no proof that the map is true, as nothing is: a world may hide more dstates than `margin`, and of the rivals that deny a return only the best is looked at. How often it is true is measured (docs/exploring.md).
+This does not prove that the map is true. A world may hide more than `margin` dstates, and of the
+rivals without a return only the best is looked at. docs/exploring.md measures how often the map is
+true.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeAlias
 
@@ -36,20 +46,21 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation import evaluate
+from ssh_abduction.online.abilities import Abilities
 from ssh_abduction.online.mapper import OnlineMapper
+from ssh_abduction.online.return_doubts import ReturnDoubts
 from ssh_abduction.rivals.explore import Experiment, next_experiment
-from ssh_abduction.rivals.machines import Seen
 from ssh_abduction.rivals.tour import next_tour
 from ssh_abduction.solver import Solution, Status, check_limit, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-# Where nothing is left to do, but the map is not proven minimal, so many times the limit of a step are spent on it.
+# Where nothing is left to do but the map is not proven minimal, it is solved for this many times
+# the time limit of a step.
 LONGER = 5
-
-# Dstates that a place may show, and still be another one than the map takes it for, as a robot drives on: as many as places with four sides have.
+# A place that has shown at most this many dstates on a tour may still be another one than the map
+# takes it for. A place with four sides has this many.
 DOUBTED = 4
 
-Doubt: TypeAlias = tuple[int, int]  # two steps, which are at one place in the map, or at one dstate
 Ending: TypeAlias = Literal["done", "inseparable", "steps", "time", "contradicted"]
 _ENDINGS: dict[Ending, str] = {
     "done": "one map is left, nothing in it is untried, and no return in it is in doubt",
@@ -64,26 +75,35 @@ class Robot(Protocol):
     """What an explorer drives."""
 
     def look(self) -> Step:
-        """What is seen here: a view, and perhaps a star, the displacement since the last look, and, in simulation, the truth, which the explorer does not go by."""
+        """What is seen here: a view, perhaps a star, and the displacement since the last look.
+
+        In simulation it may have the truth, which the explorer does not use.
+        """
 
     def can(self) -> Collection[Action | str]:
-        """What the robot can do here. Places that look alike are expected to let it do the same."""
+        """The actions that the robot can do here. They should be the same where all looks alike."""
 
     def do(self, action: Action) -> None:
-        """Do this."""
+        """Do an action."""
 
 
 @dataclass(frozen=True, slots=True)
 class Exploration:
-    """What an explorer has found out.
+    """What an explorer found out.
 
-    steps      how many actions were done
-    ending     why it ended. done: one map is left, nothing in it is untried, and no return is in doubt; inseparable: nothing that the robot can do tells the rivals apart that are left, or the minimal map from `rival`; steps: the steps that it
-               was given are spent; time: there was no time to prove which maps are minimal, or to weigh a doubt; contradicted: no map explains what was seen
-    is_unique  whether all minimal maps have the same dstates, and the same places: they differ in paths at most
-    is_true    whether it is unique and true, as far as it was driven: its dstates and places are those that the robot's looks tell as truth. None where they tell none
-    solution   the minimal maps of all that was seen
-    rival      a map with more dstates that explains all, too, is closed, and predicts the same for ever, if one was found: then the minimal map may be unique, and the world a larger one
+    Attributes:
+        steps: How many actions were done.
+        ending: Why it ended. "done": one map is left, nothing in it is untried, and no return is in
+            doubt. "inseparable": nothing that the robot can do tells the rivals that are left
+            apart, or the minimal map from `rival`. "steps": all steps are spent. "time": there was
+            no time to prove which maps are minimal, or to weigh a doubt. "contradicted": no map
+            explains what was seen.
+        is_unique: Whether all minimal maps have the same dstates and the same places.
+        is_true: Whether the map is unique and its dstates and places are the true ones, as far as
+            the robot drove. None where its looks do not tell the truth.
+        solution: The minimal maps of all that was seen.
+        rival: A map with more dstates that also explains all, is closed, and predicts the same for
+            ever, if one was found. Then the world may be larger than the unique minimal map.
     """
 
     steps: int
@@ -95,7 +115,7 @@ class Exploration:
 
     @property
     def sentence(self) -> str:
-        """What came of it, in a few words."""
+        """The result as a sentence."""
         truth = (
             {None: "", True: ", and true", False: ", and not true"}[self.is_true]
             if self.is_unique
@@ -104,8 +124,12 @@ class Exploration:
         why = _ENDINGS[self.ending]
         if self.is_unique and self.rival:
             more = len(self.rival.dstates) - len(self.solution.maps[0].dstates)
-            why = f"a map with {counted(more, 'dstates')} more explains all, too, and nothing that the robot can do tells them apart"
-        return f"after {counted(self.steps, 'steps')} the map is {'' if self.is_unique else 'not '}unique{truth}: {why}"
+            why = (
+                f"a map with {counted(more, 'dstates')} more explains all, too, "
+                "and nothing that the robot can do tells them apart"
+            )
+        unique = "" if self.is_unique else "not "
+        return f"after {counted(self.steps, 'steps')} the map is {unique}unique{truth}: {why}"
 
     def to_dict(self) -> dict[str, Any]:
         told = {name: getattr(self, name) for name in ("steps", "ending", "is_unique", "is_true")}
@@ -116,13 +140,21 @@ class Exploration:
 class Explorer:
     """Drives a robot until its minimal map is unique, closed, and beyond doubt.
 
-    robot   what it drives
-    theory  which axioms and which preference; Theory.topological() by default
-    margin  a return is in doubt while some map without it has up to so many dstates more; 0 doubts nothing
-    limit   seconds that a step, and the weighing of one doubt, may take, about; None waits for exact answers
-    maps    keep at most so many maps
+    Args:
+        robot: What it drives.
+        theory: Which axioms and which preference; Theory.topological() by default.
+        margin: A return is in doubt while some map without it has at most this many dstates more; 0
+            doubts nothing.
+        time_limit: Seconds that a step, and the weighing of one doubt, may take, about; None waits
+            for exact answers.
+        max_maps: Keep at most this many maps; None keeps all.
 
-    Raises TraceError where the robot's looks do not fit the theory, TheoryError for a theory with faults.
+    Raises:
+        TraceError: The robot's looks do not fit the theory.
+        TheoryError: The theory has faults.
+
+    Attributes:
+        mapper: The mapper that keeps the minimal maps.
 
     >>> from ssh_abduction import Explorer, Theory
     >>> from ssh_abduction.data import Step
@@ -134,8 +166,10 @@ class Explorer:
     ...         return ["on"]
     ...     def do(self, action):
     ...         self.at = (self.at + 1) % 4
-    >>> print(Explorer(Ring(), Theory.causal()).explore(100).sentence)
-    after 7 steps the map is unique, and true: one map is left, nothing in it is untried, and no return in it is in doubt
+    >>> found = Explorer(Ring(), Theory.causal()).explore(100)
+    >>> print(found.sentence)  # doctest: +NORMALIZE_WHITESPACE
+    after 7 steps the map is unique, and true: one map is left, nothing in it is untried, and no
+    return in it is in doubt
     """
 
     @renamed_parameters("limit", "maps")
@@ -162,9 +196,10 @@ class Explorer:
             )
         if theory is not None and checked_theory(theory).has_faults:
             raise TheoryError(
-                "theory: expected one without faults, as what contradicts all maps ends an exploration, got misread or slipped; leave them out"
+                "theory: expected one without faults, as what contradicts all maps ends an "
+                "exploration, got misread or slipped; leave them out"
             )
-        self._robot, self._margin, self._limit, self._most = robot, margin, time_limit, max_maps
+        self._robot, self._time_limit, self._max_maps = robot, time_limit, max_maps
         first = self._look()
         assert first.view is not None
         self.mapper = OnlineMapper(
@@ -175,30 +210,21 @@ class Explorer:
             max_maps=max_maps,
         )
         self._truths = [first.truth]
-        self._actions: dict[str, Action] = {}  # all that it was ever able to do
-        self._abilities: dict[
-            tuple[object, object], set[str]
-        ] = {}  # what it can do wherever it sees this
-        self._longer: Solution | None = (
-            None  # the answer for all steps, where the mapper had too little time for it
-        )
-        self._plan: list[str] = []
-        self._least: dict[
-            Doubt, int
-        ] = {}  # how many dstates a map has at least in which two steps are not where the map says
-        self._undecided: set[Doubt] = set()  # doubts of which nothing was found out in time
-        self._twins: dict[
-            Doubt, SSHMap
-        ] = {}  # rivals with few dstates more that nothing tells apart from the minimal map
-        self._stuck = False  # nothing was left to do when it was last asked
-        self._note(first)
+        self._abilities = Abilities()
+        self._abilities.note(first, robot.can())
+        self._doubts = ReturnDoubts(int(margin), time_limit)
+        # The answer for all steps, where the mapper had too little time for it.
+        self._longer: Solution | None = None
+        self._plan: list[str] = []  # actions to do
+        self._is_stuck = False  # nothing was left to do when a plan was last sought
 
     def __repr__(self) -> str:
-        return f"<Explorer: {counted(len(self.trace) - 1, 'steps')}, {counted(self.solution.count, 'maps')}>"
+        steps, maps = counted(len(self.trace) - 1, "steps"), counted(self.solution.count, "maps")
+        return f"<Explorer: {steps}, {maps}>"
 
     @property
     def trace(self) -> Trace:
-        """All that was seen and done, with the truth that the robot's looks tell."""
+        """All that was seen and done, with the truth that the robot's looks have."""
         trace = self.mapper.trace
         return replace(
             trace,
@@ -210,25 +236,25 @@ class Explorer:
 
     @property
     def solution(self) -> Solution:
-        """The minimal maps of all that was seen; or the best map, where there was no time for more."""
+        """The minimal maps of all that was seen, or the best map found in time."""
         return self._longer or self.mapper.solution
 
     def explore(self, steps: int) -> Exploration:
-        """Do so many actions at most, and say what was found out."""
+        """Do at most this many actions, and say what was found out."""
         if not is_whole(steps) or steps < 0:
             raise TraceError(f"steps: expected a number of actions, 0 or more, got {brief(steps)}")
         while steps > 0 and self.step():
             steps -= 1
-        if steps == 0 and not self._stuck:
-            self._stuck = not self._planned()
+        if steps == 0 and not self._is_stuck:
+            self._is_stuck = not self._planned()
         return self.result
 
     def step(self) -> bool:
-        """Do one action. False where nothing is left to do, or there is no map to go by."""
-        self._stuck = not self._planned()
-        if self._stuck:
+        """Do one action. False if nothing is left to do, or there is no map to go by."""
+        self._is_stuck = not self._planned()
+        if self._is_stuck:
             return False
-        action = self._able[self._plan.pop(0)]
+        action = self._abilities.here[self._plan.pop(0)]
         asked, known = self.mapper.searches, self.mapper.solution.count
         self._robot.do(action)
         seen = self._look()
@@ -241,12 +267,11 @@ class Explorer:
             covariance=seen.covariance,
         )
         self._truths.append(seen.truth)
-        self._note(seen)
+        self._abilities.note(seen, self._robot.can())
+        # New or fewer maps call for a new plan.
         if self.mapper.searches > asked or self.mapper.solution.count != known:
             self._plan = []
-            for doubt in (*self._twins, *self._undecided):
-                self._least.pop(doubt, None)
-            self._twins, self._undecided = {}, set()
+            self._doubts.reopen()
         self._longer = None
         return True
 
@@ -255,7 +280,7 @@ class Explorer:
         """What was found out so far."""
         solution = self.solution
         unique = _is_unique(solution)
-        rival = next(iter(self._twins.values()), None)
+        rival = next(iter(self._doubts.twins.values()), None)
         return Exploration(
             len(self.trace) - 1,
             self._ending(unique),
@@ -268,11 +293,11 @@ class Explorer:
     def _ending(self, unique: bool) -> Ending:
         if self.solution.status is Status.UNSATISFIABLE:
             return "contradicted"
-        if not self._stuck:
+        if not self._is_stuck:
             return "steps"
-        if self.solution.status is not Status.OPTIMAL or self._undecided:
+        if self.solution.status is not Status.OPTIMAL or self._doubts.undecided:
             return "time"
-        if self._twins:
+        if self._doubts.twins:
             return "inseparable"
         return "done" if unique else "inseparable" if self.solution.complete else "time"
 
@@ -290,60 +315,57 @@ class Explorer:
         seen = self._robot.look()
         if not isinstance(seen, Step) or seen.view is None:
             raise TraceError(
-                f"look: expected a Step with a view, got {brief(seen)}; let the robot say what it sees, as in Step('hall')"
+                f"look: expected a Step with a view, got {brief(seen)}; "
+                "let the robot say what it sees, as in Step('hall')"
             )
         return seen
 
-    def _note(self, seen: Step) -> None:
-        """Note what the robot can do here."""
-        self._able = {action.name: action for action in map(Action.of, self._robot.can())}
-        self._actions |= self._able
-        for star in {seen.star, None}:
-            self._abilities.setdefault((seen.view, star), set(self._able)).intersection_update(
-                self._able
-            )
-
-    def _can(self, seen: Seen) -> set[str]:
-        return self._abilities.get((seen.view, seen.star)) or self._abilities.get(
-            (seen.view, None), set()
-        )
-
     def _planned(self) -> bool:
-        """Whether there is a next action, which is the first one of the plan then."""
-        if self._plan and self._plan[0] not in self._able:
+        """Whether there is a next action. It is the first one of the plan then."""
+        able = self._abilities.here
+        if self._plan and self._plan[0] not in able:
             self._plan = []
         if not self._plan and self.solution.maps:
             self._plan = list(self._next_plan())
-        return bool(self._plan) and self._plan[0] in self._able
+        return bool(self._plan) and self._plan[0] in able
 
     def _next_plan(self) -> tuple[str, ...]:
-        """The actions of the next experiment: between minimal maps, or with what is untried; else with a return that is in doubt."""
+        """The actions of the next experiment; none if nothing is left to find out."""
         maps = list(self.solution.maps)
         found = self._experiment(maps)
+        # No known links tell the maps apart: try what is untried.
         if not found.plan.branches and (tour := self._tour(maps[0])):
             return tour
-        if not found.actions and not (
-            self.solution.status is Status.OPTIMAL and self.solution.complete
-        ):
-            longer = None if self._limit is None else LONGER * self._limit
-            self._longer = solve(
-                self.mapper.trace, self.mapper.theory, time_limit=longer, max_maps=self._most
-            )
+        # Nothing is left to do, but there may be more minimal maps: look for them longer.
+        is_proven = self.solution.status is Status.OPTIMAL and self.solution.complete
+        if not found.actions and not is_proven:
+            self._longer = self._solve_longer()
             if self._longer.maps:
                 found = self._experiment(list(self._longer.maps))
-        if found.actions or not self._margin or not self.solution.maps:
+        if found.actions or not self.solution.maps:
             return found.actions
-        best = self.solution.maps[0]
-        for doubt in self._doubts(best):
-            for rival in self._without(doubt, len(best.dstates)):
-                experiment = self._experiment([best, rival])
-                if experiment.actions:
-                    return experiment.actions
-                if len(experiment.alike) > 1:
-                    self._twins[doubt] = rival
-                self._least[doubt] = (
-                    len(best.dstates) + self._margin + 1
-                )  # from here on the two are one map, which differ in the past, or nothing tells them apart
+        return self._doubting_plan(self.solution.maps[0])
+
+    def _solve_longer(self) -> Solution:
+        """Solve all steps in more time than a step has."""
+        limit = None if self._time_limit is None else LONGER * self._time_limit
+        mapper = self.mapper
+        return solve(mapper.trace, mapper.theory, time_limit=limit, max_maps=self._max_maps)
+
+    def _doubting_plan(self, best: SSHMap) -> tuple[str, ...]:
+        """The actions that tell the map from one without one of its returns."""
+        trace, theory, dstates = self.mapper.trace, self.mapper.theory, len(best.dstates)
+        for doubt in self._doubts.open(best, trace):
+            rival = self._doubts.rival(doubt, trace, theory, dstates)
+            if rival is None:
+                continue
+            experiment = self._experiment([best, rival])
+            if experiment.actions:
+                return experiment.actions
+            # Either nothing tells the two apart, or they are one map and differ in the past.
+            if len(experiment.alike) > 1:
+                self._doubts.twins[doubt] = rival
+            self._doubts.dispel(doubt, dstates)
         return ()
 
     def _experiment(self, maps: list[SSHMap]) -> Experiment:
@@ -351,60 +373,21 @@ class Explorer:
             maps,
             self.mapper.trace,
             theory=self.mapper.theory,
-            actions=self._actions.values(),
-            can=self._can,
+            actions=self._abilities.ever.values(),
+            can=self._abilities.names,
             implied=True,
         )
 
     def _tour(self, ssh_map: SSHMap) -> tuple[str, ...]:
-        """The actions that lead soonest through all that is untried in a map."""
+        """The shortest tour through all that is untried in a map."""
         return next_tour(
             ssh_map,
             self.mapper.trace,
             theory=self.mapper.theory,
-            actions=self._actions.values(),
-            can=self._can,
+            actions=self._abilities.ever.values(),
+            can=self._abilities.names,
             margin=DOUBTED,
         )
-
-    def _doubts(self, ssh_map: SSHMap) -> Iterator[Doubt]:
-        """The returns of a map that are still in doubt, the latest first, as least is known of these."""
-        at = [ssh_map.dstates[label].place if ssh_map.places else label for label in ssh_map.labels]
-        comes = [
-            0,
-            *(
-                t
-                for t, action in enumerate(self.mapper.trace.actions, 1)
-                if not ssh_map.places or action.kind == "travel"
-            ),
-        ]
-        first: dict[int | None, int] = {}
-        for t in comes:
-            first.setdefault(at[t], t)
-        enough = len(ssh_map.dstates) + self._margin
-        yield from (
-            (first[at[t]], t)
-            for t in reversed(comes)
-            if first[at[t]] != t and self._least.get((first[at[t]], t), 0) <= enough
-        )
-
-    def _without(self, doubt: Doubt, dstates: int) -> Iterator[SSHMap]:
-        """The best map in which two steps are not where the minimal maps say, if it has few dstates more."""
-        theory = self.mapper.theory
-        kind = "different" if theory.level == "causal" else "elsewhere"
-        found = solve(
-            self.mapper.trace,
-            theory.replace(**{kind: (*getattr(theory, kind), doubt)}),
-            max_maps=1,
-            time_limit=self._limit,
-        )
-        if found.maps and len(found.maps[0].dstates) <= dstates + self._margin:
-            yield found.maps[0]
-            return
-        proven = not found.stopped or found.stopped == "maps limit"
-        if not proven and (found.bound.dstates or 0) <= dstates + self._margin:
-            self._undecided.add(doubt)
-        self._least[doubt] = dstates + self._margin + 1
 
 
 def _is_unique(solution: Solution) -> bool:
