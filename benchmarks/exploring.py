@@ -10,7 +10,7 @@ ever more steps, and then by halving. The explorer also says itself when it is d
 
     explorer       Explorer of ssh_abduction/online/explorer.py
     random         any action that the robot can do, evenly
-    rule           mazes: looks around at each place, then follows the wall to its right. Plans: the drive of simulator/plans.py, through the door that was passed least often, which knows where the robot is
+    rule           mazes: looks around at each place, then follows the wall to its right. Plans: the drive of simulator/plan_tours.py, through the door that was passed least often, which knows where the robot is
     hW             AALpy's learner without resets. Its oracle knows the truth and costs nothing but the steps of a shortest counterexample, and so does an action that cannot be done: so hW is better here than
                    it could be. It is told views, with stars on plans, learns all links, and has done once its machine predicts the same as the world
 
@@ -35,7 +35,8 @@ from typing import Any, Protocol
 from instances import HEADINGS, TURNS, doors_of
 from truth import Known, is_true, share_all
 
-from simulator.plans import Floor, Plan
+from simulator.plan_tours import Floor
+from simulator.plans import Plan
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.online.explorer import Explorer

@@ -26,7 +26,8 @@ from pathlib import Path
 from instances import displaced, maze
 
 from simulator.motion import Pose
-from simulator.plans import Plan, tour
+from simulator.plan_tours import tour
+from simulator.plans import Plan
 from simulator.robot import Body
 from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry

@@ -1,7 +1,9 @@
-"""The walls of a floor plan, with openings where the doors are: a world that a robot with a body can drive in.
+"""Makes a world with walls from a floor plan, in which a robot with a body can drive.
 
-A plan draws each room as a polygon and each door as a point on its outline. So the walls are the outlines of all rooms, and a door is an opening of DOOR metres in the outlines of both of
-its rooms, moved along the wall where a corner would narrow it. Where the outlines are apart, as walls are thick, jambs lead from one to the other.
+A plan draws each room as a polygon and each door as a point on its outline. So the walls are the
+outlines of all rooms. A door is an opening of DOOR metres in the outlines of both of its rooms,
+moved along the wall if a corner would narrow it. If the outlines are apart, as walls are thick,
+jambs connect them.
 """
 
 from __future__ import annotations
@@ -17,9 +19,9 @@ from simulator.plans import Door, Plan, Room
 from simulator.world import World
 
 Array = NDArray[np.float64]
-# Metres: how wide a door is, and how far it is off the corners of its rooms.
+# Width of a door, and distance from the corners of its rooms, in metres.
 DOOR, OFF = 1.0, 0.1
-# Metres before and behind a door in which nothing stands: what is drawn there of other walls would close it.
+# Metres on both sides of a door that are kept free of drawn walls, which would close it.
 DEPTH = 0.25
 
 
@@ -27,10 +29,11 @@ DEPTH = 0.25
 class Opening:
     """A door as an opening in a wall.
 
-    middle  metres
-    along   the direction of the wall, radians
-    width   metres
-    depth   metres from the outline of one room to that of the other
+    Attributes:
+        middle: (x, y) in metres.
+        along: Direction of the wall in radians.
+        width: Metres.
+        depth: Metres from the outline of one room to that of the other.
     """
 
     middle: tuple[float, float]
@@ -39,7 +42,7 @@ class Opening:
     depth: float
 
     def frame(self, points: Array) -> Array:
-        """Points, (n, 2), along the wall and across it, metres from the middle."""
+        """Coordinates of points, (n, 2), along and across the wall, in metres from the middle."""
         cos, sin = math.cos(self.along), math.sin(self.along)
         off = points - np.array(self.middle)
         return np.column_stack(
@@ -47,7 +50,7 @@ class Opening:
         )
 
     def point(self, along: float, across: float) -> tuple[float, float]:
-        """The point that is so far along the wall from the middle, and across it to the left."""
+        """The point at this distance along the wall, and across it to the left."""
         cos, sin = math.cos(self.along), math.sin(self.along)
         return self.middle[0] + cos * along - sin * across, self.middle[
             1
@@ -61,7 +64,13 @@ class Opening:
 
 @dataclass(frozen=True)
 class Building:
-    """A plan, its walls, and its doors as openings, numbered as in the plan."""
+    """A plan with walls and openings.
+
+    Attributes:
+        plan: The plan.
+        segments: (n, 4) walls in metres.
+        openings: Openings of the doors, in the order of the plan.
+    """
 
     plan: Plan
     segments: Array = field(repr=False)
@@ -69,11 +78,12 @@ class Building:
 
     @classmethod
     def of(cls, plan: Plan) -> Building:
-        """The building of a plan. Raises SimulatorError where a room has no outline."""
+        """Make the building of a plan. Raises SimulatorError if a room has no outline."""
         for number, room in enumerate(plan.rooms):
             if (corners := len(set(room.polygon))) < 3:
                 raise SimulatorError(
-                    f"{plan.name}: room {number}: expected a bounding_polygon of three points or more, got {corners}; draw its outline"
+                    f"{plan.name}: room {number}: expected a bounding_polygon of three points "
+                    f"or more, got {corners}; draw its outline"
                 )
         walls = np.vstack([_outline(room) for room in plan.rooms])
         openings = tuple(_opening(plan, door) for door in plan.doors)
@@ -96,11 +106,12 @@ def _outline(room: Room) -> Array:
 
 
 def _opening(plan: Plan, door: Door) -> Opening:
-    """The opening of a door in the walls of its rooms that are nearest to it."""
+    """The opening of a door in the nearest walls of its rooms."""
     walls = [_nearest(_outline(plan.rooms[room]), door.position) for room in door.rooms]
     longest = max(walls, key=lambda wall: float(np.hypot(*(wall[2:] - wall[:2]))))
     way = longest[2:] - longest[:2]
     flat = Opening(door.position, math.atan2(way[1], way[0]), DOOR, 0.0)
+    # Shift the door along the wall into the span that both rooms share, and narrow it if necessary.
     spans = [_span(flat, _outline(plan.rooms[room])) for room in door.rooms]
     low, high = max(low for low, _ in spans) + OFF, min(high for _, high in spans) - OFF
     width = min(DOOR, high - low) if high > low else DOOR
@@ -115,10 +126,12 @@ def _opening(plan: Plan, door: Door) -> Opening:
 
 
 def _span(flat: Opening, walls: Array) -> tuple[float, float]:
-    """From where to where a room has a wall along a door, metres from the door: an outline may have corners within a straight wall."""
-    ends = np.stack(
-        [flat.frame(walls[:, :2]), flat.frame(walls[:, 2:])], axis=1
-    )  # (n, 2 ends, along and across)
+    """First and last position of the wall of a room along a door, in metres from the door.
+
+    An outline may have corners within a straight wall, so connected stretches are joined.
+    """
+    # (n, 2 ends, along and across)
+    ends = np.stack([flat.frame(walls[:, :2]), flat.frame(walls[:, 2:])], axis=1)
     way = ends[:, 1] - ends[:, 0]
     level = (np.abs(ends[:, :, 1]) < DEPTH).all(1) & (np.abs(way[:, 1]) < np.abs(way[:, 0]))
     stretches: list[tuple[float, float]] = []
@@ -131,13 +144,13 @@ def _span(flat: Opening, walls: Array) -> tuple[float, float]:
 
 
 def _across(flat: Opening, wall: Array, along: float) -> float:
-    """How far across a door a wall is, so far along it."""
+    """Position of a wall across a door, at a position along it."""
     ends = flat.frame(wall.reshape(2, 2))
     return float(np.interp(along, *ends[np.argsort(ends[:, 0])].T))
 
 
 def _nearest(walls: Array, point: tuple[float, float]) -> Array:
-    """The wall that is nearest to a point, (4,)."""
+    """The wall nearest to a point, (4,)."""
     along = walls[:, 2:] - walls[:, :2]
     share = np.clip(((np.array(point) - walls[:, :2]) * along).sum(1) / (along**2).sum(1), 0, 1)
     off = np.hypot(*(walls[:, :2] + share[:, None] * along - np.array(point)).T)
@@ -146,7 +159,7 @@ def _nearest(walls: Array, point: tuple[float, float]) -> Array:
 
 
 def _cut(walls: Array, opening: Opening) -> Array:
-    """The walls without what stands in an opening: each is clipped to the outside of a rectangle (Liang and Barsky)."""
+    """Remove the parts of walls in an opening, by clipping to a rectangle (Liang and Barsky)."""
     starts, ends = opening.frame(walls[:, :2]), opening.frame(walls[:, 2:])
     half = np.array([opening.width / 2, opening.depth / 2 + DEPTH])
     way = ends - starts

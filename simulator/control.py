@@ -1,10 +1,13 @@
-"""Control laws. Each of them sees laser images and commands motions, and none knows the true pose.
+"""Control laws, which see laser images and command motions. None knows the true pose.
 
-Trajectory-following leads the robot along the midline between two walls, or along one wall at a fixed distance. Hill-climbing leads it to
-a fixed point. Along its way, that point is half a corridor's width before the wall ahead, or in the middle of a street that opens to a side;
-across its way, it is midway between the walls, or half a corridor's width from the only wall; and the heading is along the walls. Where the image
-does not show one of these, the robot does not correct it.
-Source: Kuipers & Beeson 2002, section on distinctive states; Kuipers 2000, the control level of the hierarchy.
+Trajectory-following leads the robot along the midline between two walls, or along one wall at a
+fixed distance. Hill-climbing leads it to a fixed point. Along its path, this is half a corridor's
+width before the wall ahead, or the middle of a street that opens to a side. Across its path, it is
+midway between the walls, or half a corridor's width from the only wall. The heading is along the
+walls. What the image does not show is not corrected.
+
+Reference:
+    Kuipers & Beeson 2002, section on distinctive states; Kuipers 2000, the control level.
 """
 
 from __future__ import annotations
@@ -25,23 +28,28 @@ from simulator.world import World
 
 Array = NDArray[np.float64]
 TURNS = {"left": math.pi / 2, "right": -math.pi / 2, "around": math.pi}
-# Metres that the robot drives between two images while it travels.
+# Metres between two images while the robot travels.
 STRIDE = 0.15
-# At rest the robot takes the median of this many images, beam by beam, so that noise is small and a lost beam does not count.
+# Images at rest, whose median, beam by beam, reduces noise and ignores lost beams.
 STILL = 9
-# Hill-climbing looks and moves at most this many times: noise may keep it from ever being within its tolerance.
+# Largest number of corrections while hill-climbing, since noise may keep the robot out of
+# tolerance.
 TRIES = 12
-# A travel of more metres than this has failed: where walls lead round in a circle, it would never end.
+# A travel of more metres has failed: walls that lead round in a circle would never end it.
 LONGEST_TRAVEL = 300.0
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How near to the fixed point hill-climbing ends. The defaults are as near as such a robot can be steered.
+    """Distance from the fixed point at which hill-climbing ends.
 
-    close     metres along the way
-    straight  radians of heading
-    aside     metres off the line; if it is farther off, the robot backs off and approaches once more
+    The defaults are as precise as such a robot can be steered.
+
+    Attributes:
+        close: Metres along the path.
+        straight: Radians of heading.
+        aside: Metres across the path. If the robot is farther off, it backs off and approaches
+            again.
     """
 
     close: float = 0.015
@@ -51,10 +59,16 @@ class Tolerance:
 
 @dataclass
 class Driver:
-    """A robot in a world, with its laser: what control laws may use.
+    """A robot in a world, with its laser: everything that control laws may use.
 
-    on_travel  is called with the driver after each stride of a travel
-    recorder   notes where the robot is after each motion, for a log
+    Attributes:
+        world: The world as it is on this tour.
+        robot: The robot.
+        laser: Its laser.
+        rng: Source of noise.
+        tolerance: Precision of hill-climbing.
+        on_travel: Called with the driver after each stride of a travel.
+        recorder: Records the pose after each motion, for a log.
     """
 
     world: World
@@ -66,31 +80,34 @@ class Driver:
     recorder: Recorder | None = None
 
     def look(self, images: int = 1) -> Array:
-        """An image, (180,) metres: the median of so many images, beam by beam."""
+        """An image, (180,) metres: the median of this many scans, beam by beam."""
         scans = self.laser.scan(self.world, np.repeat([self.robot.pose], images, axis=0), self.rng)
         return np.median(scans, axis=0) if images > 1 else scans[0]
 
     def see(self, images: int = 1) -> Sight:
+        """What the median of this many scans shows."""
         return sight(self.look(images), self.world.reach, self.laser.reach)
 
     def go(self, forward: float, turn: float = 0.0) -> None:
-        """Move the robot. Raises SimulatorError where it leaves the world or hits a wall."""
+        """Move the robot. Raises SimulatorError if it leaves the world or hits a wall."""
         self.robot.move(forward, turn)
         x, y, _ = self.robot.pose
         if not self.world.holds(x, y):
             raise SimulatorError(
-                f"{self.world.name}: the robot left the world at ({x:.2f}, {y:.2f}); close the gap in the walls"
+                f"{self.world.name}: the robot left the world at ({x:.2f}, {y:.2f}); close "
+                "the gap in the walls"
             )
         if forward and self.world.clearance(x, y) < self.robot.body.radius:
             raise SimulatorError(
-                f"{self.world.name}: the robot hit a wall at ({x:.2f}, {y:.2f}); give it {self.robot.body.radius} m of room"
+                f"{self.world.name}: the robot hit a wall at ({x:.2f}, {y:.2f}); give it "
+                f"{self.robot.body.radius} m of room"
             )
         if self.recorder:
             self.recorder.note(self.world, self.robot.pose)
 
 
 def act(driver: Driver, action: str) -> None:
-    """Do an action of a route: follow a trajectory or turn, and then climb to the dstate where the action ends."""
+    """Do an action of a route, then climb to the dstate where it ends."""
     if action == "travel":
         travel(driver)
         climb(driver)
@@ -102,6 +119,7 @@ def act(driver: Driver, action: str) -> None:
 def travel(driver: Driver) -> None:
     """Follow the midline or the wall to the next distinctive place."""
     reach = driver.world.reach
+    # A side street counts only after leaving the place where the robot started.
     began = driver.robot.driven
     while True:
         seen = driver.see()
@@ -111,12 +129,14 @@ def travel(driver: Driver) -> None:
             if done < 0.1:
                 x, y, _ = driver.robot.pose
                 raise SimulatorError(
-                    f"{driver.world.name}: travel at ({x:.2f}, {y:.2f}): expected a free way ahead, got a wall; change the route"
+                    f"{driver.world.name}: travel at ({x:.2f}, {y:.2f}): expected a free way "
+                    "ahead, got a wall; change the route"
                 )
             return
         if done > LONGEST_TRAVEL:
             raise SimulatorError(
-                f"{driver.world.name}: travel: expected a distinctive place within {LONGEST_TRAVEL:.0f} m, got none"
+                f"{driver.world.name}: travel: expected a distinctive place within "
+                f"{LONGEST_TRAVEL:.0f} m, got none"
             )
         stride = STRIDE if to_go is None else min(STRIDE, max(0.5 * to_go, 0.01))
         driver.go(stride, _steer(seen, reach, stride))
@@ -125,16 +145,19 @@ def travel(driver: Driver) -> None:
 
 
 def _steer(seen: Sight, reach: float, stride: float) -> float:
-    """Radians to turn on the next stride, so that the robot comes to the line and then goes along it."""
+    """Radians to turn on the next stride, to reach the line and then follow it."""
     offset = seen.offset(reach)
     wanted = 0.0 if offset is None else -math.atan(1.5 * float(np.clip(offset, -0.5, 0.5)))
     return (wanted - seen.tilt) * min(1.0, abs(stride) / 0.12)
 
 
 def climb(driver: Driver, turned: bool = False) -> None:
-    """Hill-climb to the fixed point: along the way, across it, and in heading.
+    """Hill-climb to the fixed point: along the path, across it, and in heading.
 
-    turned  the action was a turn, after which the robot does not back off to come nearer to the line
+    Args:
+        driver: The robot.
+        turned: Whether the action was a turn; then the robot does not back off to correct its
+            distance from the line.
     """
     reach, tolerance = driver.world.reach, driver.tolerance
     for attempt in range(TRIES):
@@ -159,7 +182,7 @@ def climb(driver: Driver, turned: bool = False) -> None:
 
 
 def _come_again(driver: Driver) -> None:
-    """Back off a little, and approach the fixed point once more, along the line."""
+    """Back off a little, and approach the fixed point again along the line."""
     reach = driver.world.reach
     back = 0.0
     while back < 0.5 * reach:

@@ -1,6 +1,8 @@
-"""Driving along a way, off what stands there: as someone drives a robot who knows the building, and sees what the laser sees.
+"""Drives along a planned route and around unknown obstacles.
 
-The robot aims at a point that is AIM metres ahead on its way. Where its laser shows what is no wall and would be in its way, the way is planned anew, around it.
+The driver knows the building and sees what the laser sees. The robot aims at a point AIM metres
+ahead on its route. Where the laser shows an obstacle that is no known wall, the route is planned
+again, around it.
 """
 
 from __future__ import annotations
@@ -18,27 +20,36 @@ from simulator.freespace import CELL, Cells, FreeSpace
 from simulator.laser import BEARINGS
 
 Array = NDArray[np.float64]
-# Metres that the robot drives from image to image.
+# Metres between two images.
 STRIDE = 0.1
-# Metres along the way to where the robot aims; it aims CLOSE where something is not farther off than WIDE, so that it cuts no corner there.
+# Distance in metres along the route to the aim: CLOSE if something is nearer than WIDE, so that the
+# robot cuts no corner, otherwise AIM.
 AIM, CLOSE, WIDE = 0.5, 0.2, 0.6
-# Radians that the robot turns in a stride, and from which on it turns on the spot.
+# Largest turn in a stride, and the turn from which the robot turns on the spot, in radians.
 BEND, SHARP = math.radians(20), math.radians(50)
-# Metres within which obstacles are heeded, and how far off the known walls a point has to be to be one.
+# Metres within which obstacles matter, and distance from known walls at which a point is an
+# obstacle.
 WATCH, KNOWN = 3.0, 0.25
-# Where the robot has not come on along its way in so many motions, it is stuck.
+# The robot is stuck after this many motions without progress.
 PATIENCE = 100
 
 
 def follow(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
-    """Drive along a way, (n, 2) metres. Yields after each motion the number of the way's point that the robot has come to.
+    """Drive along a route.
 
-    space  what is known of the walls; obstacles that are seen are marked in it
-    Raises SimulatorError where an obstacle closes the way, or the robot hits a wall.
+    Args:
+        driver: The robot.
+        space: Known walls; obstacles that the laser sees are added.
+        way: (n, 2) route in metres.
+
+    Yields:
+        After each motion, the index of the point of the route that the robot has reached.
+
+    Raises:
+        SimulatorError: An obstacle closes the route, or the robot hits a wall.
     """
-    numbers = np.arange(
-        len(way)
-    )  # which point of the way that was given each point of the way stands for
+    # Index in the given route of each point of the current route, which changes around obstacles.
+    numbers = np.arange(len(way))
     watch = replace(driver.laser, reach=WATCH)
     at = waited = 0
     while at < len(way) - 1:
@@ -55,14 +66,14 @@ def follow(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
 
 
 def _come_to(way: Array, at: int, driver: Driver) -> int:
-    """The point of the way that is nearest to the robot, of those that come next; the last one where several are, so that a way that leads back is no trap."""
+    """The nearest upcoming waypoint. Ties go to the last one, so that doubling back works."""
     off = np.hypot(*(way[at : at + round(1.5 * AIM / CELL)] - np.array(driver.robot.pose[:2])).T)
     nearest = len(off) - 1 - int((off[::-1]).argmin())
     return len(way) - 1 if at + len(off) == len(way) and off[-1] < 2 * STRIDE else at + nearest
 
 
 def _stride(driver: Driver, way: Array, aim: float) -> None:
-    """Turn to the point of the way at which the robot aims, and drive on where it is about ahead."""
+    """Turn to the aim on the route, and drive if it is roughly ahead."""
     x, y, heading = driver.robot.pose
     goal = way[: 2 + round(aim / CELL)][-1]
     turn = math.remainder(math.atan2(goal[1] - y, goal[0] - x) - heading, math.tau)
@@ -78,7 +89,7 @@ def _stride(driver: Driver, way: Array, aim: float) -> None:
 def _around_obstacles(
     driver: Driver, space: FreeSpace, image: Array, way: Array, numbers: Cells, at: int
 ) -> tuple[Array, Cells]:
-    """The way, planned anew where the laser shows something new in it."""
+    """Plan the route again if the laser shows something new on it."""
     seen = _obstacles(driver, space, image)
     ahead = slice(at, at + round(WATCH / CELL))
     if (
@@ -90,6 +101,7 @@ def _around_obstacles(
         ).size
     ):
         return way, numbers
+    # Rejoin the route at the first free point behind the obstacle that can be reached.
     here = driver.robot.pose[:2]
     farther = way[at : at + round(2 * WATCH / CELL)]
     part = space.part(np.vstack([farther, [here]]))
@@ -104,7 +116,7 @@ def _around_obstacles(
 
 
 def _obstacles(driver: Driver, space: FreeSpace, image: Array) -> Array:
-    """The points where the laser shows something that is neither a known wall nor marked already, (n, 2) metres. They are marked in the space."""
+    """Find points, (n, 2) metres, that are neither known walls nor marked yet, and mark them."""
     x, y, heading = driver.robot.pose
     near = image < WATCH
     angles = heading + BEARINGS[near]
@@ -116,7 +128,7 @@ def _obstacles(driver: Driver, space: FreeSpace, image: Array) -> Array:
 
 
 def _apart(points: Array, others: Array) -> Array:
-    """For each point, (n, 2), how far the nearest one of others, (m, 2), is; (n,) metres."""
+    """Distance from each point, (n, 2), to the nearest of others, (m, 2); (n,) metres."""
     off: Array = np.hypot(*(points[:, None] - others).transpose(2, 0, 1)).min(1)
     return off
 
@@ -124,5 +136,6 @@ def _apart(points: Array, others: Array) -> Array:
 def _error(driver: Driver, expected: str, got: str) -> SimulatorError:
     x, y, _ = driver.robot.pose
     return SimulatorError(
-        f"{driver.world.name}: drive at ({x:.2f}, {y:.2f}): expected {expected}, got {got}; make room there"
+        f"{driver.world.name}: drive at ({x:.2f}, {y:.2f}): expected {expected}, got {got}; "
+        "make room there"
     )

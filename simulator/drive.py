@@ -1,6 +1,7 @@
-"""A drive as a robot logs it: scans taken all along, what the odometer said at each, and, for evaluation only, where the robot really was.
+"""A drive as a robot logs it: scans and odometry, and the true poses for evaluation.
 
-While the robot drives, a Recorder notes its pose after each motion. When the drive has ended, all scans are computed at once, and the odometer reads the way.
+While the robot drives, a Recorder records its pose after each motion. At the end, all scans are
+computed at once, and the odometer reads the trajectory.
 """
 
 from __future__ import annotations
@@ -21,27 +22,30 @@ from simulator.world import World
 from ssh_abduction.data.errors import brief, is_finite
 
 Array = NDArray[np.float64]
-# Metres and radians a second at which the robot drives and turns.
+# Speed of driving in metres a second, and of turning in radians a second.
 SPEED, SPIN = 0.5, 1.0
-# Metres after which a scan is taken, and at least.
+# Metres between scans by default, and at least.
 EVERY, CLOSEST = 0.25, 0.01
-# A motion is noted in parts, of which so many are as far as it is from scan to scan, so that scans are evenly spaced.
+# A motion is recorded in parts, this many from scan to scan, so that scans are evenly spaced.
 FINE = 5
 TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A drive that has ended.
+    """A completed drive.
 
-    ranges    (n, beams) metres; infinite where the laser saw nothing within its reach
-    odometry  (n, 3): x, y, heading by the odometer, which begins at (0, 0, 0); metres and radians
-    poses     (n, 3): the same in truth
-    times     (n,) seconds since the drive began
-    metres    how far the robot drove
-    odometer  the noise of the odometry
-    laser     the scanner
-    truth     what is known about places, for evaluation only; plain data
+    Attributes:
+        name: Name of the drive.
+        ranges: (n, beams) metres; infinite if the laser saw nothing within its reach.
+        odometry: (n, 3) x, y, heading by the odometer, which begins at (0, 0, 0); metres and
+            radians.
+        poses: (n, 3) true poses.
+        times: (n,) seconds since the beginning.
+        metres: Driven distance.
+        odometer: Noise of the odometry.
+        laser: The scanner.
+        truth: The truth about places as plain data, for evaluation only.
     """
 
     name: str
@@ -60,7 +64,13 @@ class Drive:
     def judged(
         self, places: Mapping[str, Sequence[float]], scans: Sequence[str | None], **more: object
     ) -> Drive:
-        """This drive with the truth that a map of it is judged by: where the places are, in metres, and at which of them each scan was taken."""
+        """Add the truth by which maps of this drive are judged.
+
+        Args:
+            places: (x, y) of each place in metres.
+            scans: Place of each scan; None between places.
+            more: Other fields of the truth.
+        """
         visits: list[dict[str, Any]] = []
         for number, place in enumerate(scans):
             if place is not None:
@@ -84,13 +94,14 @@ class Drive:
 
 @dataclass
 class Recorder:
-    """Notes the pose of a robot after each of its motions, and that a scan is due where it has moved far enough since the last one.
+    """Records the pose of a robot after each motion, and when a scan is due.
 
-    every   metres after which a scan is taken
-    turn    radians after which a scan is taken
-    poses   after each motion
-    scans   for each arrangement of the world in which the robot drove, the numbers of the poses at which scans are taken
-    metres  driven so far
+    Attributes:
+        every: Metres between scans.
+        turn: Radians between scans.
+        poses: Poses after each motion.
+        scans: For each arrangement of the world, indices of the poses with a scan.
+        metres: Distance driven so far.
     """
 
     every: float = EVERY
@@ -98,23 +109,27 @@ class Recorder:
     poses: list[Pose] = field(default_factory=list)
     scans: list[tuple[World, list[int]]] = field(default_factory=list)
     metres: float = 0.0
-    _seconds: list[float] = field(default_factory=list)  # for each pose
-    _way: float = 0.0  # since the last scan
+    _seconds: list[float] = field(default_factory=list)  # Of each pose.
+    _way: float = 0.0  # Metres since the last scan.
     _turned: float = 0.0
 
     def __post_init__(self) -> None:
         if not is_finite(self.every) or self.every < CLOSEST:
             raise SimulatorError(
-                f"every: expected metres, {CLOSEST} or more, got {brief(self.every)}; a scan each {EVERY} m is usual"
+                f"every: expected metres, {CLOSEST} or more, got {brief(self.every)}; a scan "
+                f"each {EVERY} m is usual"
             )
 
     @property
     def taken(self) -> int:
-        """How many scans have been taken."""
+        """Number of scans so far."""
         return sum(len(numbers) for _, numbers in self.scans)
 
     def note(self, world: World, pose: Pose) -> None:
-        """Note where the robot is after a motion, and in which arrangement of the world. In a long motion scans are taken on its way."""
+        """Record the pose after a motion in an arrangement of the world.
+
+        A long motion is cut into parts, so that scans are taken on its way.
+        """
         if not self.poses:
             self._add(world, pose, 0.0, 0.0)
             return
@@ -149,7 +164,16 @@ class Recorder:
             self._way = self._turned = 0.0
 
     def drive(self, name: str, laser: Laser, odometer: Odometer, seed: int) -> Drive:
-        """The drive that has been noted, with a scan at its end, too. The noise of scans and odometer has numbers of its own, so that it does not change where the robot goes."""
+        """Make the drive, with a scan also at its end.
+
+        Scans and odometer have noise of their own, which does not change where the robot goes.
+
+        Args:
+            name: Name of the drive.
+            laser: The scanner.
+            odometer: Noise of the odometry.
+            seed: Seed of both noises.
+        """
         if self.scans[-1][1][-1:] != [len(self.poses) - 1]:
             self.scans[-1][1].append(len(self.poses) - 1)
         sight, wheels = (np.random.default_rng([seed, k]) for k in (2, 3))

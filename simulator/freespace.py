@@ -1,7 +1,8 @@
-"""Ways through free space: on a grid of cells, from where a robot is to where it is to go, off the walls and off what its laser has shown.
+"""Plans routes through free space on a grid, away from walls and seen obstacles.
 
 >>> from simulator.freespace import FreeSpace
->>> room = FreeSpace.of(np.array([[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0.0]]), radius=0.2)
+>>> walls = np.array([[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0.0]])
+>>> room = FreeSpace.of(walls, radius=0.2)
 >>> way = room.way((0.5, 1.5), (3.5, 1.5))
 >>> [(round(float(x), 1), round(float(y), 1)) for x, y in way[[0, -1]]]
 [(0.5, 1.5), (3.5, 1.5)]
@@ -25,28 +26,29 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.intp]
 Point = tuple[float, float]
-# Metres, the side of a cell.
+# Side of a cell in metres.
 CELL = 0.1
-# Square metres that are planned on at most.
+# Largest area to plan on, in square metres.
 LARGEST = 200_000
-# Metres around start and goal, and around the part of the plane that is searched.
+# Metres around start and goal, and around the part that is searched.
 MARGIN = 2.0
-# Metres off a wall from which on more room is not better, and how many times as long a metre counts that leads along a wall.
+# More distance from walls than ROOM metres is not better. A metre along a wall costs NARROW metres.
 ROOM, NARROW = 1.0, 4.0
-# Cells around start and goal within which a way may be nearer to walls than elsewhere.
+# Cells around start and goal in which a route may be nearer to walls than elsewhere.
 LEEWAY = 2
-# Metres, the spread of the filter that rounds the corners of ways.
+# Width in metres of the Gaussian filter that rounds corners.
 SMOOTH = 0.3
 
 
 @dataclass
 class FreeSpace:
-    """The cells that walls go through, and those where obstacles were seen. Row 0 is at the bottom.
+    """A grid of cells with walls and seen obstacles. Row 0 is at the bottom.
 
-    corner    x and y of the lower left corner, metres
-    occupied  (rows, columns)
-    radius    of the robot, metres: the middle of the robot stays so far off, and a cell more
-    off       (rows, columns): metres to the nearest wall, obstacles not counted
+    Attributes:
+        corner: (x, y) of the lower left corner in metres.
+        occupied: (rows, columns) cells with walls or obstacles.
+        radius: Radius of the robot in metres. Its middle stays this far and one more cell away.
+        off: (rows, columns) metres to the nearest wall, without obstacles.
     """
 
     corner: Point
@@ -59,13 +61,14 @@ class FreeSpace:
 
     @classmethod
     def of(cls, segments: Array, radius: float) -> FreeSpace:
-        """The free space between walls, (n, 4) metres. Raises SimulatorError where it is too large for a grid."""
+        """Make the free space between walls, (n, 4) metres. Raises SimulatorError."""
         ends = segments.reshape(-1, 2)
         corner = ends.min(0) - MARGIN
         width, height = ends.max(0) + MARGIN - corner
         if width * height > LARGEST:
             raise SimulatorError(
-                f"walls: expected them on at most {LARGEST:,} square metres, on which ways can be planned, got {width:,.0f} x {height:,.0f} m; check the scale"
+                f"walls: expected them on at most {LARGEST:,} square metres, on which ways "
+                f"can be planned, got {width:,.0f} x {height:,.0f} m; check the scale"
             )
         columns, rows = math.ceil(width / CELL), math.ceil(height / CELL)
         space = cls((float(corner[0]), float(corner[1])), np.zeros((rows, columns), bool), radius)
@@ -73,11 +76,11 @@ class FreeSpace:
 
     @property
     def least(self) -> float:
-        """Metres that the middle of the robot stays off what is occupied."""
+        """Metres that the middle of the robot keeps from occupied cells."""
         return self.radius + CELL
 
     def drawn(self, segments: Array) -> Mask:
-        """The cells that segments go through."""
+        """Mask of the cells that segments cross."""
         cells = np.zeros_like(self.occupied)
         for x1, y1, x2, y2 in segments:
             count = 2 + math.ceil(math.hypot(x2 - x1, y2 - y1) / (CELL / 2))
@@ -88,19 +91,19 @@ class FreeSpace:
         return cells
 
     def cells(self, points: Array) -> tuple[Cells, Cells]:
-        """The rows and the columns of the cells in which points, (n, 2), are; of points that are outside the nearest ones."""
+        """Rows and columns of the cells of points, (n, 2), or of the nearest cells."""
         columns, rows = np.floor((points - np.array(self.corner)) / CELL).astype(np.intp).T
         return rows.clip(0, self.occupied.shape[0] - 1), columns.clip(0, self.occupied.shape[1] - 1)
 
     def middles(self, points: Array) -> Array:
-        """The middles of the cells in which points are, (n, 2)."""
+        """Centres of the cells of points, (n, 2)."""
         found: Array = (np.column_stack(self.cells(points)[::-1]) + 0.5) * CELL + np.array(
             self.corner
         )
         return found
 
     def part(self, points: Array, closed: Mask | None = None) -> Part:
-        """The part of the space around points, (n, 2), in which some cells are closed besides the occupied ones."""
+        """The part of the grid around points, (n, 2), with additional closed cells."""
         rows, columns = self.cells(np.vstack([points.min(0) - MARGIN, points.max(0) + MARGIN]))
         window = slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1)
         occupied = (
@@ -110,22 +113,29 @@ class FreeSpace:
         return Part(corner, _clearance(occupied), self.least)
 
     def way(self, start: Point, goal: Point, closed: Mask | None = None) -> Array | None:
-        """The best way from one point to another that does not leave the part around both; see Part.way."""
+        """The best route between two points within the part around both; see Part.way."""
         return self.part(np.array([start, goal]), closed).way(start, goal)
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of free space: for each cell, (rows, columns), how far it is off what is occupied, and how far the robot has to be off, in metres."""
+    """A part of free space.
+
+    Attributes:
+        corner: (x, y) of the lower left corner in metres.
+        clearance: (rows, columns) metres to the nearest occupied cell.
+        least: Metres that the robot has to keep.
+    """
 
     corner: Point
     clearance: Array = field(repr=False)
     least: float
 
     def way(self, start: Point, goal: Point) -> Array | None:
-        """The best way from one point to another, (n, 2) metres, a cell's side or its diagonal from point to point; None where there is none.
+        """Find the best route between two points: short, and ROOM metres from walls if possible.
 
-        It is short, and keeps ROOM off the walls where there is room.
+        Returns:
+            (n, 2) metres, one point a cell; None if there is no route.
         """
         (row, other_row), (column, other_column) = self._cells(np.array([start, goal]))
         cells = _shortest(
@@ -135,29 +145,30 @@ class Part:
             return None
         way = self._middles(cells)
         way[0], way[-1] = start, goal
+        # Use the smoothed point only where it is far enough from obstacles.
         smooth = gaussian_filter1d(way, SMOOTH / CELL, axis=0, mode="nearest")
         smooth[0], smooth[-1] = start, goal
         safe = self.clearance[self._cells(smooth)] >= self.least
         return np.where(safe[:, None], smooth, way)
 
     def off(self, points: Array) -> Array:
-        """How far points, (n, 2), are off what is occupied, in metres."""
+        """Distance of points, (n, 2), from occupied cells, in metres."""
         found: Array = self.clearance[self._cells(points)]
         return found
 
     @cached_property
     def regions(self) -> Cells:
-        """For each cell the number of the region that the robot can drive in without leaving it; 0 where it cannot be."""
+        """Number of the connected region of each cell; 0 if the robot cannot be there."""
         numbered: Cells = label(self.clearance >= self.least, structure=np.ones((3, 3)))[0]
         return numbered
 
     def region(self, points: Array) -> Cells:
-        """The regions in which points, (n, 2), are."""
+        """Numbers of the regions of points, (n, 2)."""
         found: Cells = self.regions[self._cells(points)]
         return found
 
     def nearest(self, region: int, goal: Point, room: float) -> Point:
-        """Of all points of a region the nearest one to a goal that is `room` metres off the walls, or as far as any."""
+        """The point of a region nearest to a goal, `room` metres from walls if possible."""
         cells = np.argwhere(self.regions == region)
         clearance = self.clearance[tuple(cells.T)]
         cells = cells[clearance >= min(room, float(clearance.max()))]
@@ -177,7 +188,7 @@ class Part:
 
 
 def _clearance(occupied: Mask) -> Array:
-    """For each cell the metres to the nearest occupied one; what is outside is occupied."""
+    """Metres from each cell to the nearest occupied one. Outside counts as occupied."""
     clearance: Array = (
         distance_transform_edt(np.pad(~occupied, 1, constant_values=False))[1:-1, 1:-1] * CELL
     )
@@ -187,9 +198,10 @@ def _clearance(occupied: Mask) -> Array:
 def _shortest(
     clearance: Array, least: float, start: tuple[int, int], goal: tuple[int, int]
 ) -> Cells | None:
-    """The cells of the cheapest way, (n, 2) rows and columns, through cells that are at least so far off the walls.
+    """Cells of the cheapest route, (n, 2) rows and columns, at least this far from walls.
 
-    Around start and goal, where a robot may have come nearer to something than it would plan to, all cells are free that are not beside an occupied one.
+    Near start and goal, where the robot may be closer to something than planned, all cells are free
+    that do not touch an occupied one.
     """
     rows, columns = clearance.shape
     free = clearance >= least
@@ -205,6 +217,7 @@ def _shortest(
     ends: list[Cells] = []
     others: list[Cells] = []
     costs: list[Array] = []
+    # Connect each cell with its neighbours to the right, above and on both diagonals.
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
         here = slice(0, rows - down), slice(max(-right, 0), columns - max(right, 0))
         there = slice(down, rows), slice(max(right, 0), columns + min(right, 0))

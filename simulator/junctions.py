@@ -1,8 +1,10 @@
-"""Control laws for streets that meet at any angles. Each of them sees laser images and odometry, and none knows the true pose.
+"""Control laws for streets that meet at any angles, by laser images and odometry.
 
-The robot follows the midline of a street until a wall is ahead or a side is open. There it looks around, and climbs to the fixed point of the place, where the midlines of its streets meet. From the
-panorama there it has a model of the place, in which its gateways are the streets that lead away. A turn goes to the next gateway at its side, and a turn around to the opposite heading; the robot
-knows how it is turned by comparing what it sees with the panorama.
+The robot follows the midline of a street until a wall is ahead or a side is open. There it looks
+around and climbs to the fixed point of the place, where the midlines of its streets meet. The
+panorama there is its model of the place, whose gateways are the streets that lead away. A turn goes
+to the next gateway at its side, and a turn around to the opposite heading. The robot finds its
+heading by comparing images with the panorama. It does not know its true pose.
 """
 
 from __future__ import annotations
@@ -30,9 +32,10 @@ from simulator.surroundings import (
 )
 from ssh_abduction.data.trace import Action
 
-# Radians that the robot turns between two images.
+# Radians between two images of a turn.
 TURN = math.radians(15)
-# In reaches: how far the robot drives before it heeds what may be a place, at which distance a wall ahead stops it, and how far off a wall at its side is where the side is open.
+# In multiples of the reach: distance driven before a place is expected, distance at which a wall
+# ahead stops the robot, and distance of a side wall at which the side is open.
 LEAVE, AHEAD, OPEN = 2.2, 1.6, 1.35
 SIDES = {"left": 1, "right": -1}
 ACTIONS = {
@@ -47,7 +50,13 @@ ACTIONS = {
 
 @dataclass
 class Here:
-    """The place where the robot is: its panorama, what that shows, and how the robot is turned in it, in radians."""
+    """The place where the robot is.
+
+    Attributes:
+        ranges: (360,) panorama in metres.
+        place: What the panorama shows.
+        heading: Heading of the robot in the panorama, in radians.
+    """
 
     ranges: Array
     place: Place
@@ -55,7 +64,14 @@ class Here:
 
 
 class Pilot:
-    """Does the actions of a route with the control laws for any angles."""
+    """Does the actions of a route with the control laws for any angles.
+
+    Args:
+        driver: The robot.
+
+    Attributes:
+        here: The place where the robot is, once it has begun.
+    """
 
     here: Here
 
@@ -64,7 +80,7 @@ class Pilot:
         self.reach = driver.world.reach
 
     def begin(self) -> None:
-        """Climb to the dstate that is nearest to where the robot stands. Raises SimulatorError where that is no place."""
+        """Climb to the dstate near the start. Raises SimulatorError if there is no place."""
         if not self._climb():
             raise self._error(
                 "start",
@@ -74,7 +90,7 @@ class Pilot:
             )
 
     def act(self, action: str) -> None:
-        """Do an action of a route. Raises SimulatorError where it cannot be done."""
+        """Do an action of a route. Raises SimulatorError if it cannot be done."""
         if action == "travel":
             self._travel()
         elif action == "around":
@@ -91,7 +107,7 @@ class Pilot:
             self._face(self.here.heading + turn)
 
     def star(self) -> tuple[float, ...]:
-        """The bearings of the gateways, in degrees clockwise from straight ahead."""
+        """Bearings of the gateways, in degrees clockwise from straight ahead."""
         bearings = (
             round(math.degrees(self.here.heading - street.bearing) % 360, 1) % 360
             for street in self.here.place.streets
@@ -99,25 +115,35 @@ class Pilot:
         return tuple(sorted(bearings))
 
     def _travel(self) -> None:
+        """Follow the street to the next place, and climb to its dstate."""
         if not self.here.place.faces(self.here.heading):
             raise self._error("travel", "a free way ahead", "a wall", "change the route")
         began = self.driver.robot.driven
         heed = began + LEAVE * self.reach
         while True:
             width = self._follow(began, heed)
-            for way in (
-                (-width / 2, -width / 4, width / 2) if width else (0.0,)
-            ):  # a street that leaves at an acute angle is not seen from everywhere
+            # A street at an acute angle is not visible from everywhere, so look from several
+            # points.
+            for way in (-width / 2, -width / 4, width / 2) if width else (0.0,):
                 self._straight(way)
                 if self._climb():
                     return
             heed = self.driver.robot.driven + self.reach
 
     def _follow(self, began: float, heed: float) -> float:
-        """Follow the midline until a wall is ahead, or to the end of where a side is open; not before the robot has driven so far. For how many metres a side was open."""
+        """Follow the midline until a wall is ahead, or to the end of an open side.
+
+        Args:
+            began: Distance driven at the beginning of the travel.
+            heed: Distance driven before which walls and open sides are ignored.
+
+        Returns:
+            Metres for which a side was open; 0 for a wall ahead.
+        """
         robot, reach = self.driver.robot, self.reach
-        course = robot.odometry[2]  # of the street, by odometry
-        closed, opened = False, None  # whether there were walls at both sides, and where that ended
+        course = robot.odometry[2]  # Direction of the street by odometry.
+        # Whether there were walls on both sides, and where they ended.
+        closed, opened = False, None
         while robot.driven - began <= LONGEST_TRAVEL:
             image = self.driver.look()
             points, beams = points_of(image, BEARINGS, self.driver.laser.reach)
@@ -148,13 +174,13 @@ class Pilot:
         )
 
     def _straight(self, way: float) -> None:
-        """Drive straight ahead, or back."""
+        """Drive straight ahead, or back if negative."""
         strides = math.ceil(abs(way) / STRIDE)
         for _ in range(strides):
             self.driver.go(way / strides)
 
     def _climb(self) -> bool:
-        """Climb to the fixed point of the place here, and face the way that the robot came, straight on. False if this is no place."""
+        """Climb to the fixed point of the place, keeping the heading. False if this is no place."""
         came = self.driver.robot.odometry[2]
         for _ in range(TRIES):
             straight_on = came - self.driver.robot.odometry[2]
@@ -174,13 +200,13 @@ class Pilot:
         return place.fixed is not None
 
     def _go(self, goal: complex) -> None:
-        """Go to a point that is given in the panorama, at most `reach` metres, forward or back."""
+        """Go to a point of the panorama, forward or back, but at most `reach` metres."""
         forward = cmath.phase(goal) if abs(cmath.phase(goal)) <= math.pi / 2 else cmath.phase(-goal)
         self._face(forward)
         self._straight(min(abs(goal), self.reach) * (1 if forward == cmath.phase(goal) else -1))
 
     def _look_around(self) -> Here:
-        """Turn once all around. The panorama is in the frame of the robot at the end."""
+        """Turn once around. The panorama is in the frame of the robot at the end."""
         driver = self.driver
         panorama = Panorama(driver.look())
         for _ in range(round(math.tau / TURN)):
@@ -190,7 +216,7 @@ class Pilot:
         return Here(ranges, Place.of(ranges, self.reach, driver.laser.reach), panorama.headings[-1])
 
     def _face(self, heading: float) -> None:
-        """Turn on the spot to a heading, which is one in the panorama."""
+        """Turn on the spot to a heading in the panorama."""
         for _ in range(TRIES):
             turn = math.remainder(heading - self.here.heading, math.tau)
             if abs(turn) <= self.driver.tolerance.straight:
@@ -202,7 +228,7 @@ class Pilot:
             )
 
     def _turn(self, turn: float) -> float:
-        """Turn once, and say how far by odometry."""
+        """Turn once; return the angle by odometry."""
         before = self.driver.robot.odometry[2]
         self.driver.go(0.0, turn)
         return math.remainder(self.driver.robot.odometry[2] - before, math.tau)
@@ -210,12 +236,13 @@ class Pilot:
     def _error(self, what: str, expected: str, got: str, mend: str) -> SimulatorError:
         x, y, _ = self.driver.robot.pose
         return SimulatorError(
-            f"{self.driver.world.name}: {what} at ({x:.2f}, {y:.2f}): expected {expected}, got {got}; {mend}"
+            f"{self.driver.world.name}: {what} at ({x:.2f}, {y:.2f}): expected {expected}, "
+            f"got {got}; {mend}"
         )
 
 
 def _is_open(image: Array, side: int, reach: float) -> bool:
-    """Whether the wall at a side (1 left, -1 right) has ended: between 75 and 90 degrees what is there is farther off than a wall of the street."""
+    """Whether the wall at a side (1 left, -1 right) has ended, between 75 and 90 degrees."""
     beams = (
         image[-15:] * np.sin(BEARINGS[-15:]) if side > 0 else image[:15] * np.sin(-BEARINGS[:15])
     )
@@ -223,5 +250,5 @@ def _is_open(image: Array, side: int, reach: float) -> bool:
 
 
 def _steer(street: Street) -> float:
-    """Radians to turn on the next stride, so that the robot comes to the midline and then goes along it."""
+    """Radians to turn on the next stride, to reach the midline and then follow it."""
     return street.bearing - math.atan(1.5 * float(np.clip(street.offset, -0.5, 0.5)))

@@ -1,4 +1,4 @@
-"""A laser range finder: 180 ranges at one degree over the half circle ahead, the first at the right."""
+"""A laser range finder: 180 beams, one a degree over the half circle ahead, from the right."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ Array = NDArray[np.float64]
 BEAMS = 180
 BEARINGS: Array = np.radians(
     np.arange(BEAMS) - 89.5
-)  # radians, counter-clockwise from straight ahead
-# At most this many intersections of beams and walls are computed at once, unless a single image takes more: an array of them has 32 MB.
+)  # Radians, counterclockwise from straight ahead.
+# Intersections of beams and walls to compute at once, except for a single image: 32 MB.
 _BLOCK = 4_000_000
 
 
 @dataclass(frozen=True)
 class Laser:
-    """A laser range finder. The defaults are those of the usual scanner of the time: 5 mm of noise, 8 m of range.
+    """A laser range finder with the noise and range of a common scanner of the paper's time.
 
-    noise      standard deviation of a range, in metres
-    reach      the largest range, in metres; what is farther reads as this
-    dropouts   probability that a beam is lost, which reads as the largest range
+    Attributes:
+        noise: Standard deviation of a range in metres.
+        reach: Largest range in metres, which also stands for anything farther.
+        dropouts: Probability that a beam is lost and reads as the largest range.
     """
 
     noise: float = 0.005
@@ -32,7 +33,10 @@ class Laser:
     dropouts: float = 0.001
 
     def exact(self, world: World, poses: Array) -> Array:
-        """Ranges without noise, (m, 180) metres, from m poses (x, y, heading). One call for many poses is faster than many calls."""
+        """Ranges without noise from m poses (x, y, heading), (m, 180) metres.
+
+        One call for many poses is faster than many calls.
+        """
         poses = np.atleast_2d(poses)
         rows = max(1, _BLOCK // (BEAMS * len(world.segments)))
         return np.vstack(
@@ -40,14 +44,14 @@ class Laser:
         )
 
     def scan(self, world: World, poses: Array, rng: np.random.Generator) -> Array:
-        """Ranges as the scanner reports them, (m, 180) metres."""
+        """Ranges with noise, (m, 180) metres."""
         ranges = self.exact(world, poses)
         ranges = ranges + rng.normal(0, self.noise, ranges.shape) * (ranges < self.reach)
         ranges[rng.random(ranges.shape) < self.dropouts] = self.reach
         return np.clip(ranges, 0.01, self.reach)
 
     def _cast(self, segments: Array, poses: Array) -> Array:
-        """The distance from each pose to the nearest wall along each beam, (m, 180) metres."""
+        """Distance from each pose to the nearest wall along each beam, (m, 180) metres."""
         near = _near(segments, poses, self.reach)
         nearest: Array = np.minimum(
             meetings(near, poses, BEARINGS).min(axis=2, initial=np.inf), self.reach
@@ -56,7 +60,7 @@ class Laser:
 
 
 def _near(segments: Array, poses: Array, reach: float) -> Array:
-    """The walls that a laser may see from poses: those whose boxes are at most `reach` off the box of the poses."""
+    """The walls whose boxes are within `reach` of the box of the poses."""
     low, high = poses[:, :2].min(0) - reach, poses[:, :2].max(0) + reach
     ends, others = segments[:, :2], segments[:, 2:]
     near: Array = segments[
@@ -66,13 +70,23 @@ def _near(segments: Array, poses: Array, reach: float) -> Array:
 
 
 def meetings(segments: Array, poses: Array, bearings: Array) -> Array:
-    """The distance from each of m poses, along each of b bearings, to each of w walls, (m, b, w) metres; infinity where the ray does not meet the wall."""
+    """Distances from m poses along b bearings to w walls; infinite where a ray misses the wall.
+
+    Args:
+        segments: (w, 4) walls in metres.
+        poses: (m, 3) x, y, heading.
+        bearings: (b,) radians.
+
+    Returns:
+        (m, b, w) metres.
+    """
     angles = poses[:, 2, None] + bearings
     dx, dy = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]
     ax = segments[:, 0] - poses[:, 0, None]
     ay = segments[:, 1] - poses[:, 1, None]
     ex, ey = segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]
-    # The ray r (dx, dy) meets the wall a + s e, 0 <= s <= 1, where r (dx, dy) = a + s e. Cross products with e and with (dx, dy) yield r and s.
+    # The ray r (dx, dy) meets the wall a + s e, 0 <= s <= 1, where both are equal. Cross products
+    # with e and with (dx, dy) give r and s.
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1.0 / (dx * ey - dy * ex)
         r = (ax * ey - ay * ex)[:, None, :] * inverse

@@ -1,7 +1,8 @@
-"""Reads occupancy maps as ROS stores them: a YAML file that names an image. The borders of its occupied cells become walls.
+"""Reads occupancy maps of ROS, a YAML file and an image, and turns them into walls.
 
-The rules are those of map_server and nav2_map_server. An image is turned into cells that are occupied (100), free (0), unknown (-1), or in between.
-Walls are the borders of cells that are 100: a costmap and a particle filter take the others for no obstacle.
+The rules are those of map_server and nav2_map_server. Each pixel becomes a cell: occupied (100),
+free (0), unknown (-1), or in between. Walls are the borders of cells of 100, since costmaps and
+particle filters do not treat other cells as obstacles.
 """
 
 from __future__ import annotations
@@ -27,20 +28,22 @@ if TYPE_CHECKING:
 Mode: TypeAlias = Literal["trinary", "scale", "raw"]
 Cells: TypeAlias = NDArray[np.int8]
 
-# The largest coordinate, in metres or degrees: what is farther away is a mistake, and rounding would blur the strides of the robot there.
+# Largest coordinate in metres or degrees. A larger one is a mistake, and rounding would blur the
+# motions of the robot.
 FARTHEST = 1e6
-# Bytes that a YAML file may have: it holds a dozen fields.
+# Largest size of a YAML file in bytes; it has a dozen fields.
 LARGEST_TEXT = 2**20
-# Bytes that an image file may have, and its pixels: as floating-point numbers they take 512 MiB.
+# Largest size of an image file in bytes, and number of pixels, which take 512 MiB as floating-point
+# numbers.
 LARGEST_IMAGE, MOST_PIXELS = 128 * 2**20, 2**26
-# The kinds of image that are read, as Pillow calls them: PPM is PGM, too.
+# Kinds of images in the words of Pillow, where PPM includes PGM.
 IMAGES = ("PPM", "PNG", "BMP")
 MODES: tuple[Mode, ...] = ("trinary", "scale", "raw")
 FIELDS = {"image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode"}
-# The thresholds of a map in mode trinary that does not name them.
+# Default thresholds of mode trinary.
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
-# How YAML 1.1 writes truth values, in small letters, and the whole numbers that map_server wants.
+# Truth values of YAML 1.1 in lower case, and the whole numbers of map_server.
 TRUTHS = {
     **dict.fromkeys(("1", "true", "yes", "on", "y"), True),
     **dict.fromkeys(("0", "false", "no", "off", "n"), False),
@@ -52,13 +55,14 @@ class MapFile:
     """The fields of the YAML file of an occupancy map.
 
     Attributes:
-        image: The path of the image.
+        image: Path of the image.
         resolution: Metres a pixel.
-        origin: x and y of the lower left corner of the image in metres, and the counterclockwise turn about it in radians.
-        negate: Whether white is occupied, and not black.
-        occupied_thresh: Above this a pixel is occupied, from 0 (free) to 1.
-        free_thresh: Below this a pixel is free.
-        mode: How pixels become cells.
+        origin: (x, y) of the lower left corner of the image in metres, and its counterclockwise
+            rotation in radians.
+        negate: Whether white is occupied instead of black.
+        occupied_thresh: A pixel above this is occupied, from 0 (free) to 1.
+        free_thresh: A pixel below this is free.
+        mode: Rule that turns pixels into cells.
     """
 
     image: Path
@@ -80,24 +84,28 @@ def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
         The name of the map, and its walls as segments, (n, 4) in metres.
 
     Raises:
-        SimulatorError: The map cannot be read, or has no walls. The text names the file and the field.
+        SimulatorError: The map cannot be read, or has no walls. The text names the file and the
+            field.
     """
     fields = read_map_file(path)
     cells = _cells(fields, path)
     if fields.resolution * max(cells.shape) > FARTHEST:
         raise SimulatorError(
-            f"{named(path)}: resolution: expected a map of at most {FARTHEST:,.0f} m, got {fields.resolution} m a pixel; mend it"
+            f"{named(path)}: resolution: expected a map of at most {FARTHEST:,.0f} m, got "
+            f"{fields.resolution} m a pixel; mend it"
         )
     occupied = cells == OCCUPIED
     between = int(((cells > FREE) & ~occupied).sum())
     if not occupied.any():
         raise SimulatorError(
-            f"{named(path)}: expected walls, got a map without occupied cells ({between:,} of {cells.size:,} are in between, 1 to 99); "
+            f"{named(path)}: expected walls, got a map without occupied cells ({between:,} of "
+            f"{cells.size:,} are in between, 1 to 99); "
             f"check occupied_thresh, negate and mode"
         )
     if between:
         warnings.warn(
-            f"{named(path)}: {between:,} of {cells.size:,} cells are between free and occupied (1 to 99): they are no walls, "
+            f"{named(path)}: {between:,} of {cells.size:,} cells are between free and occupied (1 "
+            "to 99): they are no walls, "
             f"as only cells of 100 are; in mode trinary occupied_thresh decides",
             SimulatorWarning,
             stacklevel=4,
@@ -106,27 +114,29 @@ def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
 
 
 def read_map_file(path: Path) -> MapFile:
-    """Read the YAML file of an occupancy map, but not its image.
+    """Read the YAML file of an occupancy map without its image.
 
     Raises:
-        SimulatorError: The file is not readable, no YAML, or a field is missing or has no valid value.
+        SimulatorError: The file is unreadable or no YAML, or a field is missing or invalid.
     """
     try:
         fields = _fields(read_at_most(path, LARGEST_TEXT))
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise SimulatorError(
-            f"{named(path)}: expected the YAML file of an occupancy map, got none: {reason}; check the path"
+            f"{named(path)}: expected the YAML file of an occupancy map, got none: {reason}; "
+            "check the path"
         ) from None
     return _Reader(fields, path).map_file()
 
 
 def _fields(data: bytes) -> dict[str, str | list[str]]:
-    """The fields of a YAML file: each a text, or a list of texts. Raises ValueError that says what was got.
+    """The fields of a YAML file, each a text or a list of texts. Raises ValueError.
 
-    Scalars stay texts, as map_server's own parser has them: PyYAML would take 5e-2 for a text, and 1:30 for a number.
+    Scalars stay texts, as in the parser of map_server. PyYAML would read 5e-2 as a text and 1:30 as
+    a number.
     """
-    import yaml  # which takes a while to load
+    import yaml  # Imported here because it loads slowly.
 
     try:
         root = yaml.compose(data, Loader=yaml.SafeLoader)
@@ -158,15 +168,22 @@ def _fields(data: bytes) -> dict[str, str | list[str]]:
 
 
 class _Reader:
-    """Checks the fields of a map file, and says which one is wrong."""
+    """Checks the fields of a map file, and names the wrong one.
+
+    Args:
+        fields: Fields by name.
+        path: The file, for errors.
+    """
 
     def __init__(self, fields: Mapping[str, str | list[str]], path: Path) -> None:
         self.fields, self.path = fields, path
 
     def map_file(self) -> MapFile:
+        """Check all fields."""
         if strange := sorted(set(self.fields) - FIELDS):
             warnings.warn(
-                f"{named(self.path)}: expected the fields {', '.join(sorted(FIELDS))}, got others, which are not read: "
+                f"{named(self.path)}: expected the fields {', '.join(sorted(FIELDS))}, got others, "
+                "which are not read: "
                 f"{brief(', '.join(strange))}; check their spelling",
                 SimulatorWarning,
                 stacklevel=5,
@@ -178,7 +195,7 @@ class _Reader:
                 "negate",
                 "0 in mode raw, where map_server and nav2_map_server disagree on what 1 means",
             )
-        # Mode scale is a scale between both thresholds, so that a guess would change each cell.
+        # Mode scale interpolates between the thresholds, so a default would change every cell.
         occupied = self._share("occupied_thresh", None if mode == "scale" else OCCUPIED_THRESH)
         free = self._share("free_thresh", None if mode == "scale" else FREE_THRESH)
         if mode == "scale" and free >= occupied:
@@ -259,11 +276,15 @@ class _Reader:
 
 
 def _cells(fields: MapFile, path: Path) -> Cells:
-    """The cells of a map, (rows, columns), the top row first: 100 occupied, 0 free, -1 unknown, or in between.
+    """The cells of a map, (rows, columns) with the top row first.
 
-    Raises SimulatorError that names the YAML file and the image.
+    Returns:
+        100 occupied, 0 free, -1 unknown, or in between.
+
+    Raises:
+        SimulatorError: The image cannot be read. The text names the YAML file and the image.
     """
-    from PIL import Image, UnidentifiedImageError  # which takes a while to load
+    from PIL import Image, UnidentifiedImageError  # Imported here because it loads slowly.
 
     where = f"{named(path)}: image: {named(fields.image)}"
     kinds = "a PGM, PNG or BMP image"
@@ -288,12 +309,13 @@ def _cells(fields: MapFile, path: Path) -> Cells:
         raise SimulatorError(
             f"{where}: expected {kinds}: {error.strerror or error}; check the path and the file"
         ) from None
+    # Damaged images and impossible paths raise these.
     except (
         ValueError,
         SyntaxError,
         IndexError,
         OverflowError,
-    ) as error:  # of damaged images, and of paths that can be none
+    ) as error:
         raise SimulatorError(
             f"{where}: expected {kinds}: {error}; the file is damaged, or is none"
         ) from None
@@ -320,15 +342,16 @@ def _cells(fields: MapFile, path: Path) -> Cells:
 def _shades(
     image: Image.Image, with_alpha: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | bool]:
-    """The brightness of the pixels of an image, from 0 (black) to 1, and which of them are opaque.
+    """Brightness of the pixels of an image, from 0 (black) to 1, and which of them are opaque.
 
     Args:
-        image: In grey, colours or a palette.
-        with_alpha: Whether the opacity of a pixel counts as a fourth colour, as it does in mode trinary. Then all pixels are opaque.
+        image: An image in grey, colours or a palette.
+        with_alpha: Whether opacity counts as a fourth colour, as in mode trinary. Then all pixels
+            are opaque.
     """
     if image.mode == "F":
         raise ValueError("pixels that are floating-point numbers, for which map_server has no rule")
-    if image.mode.startswith("I"):  # grey, 16 bits a pixel
+    if image.mode.startswith("I"):  # Grey, 16 bits a pixel.
         return np.asarray(image, dtype=np.float64) / 65535, True
     has_alpha = image.has_transparency_data
     table = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
@@ -340,8 +363,12 @@ def _shades(
 def _edges(
     occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float, float]
 ) -> NDArray[np.float64]:
-    """The borders between occupied and other cells, joined into long segments, (n, 4) in metres. Row 0 of the cells is at the bottom."""
+    """The borders between occupied and other cells, as long segments, (n, 4) in metres.
+
+    Row 0 of the cells is at the bottom.
+    """
     found: list[tuple[float, float, float, float]] = []
+    # Find borders between rows, then between columns by transposing.
     for flipped in (False, True):
         cells = occupied.T if flipped else occupied
         padded = np.pad(cells, ((1, 1), (0, 0)))

@@ -1,7 +1,8 @@
-"""A camera that sees all around: panoramas of a world whose walls are painted, in the light of an hour of the day.
+"""A panoramic camera in a world with painted walls, in the light of any hour of the day.
 
-A panorama is drawn as a laser scan is, by a ray for each column; how high the wall stands in the column follows from its distance. The picture is on a cylinder around the robot: columns are
-bearings, rows are slopes.
+A panorama is computed like a laser scan, with a ray for each column. The height of the wall in the
+column follows from its distance. The image is a cylinder around the robot: columns are bearings,
+rows are slopes.
 
 >>> from simulator.world import World
 >>> world = World.named("notched-rectangle")
@@ -27,27 +28,35 @@ from ssh_abduction.data.checks import a_flag, a_list, a_number, a_whole_number, 
 from ssh_abduction.data.errors import brief, is_finite, is_whole
 
 Array = NDArray[np.float64]
-# Metres above the floor: the camera, and the ceiling.
+# Heights of the camera and of the ceiling, in metres.
 EYE, CEILING = 1.2, 2.5
-# The steepest slope that is seen, up and down: 45 degrees.
+# Steepest visible slope, up and down: 45 degrees.
 STEEPEST = 1.0
-# Each pixel is the mean of so many points across and down.
+# Each pixel is the mean of this many points across and down.
 ACROSS, DOWN = 3, 2
 FLOOR, WHITE = np.array([0.30, 0.27, 0.24]), np.array([0.62, 0.62, 0.60])
-# How much light there is without the sun, as a share of that of noon, and its colour (red, green, blue); the colours of the sun at noon and where it rises.
+# Share of artificial light relative to noon, and its colour (red, green, blue).
 LAMPS, LAMPLIGHT = 0.3, np.array([1.15, 1.0, 0.7])
+# Colours of the sun at noon, and at sunrise.
 DAYLIGHT, SUNRISE = np.array([0.95, 1.0, 1.1]), np.array([1.3, 0.95, 0.6])
-# By what share a wall that faces the sun is brighter, and one that faces away is darker, at noon.
+# Share by which a wall that faces the sun at noon is brighter, and one that faces away is darker.
 SIDEWAYS = 0.35
-# With a camera that does not adapt, a wall of albedo 1 in the light of noon has this value; the mean to which a camera adapts is that of a grey wall at noon.
+# Value of a wall of albedo 1 at noon without adaptation, and the mean to which a camera adapts,
+# which is that of a grey wall at noon.
 WHITE_VALUE, GREY_VALUE = 330.0, 120.0
-# Waves that make up the pattern of a texture.
+# Number of waves in the pattern of a texture.
 WAVES = 6
 
 
 @dataclass(frozen=True)
 class Light:
-    """The light of an hour: its brightness and colour, (red, green, blue), and the direction in the world, in radians, from which the sun comes, with its share."""
+    """The light of an hour.
+
+    Attributes:
+        colour: Brightness as (red, green, blue).
+        azimuth: Direction of the sun in the world, in radians.
+        share: Share by which the sun changes the brightness of a wall.
+    """
 
     colour: Array = field(repr=False)
     azimuth: float = -math.pi / 2
@@ -55,7 +64,10 @@ class Light:
 
     @classmethod
     def at(cls, hour: float) -> Self:
-        """The light at an hour, 0 to 24: the sun rises in the east (+x) at 6, is in the south at 12, and sets in the west at 18. Lamps are always on."""
+        """The light at an hour, 0 to 24. Lamps are always on.
+
+        The sun rises in the east (+x) at 6, is in the south at 12, and sets in the west at 18.
+        """
         height = max(0.0, math.sin(math.pi * (hour - 6) / 12))
         sun = height * (SUNRISE + (DAYLIGHT - SUNRISE) * height)
         return cls(
@@ -63,16 +75,21 @@ class Light:
         )
 
     def on(self, normals: Array) -> Array:
-        """How bright walls are that face these directions, in radians, by how bright one is that faces neither to the sun nor away from it."""
+        """Brightness of walls that face these directions, in radians; 1 sideways to the sun."""
         return 1 + self.share * np.cos(normals - self.azimuth)
 
 
 @dataclass(frozen=True)
 class Paint:
-    """How walls are painted. Each texture is drawn at random: a colour, stripes, a skirting board, and a pattern of waves.
+    """Paint of the walls.
 
-    seed      of all textures
-    repeated  whether parallel walls have one texture, so that places look alike; else each line of walls has its own. Clutter has one texture for each shape
+    Each texture is random: a colour, stripes, a skirting board, and a pattern of waves. Clutter has
+    one texture for each shape.
+
+    Attributes:
+        seed: Seed of all textures.
+        repeated: Whether parallel walls share a texture, so that places look alike. Otherwise each
+            line of walls has its own.
     """
 
     seed: int = 0
@@ -83,7 +100,12 @@ class Paint:
         a_flag("paint.repeated", self.repeated, SimulatorError)
 
     def keys(self, segments: Array, walls: int) -> list[tuple[Any, ...]]:
-        """What names the texture of each segment, of which the first so many are walls and the others clutter, which moves."""
+        """Name of the texture of each segment.
+
+        Args:
+            segments: (n, 4) metres.
+            walls: Number of first segments that are walls. The others are clutter, which moves.
+        """
         checked_segments("segments", segments)
         a_whole_number("walls", walls, SimulatorError)
         ways = segments[:, 2:] - segments[:, :2]
@@ -103,7 +125,7 @@ class Paint:
         return found
 
     def texture(self, key: tuple[Any, ...]) -> Array:
-        """The numbers of a texture, (13 + 6 WAVES,): see `_albedo`."""
+        """The numbers of a texture, (13 + 6 WAVES,), as in `_albedo`."""
         an_instance("key", key, tuple, SimulatorError, mend="take one of Paint.keys")
         rng = np.random.default_rng([self.seed, zlib.crc32(repr(key).encode())])
         base, stripe, skirting = (
@@ -127,15 +149,19 @@ class Paint:
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera that sees all around. Its defaults make panoramas of 24 rows, 180 columns and 3 colours.
+    """A panoramic camera. The defaults give 24 rows, 180 columns and 3 colours.
 
-    rows, columns  of a panorama; its first column is behind the robot at the left, its middle one ahead, and its first row is the highest
-    paint          how the walls are painted
-    hours          the hours of the day, from 0 to 24, at which a run begins and ends
-    noise          standard deviation of a value, of which the largest is 255
-    exposure       the share of a change of brightness that the camera makes up for, from 0 (none) to 1
+    Attributes:
+        rows: Rows of a panorama, from top to bottom.
+        columns: Columns of a panorama. The first is behind the robot at the left, the middle one
+            ahead.
+        paint: Paint of the walls.
+        hours: Hours of the day, from 0 to 24, at which a run begins and ends.
+        noise: Standard deviation of a value, which is at most 255.
+        exposure: Share of a change of brightness that the camera compensates, from 0 to 1.
 
-    Raises SimulatorError for numbers that are out of range.
+    Raises:
+        SimulatorError: A number is out of range.
     """
 
     rows: int = 24
@@ -149,7 +175,8 @@ class Camera:
         for name in ("rows", "columns"):
             if not is_whole(getattr(self, name)) or not 1 <= getattr(self, name) <= 1000:
                 raise SimulatorError(
-                    f"camera.{name}: expected a whole number from 1 to 1000, got {brief(getattr(self, name))}; change it"
+                    f"camera.{name}: expected a whole number from 1 to 1000, got "
+                    f"{brief(getattr(self, name))}; change it"
                 )
         an_instance("camera.paint", self.paint, Paint, SimulatorError, mend="make one with Paint()")
         hours = tuple(
@@ -162,7 +189,8 @@ class Camera:
         )
         if len(hours) != 2:
             raise SimulatorError(
-                f"camera.hours: expected two, at which a run begins and ends, got {brief(self.hours)}; give both"
+                "camera.hours: expected two, at which a run begins and ends, got "
+                f"{brief(self.hours)}; give both"
             )
         object.__setattr__(self, "hours", hours)
         for name, value, most in (
@@ -173,7 +201,8 @@ class Camera:
         ):
             if not is_finite(value) or not 0 <= value <= most:
                 raise SimulatorError(
-                    f"camera.{name}: expected a number from 0 to {most:g}, got {brief(value)}; change it"
+                    f"camera.{name}: expected a number from 0 to {most:g}, got "
+                    f"{brief(value)}; change it"
                 )
 
     @property
@@ -182,7 +211,7 @@ class Camera:
         return self.rows, self.columns, 3
 
     def hour(self, share: float) -> float:
-        """The hour when a share of the run is over."""
+        """The hour when this share of the run is over."""
         a_number("share", share, SimulatorError, 0, 1, what="a share")
         return self.hours[0] + share * (self.hours[1] - self.hours[0])
 
@@ -194,9 +223,17 @@ class Camera:
         hour: float = 12.0,
         walls: int | None = None,
     ) -> NDArray[np.uint8]:
-        """The panorama from a pose, (rows, columns, 3), each value from 0 to 255.
+        """Take a panorama.
 
-        walls  how many segments of the world are walls, where the others are clutter; None for all of them
+        Args:
+            world: The world.
+            pose: Pose of the robot.
+            rng: Source of noise.
+            hour: Hour of the day.
+            walls: Number of first segments that are walls; the others are clutter. None means all.
+
+        Returns:
+            (rows, columns, 3) values from 0 to 255.
         """
         an_instance(
             "rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)"
@@ -213,7 +250,7 @@ class Camera:
         return pixels
 
     def scene(self, world: World, pose: Pose, light: Light, walls: int | None = None) -> Array:
-        """The light that comes from each point of the scene, (DOWN rows, ACROSS columns, 3), without exposure and noise."""
+        """Light from each point, (DOWN rows, ACROSS columns, 3), before exposure and noise."""
         an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
         an_instance("light", light, Light, SimulatorError, mend="take Light.at(12)")
         pose = pose_of("pose", pose)
@@ -240,7 +277,7 @@ class Camera:
                 for key in self.paint.keys(segments, len(segments) if walls is None else walls)
             ]
         )
-        # A wall faces the side of it on which the robot is.
+        # The visible face of a wall is on the side of the robot.
         to_robot = np.angle(np.exp(1j * (pose[2] + bearings + math.pi - angles[hit]))) > 0
         faces = angles[hit] + np.where(to_robot, math.pi / 2, -math.pi / 2)
         wall = _albedo(textures[hit], along, height) * light.on(faces)[None, :, None]
@@ -253,7 +290,10 @@ class Camera:
 
 
 def _beginnings(segments: Array) -> Array:
-    """Where the line of each segment begins, in metres along its direction, so that a texture goes on past a gap in a wall."""
+    """Beginning of the line of each segment, in metres along its direction.
+
+    So a texture goes on behind a gap in a wall.
+    """
     ways = segments[:, 2:] - segments[:, :2]
     ways = ways / np.maximum(np.hypot(*ways.T), 1e-9)[:, None]
     degrees = np.round(np.degrees(np.arctan2(ways[:, 1], ways[:, 0]))) % 360
@@ -267,11 +307,12 @@ def _beginnings(segments: Array) -> Array:
 
 
 def _albedo(textures: Array, along: Array, height: Array) -> Array:
-    """The share of light that points of walls give back, (r, c, 3).
+    """Share of light that points of walls reflect, (r, c, 3).
 
-    textures  (c, 13 + 6 WAVES), for each column that of its wall
-    along     (c,) metres along the wall
-    height    (r, c) metres above the floor
+    Args:
+        textures: (c, 13 + 6 WAVES) texture of the wall of each column.
+        along: (c,) metres along the wall.
+        height: (r, c) metres above the floor.
     """
     base, stripe, skirting, stripes, waves = np.split(textures, [3, 6, 9, 13], axis=1)
     period, share, phase, board = stripes.T

@@ -1,4 +1,4 @@
-"""A robot that drives forward and turns (a unicycle), neither of them exactly, and whose odometry reports neither of them exactly."""
+"""A robot that drives and turns (a unicycle) with errors, and whose odometry has errors."""
 
 from __future__ import annotations
 
@@ -13,24 +13,28 @@ from simulator.motion import Pose, between
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Displacement
 
-# The systematic errors of an odometry are at most this, as a share and in radians a metre: with more the robot could not tell when it has left a place.
+# Largest systematic errors, as a share and in radians a metre. Beyond them, the robot could not
+# tell when it has left a place.
 WORST = 0.5
-# The options of the verb that set these errors.
+# Options of the verb `simulate` for these errors.
 OPTIONS = {"odometry": "odometry-noise", "scale": "scale-error", "bend": "bend-error"}
 
 
 @dataclass(frozen=True)
 class Body:
-    """How well a robot drives. The motion that it does differs from the command by a share of it, and its heading wanders with the distance.
+    """Errors of a robot's motions and odometry.
 
-    radius    metres; a wall nearer than this is a collision
-    slip      standard deviation of the motion done, as a share of the motion commanded
-    wander    standard deviation of the heading, radians for a metre driven
-    odometry  standard deviation of the motion reported, as a share of the motion done
-    scale     share by which all ways are reported longer than they are, as with wheels that have worn
-    bend      radians by which the heading reported turns to the left in each metre forward, as with wheels of unequal size
+    Attributes:
+        radius: Radius in metres; a wall nearer than this is a collision.
+        slip: Standard deviation of the actual motion, as a share of the commanded motion.
+        wander: Standard deviation of the heading, in radians for each metre driven.
+        odometry: Standard deviation of the reported motion, as a share of the actual motion.
+        scale: Share by which reported distances are too long, as with worn wheels.
+        bend: Radians a metre by which the reported heading drifts to the left, as with wheels of
+            unequal size.
 
-    Raises SimulatorError where an error of the odometry is not a number, or is too great to drive with.
+    Raises:
+        SimulatorError: An error of the odometry is no number, or too large to drive with.
     """
 
     radius: float = 0.2
@@ -50,16 +54,19 @@ class Body:
                     else ""
                 )
                 raise SimulatorError(
-                    f"body.{name}: expected a number from {least} to {WORST}{unit}, got {brief(value)}; choose a smaller error (--{OPTIONS[name]})"
+                    f"body.{name}: expected a number from {least} to {WORST}{unit}, got "
+                    f"{brief(value)}; choose a smaller error (--{OPTIONS[name]})"
                 )
 
 
 @dataclass(frozen=True)
 class Report:
-    """What the odometry says of the motion since its last report.
+    """Odometry since the last report.
 
-    displacement  (dx, dy, dtheta) in the frame of the robot at the last report, in metres and radians
-    covariance    of the displacement, (3, 3): of its noise, without the errors that repeat
+    Attributes:
+        displacement: (dx, dy, dtheta) in the frame of the robot at the last report, in metres and
+            radians.
+        covariance: (3, 3) covariance of its noise, without systematic errors.
     """
 
     displacement: Displacement
@@ -67,25 +74,34 @@ class Report:
 
 
 class Robot:
-    """The true pose of a robot, which only the simulator knows, and the motion that its odometry has reported."""
+    """The true pose of a robot, which only the simulator knows, and its odometry.
+
+    Args:
+        body: Errors of its motions.
+        pose: Start pose.
+        rng: Source of the errors.
+
+    Attributes:
+        driven: Metres driven, by odometry.
+        odometry: Pose relative to the start, by odometry.
+    """
 
     def __init__(self, body: Body, pose: Pose, rng: np.random.Generator) -> None:
         self.body = body
         self.pose = pose
-        self.driven = 0.0  # metres driven, as odometry reports them
+        self.driven = 0.0
         self.odometry: Pose = (
             0.0,
             0.0,
             0.0,
-        )  # the pose against that at the start, as odometry reports it
+        )
         self._rng = rng
-        self._reported = self.odometry  # as it was at the last report
-        self._covariance = np.zeros(
-            (3, 3)
-        )  # of the odometry, in its own frame, since the last report
+        self._reported = self.odometry  # The odometry at the last report.
+        # Of the odometry since the last report, in the frame of the start.
+        self._covariance = np.zeros((3, 3))
 
     def move(self, forward: float, turn: float) -> None:
-        """Command a motion: so many metres forward (back if negative), and so many radians of turn on the way."""
+        """Command a motion: metres forward (back if negative), and radians of turn on the way."""
         e = self._rng.normal(size=5)
         body = self.body
         forward_done = forward * (1 + body.slip * e[0])
@@ -98,7 +114,7 @@ class Robot:
         self.driven += abs(forward_told)
 
     def report(self) -> Report:
-        """The motion since the last report, or since the start, as odometry has it."""
+        """The motion by odometry since the last report, or since the start."""
         cos, sin = math.cos(self._reported[2]), math.sin(self._reported[2])
         into = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
         said = Report(between(self._reported, self.odometry), into @ self._covariance @ into.T)
@@ -106,7 +122,7 @@ class Robot:
         return said
 
     def _spread(self, forward: float, turn: float) -> None:
-        """Let the covariance grow by that of a motion, to first order."""
+        """Add the covariance of a motion, to first order."""
         middle = self.odometry[2] + turn / 2
         cos, sin = math.cos(middle), math.sin(middle)
         by_pose = np.array([[1.0, 0.0, -forward * sin], [0.0, 1.0, forward * cos], [0.0, 0.0, 1.0]])

@@ -1,7 +1,8 @@
-"""Rounds through buildings: a robot with a body really drives from room to room, through the doors of a floor plan, and logs scans all along.
+"""Simulates rounds through buildings: a robot drives from room to room and logs scans.
 
-It leaves each room by the door that it has passed least often, as in plans.tour, until the round is long enough, and then goes home by as few doors as it can. In a room with one door it
-drives to the middle and turns back; from door to door it takes the way in between.
+It leaves each room by the door that it has passed least often, as in plan_tours.tour, until the
+round is long enough. Then it goes home through as few doors as possible. In a room with one door it
+drives to the middle and turns back. From door to door it takes the direct route.
 """
 
 from __future__ import annotations
@@ -31,24 +32,29 @@ from ssh_abduction.data.words import counted
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]
-Within = tuple[
-    int, int | None, int | None
-]  # a room, and two of its doors; None stands for its middle
-# Metres that a round is long before the robot goes home.
+# A room and two of its doors; None stands for its middle.
+Within = tuple[int, int | None, int | None]
+# Length of a round in metres before the robot goes home.
 METRES = 200.0
-# Metres from the wall to where a passage through a door begins and ends.
+# Metres from the wall at which a passage through a door begins and ends.
 APPROACH = 0.45
-# Metres off the walls at which the middle of a room is, where there is so much room.
+# Distance from walls of the middle of a room in metres, if there is enough room.
 MIDDLE = 0.8
-# The scanner in buildings: it sees as far as those of the recorded logs.
+# The scanner in buildings, which sees as far as those of the recorded logs.
 LASER = Laser(noise=0.01, reach=30.0)
 
 
 class Rooms:
-    """A building as a robot of a certain radius can drive in it: within each room, while all doors are shut, and straight through doors.
+    """Routes for a robot of some radius: within rooms with shut doors, and straight through doors.
 
-    graph    the rooms as nodes, and the doors as edges through which the robot fits and to which it can come, both by their numbers
-    middles  for each room of the graph the point that the robot drives to when it goes to its middle
+    Args:
+        building: The building.
+        radius: Radius of the robot in metres.
+
+    Attributes:
+        space: Free space with open doors.
+        graph: Rooms as nodes, and doors that fit the robot and can be reached as edges, by index.
+        middles: The point in each room of the graph that the robot uses as its middle.
     """
 
     def __init__(self, building: Building, radius: float) -> None:
@@ -60,6 +66,7 @@ class Rooms:
         self._sides = [_sides(building, number) for number in range(len(building.openings))]
         self._ways: dict[Within, Array] = {}
         self.middles: dict[int, Point] = {}
+        # A door becomes an edge if it can be reached in the main region of both of its rooms.
         fits = [number for number in range(len(building.openings)) if self._fits(number)]
         reached: Counter[int] = Counter()
         for room in range(len(building.plan.rooms)):
@@ -80,34 +87,34 @@ class Rooms:
         )
 
     def way(self, room: int, start: int | None, goal: int | None) -> Array:
-        """The way within a room from door to door, (n, 2) metres; None stands for its middle."""
+        """The route within a room between two doors, (n, 2) metres; None stands for its middle."""
         if (room, start, goal) not in self._ways:
             ends = [
                 self.middles[room] if door is None else self._sides[door][room]
                 for door in (start, goal)
             ]
             way = self._part(room).way(*ends)
-            assert way is not None  # as both are in one region
+            assert way is not None  # Both are in one region.
             self._ways[room, start, goal] = way
         return self._ways[room, start, goal]
 
     def behind(self, room: int, door: int) -> int:
-        """The room to which a door leads from a room."""
+        """The room behind a door of a room."""
         return next(other for other in self._sides[door] if other != room)
 
     def through(self, door: int, room: int) -> Array:
-        """The way through a door from a room, (n, 2) metres; the middle of the door is on it."""
+        """The route through a door from a room, (n, 2) metres, over the middle of the door."""
         return _line(self._sides[door][room], self._sides[door][self.behind(room, door)])
 
     def _fits(self, door: int) -> bool:
-        """Whether the robot can drive straight through a door."""
+        """Whether the robot fits straight through a door."""
         line = (
             _line(*self._sides[door].values()) if len(self._sides[door]) == 2 else np.empty((0, 2))
         )
         return len(line) > 0 and bool((self.space.part(line).off(line) >= self.space.least).all())
 
     def _part(self, room: int) -> Part:
-        """The part of the building where a room is, with all doors shut."""
+        """The part of the building around a room, with all doors shut."""
         sides = [sides[room] for sides in self._sides if room in sides]
         return self.space.part(
             np.vstack([np.array(self.building.plan.rooms[room].polygon), *sides]), self._shut
@@ -115,7 +122,10 @@ class Rooms:
 
 
 def _sides(building: Building, number: int) -> dict[int, Point]:
-    """For the rooms of a door the points at which a passage through it begins and ends; none where it cannot be told which room is on which side."""
+    """For both rooms of a door, the points where a passage begins and ends.
+
+    Empty if it is unclear which room is on which side.
+    """
     opening, door = building.openings[number], building.plan.doors[number]
     sides = [opening.point(0.0, side * (opening.depth / 2 + APPROACH)) for side in (-1, 1)]
     here, there = (building.plan.rooms[room] for room in door.rooms)
@@ -128,7 +138,7 @@ def _sides(building: Building, number: int) -> dict[int, Point]:
 
 
 def holds(polygon: Sequence[Point], point: Point) -> bool:
-    """Whether a polygon holds a point: a ray from there to the right crosses its outline an odd number of times."""
+    """Whether a polygon contains a point: a ray crosses its outline an odd number of times."""
     x, y = point
     crossings = sum(
         (y1 > y) != (y2 > y) and x < x1 + (y - y1) * (x2 - x1) / (y2 - y1)
@@ -138,7 +148,7 @@ def holds(polygon: Sequence[Point], point: Point) -> bool:
 
 
 def _line(start: Point, goal: Point) -> Array:
-    """A straight way, (n, 2) metres."""
+    """A straight route, (n, 2) metres."""
     line: Array = np.linspace(start, goal, 1 + math.ceil(math.dist(start, goal) / CELL))
     return line
 
@@ -147,9 +157,10 @@ def _line(start: Point, goal: Point) -> Array:
 class Round:
     """A round through rooms, which ends where it began.
 
-    way    (n, 2) metres
-    rooms  for each point of the way the room in which it is
-    doors  for each passage the number of the point at which it is in the door, and the door
+    Attributes:
+        way: (n, 2) route in metres.
+        rooms: Room of each point of the route.
+        doors: For each passage, the index of the point in the door, and the door.
     """
 
     way: Array = field(repr=False)
@@ -158,14 +169,19 @@ class Round:
 
     @classmethod
     def drawn(cls, rooms: Rooms, metres: float, chance: np.random.Generator) -> Round:
-        """A round that is drawn by chance. Raises SimulatorError where no two rooms are connected by doors through which the robot fits."""
+        """Draw a round at random.
+
+        Raises:
+            SimulatorError: No two rooms are connected by doors that fit the robot.
+        """
         parts = sorted(
             nx.connected_components(rooms.graph), key=lambda part: (-len(part), min(part))
         )
         if not parts:
             plan = rooms.building.plan
             raise SimulatorError(
-                f"{plan.name}: expected rooms with doors between them through which the robot fits, got none; take another plan, or a smaller robot"
+                f"{plan.name}: expected rooms with doors between them through which the robot "
+                "fits, got none; take another plan, or a smaller robot"
             )
         home = int(chance.choice(sorted(parts[0])))
         ways: list[Array] = []
@@ -185,7 +201,7 @@ class Round:
 
 
 def _legs(rooms: Rooms, home: int, metres: float, chance: np.random.Generator) -> Iterator[Within]:
-    """The parts of a round: in which room, from which door, to which; None stands for the middle of the room."""
+    """The legs of a round: a room, with the doors of entry and exit; None stands for its middle."""
     passed: Counter[int] = Counter()
     room, came, done = home, None, 0.0
     while True:
@@ -203,6 +219,7 @@ def _legs(rooms: Rooms, home: int, metres: float, chance: np.random.Generator) -
         done += _length(rooms.way(room, came, goal)) + _length(rooms.through(goal, room))
         passed[goal] += 1
         room, came = rooms.behind(room, goal), goal
+    # Go home through as few doors as possible.
     for here, there in pairwise(nx.shortest_path(rooms.graph, room, home)):
         goal = min(rooms.graph[here][there])
         yield here, came, goal
@@ -225,10 +242,20 @@ def record_plan(
     odometer: Odometer | None = None,
     every: float = EVERY,
 ) -> Drive:
-    """Drive one round through a building `tours` times, which ends where it began, and log scans all along, each `every` metres, and in turns each ten degrees.
+    """Drive rounds through a building and log scans.
 
-    metres  that a round is long, before the robot goes home
-    Raises SimulatorError where no two rooms are connected.
+    Args:
+        plan: The plan of the building.
+        tours: Number of times that the same round is driven.
+        seed: Seed of the round and of the noise.
+        metres: Length of a round before the robot goes home.
+        laser: The scanner.
+        body: Errors of the robot.
+        odometer: Noise of the odometry in the log.
+        every: Metres between scans. In turns there is a scan every ten degrees.
+
+    Raises:
+        SimulatorError: No two rooms are connected, or a number is out of range.
     """
     if tours < 1:
         raise SimulatorError(f"tours: expected 1 or more, got {tours}")
@@ -246,9 +273,8 @@ def record_plan(
     robot = Robot(body, (x, y, float(chance.uniform(-math.pi, math.pi))), motion)
     driver = Driver(world, robot, laser, motion, recorder=recorder)
     recorder.note(world, robot.pose)
-    come = [
-        0
-    ]  # for each scan the point of the round to which the robot had come, counted on from round to round
+    # The point of the round reached at each scan, counted on from round to round.
+    come = [0]
     for number in range(tours):
         for at in follow(driver, rooms.space, tour.way):
             come += [number * len(tour.way) + at] * (recorder.taken - len(come))
@@ -277,5 +303,5 @@ def record_plan(
 
 
 def _name(room: int) -> str:
-    """As in the truth of plans.tour."""
+    """The name of a room, as in the truth of plan_tours.tour."""
     return f"room {room}"

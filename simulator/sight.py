@@ -1,7 +1,8 @@
-"""Reads from one laser image how the robot stands to the walls around it. Nothing here knows the true pose.
+"""Finds the walls around the robot in one laser image. It does not know the true pose.
 
-Walls are taken to meet at right angles. The points of the image are turned until the walls lie along the axes. Then the wall ahead, the walls
-alongside, and the far walls of streets that open to the sides are the lines on which most points of the image lie.
+Walls are assumed to meet at right angles. The points of the image are rotated until the walls are
+parallel to the axes. The wall ahead, the walls alongside, and the far walls of side streets are
+then the lines with the most points.
 """
 
 from __future__ import annotations
@@ -15,20 +16,23 @@ from numpy.typing import NDArray
 from simulator.laser import BEARINGS
 
 Array = NDArray[np.float64]
-# Metres: points are on one wall if across it they are at most so far apart. That is ten times the noise of the laser.
+# Points of a wall differ by at most this many metres across it: ten times the noise of the laser.
 THICK = 0.05
-# Metres that a wall has to be long: what is shorter is clutter, or the end of a wall.
+# Smallest length of a wall in metres; anything shorter is clutter, or the end of a wall.
 LONG = 0.4
 
 
 @dataclass(frozen=True)
 class Sight:
-    """Where the walls are, in metres and radians. A field is None where the laser sees no such wall.
+    """Positions of the walls in metres and radians. None means that no such wall is visible.
 
-    tilt           heading of the robot against the axis of the walls, counter-clockwise
-    front          distance to the wall across the way ahead
-    left, right    distances to the walls alongside
-    left_street    how far ahead the far wall of a street is that opens to the left; right_street is the same to the right
+    Attributes:
+        tilt: Heading of the robot relative to the axis of the walls, counterclockwise.
+        front: Distance to the wall ahead.
+        left: Distance to the wall on the left.
+        right: Distance to the wall on the right.
+        left_street: Distance ahead of the far wall of a street that opens to the left.
+        right_street: The same on the right.
     """
 
     tilt: float
@@ -39,9 +43,13 @@ class Sight:
     right_street: float | None
 
     def to_go(self, reach: float, streets: bool = True) -> float | None:
-        """Metres ahead to the point that is `reach` before the wall ahead, or in the middle of a street that opens to a side; to the nearer of these.
+        """Metres to the point `reach` before the wall ahead, or in the middle of a side street.
 
-        streets  whether streets count
+        The nearer point counts; None if there is neither.
+
+        Args:
+            reach: Half the width of a corridor in metres.
+            streets: Whether side streets count.
         """
         marks = [self.front] if self.front is not None and self.front < 2.5 * reach else []
         if streets:
@@ -53,7 +61,7 @@ class Sight:
         return None if not marks else min(marks) - reach
 
     def offset(self, reach: float) -> float | None:
-        """Metres that the robot is left of the midline; where there is a wall on one side only, left of the line that is `reach` off that wall."""
+        """Metres to the left of the midline, or of the line `reach` away from the only wall."""
         near = 1.5 * reach
         left = self.left if self.left is not None and self.left < near else None
         right = self.right if self.right is not None and self.right < near else None
@@ -65,10 +73,12 @@ class Sight:
 
 
 def sight(image: Array, reach: float, farthest: float) -> Sight:
-    """What an image, (180,) metres, shows.
+    """Find the walls in an image.
 
-    reach     half the width of a corridor
-    farthest  the range from which on nothing was seen
+    Args:
+        image: (180,) metres.
+        reach: Half the width of a corridor in metres.
+        farthest: Range from which nothing was seen.
     """
     seen = image < farthest - 0.02
     bearings, ranges = BEARINGS[seen], image[seen]
@@ -83,7 +93,7 @@ def sight(image: Array, reach: float, farthest: float) -> Sight:
     )
     x, y = points[:, 0], points[:, 1]
     across, along = _spacing(y), _spacing(x)
-    # Where the axis of the walls is turned to the left of the robot, the robot is turned to the right of the axis: hence the minus.
+    # If the axis is turned to the left of the robot, the robot is turned to the right of the axis.
     return Sight(
         tilt=-axis,
         front=_line(x, across, (x > 0.05) & (np.abs(y) < 0.5 * reach)),
@@ -101,7 +111,10 @@ def _turned(points: Array, angle: float) -> Array:
 
 
 def _axis(points: Array) -> float:
-    """The direction of the walls, between -45 and 45 degrees (in radians): the mean direction, modulo a right angle, of lines between near points."""
+    """The direction of the walls between -45 and 45 degrees, in radians.
+
+    It is the mean direction, modulo a right angle, of lines between near points.
+    """
     chords = points[8:] - points[:-8]
     length = np.hypot(chords[:, 0], chords[:, 1])
     good = (length > 0.08) & (length < 1.5)
@@ -118,7 +131,7 @@ def _axis(points: Array) -> float:
 
 
 def _finer(points: Array, reach: float) -> float:
-    """The angle that is left between the walls and the axes: the mean slope of the best lines, in which long lines weigh more."""
+    """The remaining angle between walls and axes: the mean slope of the best lines, by length."""
     slopes, weights = [], []
     for u, v in ((0, 1), (1, 0)):
         inside = np.abs(points[:, v]) < 3 * reach
@@ -138,12 +151,15 @@ def _finer(points: Array, reach: float) -> float:
 
 
 def _spacing(values: Array) -> Array:
-    """How many metres of a wall along this axis each point stands for."""
+    """Metres of wall along this axis that each point represents."""
     return np.minimum(np.abs(np.gradient(values)), 0.3)
 
 
 def _line(values: Array, weights: Array, chosen: NDArray[np.bool_]) -> float | None:
-    """The value that most of the chosen points share, where each point counts as much as its weight, in metres of wall. None where no wall is LONG enough."""
+    """The value that most of the chosen points share, weighted in metres of wall.
+
+    None if no wall is LONG enough.
+    """
     picked, length = values[chosen], weights[chosen]
     if len(picked) < 5:
         return None

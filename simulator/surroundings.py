@@ -1,10 +1,12 @@
-"""What a robot makes of laser images where streets meet at any angles: walls, streets, and the panorama around a place. Nothing here knows the true pose.
+"""Finds walls, streets and places in laser images where streets meet at any angles.
 
-A wall is a straight stretch of the points of an image. A street is what lies between two walls that face each other, about twice `reach` apart. The fixed point of a place is where the
+It does not know the true pose. A wall is a straight stretch of points. A street lies between two
+walls that face each other, about twice `reach` apart. The fixed point of a place is where the
 midlines of its streets meet; at a dead end it is `reach` before the wall.
 
-An image shows half a circle. As a robot that turns on the spot sees the same walls turned, images overlap, and the turn that makes them agree best is the one that it has done: a visual compass.
-So a panorama of the whole circle comes of images that are taken while the robot turns.
+An image shows half a circle. A robot that turns on the spot sees the same walls rotated, so images
+overlap, and the rotation that makes them agree best is its turn: a visual compass. So images of a
+turning robot add up to a panorama of the whole circle.
 """
 
 from __future__ import annotations
@@ -21,30 +23,36 @@ from numpy.typing import NDArray
 from simulator.laser import BEARINGS
 
 Array = NDArray[np.float64]
-# Metres that points of a wall may be off its line. That is six times the noise of the laser.
+# Largest distance in metres of points from the line of their wall: six times the noise of the
+# laser.
 THICK = 0.03
-# Metres that a wall has to be long: what is shorter is clutter.
+# Smallest length of a wall in metres; anything shorter is clutter.
 LONG = 0.4
-# Beams with nothing between them end a wall.
+# Number of missing beams that ends a wall.
 GAP = 3
-# Share of a turn by which odometry is trusted to be off at most.
+# Largest relative error of a turn by odometry.
 OFF = 0.15
-# Radians, the bearings of a panorama.
+# Bearings of a panorama in radians.
 AROUND: Array = np.radians(np.arange(360.0))
-# Radians by which two walls of a street may fail to be parallel.
+# Largest angle in radians between two walls of a street.
 PARALLEL = math.radians(8)
-# A street is as wide as this, in reaches. Its walls have to go on for so many reaches, or it is a recess of the place.
+# Width of a street in multiples of the reach, and the length of its walls; a shorter one is a
+# recess of the place.
 WIDTHS = (1.2, 3.0)
 FAR = 2.0
-# Two directions that differ by at most so many radians are one: a street that bends by less goes straight on.
+# Directions within this many radians are the same: a street that bends by less goes straight on.
 STRAIGHT = math.radians(20)
 
 
 @dataclass(frozen=True)
 class Wall:
-    """A straight wall, from the end that is seen first to the one that is seen last, counter-clockwise: so its inside is at its left.
+    """A straight wall, seen counterclockwise from start to end, so that its inside is at its left.
 
-    Points and directions of the plane are complex numbers: metres ahead of the robot, and metres to its left.
+    Points and directions are complex numbers: metres ahead of the robot, and metres to its left.
+
+    Attributes:
+        start: The first end.
+        end: The last end.
     """
 
     start: complex
@@ -52,7 +60,7 @@ class Wall:
 
     @property
     def way(self) -> complex:
-        """From the start to the end."""
+        """Vector from the start to the end."""
         return self.end - self.start
 
 
@@ -60,9 +68,10 @@ class Wall:
 class Street:
     """A street that leads away from the robot.
 
-    bearing  radians, counter-clockwise from straight ahead
-    middle   the point of its midline that is nearest to the robot
-    length   metres of it between two walls, as far as the robot sees them
+    Attributes:
+        bearing: Radians, counterclockwise from straight ahead.
+        middle: Point of its midline nearest to the robot.
+        length: Visible metres of it between two walls.
     """
 
     bearing: float
@@ -71,20 +80,20 @@ class Street:
 
     @property
     def offset(self) -> float:
-        """Metres that the robot is left of the midline, where it looks along the street."""
+        """Metres that the robot is left of the midline, looking along the street."""
         return -(self.middle * cmath.rect(1, -self.bearing)).imag
 
 
 def points_of(
     ranges: Array, bearings: Array, farthest: float
 ) -> tuple[NDArray[np.complex128], NDArray[np.intp]]:
-    """The points that an image shows, and the numbers of their beams. What is `farthest` or farther was not seen."""
+    """The points of an image, and the indices of their beams; `farthest` means unseen."""
     seen = np.flatnonzero(ranges < farthest - 0.02)
     return ranges[seen] * np.exp(1j * bearings[seen]), seen
 
 
 def walls_of(points: NDArray[np.complex128], beams: NDArray[np.intp]) -> list[Wall]:
-    """The walls on which points lie that are given counter-clockwise."""
+    """The walls in points that are given counterclockwise."""
     breaks = np.flatnonzero(np.diff(beams) > GAP) + 1
     return [wall for stretch in np.split(points, breaks) for wall in _straight(stretch)]
 
@@ -92,9 +101,13 @@ def walls_of(points: NDArray[np.complex128], beams: NDArray[np.intp]) -> list[Wa
 def streets_of(
     walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float
 ) -> list[Street]:
-    """The streets between walls, no two in one direction, clockwise from straight behind.
+    """The streets between walls, one for each direction, clockwise from straight behind.
 
-    farther  how many metres from the robot a street has to go on
+    Args:
+        walls: The walls.
+        points: All points of the image.
+        reach: Half the width of a street in metres.
+        farther: Metres from the robot that a street has to go on.
     """
     found: list[Street] = []
     for street in sorted(
@@ -111,7 +124,10 @@ def apart(one: float, other: float) -> float:
 
 
 def _straight(points: NDArray[np.complex128]) -> Iterator[Wall]:
-    """The walls of a stretch of points, which is parted where it is farthest off the line between its ends (Douglas and Peucker)."""
+    """Split points into walls where they are farthest from the line between their ends.
+
+    This is the algorithm of Douglas and Peucker.
+    """
     if len(points) < 5:
         return
     way = points[-1] - points[0]
@@ -125,7 +141,7 @@ def _straight(points: NDArray[np.complex128]) -> Iterator[Wall]:
 
 
 def _fitted(points: NDArray[np.complex128]) -> Wall:
-    """The line with the least squares of distances. Its direction is half the angle of the second moment."""
+    """The least-squares line. Its direction is half the angle of the second moment."""
     middle = points.mean()
     direction = np.sqrt(((points - middle) ** 2).sum())
     direction /= abs(direction)
@@ -137,7 +153,8 @@ def _fitted(points: NDArray[np.complex128]) -> Wall:
 def _between(
     walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float
 ) -> Iterator[Street]:
-    """The streets between any two walls: one of them at the right of who goes along it, the other at the left."""
+    """The streets between any two walls, one on the right and one on the left."""
+    # Rotate both walls so that the street points along the real axis.
     for right, left in permutations(walls, 2):
         if apart(cmath.phase(right.way), cmath.phase(-left.way)) > PARALLEL:
             continue
@@ -165,10 +182,11 @@ def _between(
 
 @dataclass(frozen=True)
 class Place:
-    """What a panorama shows of a place.
+    """A place as a panorama shows it.
 
-    streets  those that lead away from it, clockwise from straight behind the robot
-    fixed    the fixed point; None where a single street goes straight on, which is no place
+    Attributes:
+        streets: Streets that lead away, clockwise from straight behind the robot.
+        fixed: The fixed point; None if a single street goes straight on, which is no place.
     """
 
     streets: tuple[Street, ...]
@@ -176,13 +194,12 @@ class Place:
 
     @classmethod
     def of(cls, ranges: Array, reach: float, farthest: float) -> Place:
-        """The place that a panorama, (360,) metres, shows."""
+        """Find the place in a panorama, (360,) metres."""
         points, beams = points_of(np.nan_to_num(ranges, nan=farthest), AROUND, farthest)
         if not len(points):
             return cls((), None)
-        first = int(
-            np.abs(points - np.roll(points, 1)).argmax()
-        )  # a wall ends there, so none is cut in two
+        # Start where a wall ends, so that no wall is cut in two.
+        first = int(np.abs(points - np.roll(points, 1)).argmax())
         points, beams = np.roll(points, -first), (np.roll(beams, -first) - beams[first]) % 360
         streets = streets_of(walls_of(points, beams), points, reach, FAR * reach)
         return cls(
@@ -191,7 +208,7 @@ class Place:
 
     @property
     def headings(self) -> list[float]:
-        """The headings of dstates there, in radians: along each street, away from the place and, where no street is opposite, towards it."""
+        """Headings of dstates in radians: along each street, and opposite if nothing is there."""
         out = [street.bearing for street in self.streets]
         return out + [
             bearing + math.pi
@@ -200,11 +217,11 @@ class Place:
         ]
 
     def heading(self, about: float) -> float:
-        """The heading of a dstate that is nearest to one."""
+        """The heading of a dstate that is nearest to this one."""
         return min(self.headings, key=lambda heading: apart(heading, about))
 
     def beside(self, heading: float, side: int) -> float | None:
-        """How far to turn to the next street at the left (side=1) or at the right (-1), in radians; None if there is none before straight behind."""
+        """Radians to the next street at the left (side=1) or right (-1), if there is one."""
         turns = [side * (street.bearing - heading) % math.tau for street in self.streets]
         return min(
             (side * turn for turn in turns if STRAIGHT < turn < math.pi - STRAIGHT),
@@ -218,7 +235,7 @@ class Place:
 
 
 def _meeting(streets: Sequence[Street]) -> complex | None:
-    """The point with the least squares of distances to all midlines."""
+    """The point with the least squared distances to all midlines."""
     if len(streets) == 2 and apart(streets[0].bearing, streets[1].bearing + math.pi) <= STRAIGHT:
         return None
     across = np.array([1j * cmath.rect(1, street.bearing) for street in streets])
@@ -229,7 +246,7 @@ def _meeting(streets: Sequence[Street]) -> complex | None:
 
 
 def _end(streets: Sequence[Street], points: NDArray[np.complex128], reach: float) -> complex | None:
-    """The point of the midline of the only street that is `reach` before the wall at its end."""
+    """The point on the midline of the only street, `reach` before the wall at its end."""
     for street in streets:
         along = cmath.rect(1, street.bearing)
         seen = (points - street.middle) / along
@@ -240,19 +257,28 @@ def _end(streets: Sequence[Street], points: NDArray[np.complex128], reach: float
 
 
 class Panorama:
-    """Ranges all around, one a degree, as far as images have shown them; the first one straight ahead of the robot as it began to turn.
+    """Ranges all around, one a degree, collected from images of a turning robot.
 
-    headings  how the robot was turned at each image, in radians
+    Straight ahead is the heading at the first image.
+
+    Args:
+        image: The first image.
+
+    Attributes:
+        headings: Heading of the robot at each image, in radians.
     """
 
     def __init__(self, image: Array) -> None:
         self.headings = [0.0]
         self._rows = [_around(image, 0.0)]
-        self._first = self._rows[0]  # what was shown first of each degree
+        self._first = self._rows[0]  # First value of each degree.
 
     @property
     def ranges(self) -> Array:
-        """(360,) metres, counter-clockwise; nan where no image has shown anything. A beam that is lost in one image is there in others."""
+        """(360,) metres, counterclockwise; NaN where nothing is known.
+
+        The median over images ignores a beam that is lost in one of them.
+        """
         rows = np.array(self._rows)
         shown = ~np.isnan(rows).all(axis=0)
         ranges = np.full(360, np.nan)
@@ -260,7 +286,7 @@ class Panorama:
         return ranges
 
     def add(self, image: Array, turned: float) -> None:
-        """Take in one more image, after a turn of about so many radians."""
+        """Add an image after a turn of about this many radians."""
         heading = compass(self._first, image, self.headings[-1] + turned, turned)
         self.headings.append(heading)
         self._rows.append(_around(image, heading))
@@ -268,24 +294,28 @@ class Panorama:
 
 
 def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
-    """How the robot is turned, in radians, that sees an image where the ranges around it are known: about so, and as the two agree best.
+    """The heading in radians at which an image agrees best with known ranges.
 
-    turned  how far the robot has turned since it last knew, by odometry, which may be off by a share of it
+    Args:
+        ranges: (360,) known ranges in metres.
+        image: The image.
+        about: Expected heading.
+        turned: Turn by odometry since the last known heading, which is off by a share of it.
     """
     best = about
     for window, step in ((2 + OFF * math.degrees(abs(turned)), 0.5), (0.5, 0.05)):
         tried = best + np.radians(np.arange(-window, window + step / 2, step))
         known = np.interp(np.degrees(tried[:, None] + BEARINGS), np.arange(360), ranges, period=360)
-        shown = ~np.isnan(known).any(
-            axis=0
-        )  # the same beams for all, or what is not known would look like agreement
+        # Compare the same beams for all headings; otherwise unknown ranges would look like
+        # agreement.
+        shown = ~np.isnan(known).any(axis=0)
         off = np.minimum(np.abs(known[:, shown] - image[shown]), 0.3)
         best = float(tried[int(off.mean(axis=1).argmin())])
     return best
 
 
 def _around(image: Array, heading: float) -> Array:
-    """An image as ranges all around, (360,) metres; nan where it shows nothing."""
+    """An image as ranges all around, (360,) metres; NaN where it shows nothing."""
     bearings = np.angle(np.exp(1j * (AROUND - heading)))
     ranges: Array = np.interp(bearings, BEARINGS, image, left=np.nan, right=np.nan)
     return ranges

@@ -1,4 +1,4 @@
-"""Simulates tours: a robot drives a route again and again, and logs at each dstate the image that it sees and the action that it does next."""
+"""Simulates tours: a robot drives a route repeatedly and logs images and actions."""
 
 from __future__ import annotations
 
@@ -30,18 +30,19 @@ from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.data.words import counted
 
 Array = NDArray[np.float64]
-# More tours than this are a mistake: to drive them takes days, and all steps are kept in memory.
+# More tours than this are a mistake: they take days, and all steps are kept in memory.
 MOST_TOURS = 100_000
 QUARTERS = {"travel": 0, "right": 1, "around": 2, "left": 3}
 
 
 @dataclass
 class Star:
-    """The openings of the place where the robot is, as it has seen them since it came there.
+    """The openings of the place where the robot is, as seen since it arrived.
 
-    reach   half the width of a corridor, in metres
-    slots   whether there is an opening, by slot; slot 0 is the one that the robot faced as it came
-    facing  the slot that it faces now
+    Attributes:
+        reach: Half the width of a corridor in metres.
+        slots: Whether there is an opening, by slot. Slot 0 is the direction of arrival.
+        facing: The slot that the robot faces.
     """
 
     reach: float
@@ -49,20 +50,26 @@ class Star:
     facing: int = 0
 
     def act(self, action: str) -> None:
+        """Update the slots after an action."""
         if action == "travel":
+            # The robot came through the opening behind it.
             self.slots, self.facing = (
                 {2: True},
                 0,
-            )  # behind the robot is the opening through which it came
+            )
         else:
             self.facing = (self.facing + QUARTERS[action]) % 4
 
     def look(self, image: Array) -> None:
-        """Take the directions ahead, right and left for openings if the wall there is far. What is behind the robot is not in the image."""
+        """Mark the directions ahead, right and left as openings if their walls are far.
+
+        The image does not show what is behind the robot.
+        """
         for slot, beams in ((0, image[82:98]), (1, image[:10]), (3, image[-10:])):
             self.slots[(self.facing + slot) % 4] = bool(np.median(beams) > 1.8 * self.reach)
 
     def seen(self) -> tuple[float, ...]:
+        """The openings ahead, right, behind and left, as far as known."""
         return tuple(float(self.slots.get((self.facing + k) % 4, False)) for k in range(4))
 
 
@@ -78,15 +85,29 @@ def simulate(
     every: float | None = None,
     camera: Camera | None = None,
 ) -> Trace:
-    """Drive `tours` tours, and log an image at each dstate: (tours x actions) steps, of which the last one has no action.
+    """Drive tours of a world, and log an image at each dstate.
 
-    stars   also log the openings at each place, as the robot saw them since it came there
-    every   log an image each so many metres of odometry instead, wherever the robot is; the trace then has travels only
-    camera  log its panoramas instead of ranges, row by row, as whole numbers; `panorama` in the trace's header is their shape. The robot drives by its laser as before, so with one seed
-            both drives are the same
-    Each step has as its displacement what the robot's odometry says of all motions since the last step, those of hill-climbing included;
-    the trace's odometry is the noise that fits them. The truth goes into `truth`: dstate, place, path and pose. Nothing but evaluation may read it.
-    Raises SimulatorError where the route cannot be driven.
+    A trace has tours x actions steps, and its last step has no action. The displacement of a step
+    is the odometry of all motions since the last step, also those of hill-climbing; the odometry of
+    the trace is the noise that fits them. `truth` has dstate, place, path and pose, for evaluation
+    only.
+
+    Args:
+        world: The world.
+        tours: Number of tours.
+        seed: Seed of all noise.
+        laser: The scanner.
+        body: Errors of the robot.
+        tolerance: Precision of hill-climbing.
+        stars: Whether to log the openings at each place, as seen since the robot arrived there.
+        every: Metres of odometry between images, wherever the robot is; the trace then has travels
+            only. None logs at dstates.
+        camera: A camera whose panoramas are logged instead of ranges, row by row, as whole numbers;
+            `panorama` in the header is their shape. The robot still drives by its laser, so with
+            the same seed both drives are the same.
+
+    Raises:
+        SimulatorError: The route cannot be driven.
     """
     if every is not None:
         a_number(
@@ -109,7 +130,8 @@ def simulate(
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     if world.by_places:
         raise SimulatorError(
-            f"{world.name}: route: expected actions, got places, to which a robot drives that logs scans all along; write --as carmen, or give a route of actions"
+            f"{world.name}: route: expected actions, got places, to which a robot drives that "
+            "logs scans all along; write --as carmen, or give a route of actions"
         )
     driver = _driver(world, tours, seed, laser, body, tolerance)
     body, tolerance = driver.robot.body, driver.tolerance
@@ -143,9 +165,21 @@ def record(
     odometer: Odometer | None = None,
     every: float = EVERY,
 ) -> Drive:
-    """Drive `tours` tours as `simulate` does, and log scans all along: each `every` metres, and in turns each ten degrees.
+    """Drive tours as `simulate` does, and log scans.
 
-    The odometer of the log is none that the control laws steer by: its noise is that of robots that were logged. Raises SimulatorError where the route cannot be driven.
+    The odometer of the log is not the one for control: it has the noise of robots in recorded logs.
+
+    Args:
+        world: The world.
+        tours: Number of tours.
+        seed: Seed of all noise.
+        laser: The scanner.
+        body: Errors of the robot.
+        odometer: Noise of the odometry in the log.
+        every: Metres between scans. In turns there is a scan every ten degrees.
+
+    Raises:
+        SimulatorError: The route cannot be driven.
     """
     driver = _driver(world, tours, seed, laser, body, None)
     recorder = driver.recorder = Recorder(every)
@@ -163,14 +197,14 @@ def record(
 
 
 def _place(world: World, pose: Array) -> str | None:
-    """The place where a robot is: the nearest one, where that is at most `reach` away; None between places."""
+    """The nearest place of a robot if it is within `reach`; None between places."""
     far = {name: math.dist(at, pose[:2]) for name, at in world.places.items()}
     nearest = min(far, key=far.__getitem__, default=None)
     return nearest if nearest is not None and far[nearest] <= world.reach else None
 
 
 def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
-    """Drive to the places of the route, tour after tour, off what stands there on that tour. Before each of them its number, and what it is called."""
+    """Drive to the places of the route on all tours; yield number and name before each."""
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
@@ -183,7 +217,8 @@ def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]
                 off = world.clearance(*world.stops[stop])
                 mend = f"open the walls, or move {stop}, which is {off:.2f} m off the nearest one"
                 raise SimulatorError(
-                    f"{world.name}: route: expected a way from ({x:.2f}, {y:.2f}) to {stop}, got none; {mend}"
+                    f"{world.name}: route: expected a way from ({x:.2f}, {y:.2f}) to {stop}, "
+                    f"got none; {mend}"
                 )
             try:
                 deque(follow(driver, space, way), maxlen=0)
@@ -201,7 +236,7 @@ def _driver(
     body: Body | None,
     tolerance: Tolerance | None,
 ) -> Driver:
-    """A robot at the start of a world. Raises SimulatorError where no tour can begin."""
+    """A robot at the start of a world. Raises SimulatorError if no tour can begin."""
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     a_whole_number("tours", tours, SimulatorError, 1, MOST_TOURS)
     a_whole_number("seed", seed, SimulatorError)
@@ -220,13 +255,15 @@ def _driver(
             )
     if not world.route:
         raise SimulatorError(
-            f"{world.name}: route: expected at least one action, got none; add it to the world, or give one"
+            f"{world.name}: route: expected at least one action, got none; add it to the "
+            "world, or give one"
         )
     body = body or Body()
     x, y, _ = world.start
     if not world.holds(x, y) or world.clearance(x, y) < body.radius:
         raise SimulatorError(
-            f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, {y}); move it"
+            f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, "
+            f"{y}); move it"
         )
     rng = np.random.default_rng(seed)
     return Driver(
@@ -239,7 +276,7 @@ def _driver(
 
 
 def _noise(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Noise:
-    """What the displacements are worth. Where each has a covariance, only the errors that repeat are left to say."""
+    """The noise of the displacements. If each has a covariance, only systematic errors remain."""
     if world.angles == "any" and tolerance is not None:
         return Noise(scale=abs(body.scale), bend=abs(body.bend))
     return noise_model(log.reports, body, tolerance)
@@ -247,10 +284,13 @@ def _noise(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> N
 
 @dataclass
 class Eye:
-    """What is logged as the image of a step: the ranges of the laser, or what a camera sees instead.
+    """Makes the logged image of a step: ranges of the laser, or a panorama.
 
-    walls    how many segments of the world are no clutter
-    actions  how many there are in the run, by which the hour is told
+    Attributes:
+        camera: The camera, or None for ranges.
+        walls: Number of segments of the world without clutter.
+        rng: Source of noise of the camera.
+        actions: Number of actions of the run, which tells the hour.
     """
 
     camera: Camera | None
@@ -259,7 +299,7 @@ class Eye:
     actions: int
 
     def image(self, driver: Driver, ranges: Array, done: int) -> tuple[float, ...]:
-        """The image that is logged after so many actions."""
+        """The image after this many actions."""
         if self.camera is None:
             return tuple(round(float(r), 4) for r in ranges)
         hour = self.camera.hour(done / max(self.actions - 1, 1))
@@ -272,14 +312,20 @@ class Eye:
 
 @dataclass
 class Log:
-    """What the odometry of a robot reports between the steps that are logged."""
+    """Odometry between the logged steps.
+
+    Attributes:
+        robot: The robot.
+        reports: Reports of its odometry between steps.
+        begun: Whether a step was logged already.
+    """
 
     robot: Robot
     reports: list[Report] = field(default_factory=list)
     begun: bool = False
 
     def displacement(self) -> Displacement | None:
-        """The displacement from the last step, rounded as logs are; None for the first step."""
+        """Displacement from the last step, rounded; None for the first step."""
         report = self.robot.report()
         if not self.begun:
             self.begun = True
@@ -290,14 +336,19 @@ class Log:
 
 
 def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | None = None) -> Noise:
-    """The noise of the displacements between dstates, from that of the robot's wheels and from the tolerance of hill-climbing.
+    """The noise of the displacements between dstates, from odometry and hill-climbing.
 
-    Each motion that the wheels report errs by a share of itself, so that of many motions together a smaller share is wrong. The shares of a
-    step are those by which the reports have, on the average, the covariance that they have.
+    Each reported motion has an error proportional to it, so the relative error of many motions
+    together is smaller. The shares here reproduce the mean covariance of the reports.
 
-    A map speaks of fixed points, and hill-climbing ends off them at both ends of a step: evenly spread, as this model has it, within its
-    tolerance. A heading that is off where a step begins also puts the end of the step aside. Without a tolerance the displacements are
-    those between the poses themselves.
+    A map describes fixed points. Hill-climbing ends within its tolerance of them at both ends of a
+    step; the model assumes a uniform distribution. A wrong heading at the beginning also moves the
+    end sideways.
+
+    Args:
+        reports: Reports between steps.
+        body: Errors of the robot.
+        tolerance: Precision of hill-climbing; None for displacements between poses themselves.
     """
     ways = math.fsum(math.hypot(*r.displacement[:2]) ** 2 for r in reports)
     turns = math.fsum(r.displacement[2] ** 2 for r in reports)
@@ -326,13 +377,14 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
 def _at_dstates(
     driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye
 ) -> Iterator[Step]:
+    """Drive all tours, and make a step at each dstate."""
     if world.angles == "any":
         yield from _at_junctions(driver, log, world, tours, stars, eye)
         return
     star, watch = Star(world.reach), Watch(world, driver, tours)
     with watch.start():
         climb(driver)
-        if stars:  # look behind, as the half circle does not show it
+        if stars:  # The image shows half a circle, so look behind, too.
             driver.go(0.0, math.pi)
             star.facing = 2
             star.look(driver.look(STILL))
@@ -360,7 +412,11 @@ def _at_dstates(
 def _at_junctions(
     driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye
 ) -> Iterator[Step]:
-    """The same where streets meet at any angles. How much the robot turned to look around differs from step to step, so each displacement has a covariance of its own."""
+    """The same as `_at_dstates`, for streets that meet at any angles.
+
+    The robot turns by different amounts to look around, so each displacement has its own
+    covariance.
+    """
     pilot, watch = Pilot(driver), Watch(world, driver, tours)
     with watch.start():
         pilot.begin()
@@ -386,16 +442,15 @@ def _at_junctions(
 
 
 def _covariance(report: Report, tolerance: Tolerance, action: str) -> Covariance:
-    """The covariance of a displacement between fixed points: that of the odometry, and at both ends what hill-climbing leaves, which is anywhere in its tolerance.
+    """Covariance of a displacement between fixed points, from odometry and hill-climbing.
 
-    A turn stays at one point, to a millimetre.
+    Hill-climbing ends anywhere within its tolerance. A turn stays at one point, to a millimetre.
     """
     dx, dy, _ = report.displacement
     near = tolerance.close / math.sqrt(3) if action == "travel" else 0.001
     left = np.diag([near**2, near**2, tolerance.straight**2 / 3])
-    by_start = np.array(
-        [[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]]
-    )  # a heading that is off puts the end aside
+    # A wrong heading moves the end sideways.
+    by_start = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     whole = report.covariance + by_start @ left @ by_start.T + left
     a, b, c = (tuple(float(f"{v:.4g}") for v in row) for row in (whole + whole.T) / 2)
     return a, b, c  # type: ignore[return-value]
@@ -404,7 +459,10 @@ def _covariance(report: Report, tolerance: Tolerance, action: str) -> Covariance
 def _evenly(
     driver: Driver, log: Log, world: World, tours: int, every: float, eye: Eye
 ) -> list[Step]:
-    """Images each `every` metres of odometry. What is at most that far along the route counts as one spot, tour after tour."""
+    """Log images every `every` metres of odometry.
+
+    Points within that distance along the route count as one spot on all tours.
+    """
     logged: list[Step] = []
     leg_began = due = 0.0
     leg = 0
@@ -434,7 +492,7 @@ def _evenly(
 
 
 def _legs(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
-    """Drive all tours. Before each action its number, and what it is."""
+    """Drive all tours; yield the number and name of each action before it."""
     pilot, watch = Pilot(driver) if world.angles == "any" else None, Watch(world, driver, tours)
     with watch.start():
         pilot.begin() if pilot else climb(driver)
@@ -448,6 +506,7 @@ def _legs(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]
 
 
 def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:
+    """The truth about a pose: the nearest true dstate, if the world has any."""
     found = world.nearest(pose)
     where = {"pose": [round(float(v), 5) for v in pose]}
     return (

@@ -1,6 +1,8 @@
-"""Watches a drive: whether each action ends where the world says, and each tour where it began. What goes wrong is told with the action and the likely cause.
+"""Checks that actions end where the world says, and that tours end where they began.
 
-The control laws see images alone, and do not know when they have taken one place for another. Here the true pose is compared with the true dstates of the world, where it has any.
+The control laws see images only and do not notice when they confuse places. This module compares
+the true pose with the true dstates of the world, if it has any. Errors name the action and the
+likely cause.
 """
 
 from __future__ import annotations
@@ -19,17 +21,25 @@ from simulator.laser import meetings
 from simulator.motion import Pose, between
 from simulator.world import World, are_square
 
-# Metres, and radians, by which a robot may be off the place where it is to be; `reach` metres, if that is more.
+# Largest distance from the expected place in metres, or `reach` if that is more, and largest
+# difference of heading in radians.
 NEAR, FACING = 0.5, math.radians(45)
-# Of the way to the next place of a path, how far that may be to a side.
+# Largest sideways distance of the next place on a path, as a share of the distance.
 STRAIGHT = 0.2
-# Errors of motions and of odometry, as a share, and of ranges, in metres, that the control laws do not bear for sure.
+# Relative errors of motions and odometry, and errors of ranges in metres, from which the control
+# laws may fail.
 NOISY, BLURRED = 0.1, 0.03
 
 
 @dataclass
 class Watch:
-    """Watches a driver on the tours of a world, as it is in its file."""
+    """Watches a driver on its tours.
+
+    Attributes:
+        world: The world as in its file.
+        driver: The robot.
+        tours: Number of tours.
+    """
 
     world: World
     driver: Driver
@@ -38,7 +48,7 @@ class Watch:
 
     @contextmanager
     def start(self) -> Iterator[None]:
-        """Watch how the robot comes to its first dstate."""
+        """Watch how the robot reaches its first dstate."""
         try:
             yield
         except SimulatorError as error:
@@ -46,7 +56,16 @@ class Watch:
 
     @contextmanager
     def action(self, number: int, name: str) -> Iterator[None]:
-        """Watch one action, which is counted on from tour to tour. Raises SimulatorError where it ends at another place than the world says, or a tour elsewhere than it began."""
+        """Watch one action.
+
+        Args:
+            number: Number of the action, counted on from tour to tour.
+            name: The action.
+
+        Raises:
+            SimulatorError: It ends at another place than the world says, or a tour ends elsewhere
+                than it began.
+        """
         before = self.driver.robot.pose
         self._home = self._home or before
         tour, place = divmod(number, len(self.world.route))
@@ -60,21 +79,26 @@ class Watch:
         if expected and self._is_elsewhere(expected, after):
             at = self.world.places[expected]
             raise SimulatorError(
-                f"{self.world.name}: {where}: expected the robot to come to {_at(expected, at)}, got it {_at('', after)}, "
-                f"{math.dist(at, after[:2]):.1f} m off; so it drives another route than it was told{self._because(before)}"
+                f"{self.world.name}: {where}: expected the robot to come to {_at(expected, at)}, "
+                f"got it {_at('', after)}, "
+                f"{math.dist(at, after[:2]):.1f} m off; so it drives another route than it was "
+                f"told{self._because(before)}"
             )
         if place == len(self.world.route) - 1:
             self._ended(tour, after)
 
     def _ended(self, tour: int, pose: Pose) -> None:
-        """Compare where a tour has ended with where the first one began."""
+        """Compare the end of a tour with the beginning of the first one."""
         assert self._home is not None
         if (
             math.dist(pose[:2], self._home[:2]) <= self._near
             and abs(math.remainder(pose[2] - self._home[2], math.tau)) <= FACING
         ):
             return
-        text = f"{self.world.name}: tour {tour + 1}: expected it to end where it began, {_at('', self._home)}, got its end {_at('', pose)}, {_off(self._home, pose)}"
+        text = (
+            f"{self.world.name}: tour {tour + 1}: expected it to end where it began, "
+            f"{_at('', self._home)}, got its end {_at('', pose)}, {_off(self._home, pose)}"
+        )
         if self.tours == 1:
             warnings.warn(
                 f"{text}; it cannot be driven again from there", SimulatorWarning, stacklevel=2
@@ -87,12 +111,12 @@ class Watch:
         return max(NEAR, self.world.reach)
 
     def _is_elsewhere(self, place: str, pose: Pose) -> bool:
-        """Whether a robot is nearer to another place, or far from all."""
+        """Whether a robot is nearer to another place, or far from all places."""
         far = {name: math.dist(at, pose[:2]) for name, at in self.world.places.items()}
         return far[place] > min(2 * self._near, *far.values())
 
     def _expected(self, action: str, pose: Pose) -> str | None:
-        """The place at which an action is to end, from a pose; None where the world does not say."""
+        """The place where an action from a pose should end; None if the world does not say."""
         here = self.world.nearest(pose)
         if (
             here is None
@@ -114,20 +138,33 @@ class Watch:
         return min(ahead)[1] if ahead else None
 
     def _because(self, before: Pose | None = None) -> str:
-        """The likely causes, as the end of a message; nothing where none is known. `before` is where the action began."""
+        """The likely causes of an error as the end of a message, empty if there are none.
+
+        Args:
+            before: Pose where the action began.
+        """
         found = list(self._causes(before or self.driver.robot.pose))
         return f". Likely cause: {'; or '.join(found)}" if found else ""
 
     def _causes(self, before: Pose) -> Iterator[str]:
         world, body = self.world, self.driver.robot.body
         if world.own_reach is not None and world.own_reach != world.reach:
-            yield f"reach is {world.reach:g} m, and the world's own is {world.own_reach:g} m (leave --reach out)"
+            yield (
+                f"reach is {world.reach:g} m, and the world's own is {world.own_reach:g} m (leave "
+                "--reach out)"
+            )
         elif (half := self._half_width(before)) and not (
             0.6 * half if world.angles == "any" else 0.0
         ) <= world.reach <= 1.25 * half:
-            yield f"reach is {world.reach:g} m, and half the width of the street there is {half:.2f} m (give that as reach)"
+            yield (
+                f"reach is {world.reach:g} m, and half the width of the street there is "
+                f"{half:.2f} m (give that as reach)"
+            )
         if world.angles == "right" and not are_square(world.segments):
-            yield 'walls meet at other than right angles, and the world says "right" (write "angles": "any")'
+            yield (
+                'walls meet at other than right angles, and the world says "right" (write '
+                '"angles": "any")'
+            )
         for what, value, mend in (
             ("the odometry errs", body.odometry, "give less --odometry-noise"),
             ("a motion errs", body.slip, "give the body less slip"),
@@ -135,17 +172,28 @@ class Watch:
             if value > NOISY:
                 yield f"{what} by {100 * value:.0f} % ({mend})"
         if abs(body.bend) > math.radians(2):
-            yield f"the odometry bends by {math.degrees(body.bend):.1f} degrees in each metre (give less --bend-error)"
+            yield (
+                f"the odometry bends by {math.degrees(body.bend):.1f} degrees in each metre (give "
+                "less --bend-error)"
+            )
         if self.driver.laser.noise > BLURRED:
-            yield f"ranges err by {100 * self.driver.laser.noise:.0f} cm (give the laser less noise)"
+            noise = 100 * self.driver.laser.noise
+            yield f"ranges err by {noise:.0f} cm (give the laser less noise)"
         start = world.nearest(world.start)
         if start and (away := math.dist(start.pose[:2], world.start[:2])) > self._near:
-            yield f"the start is {away:.1f} m off the nearest dstate of the world, {start.name} (move the start)"
+            yield (
+                f"the start is {away:.1f} m off the nearest dstate of the world, {start.name} "
+                "(move the start)"
+            )
         if world.angles == "right" and (off := _off_axis(world)) > FACING / 2:
             yield f"the start heads {math.degrees(off):.0f} degrees off the walls (turn the start)"
 
     def _half_width(self, before: Pose) -> float | None:
-        """Half the width of the street in which the robot has driven, in metres, without clutter, halfway from where it was before: across a street walls are nearest. None where there are no walls."""
+        """Half the width of the street in metres, without clutter, or None without walls.
+
+        It is measured halfway between the pose before and the current one, in the narrowest
+        direction.
+        """
         angles = np.radians(np.arange(360.0))
         middle = np.append((np.array(before[:2]) + self.driver.robot.pose[:2]) / 2, 0.0)
         ranges = meetings(self.world.segments, middle[None], angles).min(2)[0]
@@ -154,7 +202,7 @@ class Watch:
 
 
 def _off_axis(world: World) -> float:
-    """Radians between the start's heading and the nearest direction of the longest wall, or one at right angles to it."""
+    """Radians between the heading of the start and the nearest direction of the longest wall."""
     ways = world.segments[:, 2:] - world.segments[:, :2]
     longest = ways[int(np.hypot(*ways.T).argmax())]
     return abs(math.remainder(world.start[2] - math.atan2(longest[1], longest[0]), math.pi / 2))

@@ -1,6 +1,7 @@
-"""Worlds: walls as segments in metres, clutter that may move between tours, and, where it is known, the truth about dstates.
+"""Worlds: walls, clutter that may move between tours, and the true dstates if known.
 
-A world is a JSON file that a user can write (docs/worlds.md), or an occupancy map as ROS has it (a YAML file and an image).
+A world is a JSON file that a user can write (docs/worlds.md), or an occupancy map of ROS (a YAML
+file and an image).
 
 >>> from simulator.world import World
 >>> World.named("notched-rectangle").segments.shape[1]
@@ -40,20 +41,21 @@ Angles: TypeAlias = Literal["right", "any"]
 Point: TypeAlias = tuple[float, float]
 FORMAT, VERSION = "ssh-world", 1
 ACTIONS = ("travel", "right", "left", "around")
-# Degrees that the straight pieces of an arc are long at most, and metres of those of a ragged wall.
+# Largest length of the straight pieces of an arc in degrees, and of a ragged wall in metres.
 ARC, RAGGED = 5.0, 0.3
-# Metres of walls that may be ragged.
+# Largest total length of ragged walls, in metres.
 LONGEST = 20_000
-# Radians that a wall may be off a right angle; and of all walls at most this share may be off by more. So a column, or a corner that is cut off, leaves a world right-angled.
+# A wall is square if it is within SQUARE radians of a right angle to the others. A right-angled
+# world has at most OBLIQUE of its walls, by length, that are not: a column or a cut corner.
 SQUARE, OBLIQUE = math.radians(5), 0.1
-# The smallest `reach` of a world, in metres: a laser reports no range that is smaller.
+# Smallest `reach` of a world in metres: a laser reports no smaller range.
 NEAREST = 0.01
-# Bytes that a world file may have.
+# Largest size of a world file in bytes.
 LARGEST = 64 * 2**20
 
 
 def checked_segments(name: str, value: object) -> Array:
-    """Segments, (n, 4), in metres. Raises SimulatorError."""
+    """Check an array of segments, (n, 4), in metres. Raises SimulatorError."""
     if (
         isinstance(value, np.ndarray)
         and value.dtype.kind in "fiu"
@@ -63,12 +65,13 @@ def checked_segments(name: str, value: object) -> Array:
     ):
         return value
     raise SimulatorError(
-        f"{name}: expected an array of segments, (n, 4) in metres, got {brief(value)}; make one with numpy.array"
+        f"{name}: expected an array of segments, (n, 4) in metres, got {brief(value)}; make "
+        "one with numpy.array"
     )
 
 
 def pose_of(name: str, value: object) -> tuple[float, float, float]:
-    """A pose (x, y, heading), in metres and radians. Raises SimulatorError."""
+    """Check a pose (x, y, heading) in metres and radians. Raises SimulatorError."""
     x, y, heading = numbers(
         name, value, SimulatorError, 3, "x, y and heading, in metres and radians"
     )
@@ -77,7 +80,15 @@ def pose_of(name: str, value: object) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class TrueDState:
-    """Where a dstate really is, for evaluation only. Its pose is (x, y, heading) in metres and radians."""
+    """The true pose of a dstate, for evaluation only.
+
+    Attributes:
+        name: Name of the dstate.
+        place: Name of its place.
+        path: Name of its path.
+        direction: 1 along the path, or -1.
+        pose: (x, y, heading) in metres and radians.
+    """
 
     name: str
     place: str
@@ -88,7 +99,13 @@ class TrueDState:
 
 @dataclass(frozen=True)
 class Clutter:
-    """A closed polygon. For each tour it is moved from where it stands in the file, by up to `moves` metres in x and y, and it is there with probability `present`."""
+    """A closed polygon that may be elsewhere, or absent, on each tour.
+
+    Attributes:
+        segments: (n, 4) walls in metres, as in the file.
+        moves: Largest shift in x and y for a tour, in metres.
+        present: Probability that it is there on a tour.
+    """
 
     segments: Array = field(repr=False)
     moves: tuple[float, float] = (0.0, 0.0)
@@ -97,17 +114,20 @@ class Clutter:
 
 @dataclass(frozen=True)
 class World:
-    """Walls and clutter.
+    """Walls and clutter, and what a robot is to do in them.
 
-    segments  the walls, (n, 4): x1, y1, x2, y2 in metres
-    start     the pose (x, y, heading) in which the robot starts, in metres and radians
-    route     the actions of one tour, which ends where it began; or the places to which it leads
-    reach     the distance at which the robot follows a wall, in metres: half the width of a corridor
-    dstates   the truth, for evaluation only
-    angles    the angles at which streets meet, which choose the control laws: right, or any
-    places    where places are, in metres, by their names: those of the dstates, or those of a route of places
-    own_reach  the reach of the world's file, where another one was chosen
-    via       points that are no places, through which a route of places may lead
+    Attributes:
+        name: Name of the world.
+        segments: (n, 4) walls: x1, y1, x2, y2 in metres.
+        clutter: Polygons that may move between tours.
+        start: Start pose (x, y, heading) in metres and radians.
+        route: Actions of one tour, which ends where it began; or the places to drive to.
+        reach: Distance in metres at which the robot follows a wall: half the width of a corridor.
+        dstates: The truth, for evaluation only.
+        angles: Angles at which streets meet, which choose the control laws: right, or any.
+        places: (x, y) of places in metres by name: those of the dstates, or of a route of places.
+        via: (x, y) by name of points that are no places, through which a route of places may lead.
+        own_reach: The reach of the file, if another one was chosen.
     """
 
     name: str
@@ -151,12 +171,12 @@ class World:
 
     @property
     def by_places(self) -> bool:
-        """Whether the route is one of places."""
+        """Whether the route consists of places."""
         return bool(self.route) and not set(self.route) <= set(ACTIONS)
 
     @property
     def stops(self) -> dict[str, Point]:
-        """All that a route of places may lead to."""
+        """All points that a route of places may lead to."""
         return {**self.via, **self.places}
 
     @property
@@ -173,7 +193,7 @@ class World:
         return left < x < right and bottom < y < top
 
     def arranged(self, rng: np.random.Generator) -> World:
-        """This world as it is on one tour: the clutter has been moved at random, and is part of the walls."""
+        """Make the world of one tour: move the clutter at random, and add it to the walls."""
         an_instance(
             "rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)"
         )
@@ -195,7 +215,10 @@ class World:
         return float(np.hypot(*(a + t[:, None] * along - np.array([x, y])).T).min())
 
     def nearest(self, pose: Sequence[float]) -> TrueDState | None:
-        """The true dstate that is nearest to a pose, where a radian counts like a metre; None if the world knows no true dstates."""
+        """The true dstate nearest to a pose, where a radian counts as a metre.
+
+        None if the world has no true dstates.
+        """
         x, y, heading = pose_of("pose", pose)
         if not self.dstates:
             return None
@@ -210,7 +233,16 @@ class World:
     def with_choices(
         self, start: str | None = None, route: str | None = None, reach: float | None = None
     ) -> World:
-        """This world with another start ("x,y,degrees"), route ("travel,right,…") or reach (metres). Raises SimulatorError."""
+        """Change the start, route or reach.
+
+        Args:
+            start: "x,y,degrees" in metres and degrees.
+            route: "travel,right,…", or names of places.
+            reach: Metres.
+
+        Raises:
+            SimulatorError: An argument has no such form.
+        """
         reader = _Reader(self.name)
         world = self
         if start is not None:
@@ -231,7 +263,14 @@ class World:
 
     @classmethod
     def named(cls, name: str) -> World:
-        """A world that comes with the package (as notched-rectangle or triangle), or the one in a file: .json, or .yaml for an occupancy map."""
+        """Load a world by name, such as notched-rectangle or triangle, or from a file.
+
+        Args:
+            name: Name of a world of the package, or a file: .json, or .yaml for an occupancy map.
+
+        Raises:
+            SimulatorError: There is no such world.
+        """
         shipped = {
             path.stem: path for path in (Path(str(files("simulator"))) / "worlds").glob("*.json")
         }
@@ -239,7 +278,8 @@ class World:
             return cls.load(shipped[name])
         if not isinstance(name, str) or not Path(name).suffix:
             raise SimulatorError(
-                f"world: expected one of {', '.join(sorted(shipped))}, or a file, got {brief(name)}; a file ends in .json or .yaml"
+                f"world: expected one of {', '.join(sorted(shipped))}, or a file, got "
+                f"{brief(name)}; a file ends in .json or .yaml"
             )
         return (
             cls.from_occupancy(name) if Path(name).suffix in (".yaml", ".yml") else cls.load(name)
@@ -247,45 +287,55 @@ class World:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> World:
-        """The world in a JSON file. Raises SimulatorError that names the field."""
+        """Load a world from a JSON file. Raises SimulatorError that names the field."""
         path = a_path("path", path, SimulatorError)
         try:
             data = parse_json(read_at_most(path, LARGEST).decode("utf-8"))
         except OSError as error:
             raise SimulatorError(
-                f"{named(path)}: expected a readable world: {error.strerror or error}; check the path"
+                f"{named(path)}: expected a readable world: {error.strerror or error}; check "
+                "the path"
             ) from None
         except ValueError as error:
             raise SimulatorError(
-                f"{named(path)}: expected a world in JSON, got something else ({brief(str(error))}); mend it"
+                f"{named(path)}: expected a world in JSON, got something else "
+                f"({brief(str(error))}); mend it"
             ) from None
         return _Reader(str(path)).world(data)
 
     @classmethod
     def from_occupancy(cls, path: str | os.PathLike[str]) -> World:
-        """The world whose walls are those of an occupancy map, as ROS stores it: a YAML file and its image (docs/worlds.md)."""
+        """Make a world from an occupancy map of ROS, a YAML file and its image (docs/worlds.md).
+
+        The robot starts in the mean of the ends of all walls.
+        """
         name, segments = read_occupancy(Path(a_path("path", path, SimulatorError)))
         middle = segments.reshape(-1, 2).mean(0)
         return cls(printable(name), segments, start=(float(middle[0]), float(middle[1]), 0.0))
 
 
 def are_square(walls: Array) -> bool:
-    """Whether nearly all walls, by their length, are along two directions that are at right angles."""
+    """Whether nearly all walls, by length, have one of two perpendicular directions."""
     ways = (walls[:, 2] - walls[:, 0]) + 1j * (walls[:, 3] - walls[:, 1])
     lengths = np.abs(ways)
-    directions = np.angle(ways) * 4  # walls along the axes, either way, have one direction
+    directions = np.angle(ways) * 4  # Directions a quarter turn apart become equal.
     axis = directions[lengths.argmax()]
     off = np.abs(np.angle(np.exp(1j * (directions - axis)))) / 4
     return bool(lengths[off > SQUARE].sum() <= OBLIQUE * lengths.sum())
 
 
 class _Reader:
-    """Checks the fields of a world, and says which one is wrong."""
+    """Checks the fields of a world, and names the wrong one.
+
+    Args:
+        where: Name of the file, for errors.
+    """
 
     def __init__(self, where: str) -> None:
         self.where = where
 
     def world(self, data: Any) -> World:
+        """Make the world of a JSON object."""
         if (
             not isinstance(data, Mapping)
             or data.get("format") != FORMAT
@@ -339,7 +389,8 @@ class _Reader:
 
     def wrong(self, name: str, expected: str, value: Any) -> SimulatorError:
         return SimulatorError(
-            f"{self.where}: {name}: expected {expected}, got {brief(value)}; mend it (docs/worlds.md)"
+            f"{self.where}: {name}: expected {expected}, got {brief(value)}; mend it "
+            "(docs/worlds.md)"
         )
 
     def list(self, data: Mapping[str, Any], name: str) -> list[Any]:
@@ -355,14 +406,17 @@ class _Reader:
         return np.array(value, dtype=float)
 
     def loop(self, value: Any, name: str) -> Array:
-        """A closed polygon as segments."""
+        """Segments of a closed polygon."""
         if not isinstance(value, list) or len(value) < 3:
             raise self.wrong(name, "at least three points [x, y]", value)
         points = np.array([self.numbers(p, 2, f"{name}[{i}]") for i, p in enumerate(value)])
         return np.hstack([points, np.roll(points, -1, axis=0)])
 
     def arc(self, value: Any, name: str) -> Array:
-        """An arc as segments: x and y of its centre, its radius, and between which directions it is, counter-clockwise, in degrees."""
+        """Segments of an arc: x and y of the centre, radius, first and last direction.
+
+        Directions are degrees, counterclockwise.
+        """
         x, y, radius, first, last = self.numbers(value, 5, name)
         if not radius > 0 or not 0 < last - first <= 360:
             raise self.wrong(
@@ -375,13 +429,16 @@ class _Reader:
         return np.hstack([points[:-1], points[1:]])
 
     def occupancy(self, value: Any) -> Array:
-        """The walls of an occupancy map, whose YAML file is named against the folder of the world."""
+        """Walls of an occupancy map, named relative to the folder of the world."""
         if not isinstance(value, str):
             raise self.wrong("occupancy", "the name of a YAML file", value)
         return read_occupancy(Path(self.where).parent / value)[1]
 
     def ragged(self, walls: Array, value: Any) -> Array:
-        """The walls in pieces, whose ends are off by so many metres (a standard deviation): always the same, so that a world looks the same on each drive."""
+        """Cut walls into pieces, and shift their ends by Gaussian noise in metres.
+
+        The noise is always the same, so that a world looks the same on each drive.
+        """
         if not is_finite(value) or not 0 <= value <= 1:
             raise self.wrong("ragged", "metres by which walls are uneven, 0 to 1", value)
         if not value:
@@ -398,9 +455,10 @@ class _Reader:
                 (x1, y1), (x2, y2), 1 + math.ceil(math.hypot(x2 - x1, y2 - y1) / RAGGED)
             )
             pieces.append(np.hstack([line[:-1], line[1:]]))
+        # Walls that meet still meet.
         ends, which = np.unique(
             np.vstack(pieces).reshape(-1, 2).round(6), axis=0, return_inverse=True
-        )  # walls that meet still do
+        )
         moved: Array = (ends + np.random.default_rng(0).normal(0, value, ends.shape))[
             which.ravel()
         ].reshape(-1, 4)
@@ -417,7 +475,7 @@ class _Reader:
         return {text: (x, y) for text, (x, y) in found.items()}
 
     def route(self, value: Sequence[Any], stops: Mapping[str, Point]) -> tuple[str, ...]:
-        """Actions, or the names of places."""
+        """Check a route of actions or of places."""
         by_places = any(isinstance(stop, str) and stop in stops for stop in value)
         for i, stop in enumerate(value):
             if by_places and not (isinstance(stop, str) and stop in stops):

@@ -834,7 +834,16 @@ def test_docstrings_run() -> None:
     import doctest
     import importlib
 
-    for name in ("confidence", "features", "quality", "reciprocal", "views", "recognition"):
+    for name in (
+        "appearance",
+        "confidence",
+        "features",
+        "likelihood",
+        "quality",
+        "reciprocal",
+        "recognition",
+        "views",
+    ):
         result = doctest.testmod(importlib.import_module(f"perception.{name}"))
         assert result.failed == 0
         assert result.attempted > 0

@@ -11,7 +11,8 @@ import pytest
 
 from simulator.errors import SimulatorError
 from simulator.motion import moved
-from simulator.plans import APART, STRAIGHT, Plan, tour
+from simulator.plan_tours import tour
+from simulator.plans import APART, STRAIGHT, Plan
 from ssh_abduction import Theory, Trace, evaluate, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import Odometry

@@ -89,7 +89,7 @@ THEMES: dict[str, tuple[str, ...]] = {
         "simulator.panorama.Camera",
         "simulator.panorama.Paint",
         "simulator.plans.Plan",
-        "simulator.plans.tour",
+        "simulator.plan_tours.tour",
         "perception.errors.PerceptionError",
         "simulator.errors.SimulatorError",
     ),

@@ -1,0 +1,199 @@
+"""Reads floor plans from XML files, as in M. Luperto's data set of school plans.
+
+A file has rooms as polygons in pixels, doors as `portal`, and the size of a pixel.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from simulator.errors import SimulatorError
+from ssh_abduction.data.checks import a_path
+from ssh_abduction.data.errors import brief, named, printable
+from ssh_abduction.data.files import read_at_most
+
+Point = tuple[float, float]
+# Largest size of a plan in bytes.
+LARGEST = 64 * 2**20
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+
+@dataclass(frozen=True)
+class Room:
+    """A room.
+
+    Attributes:
+        name: Its name in the file.
+        use: Its purpose.
+        centre: (x, y) of its middle in metres.
+        polygon: Its corners in metres.
+    """
+
+    name: str
+    use: str
+    centre: Point
+    polygon: tuple[Point, ...] = field(default=(), repr=False)
+
+
+@dataclass(frozen=True)
+class Door:
+    """A door between two rooms.
+
+    Attributes:
+        rooms: Indices of the rooms in the plan.
+        position: (x, y) in metres.
+    """
+
+    rooms: tuple[int, int]
+    position: Point
+
+
+def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tuple[Door, ...]]:
+    """Read the name, the rooms and the doors of a plan. Raises SimulatorError."""
+    path = a_path("path", path, SimulatorError)
+    try:
+        data = read_at_most(path, LARGEST)
+    except OSError as error:
+        raise SimulatorError(
+            f"{named(path)}: expected a readable plan: {error.strerror or error}; check the path"
+        ) from None
+    except ValueError as error:
+        raise SimulatorError(f"{named(path)}: expected a plan: {error}; check the path") from None
+    if b"<!ENTITY" in data:
+        raise SimulatorError(
+            f"{named(path)}: expected a plan without entities of its own, got some; write them out"
+        )
+    try:
+        building = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise SimulatorError(
+            f"{named(path)}: expected a plan in XML, got something else "
+            f"({brief(str(error))}); mend it"
+        ) from None
+    name = printable(Path(path).stem.removesuffix("_updated"))
+    return name, *_Reader(named(path)).plan(building)
+
+
+class _Reader:
+    """Reads the XML of a plan, and says what is wrong with it.
+
+    Args:
+        where: Name of the file, for errors.
+    """
+
+    def __init__(self, where: str) -> None:
+        self.where = where
+
+    def plan(self, building: Element) -> tuple[tuple[Room, ...], tuple[Door, ...]]:
+        """Make the rooms and doors of a plan."""
+        scale = self.scale(building)
+        spaces = building.findall("floor/spaces/space")
+        if not spaces:
+            raise self.wrong("floor/spaces", "at least one space", None)
+        rooms = tuple(self.room(space, f"space[{i}]", scale) for i, space in enumerate(spaces))
+        numbers = {room.name: i for i, room in enumerate(rooms)}
+        if len(numbers) < len(rooms):
+            raise self.wrong("space", "an id for each space that no other has", None)
+        # Collect the positions of each door from both of its rooms.
+        sides: dict[tuple[int, int], dict[int, list[Point]]] = {}
+        for here, space in enumerate(spaces):
+            middles = {
+                line.get("id"): self.middle(line, scale)
+                for line in space.findall("space_representation/linesegment")
+            }
+            for i, portal in enumerate(space.findall("portals/portal")):
+                pair = self.pair(portal, numbers, here, f"space[{here}].portal[{i}]")
+                if (middle := middles.get(portal.findtext("linesegment"))) is not None:
+                    sides.setdefault(pair, {}).setdefault(here, []).append(middle)
+        doors = tuple(
+            Door(pair, position)
+            for pair in sorted(sides)
+            for position in _matched(*(sides[pair].get(room, []) for room in pair))
+        )
+        return rooms, doors
+
+    def wrong(self, name: str, expected: str, value: object) -> SimulatorError:
+        return SimulatorError(
+            f"{self.where}: {name}: expected {expected}, got "
+            f"{'none' if value is None else brief(value)}; mend it"
+        )
+
+    def scale(self, building: Element) -> float:
+        """Metres a pixel."""
+        pixels = self.number(
+            building.findtext("scale/represented_distance/value"), "scale/represented_distance"
+        )
+        length = self.number(building.findtext("scale/real_distance/value"), "scale/real_distance")
+        unit = building.findtext("scale/real_distance/um")
+        if unit not in METRES:
+            raise self.wrong("scale/real_distance/um", " or ".join(METRES), unit)
+        if not (pixels > 0 and length > 0):
+            raise self.wrong("scale", "distances above 0", [pixels, length])
+        return METRES[unit] * length / pixels
+
+    def room(self, space: Element, where: str, scale: float) -> Room:
+        if not (name := space.get("id")):
+            raise self.wrong(f"{where}.id", "a text", name)
+        corners = tuple(
+            self.point(point, where, scale) for point in space.findall("bounding_polygon/point")
+        )
+        centre = self.point(space.find("centroid/point"), f"{where}.centroid", scale)
+        return Room(name, (space.findtext("labels/label") or "").strip(), centre, corners)
+
+    def pair(
+        self, portal: Element, numbers: Mapping[str, int], here: int, where: str
+    ) -> tuple[int, int]:
+        names = [target.text or "" for target in portal.findall("target/id")]
+        rooms = sorted({numbers[name] for name in names if name in numbers})
+        if len(names) != 2 or len(rooms) != 2 or here not in rooms:
+            raise self.wrong(f"{where}.target", "the ids of this space and of another one", names)
+        return rooms[0], rooms[1]
+
+    def middle(self, line: Element, scale: float) -> Point:
+        ends = [self.point(point, "linesegment", scale) for point in line.findall("point")]
+        if not ends:
+            raise self.wrong("linesegment", "points", None)
+        return _mean(ends)
+
+    def point(self, point: Element | None, where: str, scale: float) -> Point:
+        """A point in metres. In drawings y points down; here it points north."""
+        if point is None:
+            raise self.wrong(f"{where}.point", "x and y", None)
+        return scale * self.number(point.get("x"), f"{where}.x"), -scale * self.number(
+            point.get("y"), f"{where}.y"
+        )
+
+    def number(self, text: str | None, where: str) -> float:
+        try:
+            value = float(text or "")
+        except ValueError:
+            raise self.wrong(where, "a number", text) from None
+        if not abs(value) <= 1e6:
+            raise self.wrong(where, "a number of at most 1,000,000", text)
+        return value
+
+
+def _matched(here: Sequence[Point], there: Sequence[Point]) -> Iterator[Point]:
+    """The doors between two rooms, each drawn on both sides of the wall or on one side only."""
+    distances = np.array([[math.dist(a, b) for b in there] for a in here]).reshape(
+        len(here), len(there)
+    )
+    first, second = linear_sum_assignment(distances)
+    yield from (_mean([here[i], there[j]]) for i, j in zip(first, second, strict=True))
+    yield from (point for i, point in enumerate(here) if i not in first)
+    yield from (point for j, point in enumerate(there) if j not in second)
+
+
+def _mean(points: Sequence[Point]) -> Point:
+    return math.fsum(x for x, _ in points) / len(points), math.fsum(y for _, y in points) / len(
+        points
+    )

@@ -1,0 +1,271 @@
+"""Simulates drives from room to room of a floor plan."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from simulator.errors import SimulatorError
+from simulator.motion import Pose, between, reported
+from simulator.plans import APART, Plan
+from ssh_abduction.data.checks import (
+    a_number,
+    a_whole_number,
+    an_instance,
+)
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.star import Gateway as Sighted
+from ssh_abduction.data.trace import Action, Step, Trace
+
+# Views round the directions of doors to this many degrees.
+COARSE = 45
+# Largest number of actions of a tour, so that its trace fits into memory.
+MOST_STEPS = 10_000_000
+
+
+@dataclass(frozen=True)
+class Stand:
+    """State of the robot on a tour.
+
+    Attributes:
+        room: The room.
+        gateway: The gateway that it faces, or has behind it.
+        faces: Whether it faces the gateway.
+    """
+
+    room: int
+    gateway: int
+    faces: bool = True
+
+
+def tour(
+    plan: Plan,
+    steps: int,
+    seed: int = 0,
+    odometry: Odometry | None = None,
+    *,
+    scale: float = 0.0,
+    bend: float = 0.0,
+    apart: float = APART,
+) -> Trace:
+    """Simulate a drive from room to room, with views, stars and displacements.
+
+    The robot turns to the door of the room that it has passed least often and travels through it.
+    Ties are broken at random. It does not go back through the door that it came by unless there is
+    no other. A turn is named by its side and by the number of gateways that it passes to that side.
+    A turn is "around" if it ends where the robot came from, or goes from a door to the opposite
+    one. A view is the number of doors and their rough directions, so many rooms look alike.
+
+    Args:
+        plan: The plan.
+        steps: Number of actions.
+        seed: Seed of the drive and of the noise.
+        odometry: Noise of the displacements, which the trace states; None makes them exact.
+        scale: Systematic error of distances, as in simulator.motion.reported.
+        bend: Systematic error of headings, as in simulator.motion.reported.
+        apart: Degrees between the doors of a room, as in Plan.told_apart. Bearings are off by at
+            most a quarter of it, so that two doors never look like one.
+
+    Returns:
+        A trace whose truth has dstate, place, path and pose.
+
+    Raises:
+        SimulatorError: No two rooms are connected.
+    """
+    an_instance("plan", plan, Plan, SimulatorError, mend="take Plan.load")
+    a_whole_number("steps", steps, SimulatorError, 0, MOST_STEPS, what="a number of actions")
+    a_whole_number("seed", seed, SimulatorError)
+    if odometry is not None:
+        an_instance(
+            "odometry",
+            odometry,
+            Odometry,
+            SimulatorError,
+            mend="make one with Odometry(), or leave it out",
+        )
+    a_number("scale", scale, SimulatorError, -1, 1, what="a share")
+    a_number("bend", bend, SimulatorError, -1, 1, what="radians a metre")
+    plan = plan.told_apart(apart)
+    if len(plan.connected) < 2:
+        raise SimulatorError(
+            f"{plan.name}: expected rooms with doors between them, got none that are "
+            "connected; take another plan"
+        )
+    # Separate generators, so that the noise does not change where the robot goes.
+    walk, drawn, sighted = (np.random.default_rng([seed, k]) for k in range(3))
+    logged: list[Step] = []
+    before: Pose | None = None
+    for stand, action in _drive(plan, steps, walk):
+        pose = _pose(plan, stand)
+        moved = None if before is None else between(before, pose)
+        if moved is not None and odometry is not None:
+            moved = reported(moved, odometry, drawn, scale=scale, bend=bend)
+        bearings = _bearings(plan, stand)
+        star = _sighted(plan, stand, apart / 4, sighted)
+        logged.append(Step(_view(bearings), action, star, moved, truth=_truth(plan, stand, pose)))
+        before = pose
+    return Trace(tuple(logged), name=f"{plan.name}, {steps} steps, seed {seed}", odometry=odometry)
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A plan as a world in which a robot is driven action by action.
+
+    >>> from simulator.plans import Door, Plan, Room
+    >>> from simulator.plan_tours import Floor
+    >>> rooms = Room("a", "", (0, 0)), Room("b", "", (0, 9))
+    >>> floor = Floor(Plan("two", rooms, (Door((0, 1), (0, 5)),)))
+    >>> floor.sight(floor.start).view, [action.name for action in floor.ends(floor.start)]
+    ('1 door: 0', ['travel'])
+
+    Attributes:
+        plan: The plan, with doors told apart already, as by Plan.told_apart.
+        spread: Error of the bearings that a star states, in degrees. The bearings are exact.
+    """
+
+    plan: Plan
+    spread: float = APART / 4
+
+    @property
+    def start(self) -> Stand:
+        """At the first gateway of the first connected room."""
+        return Stand(self.plan.connected[0], 0)
+
+    def sight(self, stand: Stand) -> Step:
+        """What the robot sees: a step with a view and a star, but no truth."""
+        bearings = _bearings(self.plan, stand)
+        return Step(_view(bearings), star=_star(self.plan, stand, bearings, self.spread))
+
+    def ends(self, stand: Stand) -> dict[Action, Stand]:
+        """The possible actions with their results: turns to other gateways, and travels."""
+        return dict(
+            next(self.way_through(stand, goal))
+            for goal in range(len(self.plan.gateways[stand.room]))
+        )
+
+    def way_through(self, stand: Stand, goal: int) -> Iterator[tuple[Action, Stand]]:
+        """The actions that lead through a gateway of the room, with their results."""
+        return _way_through(self.plan, stand, goal)
+
+
+def _drive(
+    plan: Plan, steps: int, chance: np.random.Generator
+) -> Iterator[tuple[Stand, Action | None]]:
+    """The states of a drive with the next actions, which end with None."""
+    room = int(chance.choice(plan.connected))
+    stand = Stand(room, int(chance.integers(len(plan.gateways[room]))))
+    came_by: int | None = None
+    passed: Counter[int] = Counter()
+    while True:
+        found = plan.gateways[stand.room]
+        choices = [k for k, g in enumerate(found) if g.door != came_by] or list(range(len(found)))
+        least = min(passed[found[k].door] for k in choices)
+        goal = int(chance.choice([k for k in choices if passed[found[k].door] == least]))
+        for action, after in _way_through(plan, stand, goal):
+            if steps == 0:
+                yield stand, None
+                return
+            yield stand, action
+            stand, steps = after, steps - 1
+        came_by = found[goal].door
+        passed[came_by] += 1
+
+
+def _way_through(plan: Plan, stand: Stand, goal: int) -> Iterator[tuple[Action, Stand]]:
+    """The actions that lead through a gateway of a room, with their results."""
+    if stand != (turned := Stand(stand.room, goal)):
+        yield _turn(plan, stand, goal), turned
+    gateway = plan.gateways[stand.room][goal]
+    back = next(k for k, g in enumerate(plan.gateways[gateway.to]) if g.door == gateway.door)
+    ahead = plan.gateways[gateway.to][back].opposite
+    yield (
+        Action.of("travel"),
+        Stand(gateway.to, back, False) if ahead is None else Stand(gateway.to, ahead),
+    )
+
+
+def _turn(plan: Plan, stand: Stand, goal: int) -> Action:
+    """The turn to a gateway, numbered on its side without the gateway that the robot faces."""
+    found = plan.gateways[stand.room]
+    if goal == (found[stand.gateway].opposite if stand.faces else stand.gateway):
+        return Action.of("around")
+    bearings = _bearings(plan, stand)
+    clockwise = sorted(bearing for bearing in bearings if bearing > 0)
+    side, order = ("right", clockwise) if bearings[goal] < 180 else ("left", clockwise[::-1])
+    number = order.index(bearings[goal]) + 1
+    return Action.of(
+        {"name": f"{side} to gateway {number}", "kind": "turn", "turn": side, "gateway": number}
+    )
+
+
+def _heading(plan: Plan, stand: Stand) -> float:
+    """Heading in degrees clockwise from north."""
+    return plan.gateways[stand.room][stand.gateway].bearing + (0 if stand.faces else 180)
+
+
+def _bearings(plan: Plan, stand: Stand) -> tuple[float, ...]:
+    """Bearing of each gateway of the room, in degrees clockwise from ahead.
+
+    Their order would reveal the heading, so stars are sorted.
+    """
+    heading = _heading(plan, stand)
+    return tuple(
+        round((gateway.bearing - heading) % 360, 3) % 360 for gateway in plan.gateways[stand.room]
+    )
+
+
+def _sighted(
+    plan: Plan, stand: Stand, spread: float, chance: np.random.Generator
+) -> tuple[Sighted, ...]:
+    """The star with errors: each bearing is off by at most `spread` degrees."""
+    found = plan.gateways[stand.room]
+    off = chance.uniform(-spread, spread, len(found)).tolist()
+    bearings = [
+        round(bearing + wrong, 3) % 360
+        for bearing, wrong in zip(_bearings(plan, stand), off, strict=True)
+    ]
+    return _star(plan, stand, bearings, spread)
+
+
+def _view(bearings: Sequence[float]) -> str:
+    """The number of doors and their rough directions."""
+    rough = sorted({round(bearing / COARSE) * COARSE % 360 for bearing in bearings})
+    return f"{len(bearings)} door{'s' * (len(bearings) > 1)}: {' '.join(map(str, rough))}"
+
+
+def _star(
+    plan: Plan, stand: Stand, bearings: Sequence[float], spread: float
+) -> tuple[Sighted, ...]:
+    """The star of gateways at these bearings, sorted, with opposite doors marked."""
+    found = plan.gateways[stand.room]
+    order = sorted(range(len(found)), key=lambda k: bearings[k])
+    opposite = [found[k].opposite for k in order]
+    return tuple(
+        Sighted(bearings[k], spread, None if other is None else order.index(other))
+        for k, other in zip(order, opposite, strict=True)
+    )
+
+
+def _pose(plan: Plan, stand: Stand) -> Pose:
+    return (
+        *plan.rooms[stand.room].centre,
+        math.remainder(math.radians(90 - _heading(plan, stand)), math.tau),
+    )
+
+
+def _truth(plan: Plan, stand: Stand, pose: Pose) -> dict[str, object]:
+    """The truth about a step: dstate, place, path, direction and pose."""
+    door = plan.gateways[stand.room][stand.gateway].door
+    path, direction = plan.courses[stand.room, door]
+    place = f"room {stand.room}"
+    return {
+        "dstate": f"{place}, {'at' if stand.faces else 'from'} door {door}",
+        "place": place,
+        "path": f"path {path}",
+        "direction": direction if stand.faces else -direction,
+        "pose": [round(v, 5) for v in pose],
+    }
