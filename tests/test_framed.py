@@ -33,7 +33,7 @@ from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
 from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visits import OPEN, VisitLabels
-from ssh_abduction.solver.guesses import annealing
+from ssh_abduction.solver.guesses import annealing, sampling
 from ssh_abduction.solver.guesses.annealing import Guess, attempts
 from ssh_abduction.solver.guesses.merging import kept, merged_near
 from ssh_abduction.solver.prefixes import Prefixes
@@ -148,9 +148,10 @@ def test_lists_the_maps_of_the_plain_encoding(
         patch.multiple(same, **cores),
         patch.multiple(framed, **sought),
         patch.object(paths_module, "SECONDS", 0.0),
-        patch.multiple(
-            annealing, ANNEALED=((0.5, data.draw(st.integers(1, 20), label="sweeps")),), LAST=2
+        patch.object(
+            annealing, "ANNEALED", ((0.5, data.draw(st.integers(1, 20), label="sweeps")),)
         ),
+        patch.object(sampling, "LAST", 2),
         patch.object(FramedEngine, "_charted", charted),
         patch.object(engine.Task, "has_processors", processors),
     ):
@@ -183,7 +184,8 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(
         patch.multiple(framed, SOON=-1.0, Beside=Before, MANY_DSTATES=sweeps % 2),
         patch.object(same, "FIRST_PAIRS", 5 * (sweeps % 3)),
         patch.object(paths_module, "SECONDS", 0.0),
-        patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=2),
+        patch.object(annealing, "ANNEALED", ((0.5, sweeps),)),
+        patch.object(sampling, "LAST", 2),
         patch.object(engine.Task, "has_processors", True),
         patch.object(FramedEngine, "_named_at", always_named_at),
         patch.object(FramedEngine, "_charted", plainly_charted),
@@ -704,7 +706,10 @@ def test_a_guess_holds_the_stars(trace: Trace, sweeps: int) -> None:
     chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     if chart is None:
         return
-    with patch.multiple(annealing, ANNEALED=((0.5, sweeps),), LAST=1):
+    with (
+        patch.object(annealing, "ANNEALED", ((0.5, sweeps),)),
+        patch.object(sampling, "LAST", 1),
+    ):
         _, guess = next(attempts(chart))
     assert len(guess.states) == len(guess.sure) == len(chart.stars)
     stars: dict[int, tuple[int, ...]] = {}

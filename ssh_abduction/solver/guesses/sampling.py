@@ -1,0 +1,277 @@
+"""Draw the states of visits by annealing: a blocked Gibbs sampler of a hidden Markov model.
+
+`guesses/annealing.py` says what states are, and which are possible for each visit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+# The weight of each state in the Dirichlet prior, in visits. One visit outweighs the whole prior.
+WEIGHT = 0.002
+# The number of states in the prior. The true number would give small and large maps different
+# weights.
+STATES = 60
+# The power of probabilities in the last sweep of a stage, just below that of the model, 1.
+COLD = 0.95
+# Then LAST sweeps follow with the power QUENCHED, which make the result nearly deterministic.
+LAST, QUENCHED = 50, 4.0
+# The visits of a stretch, which are drawn together. All stretches are drawn side by side, given the
+# visits at their ends.
+STRETCH = 20
+# The likely states that a visit is drawn from. With 8, chosen twice as often, twice as many sweeps
+# are needed.
+LIKELY = 16
+# The sweeps after which likely states are chosen again.
+ROUND = 50
+
+States: TypeAlias = NDArray[np.int_]
+
+
+class _Transitions:
+    """How often actions led from state to state in the last draw.
+
+    The table of transitions has a row for each state and action, and a column for each state.
+
+    Attributes:
+        counts: The table.
+        totals: The sum of each row.
+    """
+
+    def __init__(
+        self, leaves: Sequence[tuple[int, int]], ways: int, states: int, labels: States
+    ) -> None:
+        """Count the transitions of a draw.
+
+        Args:
+            leaves: The slot and action at which each visit but the last ends.
+            ways: The states of a place. With 4, states 2 and 3 face opposite to 0 and 1.
+            states: The number of states.
+            labels: The state of each visit.
+        """
+        number: dict[int, int] = {}
+        self._slot = np.array([slot for slot, _ in leaves], dtype=int)
+        self._action = np.array(
+            [number.setdefault(action, len(number)) for _, action in leaves], dtype=int
+        )
+        self._actions = max(1, len(number))
+        self._ways = ways
+        self._states = states
+        self._back = np.arange(states) ^ 2  # for each state, the one that faces the other way
+        self._visits = np.arange(len(leaves))
+        self._counted, self.counts, self.totals = self._tallied(labels)
+
+    def count(self, labels: States) -> None:
+        """Count the transitions of another draw."""
+        self._counted, self.counts, self.totals = self._tallied(labels)
+
+    def rows(self, states: States, visits: States) -> States:
+        """The rows of the table for visits that are in these states."""
+        turned = (states + self._slot[visits]) % self._ways
+        rows: States = (states - states % self._ways + turned) * self._actions + self._action[
+            visits
+        ]
+        return rows
+
+    def entries(self, states: States) -> States:
+        """The entries of the table from the states of each visit to those of the next.
+
+        Args:
+            states: Visits x states, padded with -1. Padding gets the last row or column, where
+                nothing is likely.
+
+        Returns:
+            Visits but the last x states x states of the next visit.
+        """
+        rows = self.rows(states[:-1], self._visits[:, None])
+        rows[states[:-1] < 0] = self._states * self._actions
+        there = np.where(states[1:] < 0, self._states, states[1:])
+        entries: States = rows[:, :, None] * (self._states + 1) + there[:, None, :]
+        return entries
+
+    def likely(self, entries: States, power: float) -> NDArray[np.float32]:
+        """The probabilities of these entries, by the counts and the prior, to a power."""
+        shape = self._states * self._actions + 1, self._states + 1
+        totals = self.totals + np.float32(STATES * WEIGHT)
+        table = np.zeros(shape, dtype=np.float32)
+        table[:-1, :-1] = np.power(np.float32(WEIGHT) / totals, np.float32(power))[:, None]
+        row, column = np.divmod(self._counted, self._states)
+        table[row, column] = np.power(
+            (self.counts[row, column] + np.float32(WEIGHT)) / totals[row], np.float32(power)
+        )
+        return table.ravel()[entries]
+
+    def _tallied(self, labels: States) -> tuple[States, NDArray[np.float32], NDArray[np.float32]]:
+        """The transitions of a draw as entries of the table, the table, and its row sums.
+
+        The ways back of travels count, too.
+        """
+        here, there = labels[:-1], labels[1:]
+        rows = self.rows(here, self._visits)
+        entries = rows * self._states + there
+        if self._ways > 1:
+            back = self._back[there] * self._actions + self._action
+            entries = np.concatenate(
+                [entries, back * self._states + self._back[rows // self._actions]]
+            )
+        shape = self._states * self._actions, self._states
+        counts = np.bincount(entries, minlength=shape[0] * shape[1])
+        table = counts.reshape(shape).astype(np.float32)
+        return entries, table, table.sum(axis=1)
+
+
+@dataclass
+class _Choice:
+    """The states that visits are drawn from during a round of sweeps.
+
+    Attributes:
+        states: Visits x states, padded with -1.
+        entries: The entries of the table of transitions for these states.
+        drawn: The column of the last drawn state of each visit.
+    """
+
+    states: States
+    entries: States
+    drawn: States
+
+
+class Sampler:
+    """Draws the states of all visits again and again, given each other.
+
+    Attributes:
+        labels: The last drawn state of each visit.
+    """
+
+    def __init__(
+        self,
+        options: States,
+        leaves: Sequence[tuple[int, int]],
+        ways: int,
+        random: np.random.Generator,
+    ) -> None:
+        """Draw a state for each visit at random.
+
+        Args:
+            options: Visits x possible states, padded with -1.
+            leaves: The slot and action at which each visit but the last ends.
+            ways: The states of a place, as ways to stand there: 1 or 4.
+            random: The source of random numbers.
+        """
+        self._random = random
+        self._options = options
+        self._visits = np.arange(len(options))
+        counts = (options >= 0).sum(axis=1)
+        self.labels = options[self._visits, (random.random(len(counts)) * counts).astype(int)]
+        states = ways * (int(options.max()) // ways + 1)
+        self._transitions = _Transitions(leaves, ways, states, self.labels)
+
+    def anneal(self, first: float, sweeps: int, check: Callable[[], None]) -> None:
+        """Anneal the states.
+
+        Args:
+            first: The power of probabilities in the first sweep. It rises to COLD.
+            sweeps: The number of sweeps, before LAST sweeps with the power QUENCHED.
+            check: Called before each sweep; may raise.
+        """
+        for sweep in range(sweeps + LAST):
+            check()
+            power = first + (COLD - first) * sweep / sweeps if sweep < sweeps else QUENCHED
+            if sweep % ROUND == 0:
+                choice = self._choose(power)
+            self._sweep(choice, power)
+
+    def sure(self) -> NDArray[np.bool_]:
+        """Whether the actions to and from each visit lead where such actions mostly lead."""
+        counts = self._transitions.counts
+        rows = self._transitions.rows(self.labels[:-1], self._visits[:-1])
+        odd = counts[rows, self.labels[1:]] < counts[rows].max(axis=1)
+        sure = np.ones(len(self._visits), dtype=bool)
+        sure[:-1] &= ~odd
+        sure[1:] &= ~odd
+        return sure
+
+    def failed(self) -> int:
+        """The number of travels that lead elsewhere than most with the same state and action."""
+        return int((self._transitions.totals - self._transitions.counts.max(axis=1)).sum())
+
+    def _choose(self, power: float) -> _Choice:
+        """Choose LIKELY states for each visit at random, weighted by probability.
+
+        The last drawn state is always among them.
+        """
+        likely = self._transitions.likely(self._transitions.entries(self._options), power)
+        drawn = (self._options == self.labels[:, None]).argmax(axis=1)
+        starts, lengths = self._stretches(0)
+        ahead = self._filtered(self._options, likely, drawn, starts, lengths)
+        behind = np.ones_like(ahead)
+        # Backward messages of all stretches side by side, from their last visits to their first.
+        for i in range(int(lengths.max()) - 1, -1, -1):
+            visits = starts[lengths > i] + i
+            visits = visits[visits < self._visits[-1]]
+            last = lengths[lengths > i][: len(visits)] == i + 1
+            within, ends = visits[~last], visits[last]
+            behind[within] = (likely[within] @ behind[within + 1, :, None])[:, :, 0]
+            behind[ends] = likely[ends, :, drawn[ends + 1]]
+            behind[visits] /= behind[visits].max(axis=1, keepdims=True)
+        # The Gumbel trick samples states without replacement by their probabilities.
+        rank = np.log(np.maximum(ahead * behind, 1e-30)) + self._random.gumbel(size=ahead.shape)
+        rank[self._options < 0] = -np.inf
+        rank[self._visits, drawn] = np.inf
+        few = min(LIKELY, rank.shape[1])
+        chosen = np.argpartition(-rank, few - 1, axis=1)[:, :few]
+        states = np.take_along_axis(self._options, chosen, axis=1)
+        drawn = (states == self.labels[:, None]).argmax(axis=1)
+        return _Choice(states, self._transitions.entries(states), drawn)
+
+    def _sweep(self, choice: _Choice, power: float) -> None:
+        """Draw the states of all visits, stretch by stretch."""
+        likely = self._transitions.likely(choice.entries, power)
+        starts, lengths = self._stretches(int(self._random.integers(STRETCH)))
+        ahead = self._filtered(choice.states, likely, choice.drawn, starts, lengths)
+        place = choice.drawn.copy()
+        # Backward sampling: draw each visit given the visit after it.
+        for i in range(int(lengths.max()) - 1, -1, -1):
+            visits = starts[lengths > i] + i
+            weights = ahead[visits]
+            before = visits < self._visits[-1]
+            goes_on = visits[before]
+            weights[before] *= likely[goes_on, :, place[goes_on + 1]]
+            sums = weights.cumsum(axis=1)
+            drawn = (sums < self._random.random((len(visits), 1)) * sums[:, -1:]).sum(axis=1)
+            place[visits] = np.minimum(drawn, sums.shape[1] - 1)
+        choice.drawn = place
+        self.labels = choice.states[self._visits, place]
+        self._transitions.count(self.labels)
+
+    def _stretches(self, first: int) -> tuple[States, States]:
+        """The first visits and the lengths of stretches, if the second starts at `first`."""
+        starts = np.unique(np.append(0, np.arange(first, len(self._visits), STRETCH)))
+        return starts, np.diff(np.append(starts, len(self._visits)))
+
+    def _filtered(
+        self,
+        states: States,
+        likely: NDArray[np.float32],
+        drawn: States,
+        starts: States,
+        lengths: States,
+    ) -> NDArray[np.float32]:
+        """Forward messages: the probability of each state of each visit, as visits x states.
+
+        They are conditioned on the visits before it in its stretch, and on the last draw of the
+        visit before the stretch.
+        """
+        ahead = (states >= 0).astype(np.float32)
+        for i in range(int(lengths.max())):
+            visits = starts[lengths > i] + i
+            if i:
+                ahead[visits] = (ahead[visits - 1, None, :] @ likely[visits - 1])[:, 0]
+            else:
+                ahead[visits[1:]] = likely[visits[1:] - 1, drawn[visits[1:] - 1]]
+            ahead[visits] /= ahead[visits].sum(axis=1, keepdims=True)
+        return ahead
