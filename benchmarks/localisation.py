@@ -36,7 +36,7 @@ from ssh_abduction.data import Step
 from ssh_abduction.data.maps import DState
 from ssh_abduction.evaluation.paper.figures import draw_beliefs
 from ssh_abduction.online import Belief
-from ssh_abduction.online.localiser import Verdict
+from ssh_abduction.online.belief import Verdict
 
 FAMILIES: dict[str, Callable[[int], Walk]] = {
     "machines of 20 states, 6 views": lambda seed: moore(20, 6, steps=1000, seed=seed),

@@ -27,7 +27,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import LocaliserError, MapError, Step, TraceError
 from ssh_abduction.data.maps import DState
 from ssh_abduction.online import Belief, Chances
-from ssh_abduction.online.localiser import COLLAPSED, Verdict
+from ssh_abduction.online.belief import COLLAPSED, Verdict
 
 Array = np.ndarray[Any, Any]
 

@@ -105,7 +105,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _localiser(options: argparse.Namespace) -> Localiser:
     """The localiser that the options ask for. Raises AbductionError that names the file that is wrong."""
-    from ssh_abduction.online.localiser import Chances, Localiser
+    from ssh_abduction.online.chances import Chances
+    from ssh_abduction.online.localiser import Localiser
 
     maps = maps_of(read_maps(options.maps), str(options.maps))
     if not maps:

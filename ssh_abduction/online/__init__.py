@@ -5,21 +5,21 @@ from ssh_abduction import lazy_names
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
+    from ssh_abduction.online.belief import Belief
+    from ssh_abduction.online.chances import Chances
     from ssh_abduction.online.explorer import Exploration, Explorer
-    from ssh_abduction.online.localiser import Belief, Chances, Localiser
+    from ssh_abduction.online.localiser import Localiser
     from ssh_abduction.online.mapper import OnlineMapper
     from ssh_abduction.online.routes import Move, Route, route
 
 _HOMES = {
+    "belief": ("Belief",),
+    "chances": ("Chances",),
     "explorer": (
         "Exploration",
         "Explorer",
     ),
-    "localiser": (
-        "Belief",
-        "Chances",
-        "Localiser",
-    ),
+    "localiser": ("Localiser",),
     "mapper": ("OnlineMapper",),
     "routes": (
         "Move",

@@ -9,8 +9,10 @@ import numpy as np
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.online.belief import Belief
+from ssh_abduction.online.chances import Chances
 from ssh_abduction.online.hypotheses import Rival
-from ssh_abduction.online.localiser import Belief, Chances, Localiser
+from ssh_abduction.online.localiser import Localiser
 from ssh_abduction.online.rival_maps import RARE, RivalMaps
 from ssh_abduction.theory.theory import Theory
 
