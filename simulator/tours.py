@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,60 +17,19 @@ from simulator.errors import SimulatorError
 from simulator.freespace import FreeSpace
 from simulator.junctions import ACTIONS, Pilot
 from simulator.laser import Laser
-from simulator.motion import DIGITS
 from simulator.odometer import Odometer
 from simulator.panorama import Camera
-from simulator.robot import Body, Report, Robot
+from simulator.robot import Body, Robot
+from simulator.tour_log import Eye, Log, Star, covariance_of, noise_of
 from simulator.watch import Watch
 from simulator.world import World
 from ssh_abduction.data.checks import a_flag, a_number, a_whole_number, an_instance
-from ssh_abduction.data.odometry import Covariance, Displacement
-from ssh_abduction.data.odometry import Odometry as Noise
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.data.words import counted
 
 Array = NDArray[np.float64]
 # More tours than this are a mistake: they take days, and all steps are kept in memory.
 MOST_TOURS = 100_000
-QUARTERS = {"travel": 0, "right": 1, "around": 2, "left": 3}
-
-
-@dataclass
-class Star:
-    """The openings of the place where the robot is, as seen since it arrived.
-
-    Attributes:
-        reach: Half the width of a corridor in metres.
-        slots: Whether there is an opening, by slot. Slot 0 is the direction of arrival.
-        facing: The slot that the robot faces.
-    """
-
-    reach: float
-    slots: dict[int, bool] = field(default_factory=dict)
-    facing: int = 0
-
-    def act(self, action: str) -> None:
-        """Update the slots after an action."""
-        if action == "travel":
-            # The robot came through the opening behind it.
-            self.slots, self.facing = (
-                {2: True},
-                0,
-            )
-        else:
-            self.facing = (self.facing + QUARTERS[action]) % 4
-
-    def look(self, image: Array) -> None:
-        """Mark the directions ahead, right and left as openings if their walls are far.
-
-        The image does not show what is behind the robot.
-        """
-        for slot, beams in ((0, image[82:98]), (1, image[:10]), (3, image[-10:])):
-            self.slots[(self.facing + slot) % 4] = bool(np.median(beams) > 1.8 * self.reach)
-
-    def seen(self) -> tuple[float, ...]:
-        """The openings ahead, right, behind and left, as far as known."""
-        return tuple(float(self.slots.get((self.facing + k) % 4, False)) for k in range(4))
 
 
 def simulate(
@@ -145,7 +104,7 @@ def simulate(
         else _evenly(driver, log, world, tours, every, eye)
     )
     steps[-1] = replace(steps[-1], action=None)
-    odometry = _noise(log, world, body, tolerance if every is None else None)
+    odometry = noise_of(log, world, body, tolerance if every is None else None)
     extra = {} if camera is None else {"panorama": list(camera.shape)}
     return Trace(
         tuple(steps),
@@ -275,105 +234,6 @@ def _driver(
     )
 
 
-def _noise(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Noise:
-    """The noise of the displacements. If each has a covariance, only systematic errors remain."""
-    if world.angles == "any" and tolerance is not None:
-        return Noise(scale=abs(body.scale), bend=abs(body.bend))
-    return noise_model(log.reports, body, tolerance)
-
-
-@dataclass
-class Eye:
-    """Makes the logged image of a step: ranges of the laser, or a panorama.
-
-    Attributes:
-        camera: The camera, or None for ranges.
-        walls: Number of segments of the world without clutter.
-        rng: Source of noise of the camera.
-        actions: Number of actions of the run, which tells the hour.
-    """
-
-    camera: Camera | None
-    walls: int
-    rng: np.random.Generator
-    actions: int
-
-    def image(self, driver: Driver, ranges: Array, done: int) -> tuple[float, ...]:
-        """The image after this many actions."""
-        if self.camera is None:
-            return tuple(round(float(r), 4) for r in ranges)
-        hour = self.camera.hour(done / max(self.actions - 1, 1))
-        return tuple(
-            self.camera.shot(driver.world, driver.robot.pose, self.rng, hour, self.walls)
-            .ravel()
-            .tolist()
-        )
-
-
-@dataclass
-class Log:
-    """Odometry between the logged steps.
-
-    Attributes:
-        robot: The robot.
-        reports: Reports of its odometry between steps.
-        begun: Whether a step was logged already.
-    """
-
-    robot: Robot
-    reports: list[Report] = field(default_factory=list)
-    begun: bool = False
-
-    def displacement(self) -> Displacement | None:
-        """Displacement from the last step, rounded; None for the first step."""
-        report = self.robot.report()
-        if not self.begun:
-            self.begun = True
-            return None
-        self.reports.append(report)
-        dx, dy, turned = (round(v, DIGITS) for v in report.displacement)
-        return dx, dy, turned
-
-
-def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | None = None) -> Noise:
-    """The noise of the displacements between dstates, from odometry and hill-climbing.
-
-    Each reported motion has an error proportional to it, so the relative error of many motions
-    together is smaller. The shares here reproduce the mean covariance of the reports.
-
-    A map describes fixed points. Hill-climbing ends within its tolerance of them at both ends of a
-    step; the model assumes a uniform distribution. A wrong heading at the beginning also moves the
-    end sideways.
-
-    Args:
-        reports: Reports between steps.
-        body: Errors of the robot.
-        tolerance: Precision of hill-climbing; None for displacements between poses themselves.
-    """
-    ways = math.fsum(math.hypot(*r.displacement[:2]) ** 2 for r in reports)
-    turns = math.fsum(r.displacement[2] ** 2 for r in reports)
-    along, across, heading = (
-        np.sum([np.diag(r.covariance) for r in reports], axis=0) if reports else np.zeros(3)
-    )
-    share = 1 / ways if ways else 0.0
-    offset, tilt = (
-        (tolerance.close / math.sqrt(3), tolerance.straight / math.sqrt(3))
-        if tolerance
-        else (0.0, 0.0)
-    )
-    errors = {
-        "along": math.sqrt(along * share),
-        "across": math.sqrt(across * share + tilt**2),
-        "heading": math.sqrt(max(heading - body.odometry**2 * turns, 0.0) * share),
-        "turning": body.odometry,
-        "position": math.sqrt(2) * offset,
-        "angle": math.sqrt(2) * tilt,
-        "scale": abs(body.scale),
-        "bend": abs(body.bend),
-    }
-    return Noise.of({name: round(error, 6) for name, error in errors.items()})
-
-
 def _at_dstates(
     driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye
 ) -> Iterator[Step]:
@@ -433,27 +293,12 @@ def _at_junctions(
                 displacement=displacement,
                 covariance=None
                 if displacement is None
-                else _covariance(log.reports[-1], driver.tolerance, done),
+                else covariance_of(log.reports[-1], driver.tolerance, done),
                 truth=_truth(world, driver.robot.pose),
             )
             with watch.action(number, action):
                 pilot.act(action)
             done = action
-
-
-def _covariance(report: Report, tolerance: Tolerance, action: str) -> Covariance:
-    """Covariance of a displacement between fixed points, from odometry and hill-climbing.
-
-    Hill-climbing ends anywhere within its tolerance. A turn stays at one point, to a millimetre.
-    """
-    dx, dy, _ = report.displacement
-    near = tolerance.close / math.sqrt(3) if action == "travel" else 0.001
-    left = np.diag([near**2, near**2, tolerance.straight**2 / 3])
-    # A wrong heading moves the end sideways.
-    by_start = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
-    whole = report.covariance + by_start @ left @ by_start.T + left
-    a, b, c = (tuple(float(f"{v:.4g}") for v in row) for row in (whole + whole.T) / 2)
-    return a, b, c  # type: ignore[return-value]
 
 
 def _evenly(

@@ -19,7 +19,8 @@ from simulator.control import TURNS, Driver
 from simulator.errors import SimulatorError, SimulatorWarning
 from simulator.laser import meetings
 from simulator.motion import Pose, between
-from simulator.world import World, are_square
+from simulator.world import World
+from simulator.world_files import are_square
 
 # Largest distance from the expected place in metres, or `reach` if that is more, and largest
 # difference of heading in radians.

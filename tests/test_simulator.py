@@ -19,7 +19,8 @@ from simulator.laser import BEARINGS, Laser
 from simulator.motion import between, moved, reported
 from simulator.robot import Body, Robot
 from simulator.sight import LONG, sight
-from simulator.tours import noise_model, simulate
+from simulator.tour_log import noise_model
+from simulator.tours import simulate
 from simulator.world import World
 from ssh_abduction import Trace
 from ssh_abduction.data import Odometry

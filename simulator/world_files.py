@@ -1,0 +1,289 @@
+"""Reads the fields of world files: walls, clutter, places, routes and true dstates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.errors import SimulatorError
+from simulator.occupancy import FARTHEST, read_occupancy
+from ssh_abduction.data.errors import brief, is_finite, printable
+
+Array = NDArray[np.float64]
+Angles: TypeAlias = Literal["right", "any"]
+Point: TypeAlias = tuple[float, float]
+FORMAT, VERSION = "ssh-world", 1
+ACTIONS = ("travel", "right", "left", "around")
+# Largest length of the straight pieces of an arc in degrees, and of a ragged wall in metres.
+ARC, RAGGED = 5.0, 0.3
+# Largest total length of ragged walls, in metres.
+LONGEST = 20_000
+# A wall is square if it is within SQUARE radians of a right angle to the others. A right-angled
+# world has at most OBLIQUE of its walls, by length, that are not: a column or a cut corner.
+SQUARE, OBLIQUE = math.radians(5), 0.1
+# Smallest `reach` of a world in metres: a laser reports no smaller range.
+NEAREST = 0.01
+
+
+@dataclass(frozen=True)
+class TrueDState:
+    """The true pose of a dstate, for evaluation only.
+
+    Attributes:
+        name: Name of the dstate.
+        place: Name of its place.
+        path: Name of its path.
+        direction: 1 along the path, or -1.
+        pose: (x, y, heading) in metres and radians.
+    """
+
+    name: str
+    place: str
+    path: str
+    direction: int
+    pose: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Clutter:
+    """A closed polygon that may be elsewhere, or absent, on each tour.
+
+    Attributes:
+        segments: (n, 4) walls in metres, as in the file.
+        moves: Largest shift in x and y for a tour, in metres.
+        present: Probability that it is there on a tour.
+    """
+
+    segments: Array = field(repr=False)
+    moves: tuple[float, float] = (0.0, 0.0)
+    present: float = 1.0
+
+
+def are_square(walls: Array) -> bool:
+    """Whether nearly all walls, by length, have one of two perpendicular directions."""
+    ways = (walls[:, 2] - walls[:, 0]) + 1j * (walls[:, 3] - walls[:, 1])
+    lengths = np.abs(ways)
+    directions = np.angle(ways) * 4  # Directions a quarter turn apart become equal.
+    axis = directions[lengths.argmax()]
+    off = np.abs(np.angle(np.exp(1j * (directions - axis)))) / 4
+    return bool(lengths[off > SQUARE].sum() <= OBLIQUE * lengths.sum())
+
+
+class WorldReader:
+    """Checks the fields of a world, and names the wrong one.
+
+    Args:
+        where: Name of the file, for errors.
+    """
+
+    def __init__(self, where: str) -> None:
+        self.where = where
+
+    def fields(self, data: Any) -> dict[str, Any]:
+        """The fields of a World from a JSON object."""
+        if (
+            not isinstance(data, Mapping)
+            or data.get("format") != FORMAT
+            or data.get("version") != VERSION
+        ):
+            raise self.wrong(
+                "format", f'an object with "format": "{FORMAT}", "version": {VERSION}', data
+            )
+        walls = [self.loop(p, f"polygons[{i}]") for i, p in enumerate(self.list(data, "polygons"))]
+        walls += [
+            self.numbers(s, 4, f"segments[{i}]").reshape(1, 4)
+            for i, s in enumerate(self.list(data, "segments"))
+        ]
+        walls += [self.arc(a, f"arcs[{i}]") for i, a in enumerate(self.list(data, "arcs"))]
+        if "occupancy" in data:
+            walls.append(self.occupancy(data["occupancy"]))
+        if not walls:
+            raise self.wrong(
+                "polygons", "at least one wall in polygons, segments, arcs or occupancy", []
+            )
+        segments = np.vstack(walls)
+        dstates = tuple(
+            self.dstate(s, f"dstates[{i}]") for i, s in enumerate(self.list(data, "dstates"))
+        )
+        places = {state.place: state.pose[:2] for state in dstates} | self.points(
+            data.get("places", {}), "places"
+        )
+        via = self.points(data.get("via", {}), "via")
+        stops = {**via, **places}
+        route = self.route(self.list(data, "route"), stops)
+        start = [*stops[route[0]], 0.0] if set(route) & set(stops) else [0, 0, 0]
+        return {
+            "name": self.name(data.get("name", printable(Path(self.where).stem))),
+            "segments": self.ragged(segments, data.get("ragged", 0.0)),
+            "angles": self.angles(data.get("angles"), segments),
+            "clutter": tuple(
+                self.clutter(c, f"clutter[{i}]") for i, c in enumerate(self.list(data, "clutter"))
+            ),
+            "start": self.pose(data.get("start", start), "start"),
+            "route": route,
+            "reach": self.reach(data.get("reach", 1.0)),
+            "dstates": dstates,
+            "places": places,
+            "via": via,
+        }
+
+    def name(self, value: Any) -> str:
+        if not isinstance(value, str):
+            raise self.wrong("name", "a text", value)
+        return value
+
+    def wrong(self, name: str, expected: str, value: Any) -> SimulatorError:
+        return SimulatorError(
+            f"{self.where}: {name}: expected {expected}, got {brief(value)}; mend it "
+            "(docs/worlds.md)"
+        )
+
+    def list(self, data: Mapping[str, Any], name: str) -> list[Any]:
+        value = data.get(name, [])
+        if not isinstance(value, list):
+            raise self.wrong(name, "a list", value)
+        return value
+
+    def numbers(self, value: Any, count: int, name: str) -> Array:
+        good = isinstance(value, list) and len(value) == count
+        if not good or not all(is_finite(x) and abs(x) <= FARTHEST for x in value):
+            raise self.wrong(name, f"{count} finite numbers, of at most {FARTHEST:,.0f}", value)
+        return np.array(value, dtype=float)
+
+    def loop(self, value: Any, name: str) -> Array:
+        """Segments of a closed polygon."""
+        if not isinstance(value, list) or len(value) < 3:
+            raise self.wrong(name, "at least three points [x, y]", value)
+        points = np.array([self.numbers(p, 2, f"{name}[{i}]") for i, p in enumerate(value)])
+        return np.hstack([points, np.roll(points, -1, axis=0)])
+
+    def arc(self, value: Any, name: str) -> Array:
+        """Segments of an arc: x and y of the centre, radius, first and last direction.
+
+        Directions are degrees, counterclockwise.
+        """
+        x, y, radius, first, last = self.numbers(value, 5, name)
+        if not radius > 0 or not 0 < last - first <= 360:
+            raise self.wrong(
+                name,
+                "[x, y, radius above 0, from, to], where `to` is up to 360 degrees above `from`",
+                value,
+            )
+        angles = np.radians(np.linspace(first, last, 1 + math.ceil((last - first) / ARC)))
+        points = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
+        return np.hstack([points[:-1], points[1:]])
+
+    def occupancy(self, value: Any) -> Array:
+        """Walls of an occupancy map, named relative to the folder of the world."""
+        if not isinstance(value, str):
+            raise self.wrong("occupancy", "the name of a YAML file", value)
+        return read_occupancy(Path(self.where).parent / value)[1]
+
+    def ragged(self, walls: Array, value: Any) -> Array:
+        """Cut walls into pieces, and shift their ends by Gaussian noise in metres.
+
+        The noise is always the same, so that a world looks the same on each drive.
+        """
+        if not is_finite(value) or not 0 <= value <= 1:
+            raise self.wrong("ragged", "metres by which walls are uneven, 0 to 1", value)
+        if not value:
+            return walls
+        if np.hypot(*(walls[:, 2:] - walls[:, :2]).T).sum() > LONGEST:
+            raise self.wrong(
+                "ragged",
+                f"walls of at most {LONGEST:,} m together, as uneven walls have many pieces",
+                value,
+            )
+        pieces = []
+        for x1, y1, x2, y2 in walls:
+            line = np.linspace(
+                (x1, y1), (x2, y2), 1 + math.ceil(math.hypot(x2 - x1, y2 - y1) / RAGGED)
+            )
+            pieces.append(np.hstack([line[:-1], line[1:]]))
+        # Walls that meet still meet.
+        ends, which = np.unique(
+            np.vstack(pieces).reshape(-1, 2).round(6), axis=0, return_inverse=True
+        )
+        moved: Array = (ends + np.random.default_rng(0).normal(0, value, ends.shape))[
+            which.ravel()
+        ].reshape(-1, 4)
+        return moved
+
+    def points(self, value: Any, name: str) -> dict[str, Point]:
+        if not isinstance(value, Mapping):
+            raise self.wrong(name, "an object of names and points [x, y]", value)
+        if clash := next((text for text in value if text in ACTIONS or "," in text), None):
+            raise self.wrong(name, "names without commas that are no actions", clash)
+        found = {
+            text: self.numbers(point, 2, f"{name}.{text}").tolist() for text, point in value.items()
+        }
+        return {text: (x, y) for text, (x, y) in found.items()}
+
+    def route(self, value: Sequence[Any], stops: Mapping[str, Point]) -> tuple[str, ...]:
+        """Check a route of actions or of places."""
+        by_places = any(isinstance(stop, str) and stop in stops for stop in value)
+        for i, stop in enumerate(value):
+            if by_places and not (isinstance(stop, str) and stop in stops):
+                raise self.wrong(
+                    f"route[{i}]",
+                    f"a place ({', '.join(stops)}), as there are others in the route",
+                    stop,
+                )
+            if not by_places and stop not in ACTIONS:
+                raise self.wrong(
+                    f"route[{i}]",
+                    "travel, right, left or around" + (", or the name of a place" if stops else ""),
+                    stop,
+                )
+        return tuple(value)
+
+    def reach(self, value: Any) -> float:
+        if not is_finite(value) or not NEAREST <= value <= FARTHEST:
+            raise self.wrong("reach", f"metres above 0, {NEAREST} to {FARTHEST:,.0f}", value)
+        return float(value)
+
+    def angles(self, value: Any, walls: Array) -> Angles:
+        if value not in (None, "right", "any"):
+            raise self.wrong("angles", '"right" or "any"', value)
+        chosen: Angles = value or ("right" if are_square(walls) else "any")
+        return chosen
+
+    def pose(self, value: Any, name: str) -> tuple[float, float, float]:
+        x, y, degrees = self.numbers(value, 3, name)
+        return float(x), float(y), math.radians(degrees)
+
+    def clutter(self, value: Any, name: str) -> Clutter:
+        if not isinstance(value, Mapping):
+            raise self.wrong(name, "an object with a polygon", value)
+        moves = self.numbers(value.get("moves", [0, 0]), 2, f"{name}.moves")
+        present = value.get("present", 1.0)
+        if not is_finite(present) or not 0 <= present <= 1:
+            raise self.wrong(f"{name}.present", "a probability", present)
+        return Clutter(
+            self.loop(value.get("polygon"), f"{name}.polygon"),
+            (float(moves[0]), float(moves[1])),
+            float(present),
+        )
+
+    def dstate(self, value: Any, name: str) -> TrueDState:
+        if not isinstance(value, Mapping) or value.get("direction") not in (1, -1):
+            raise self.wrong(
+                name, "an object with name, place, path, direction 1 or -1, pose", value
+            )
+        texts = [value.get(key) for key in ("name", "place", "path")]
+        if not all(isinstance(text, str) for text in texts):
+            raise self.wrong(name, "texts for name, place and path", value)
+        label, place, path = map(str, texts)
+        return TrueDState(
+            label,
+            place,
+            path,
+            int(value["direction"]),
+            self.pose(value.get("pose"), f"{name}.pose"),
+        )
