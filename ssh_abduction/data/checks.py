@@ -1,4 +1,4 @@
-"""One way to check the arguments of public functions: each check returns the value, or raises one of the package's errors.
+"""Checks of the arguments of public functions. Each returns the value or raises an error.
 
 >>> from ssh_abduction.data.checks import a_number, one_of
 >>> from ssh_abduction.data.errors import MapError, SolverError
@@ -7,12 +7,13 @@
 >>> a_number("near", -1, SolverError, above=0, what="metres")
 Traceback (most recent call last):
 ssh_abduction.data.errors.SolverError: near: expected metres above 0, got -1; change it
->>> one_of("level", "rooms", ("places", "dstates"), MapError)
+>>> one_of("level", "all", ("places", "dstates"), MapError)
 Traceback (most recent call last):
-ssh_abduction.data.errors.MapError: level: expected places or dstates, got 'rooms'; take one of these
+ssh_abduction.data.errors.MapError: level: expected places or dstates, got 'all'; take one of these
 
-All checks take the name of the argument, its value, and the error to raise. numpy's numbers are numbers; true and false are
-none. A path is a text or an os.PathLike that stands for a text. Bytes are no path: decode them with os.fsdecode.
+All checks take what messages call the argument, its value, and the error to raise. Numbers of
+numpy are numbers; truth values are not. A path is a text, or an os.PathLike that stands for a text.
+Bytes are not a path: decode them with os.fsdecode.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ def a_whole_number(
 
 
 def a_count_of_maps(value: object, error: Kind) -> int | None:
-    """How many maps to list at most, 1 or more; None lists all."""
+    """The most maps to list, 1 or more; None for all."""
     mend = "None lists all (--maps 0)"
     return (
         None if value is None else a_whole_number("max_maps (--maps)", value, error, 1, mend=mend)
@@ -83,7 +84,7 @@ def a_count_of_maps(value: object, error: Kind) -> int | None:
 def numbers(
     name: str, value: object, error: Kind, length: int, what: str, mend: str = "change it"
 ) -> tuple[float, ...]:
-    """So many finite numbers, from a list, a tuple or an array."""
+    """A given number of finite numbers, from a list, a tuple or an array."""
     listed = value.tolist() if hasattr(value, "tolist") else value
     if (
         isinstance(listed, Sequence)
@@ -96,7 +97,7 @@ def numbers(
 
 
 def a_flag(name: str, value: object, error: Kind) -> bool:
-    """True or false; numpy's, too."""
+    """True or false, perhaps of numpy."""
     if isinstance(value, bool) or type(value).__name__ == "bool":  # numpy's, without loading numpy
         return bool(value)
     raise error(f"{name}: expected true or false, got {brief(value)}; take one of these")
@@ -136,7 +137,7 @@ def an_instance(name: str, value: object, kind: type[T], error: Kind, *, mend: s
 def all_instances(
     name: str, values: object, kind: type[T], error: Kind, *, mend: str
 ) -> tuple[T, ...]:
-    """Values of a class, from anything that can be iterated over. Messages name the first one that is wrong."""
+    """Values of a class, from any iterable. Messages name the first one that is wrong."""
     return tuple(
         an_instance(f"{name}[{i}]", value, kind, error, mend=mend)
         for i, value in enumerate(a_list(name, values, error))
@@ -146,7 +147,7 @@ def all_instances(
 def a_list(
     name: str, value: object, error: Kind, *, what: str = "a list", mend: str = "give a list"
 ) -> list[Any]:
-    """The members of a list, a tuple, an array, a generator or the like. A text, bytes and an object are no lists."""
+    """The members of an iterable that is not a text, bytes or a mapping."""
     if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
         return list(value)
     raise error(f"{name}: expected {what}, got {brief(value)}; {mend}")
@@ -160,19 +161,20 @@ def an_object(name: str, value: object, error: Kind) -> Mapping[str, Any]:
 
 
 def a_function(name: str, value: object, error: Kind, *, what: str) -> Callable[..., Any]:
-    """Anything that can be called."""
+    """A function, or anything else that can be called."""
     if callable(value):
         return value
     raise error(f"{name}: expected {what}, got {brief(value)}; give a function")
 
 
 def a_path(name: str, value: object, error: Kind) -> str:
-    """The path of a file, as a text. It may be empty, or hold what no path may hold: who opens the file says so."""
+    """The path of a file, as a text. Whether it is possible shows when the file is opened."""
     path = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if isinstance(path, str):
         return path
     raise error(
-        f"{name}: expected the path of a file, as a text or a pathlib.Path, got {brief(value)}; name a file"
+        f"{name}: expected the path of a file, as a text or a pathlib.Path, got {brief(value)}; "
+        f"name a file"
     )
 
 
@@ -182,16 +184,9 @@ def _between(low: float, high: float, above: float = -math.inf) -> str:
     def told(number: float) -> str:
         return f"{number:,.0f}" if number == round(number) else f"{number:g}"
 
+    has_low, has_high = math.isfinite(low), math.isfinite(high)
     if math.isfinite(above):
-        return f" above {told(above)}" + (
-            f" and at most {told(high)}" if math.isfinite(high) else ""
-        )
-    if math.isfinite(low) and math.isfinite(high):
-        return f" from {told(low)} to {told(high)}"
-    return (
-        f", {told(low)} or more"
-        if math.isfinite(low)
-        else f", {told(high)} or less"
-        if math.isfinite(high)
-        else ""
-    )
+        return f" above {told(above)}" + (f" and at most {told(high)}" if has_high else "")
+    if has_low:
+        return f" from {told(low)} to {told(high)}" if has_high else f", {told(low)} or more"
+    return f", {told(high)} or less" if has_high else ""

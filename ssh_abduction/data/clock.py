@@ -1,7 +1,7 @@
-"""Lets whatever takes long look at the clock and at Ctrl-C, wherever it is called from.
+"""Limits of time and Ctrl-C for code that does not know the search that it works for.
 
-A search knows its limits. The checker, evidence and sketches work for it, but do not know the search. So a search names the function that looks at
-its limits (`heeding`), and whatever may take longer than a moment calls `look_at_clock` in its loops. Where no search is under way, that does nothing.
+A search names the function that checks its limits (`heeding`). The checker, evidence and guesses
+call `look_at_clock` in loops that may take long. Without a search that does nothing.
 
 >>> def over():
 ...     raise TimeoutError("the time is over")
@@ -25,7 +25,7 @@ _check: ContextVar[Callable[[], None] | None] = ContextVar("check", default=None
 
 
 def look_at_clock() -> None:
-    """Call the function that `heeding` named last in this thread. It raises where the work is to end."""
+    """Check the limits of the search in this thread. It raises if the work has to end."""
     check = _check.get()
     if check is not None:
         check()
@@ -40,10 +40,10 @@ def each_looking(items: Iterable[Item]) -> Iterator[Item]:
 
 @contextmanager
 def heeding(check: Callable[[], None]) -> Iterator[None]:
-    """Let `look_at_clock` call this function within the context, after those of the contexts around it.
+    """Let `look_at_clock` call a function in this context, after those of the contexts around it.
 
     Args:
-        check: Raises where the work is to end. It is called often, so it should take microseconds.
+        check: Raises if the work has to end. It is called often, so it should take microseconds.
     """
     around = _check.get()
 
@@ -60,7 +60,7 @@ def heeding(check: Callable[[], None]) -> Iterator[None]:
 
 
 def each_heeding(check: Callable[[], None], items: Iterator[Item]) -> Iterator[Item]:
-    """The same items, each made within `heeding(check)`; whoever uses an item meanwhile does so outside of it."""
+    """The same items, each made within `heeding(check)` and used outside of it."""
     while True:
         with heeding(check):
             try:

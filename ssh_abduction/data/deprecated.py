@@ -1,4 +1,4 @@
-"""Old names of parameters, which work for one more version and warn."""
+"""Old names of parameters, which work for one more version, with a warning."""
 
 from __future__ import annotations
 

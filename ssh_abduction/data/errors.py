@@ -1,7 +1,9 @@
-"""Every error that a user can cause or mend: one root, one subclass a layer.
+"""The errors that a user can cause or mend: one root, and one subclass for each layer.
 
-What bad input causes is a ValueError, too, so that programs which know nothing of this package catch it. What bad input does not cause is none: a defect of
-this program (`InternalError` of `solver/judging.py`), and what is missing on a machine, which is an AbductionError alone. Limits that are over are no errors: `Solution.stopped` says so.
+Errors of bad input are ValueErrors, too, so that programs without knowledge of this package can
+catch them. Something that is missing on the machine is a plain AbductionError, and a defect of this
+package is an `InternalError` (`solver/judging.py`). A limit that was reached is no error:
+`Solution.stopped` says so.
 """
 
 from __future__ import annotations
@@ -13,14 +15,14 @@ from typing import TypeGuard
 
 
 class AbductionError(Exception):
-    """Root of the package's errors. Its text is one line: what was expected, what came, how to mend it."""
+    """The root of all errors. Its text is one line: what was expected, what came, what to do."""
 
     def __str__(self) -> str:
         return printable(super().__str__())  # names of files and views may hold anything
 
 
 class TraceError(AbductionError, ValueError):
-    """A trace, or a file of one, is malformed."""
+    """A trace or a trace file is malformed."""
 
 
 class TheoryError(AbductionError, ValueError):
@@ -28,29 +30,29 @@ class TheoryError(AbductionError, ValueError):
 
 
 class MapError(AbductionError, ValueError):
-    """A map, or a file of maps, is malformed."""
+    """A map or a file of maps is malformed."""
 
 
 class LocaliserError(AbductionError, ValueError):
-    """What a localiser is made of, or is asked, does not fit."""
+    """An argument of a localiser is wrong."""
 
 
 class SolverError(AbductionError, ValueError):
-    """The solver cannot do what was asked."""
+    """The solver cannot do this."""
 
 
 class RangeError(AbductionError, ValueError, IndexError):
-    """A step or a map that there is not. The text names the range."""
+    """There is no such step or map. The text names the range."""
 
 
 def named(source: object) -> str:
-    """A file's name as an error message shows it: on one line."""
+    """The name of a file for a message, on one line."""
     text = str(source)
     return text if text.isprintable() else repr(text)
 
 
 def brief(value: object, width: int = 60) -> str:
-    """`value` as an error message shows it: on one line, cut to `width` characters."""
+    """A value for a message, on one line of at most `width` characters."""
     try:
         text = repr(value)
     except (RecursionError, ValueError):  # nested without end, or a number of thousands of digits
@@ -59,7 +61,7 @@ def brief(value: object, width: int = 60) -> str:
 
 
 def printable(text: str) -> str:
-    """A text on one line, in which characters that would steer a terminal, or that nobody sees, are escaped."""
+    """A text on one line, with invisible characters and those that steer a terminal escaped."""
     return (
         text
         if text.isprintable()
@@ -68,14 +70,21 @@ def printable(text: str) -> str:
 
 
 def xml_text(text: str) -> str:
-    """A text without the characters that XML cannot hold, or that would steer a terminal, each replaced by U+FFFD."""
+    """A text for XML: characters that XML cannot hold or that steer a terminal become U+FFFD."""
     return re.sub("[^\t\n -~\u00a0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
 
 
 def checked_index(index: object, count: int, what: str) -> int:
-    """An index into `count` things, from 0; a negative one counts from the end. Raises RangeError that names the range, and TypeError where it is no whole number.
+    """An index that counts from 0.
 
-    what  the things, as messages call them: steps, maps
+    Args:
+        index: What the caller gave; a negative one counts from the end.
+        count: How many things there are.
+        what: What messages call them: steps, maps.
+
+    Raises:
+        RangeError: If there is no such thing.
+        TypeError: If the index is not a whole number.
     """
     if not is_whole(index):
         raise TypeError(f"{what}: expected a whole number or a slice, got {brief(index)}")
@@ -91,7 +100,7 @@ def checked_index(index: object, count: int, what: str) -> int:
 
 
 def is_finite(value: object) -> TypeGuard[float]:
-    """Whether a value is a number (numpy's, too; true and false are none) that a floating-point number can hold."""
+    """Whether a value is a number that a finite float can hold. Truth values are not numbers."""
     try:
         return (
             isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
@@ -101,12 +110,12 @@ def is_finite(value: object) -> TypeGuard[float]:
 
 
 def is_whole(value: object) -> TypeGuard[int]:
-    """Whether a value is a whole number (numpy's, too; true and false are none)."""
+    """Whether a value is a whole number. Truth values are not numbers."""
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 
 def is_writable(text: str) -> bool:
-    """Whether UTF-8 can hold a text: half of a surrogate pair cannot be written."""
+    """Whether UTF-8 can hold a text: it cannot hold one half of a surrogate pair."""
     try:
         text.encode("utf-8")
     except UnicodeEncodeError:

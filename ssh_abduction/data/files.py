@@ -1,4 +1,4 @@
-"""Files that nobody has checked yet are read, files are written so that they appear whole or not at all, and those that ship are found."""
+"""Reading JSON that may be malformed, writing files whole or not at all, finding shipped files."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-# So many objects and lists may be within each other: Python's own functions for values fail where there are thousands of them.
+# Levels of nested objects and lists. Python's own functions fail at thousands of levels.
 DEEPEST = 100
-# So many digits a whole number may have: longer ones cannot be made into floating-point numbers.
+# Digits of a whole number. A much longer one is no floating-point number.
 LONGEST_NUMBER = 100
-# How a line begins in which CARMEN, g2o or TORO log what a robot saw and did.
+# How a line of a log of CARMEN, g2o or TORO begins.
 LINE_OF_A_LOG = re.compile(
-    rb"^(FLASER|RLASER|ROBOTLASER\d|RAWLASER\d|ODOM|PARAM|SYNC|TRUEPOS|NEFF|VERTEX2|VERTEX_SE2|EDGE2|EDGE_SE2)\s",
+    rb"^(FLASER|RLASER|ROBOTLASER\d|RAWLASER\d|ODOM|PARAM|SYNC|TRUEPOS|NEFF"
+    rb"|VERTEX2|VERTEX_SE2|EDGE2|EDGE_SE2)\s",
     re.MULTILINE,
 )
 _LONG_NUMBER = re.compile(rf"\d{{{LONGEST_NUMBER + 1}}}")
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
-_UNSEEN = re.compile(
-    "[\x7f-\x9f\u2028\u2029]"
-)  # control characters that JSON need not escape, and that terminals obey
+# Control characters that JSON need not escape, and that steer a terminal.
+_UNSEEN = re.compile("[\x7f-\x9f\u2028\u2029]")
 
 
 class NotFinite(ValueError):  # noqa: N818 - part of an error message, which the caller completes
-    """JSON in which NaN or Infinity stands for a number. `field` says where."""
+    """JSON with NaN or Infinity, in the field `field`."""
 
     def __init__(self, field: str, text: str) -> None:
         super().__init__(f"{text} in {field}" if field else text)
@@ -39,14 +39,20 @@ class NotFinite(ValueError):  # noqa: N818 - part of an error message, which the
 
 
 class HalfCharacter(ValueError):  # noqa: N818 - part of an error message, which the caller completes
-    """JSON in which one half of a surrogate pair stands alone: no encoding can write it again."""
+    """JSON with one half of a surrogate pair, which no encoding can write again."""
 
 
 def parse_json(text: str) -> Any:
-    """The value of a JSON text that can be relied on: no field is given twice, numbers are finite and not endless, texts can be
+    """The value of a JSON text.
+
+    No field is given twice, numbers are finite and have at most LONGEST_NUMBER digits, texts can be
     written again, and nothing is nested more than DEEPEST times.
 
-    Raises json.JSONDecodeError for broken JSON, NotFinite, HalfCharacter, and ValueError with what was got instead of sound JSON.
+    Raises:
+        json.JSONDecodeError: If the JSON is broken.
+        NotFinite: If a number is not finite.
+        HalfCharacter: If a text cannot be written again.
+        ValueError: If something else is wrong; the text says what was found.
     """
     not_finite: list[str] = []
 
@@ -74,7 +80,12 @@ def parse_json(text: str) -> Any:
 
 
 def json_line(value: Any) -> str:
-    """A value as JSON on one line. Characters that would steer a terminal are escaped. Raises TypeError or ValueError."""
+    """A value as JSON on one line, with characters that steer a terminal escaped.
+
+    Raises:
+        TypeError: If JSON cannot hold the value.
+        ValueError: If JSON cannot hold the value.
+    """
     return _UNSEEN.sub(
         lambda found: f"\\u{ord(found[0]):04x}",
         json.dumps(value, ensure_ascii=False, allow_nan=False),
@@ -83,14 +94,19 @@ def json_line(value: Any) -> str:
 
 @cache
 def shipped(name: str) -> Path:
-    """The folder of this name that ships: inside the installed package, or beside it in a checkout."""
+    """A folder that ships with the package: inside of it or, in a checkout, beside it."""
     package = Path(__file__).resolve().parent.parent
     packaged = package / name
     return packaged if packaged.is_dir() else package.parent / name
 
 
 def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
-    """The bytes of a file. Raises OSError, and ValueError where there are more than `most`, as of a device that never ends."""
+    """The bytes of a file.
+
+    Raises:
+        OSError: If it cannot be read.
+        ValueError: If there are more than `most`. A device may never end.
+    """
     with Path(path).open("rb") as file:
         data = file.read(most + 1)
     if len(data) > most:
@@ -99,10 +115,14 @@ def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
 
 
 def write_file(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file, which appears whole or not at all, with the permissions of the file that it replaces.
+    """Write a file, which appears whole or not at all, and keeps the permissions of an older one.
 
-    Nothing but a regular file is ever replaced: through a symbolic link its target is written, and a device or a pipe takes the bytes.
-    Raises OSError, which names this file and no other, and ValueError for a text that is no path.
+    Only a regular file is replaced. Through a symbolic link its target is written. A device or a
+    pipe takes the bytes.
+
+    Raises:
+        OSError: If it cannot be written; the error names this file.
+        ValueError: If the text is no path.
     """
     if not os.fspath(path):
         raise ValueError("expected the name of a file, got an empty text")
@@ -117,9 +137,8 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> None:
         except OSError as error:
             raise OSError(error.errno, error.strerror, os.fspath(path)) from None
         return
-    draft = target.with_name(
-        f".{os.getpid()}-{threading.get_ident():x}.part"
-    )  # short, as the target's name may be as long as names can be
+    # A short name, as the target's name may be as long as names can be.
+    draft = target.with_name(f".{os.getpid()}-{threading.get_ident():x}.part")
     try:
         draft.write_bytes(data)
         if mode is not None:
@@ -128,11 +147,12 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> None:
     except OSError as error:
         raise OSError(error.errno, error.strerror, os.fspath(path)) from None
     finally:
-        with suppress(OSError):  # where the folder is not there, or is a file
+        with suppress(OSError):  # if the folder does not exist, or is a file
             draft.unlink(missing_ok=True)
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object without a field that is given twice."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
         names = [name for name, _ in pairs]
@@ -142,13 +162,14 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _integer(text: str) -> int:
+    """A whole number of JSON that is not too long."""
     if len(text) > LONGEST_NUMBER:
         raise ValueError(f"a number of more than {LONGEST_NUMBER} digits; shorten it")
     return int(text)
 
 
 def _is_deep(value: Any) -> bool:
-    """Whether more than DEEPEST objects and lists are within each other."""
+    """Whether objects and lists are nested more than DEEPEST times."""
     level = [value]
     for _ in range(DEEPEST + 1):
         inside = (
@@ -163,18 +184,13 @@ def _is_deep(value: Any) -> bool:
 
 
 def _where_nan(value: Any, path: str = "") -> str:
-    """The field in which a value that is no number stands."""
+    """The path of the first NaN in a value; an empty text if there is none."""
+    is_list = isinstance(value, list)
     inside: Iterable[tuple[Any, Any]] = (
-        value.items()
-        if isinstance(value, dict)
-        else enumerate(value)
-        if isinstance(value, list)
-        else ()
+        enumerate(value) if is_list else value.items() if isinstance(value, dict) else ()
     )
     for key, item in inside:
-        here = (
-            f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}" if path else str(key)
-        )
+        here = f"{path}[{key}]" if is_list else f"{path}.{key}" if path else str(key)
         if isinstance(item, float) and math.isnan(item):
             return here
         if isinstance(item, dict | list) and (deeper := _where_nan(item, here)):

@@ -1,6 +1,8 @@
-"""The package's log: `logging.getLogger("ssh_abduction")` and the loggers below it. Silent, unless a program asks (`logging.basicConfig`, or `-v` in the shell).
+"""The package's log: `logging.getLogger("ssh_abduction")` and the loggers below it.
 
-Its messages are sentences for people, and no interface. INFO says what a search begins, finds and proves; DEBUG says what is given to clingo.
+It is silent unless a program asks for it (`logging.basicConfig`, or `-v` in the shell). Messages
+are sentences for people and may change. INFO says what a search begins, finds and proves. DEBUG
+says what clingo gets.
 
 >>> log_of("ssh_abduction.solver.search").name, PROGRESS.name
 ('ssh_abduction.solver.search', 'ssh_abduction.progress')
@@ -12,7 +14,7 @@ import logging
 
 PACKAGE = "ssh_abduction"
 logging.getLogger(PACKAGE).addHandler(logging.NullHandler())
-# How far a search is: at INFO where it knows more than before, at DEBUG now and then.
+# Progress of a search: INFO if it knows more than before, DEBUG now and then.
 PROGRESS = logging.getLogger(f"{PACKAGE}.progress")
 
 

@@ -1,7 +1,8 @@
 """The only place where `data` loads a package above it: functions of `ssh_abduction.output`.
 
-Notebooks call `_repr_html_` of a value, so the values of this package have that method. The HTML is
-made in `ssh_abduction.output`, which imports this package. It is therefore loaded when it is called.
+Notebooks call `_repr_html_` of a value, so the values of this package have that method. The HTML
+is made in `ssh_abduction.output`, which imports this package. It is therefore loaded when it is
+called.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
-"""What a robot's odometry is worth: how far the displacements that it reports may be off.
+"""Odometry: displacements, poses, and the noise model of displacements without a covariance.
 
 >>> from ssh_abduction.data.odometry import Odometry
 >>> covariance = Odometry(along=0.05, across=0.0, position=0.0).covariance((10.0, 0.0, 0.0))
 >>> round(covariance[0][0], 3), round(covariance[1][1], 3)
 (0.25, 0.0)
 
-A displacement is (dx, dy, dtheta), in metres and radians, in the frame of the robot before it moved: x ahead, y to the left, dtheta counterclockwise.
+A displacement is (dx, dy, dtheta), in metres and radians, in the frame of the robot before it
+moved: x ahead, y to the left, dtheta counterclockwise.
 """
 
 from __future__ import annotations
@@ -22,27 +23,34 @@ Pose: TypeAlias = tuple[float, float, float]
 Displacement: TypeAlias = tuple[float, float, float]
 Covariance: TypeAlias = tuple[Displacement, Displacement, Displacement]
 
-# No step is farther than this, in metres, and none turns farther than this, in radians: what is more was meant in other units.
+# The longest step in metres, and the largest turn in radians. Larger numbers were meant in other
+# units.
 FARTHEST, MOST_TURNED = 1000.0, 4 * math.pi
-# Each step may be off by this, in metres and in radians, however good its odometry claims to be: numbers in a log are rounded.
+# The least standard deviation of a step, in metres and in radians, as numbers in a log are rounded.
 ROUNDED = 1e-3
-# Two entries of a covariance that are to be equal may differ by such a share, as numbers in a log are rounded.
+# The share by which symmetric entries of a covariance may differ, for the same reason.
 SYMMETRIC = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """The noise of displacements that come without a covariance, and the errors that repeat.
+    """The noise of displacements without a covariance, and their systematic errors.
 
-    along, across  standard deviation along and across the way of a step, as a share of that way
-    heading        standard deviation of the heading, in radians a metre
-    turning        standard deviation of the heading, as a share of the turn
-    position       standard deviation in x and in y, in metres, that a step has whatever its length
-    angle          standard deviation of the heading, in radians, that a step has whatever its length
-    scale          how far the scale of all displacements may be wrong, as a share: one unknown for the trace
-    bend           how much the heading may drift steadily, in radians a metre: one unknown for the trace
-    offset         standard deviation in x and in y, in metres, of where a dstate is taken to be at each visit, which does not add up along the way
-    facing         the same of its heading, in radians
+    All numbers are standard deviations.
+
+    Attributes:
+        along: Along the way of a step, as a share of its length.
+        across: Across the way of a step, as a share of its length.
+        heading: Of the heading, in radians for each metre of the step.
+        turning: Of the heading, as a share of the turn.
+        position: In x and in y, in metres, for any step.
+        angle: Of the heading, in radians, for any step.
+        scale: Of the scale of all displacements, as a share: one unknown for the trace.
+        bend: Of a steady drift of the heading, in radians a metre: one unknown for the trace.
+        offset: Of the position of a dstate at each visit, in x and in y, in metres. It does not add
+            up along the way.
+        facing: Of the heading of a dstate at each visit, in radians.
+        extra: Fields of the trace file that this package does not know.
     """
 
     along: float = 0.05
@@ -62,42 +70,52 @@ class Odometry:
             value = getattr(self, name)
             if not is_finite(value) or not 0 <= value <= FARTHEST:
                 raise TraceError(
-                    f"odometry.{name}: expected a number from 0 to {FARTHEST:.0f}, got {brief(value)}; give a standard deviation"
+                    f"odometry.{name}: expected a number from 0 to {FARTHEST:.0f}, "
+                    f"got {brief(value)}; give a standard deviation"
                 )
             object.__setattr__(self, name, float(value))
         an_object("odometry.extra", self.extra, TraceError)
 
     @classmethod
     def of(cls, value: Any) -> Odometry:
-        """Odometry from an object with any of its fields; the others have their defaults. Raises TraceError."""
+        """Odometry from an object with some of its fields; the others get their defaults.
+
+        Raises:
+            TraceError: If a field is wrong.
+        """
         if isinstance(value, Odometry):
             return value
         if not isinstance(value, Mapping):
             raise TraceError(
-                f'odometry: expected an object, got {brief(value)}; write {{"along": 0.05, "heading": 0.005}}'
+                f"odometry: expected an object, got {brief(value)}; "
+                f'write {{"along": 0.05, "heading": 0.005}}'
             )
         known = {name: value[name] for name in NUMBERS if value.get(name) is not None}
         return cls(**known, extra={name: v for name, v in value.items() if name not in NUMBERS})
 
     def to_json(self) -> dict[str, Any]:
+        """The odometry as plain data, as the header of a trace file holds it."""
         return {**{name: v for name, v in asdict(self).items() if name in NUMBERS}, **self.extra}
 
     def covariance(self, displacement: Displacement) -> Covariance:
-        """The covariance of a displacement, (3, 3), in metres and radians and in the frame of the robot before it moved."""
+        """The covariance of a displacement.
+
+        Args:
+            displacement: (dx, dy, dtheta), in metres and radians.
+
+        Returns:
+            (3, 3), in metres and radians, in the frame of the robot before it moved.
+        """
         dx, dy, turned = checked_displacement(displacement, "displacement")
-        along, across, offset = (
-            (self.along * dx) ** 2,
-            (self.across * dx) ** 2,
-            self.position**2 + ROUNDED**2,
-        )
-        along, across = along + (self.along * dy) ** 2, across + (self.across * dy) ** 2
+        # Variances along and across the way, turned into the frame of the robot.
+        along = (self.along * dx) ** 2 + (self.along * dy) ** 2
+        across = (self.across * dx) ** 2 + (self.across * dy) ** 2
         way = math.hypot(dx, dy)
         cos, sin = (dx / way, dy / way) if way else (1.0, 0.0)
+        offset = self.position**2 + ROUNDED**2
+        xx = along * cos**2 + across * sin**2 + offset
+        yy = along * sin**2 + across * cos**2 + offset
         mixed = (along - across) * cos * sin
-        xx, yy = (
-            along * cos**2 + across * sin**2 + offset,
-            along * sin**2 + across * cos**2 + offset,
-        )
         heading = (
             (self.heading * way) ** 2 + (self.turning * turned) ** 2 + self.angle**2 + ROUNDED**2
         )
@@ -108,67 +126,72 @@ NUMBERS = tuple(f.name for f in fields(Odometry) if f.name != "extra")
 
 
 def checked_displacement(value: Any, where: str) -> Displacement:
-    """A displacement that a user gives. Raises TraceError."""
+    """A displacement that a caller gives."""
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
-    if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 3:
+    if not _is_triple(value):
         raise TraceError(
             f"{where}: expected [dx, dy, dtheta], got {brief(value)}; give metres, metres, radians"
         )
     for i, x in enumerate(value):
         if not is_finite(x):
             raise TraceError(
-                f"{where}[{i}]: expected a finite number, got {brief(x)}; replace it, or leave the field out"
+                f"{where}[{i}]: expected a finite number, got {brief(x)}; "
+                f"replace it, or leave the field out"
             )
     dx, dy, turned = map(float, value)
     if max(abs(dx), abs(dy)) > FARTHEST:
         raise TraceError(
-            f"{where}: expected metres, at most {FARTHEST:,.0f} in a step, got {brief(list(value))}; convert it to metres"
+            f"{where}: expected metres, at most {FARTHEST:,.0f} in a step, "
+            f"got {brief(list(value))}; convert it to metres"
         )
     if abs(turned) > MOST_TURNED:
         raise TraceError(
-            f"{where}[2]: expected radians, from {-MOST_TURNED:.1f} to {MOST_TURNED:.1f}, got {brief(value[2])}; convert it from degrees"
+            f"{where}[2]: expected radians, from {-MOST_TURNED:.1f} to {MOST_TURNED:.1f}, "
+            f"got {brief(value[2])}; convert it from degrees"
         )
     return dx, dy, turned
 
 
 def checked_covariance(value: Any, where: str) -> Covariance:
-    """A covariance that a user gives: symmetric and positive definite. Raises TraceError."""
+    """A covariance that a caller gives: symmetric and positive definite."""
     if hasattr(value, "tolist"):
-        value = value.tolist()
-    rows = (
-        value
-        if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 3
-        else ()
-    )
-    if not rows or not all(
-        isinstance(row, Sequence) and not isinstance(row, str) and len(row) == 3 for row in rows
-    ):
+        value = value.tolist()  # numpy's
+    if not _is_triple(value) or not all(map(_is_triple, value)):
         raise TraceError(
-            f"{where}: expected three rows of three numbers, got {brief(value)}; give the covariance of [dx, dy, dtheta]"
+            f"{where}: expected three rows of three numbers, got {brief(value)}; "
+            f"give the covariance of [dx, dy, dtheta]"
         )
-    for i, row in enumerate(rows):
+    for i, row in enumerate(value):
         for j, x in enumerate(row):
             if not is_finite(x):
                 raise TraceError(
-                    f"{where}[{i}][{j}]: expected a finite number, got {brief(x)}; replace it, or leave the field out"
+                    f"{where}[{i}][{j}]: expected a finite number, got {brief(x)}; "
+                    f"replace it, or leave the field out"
                 )
-    (a, b, c), (d, e, f), (g, h, k) = (tuple(map(float, row)) for row in rows)
+    (a, b, c), (d, e, f), (g, h, k) = (tuple(map(float, row)) for row in value)
     largest = max(abs(x) for x in (a, b, c, d, e, f, g, h, k))
     if max(abs(b - d), abs(c - g), abs(f - h)) > SYMMETRIC * largest:
         raise TraceError(
-            f"{where}: expected a symmetric matrix, got {brief(value)}; mend the entries that differ"
+            f"{where}: expected a symmetric matrix, got {brief(value)}; "
+            f"mend the entries that differ"
         )
+    # A matrix is positive definite if its leading minors are positive.
     minors = a, a * e - b * b, a * (e * k - f * f) - b * (b * k - f * c) + c * (b * f - e * c)
     if not all(minor > 0 for minor in minors) or not all(map(math.isfinite, minors)):
         raise TraceError(
-            f"{where}: expected a positive definite matrix, got {brief(value)}; give variances above 0, in square metres and square radians"
+            f"{where}: expected a positive definite matrix, got {brief(value)}; "
+            f"give variances above 0, in square metres and square radians"
         )
     return (a, b, c), (b, e, f), (c, f, k)
 
 
+def _is_triple(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 3
+
+
 def moved(pose: Pose, displacement: Displacement) -> Pose:
-    """The pose, (x, y, heading), after a displacement in the frame of a pose; metres and radians."""
+    """The pose (x, y, heading) after a displacement from another pose; metres and radians."""
     x, y, heading = pose
     dx, dy, turned = displacement
     cos, sin = math.cos(heading), math.sin(heading)
@@ -180,14 +203,14 @@ def moved(pose: Pose, displacement: Displacement) -> Pose:
 
 
 def between(start: Pose, end: Pose) -> Displacement:
-    """The displacement that leads from one pose to another, in the frame of the first. It turns by at most half a turn."""
+    """The displacement from one pose to another, in the frame of the first, with the short turn."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     cos, sin = math.cos(start[2]), math.sin(start[2])
     return cos * dx + sin * dy, cos * dy - sin * dx, math.remainder(end[2] - start[2], math.tau)
 
 
 def in_words(displacement: Displacement) -> str:
-    """A displacement as it is said: 4.1 m ahead, 0.2 m left, turned 90 degrees left.
+    """A displacement in words.
 
     >>> in_words((4.1, -0.2, 0.0))
     '4.1 m ahead, 0.2 m right'

@@ -1,4 +1,4 @@
-"""Stars: which gateways a robot sees at a place, and in which direction each of them is.
+"""Stars: the gateways that a robot sees at a place, each with its bearing.
 
 >>> from ssh_abduction.data.star import Star
 >>> [gateway.bearing for gateway in Star.of((1, 0, 1, 0)).gateways]
@@ -8,8 +8,9 @@ True
 >>> [frame.bearings for frame in Star.of((1, None, 1, 0)).frames]
 [(0, 180), (0, 90, 180)]
 
-A gateway is known by its bearing, in degrees clockwise from straight ahead. Two sightings of one gateway agree if their bearings, once one of them is turned, differ by at most the
-sum of their spreads. So nothing here asks for right angles. Where all gateways are near quarters, a star is also four openings, which is what the fast engines read.
+Bearings are degrees clockwise from straight ahead. Two sightings of one gateway agree if their
+bearings, after a turn, differ by at most the sum of their spreads. Angles need not be right angles.
+If all gateways are near quarters, a star is also four openings, which the fast engines read.
 """
 
 from __future__ import annotations
@@ -21,25 +22,33 @@ from math import ceil
 from typing import Any, TypeAlias
 
 from ssh_abduction.data.errors import TraceError, brief, is_finite, is_whole
+from ssh_abduction.data.observation import plain_number
 
 Openings: TypeAlias = tuple[bool, bool, bool, bool]
 Entry: TypeAlias = "float | Gateway | None"
 
-SPREAD = 10.0  # Degrees that a bearing may be off, where a trace does not say. So junctions of 90 and of 120 degrees are told apart, as these differ by more than twice that.
-QUARTER = 20.0  # Degrees that a bearing may be off a quarter (ahead, right, back, left) and still be taken for it.
-WIDEST = 90.0  # A gateway that was not observed may be anywhere in a half circle, at most.
-MOST_UNKNOWN = 6  # Gateways of one star that were not observed: each may be there or not, so more of them would leave too many ways.
+# Degrees that a bearing may be off by default. Junctions of 90 and of 120 degrees are then
+# different, as these differ by more than twice as much.
+SPREAD = 10.0
+# Degrees that a bearing may be off a quarter (ahead, right, back, left) and still count as it.
+QUARTER = 20.0
+# The largest spread: a gateway that was not observed may be anywhere in a half circle.
+WIDEST = 90.0
+# Unobserved gateways of a star. Each may exist or not, so a star has up to 2**6 frames.
+MOST_UNKNOWN = 6
 _FIELDS = ("bearing", "spread", "opposite", "open")
 
 
 @dataclass(frozen=True, slots=True)
 class Gateway:
-    """A way out of a place, as it is seen at one step.
+    """A way out of a place, as seen at one step.
 
-    bearing   degrees, clockwise from straight ahead
-    spread    degrees that the bearing may be off
-    opposite  the index, in the star, of the gateway that the same path leaves through; None where that is the one straight opposite, if there is one
-    open      True; None where it was not observed whether there is a gateway
+    Attributes:
+        bearing: Degrees, clockwise from straight ahead.
+        spread: Degrees that the bearing may be off.
+        opposite: The index in the star of the other gateway of the same path; None for the one
+            straight opposite, if there is one.
+        open: True; None if it was not observed whether the gateway exists.
     """
 
     bearing: float
@@ -48,7 +57,7 @@ class Gateway:
     open: bool | None = True
 
     def to_json(self) -> Any:
-        """The bearing alone, or an object where there is more to say."""
+        """The bearing, or an object if there is more to say."""
         if self == Gateway(self.bearing):
             return self.bearing
         said = {"bearing": self.bearing, "spread": self.spread}
@@ -58,11 +67,14 @@ class Gateway:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The gateways of a place as they are seen at one step, none of them unknown. They are its slots, numbered clockwise from the one ahead, or the next after it.
+    """The gateways of a place as seen at one step, all of them known.
 
-    bearings  whole degrees, clockwise from straight ahead
-    spreads   whole degrees
-    opposite  for each slot, the slot that the star declares to be the other side of the same path, or None
+    They are its slots, numbered clockwise from the one ahead, or from the next one.
+
+    Attributes:
+        bearings: Whole degrees, clockwise from straight ahead.
+        spreads: Whole degrees.
+        opposite: For each slot the other slot of the same path, if the star declares one.
     """
 
     bearings: tuple[int, ...]
@@ -71,11 +83,14 @@ class Frame:
 
     @property
     def slots(self) -> int:
-        """How many gateways there are."""
+        """The number of gateways."""
         return len(self.bearings)
 
     def nth(self, turn: str | None, number: int) -> int | None:
-        """The slot of the gateway that is so many to the right or left of straight ahead, the one straight ahead not counted; None if there are fewer."""
+        """The slot of a gateway counted from 1 to a side, without the one straight ahead.
+
+        None if there are fewer gateways.
+        """
         beside = [k for k in range(self.slots) if not self.faces(k)]
         order = beside if turn == "right" else beside[::-1]
         return order[number - 1] if number <= len(order) else None
@@ -91,13 +106,17 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Star:
-    """All gateways that are seen at a step."""
+    """All gateways that are seen at a step.
+
+    Attributes:
+        gateways: The gateways.
+    """
 
     gateways: tuple[Gateway, ...]
 
     @classmethod
     def of(cls, entries: Sequence[Entry]) -> Star:
-        """The star that a trace writes as four 0/1/null (ahead, right, back, left), or as bearings and gateways."""
+        """The star from four 0/1/None (ahead, right, back, left), or from bearings and gateways."""
         if is_four(entries):
             quarters = ((90.0 * k, entry) for k, entry in enumerate(entries))
             return cls(
@@ -116,8 +135,10 @@ class Star:
 
     @property
     def openings(self) -> Openings | None:
-        """Whether there is a gateway (ahead, right, back, left). None where some gateway was not observed, is in none of these directions, or has another
-        opposite than the one straight opposite, or where two are in one direction.
+        """Whether there is a gateway ahead, right, back and left.
+
+        None if a gateway was not observed, is in none of these directions, or has another opposite
+        than the one straight opposite, or if two gateways are in one direction.
         """
         found: dict[int, int] = {}
         for k, gateway in enumerate(self.gateways):
@@ -134,7 +155,7 @@ class Star:
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        """All that the place may look like from here: each gateway that was not observed is there, or is not."""
+        """The possible frames of the place, with and without each unobserved gateway."""
         unknown = [k for k, gateway in enumerate(self.gateways) if not gateway.open]
         left_out = (
             set(some)
@@ -150,7 +171,7 @@ class Star:
 
     @property
     def too_near(self) -> tuple[float, float] | None:
-        """The bearings of two gateways that could be one, by their spreads; None if there are no such."""
+        """The bearings of two gateways whose spreads overlap; None if there are none."""
         seen = [gateway for gateway in self.gateways if gateway.open]
         for a, b in combinations(seen, 2):
             if abs((a.bearing - b.bearing + 180) % 360 - 180) <= a.spread + b.spread:
@@ -166,28 +187,38 @@ class Star:
         gateways = [self.gateways[k] for k in clockwise]
         return Frame(
             tuple(round(g.bearing) % 360 for g in gateways),
-            tuple(
-                ceil(g.spread + abs(g.bearing - round(g.bearing))) for g in gateways
-            ),  # what rounding the bearing takes away is given back
+            # Add the error of rounding the bearing.
+            tuple(ceil(g.spread + abs(g.bearing - round(g.bearing))) for g in gateways),
             tuple(None if g.opposite is None else slot.get(g.opposite) for g in gateways),
         )
 
 
 def is_four(entries: Sequence[Entry]) -> bool:
-    """Whether a star is written as four 0/1/null, which are openings and not bearings: as bearings at least two of them would be equal."""
+    """Whether a star is written as four 0/1/None.
+
+    They cannot be bearings, as two of them would be equal.
+    """
     return len(entries) == 4 and all(
         x is None or (not isinstance(x, Gateway) and x in (0, 1)) for x in entries
     )
 
 
 def near_quarter(bearing: float) -> int | None:
-    """The quarter (0 ahead, 1 right, 2 back, 3 left) that a bearing is near, or None."""
+    """The quarter that a bearing is near: 0 ahead, 1 right, 2 back, 3 left, or None."""
     quarter = round(bearing / 90)
     return quarter % 4 if abs(bearing - 90 * quarter) <= QUARTER else None
 
 
 def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
-    """The star that a trace gives, its numbers and objects checked. Raises TraceError that says where."""
+    """A star of a trace, checked.
+
+    Args:
+        value: What the trace or the caller gives.
+        where: What messages call it.
+
+    Raises:
+        TraceError: If it is no star.
+    """
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
     if not isinstance(value, list | tuple):
@@ -199,21 +230,19 @@ def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
         x is None or x in (0, 1) for x in given if not isinstance(x, Mapping | Gateway)
     )
     star = tuple(_entry(x, len(given), four, f"{where}[{i}]") for i, x in enumerate(given))
-    if not is_four(star) and len(
-        {
-            (e.bearing if isinstance(e, Gateway) else float(e or 0)) % 360
-            for e in star
-            if _is_seen(e)
-        }
-    ) < sum(map(_is_seen, star)):
+    seen = [entry for entry in star if _is_seen(entry)]
+    bearings = {(e.bearing if isinstance(e, Gateway) else float(e or 0)) % 360 for e in seen}
+    if not is_four(star) and len(bearings) < len(seen):
         raise TraceError(
-            f"{where}: expected four 0/1 (openings ahead, right, back, left) or different bearings in degrees, got {brief(list(value))}; mend it"
+            f"{where}: expected four 0/1 (openings ahead, right, back, left) or different bearings "
+            f"in degrees, got {brief(list(value))}; mend it"
         )
     for i, entry in enumerate(star):
         _check_opposite(i, entry, star, f"{where}[{i}]")
-    if sum(not _is_seen(entry) for entry in star) > MOST_UNKNOWN:
+    if len(star) - len(seen) > MOST_UNKNOWN:
         raise TraceError(
-            f"{where}: expected at most {MOST_UNKNOWN} gateways that were not observed, got more; leave some out"
+            f"{where}: expected at most {MOST_UNKNOWN} gateways that were not observed, got more; "
+            f"leave some out"
         )
     return star
 
@@ -228,30 +257,27 @@ def _is_seen(entry: Entry) -> bool:
 
 
 def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
+    """An entry of a star of `count` entries, checked. `four` says whether it has four openings."""
     if isinstance(value, Gateway):
-        value = {
-            "bearing": value.bearing,
-            "spread": value.spread,
-            "opposite": value.opposite,
-            "open": value.open,
-        }
+        value = {name: getattr(value, name) for name in _FIELDS}
     if isinstance(value, Mapping):
         return _gateway(value, count, where)
     if value is None and four:
         return None
     if not is_finite(value):
         raise TraceError(
-            f"{where}: expected a finite number, got {brief(value)}; replace it, or leave the field out"
+            f"{where}: expected a finite number, got {brief(value)}; "
+            f"replace it, or leave the field out"
         )
-    return (
-        value if type(value) in (int, float) else int(value) if is_whole(value) else float(value)
-    )  # numpy's numbers are no JSON
+    return plain_number(value)
 
 
 def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
+    """A gateway that is written as an object, checked."""
     if unknown := [name for name in value if name not in _FIELDS]:
         raise TraceError(
-            f"{where}: expected fields out of {', '.join(_FIELDS)}, got {brief(unknown[0])}; leave it out"
+            f"{where}: expected fields out of {', '.join(_FIELDS)}, got {brief(unknown[0])}; "
+            f"leave it out"
         )
     bearing, spread, opposite, is_open = (
         value.get(name, default)
@@ -259,20 +285,24 @@ def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
     )
     if not is_finite(bearing):
         raise TraceError(
-            f"{where}.bearing: expected a number of degrees, got {brief(bearing)}; say in which direction the gateway is"
+            f"{where}.bearing: expected a number of degrees, got {brief(bearing)}; "
+            f"say in which direction the gateway is"
         )
     if is_open is not None and is_open is not True:
         raise TraceError(
-            f"{where}.open: expected true, or null where it was not observed, got {brief(is_open)}; leave out what is closed"
+            f"{where}.open: expected true, or null where it was not observed, "
+            f"got {brief(is_open)}; leave out what is closed"
         )
     widest = WIDEST if is_open is None else WIDEST / 2
     if not is_finite(spread) or not 0 <= spread <= widest:
         raise TraceError(
-            f"{where}.spread: expected 0 to {widest:g} degrees, got {brief(spread)}; say how far the bearing may be off"
+            f"{where}.spread: expected 0 to {widest:g} degrees, got {brief(spread)}; "
+            f"say how far the bearing may be off"
         )
     if opposite is not None and not (is_whole(opposite) and 0 <= opposite < count):
         raise TraceError(
-            f"{where}.opposite: expected the index of a gateway, 0 to {count - 1}, got {brief(opposite)}; count from 0"
+            f"{where}.opposite: expected the index of a gateway, 0 to {count - 1}, "
+            f"got {brief(opposite)}; count from 0"
         )
     return Gateway(
         float(bearing), float(spread), None if opposite is None else int(opposite), is_open
@@ -280,11 +310,13 @@ def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
 
 
 def _check_opposite(i: int, entry: Entry, star: Sequence[Entry], where: str) -> None:
+    """Check that the opposite of a gateway is another one, whose opposite is this one."""
     if not isinstance(entry, Gateway) or entry.opposite is None:
         return
     other = star[entry.opposite]
     back = other.opposite if isinstance(other, Gateway) else None
     if entry.opposite == i or back not in (None, i):
         raise TraceError(
-            f"{where}.opposite: expected another gateway, whose opposite is this one, got {entry.opposite}; pair each gateway with one other"
+            f"{where}.opposite: expected another gateway, whose opposite is this one, "
+            f"got {entry.opposite}; pair each gateway with one other"
         )

@@ -1,4 +1,4 @@
-"""Values in a few words, as messages and the reprs of values say them.
+"""Values in a few words, for messages and reprs.
 
 >>> counted(8, "dstates"), counted(1, "dstates")
 ('8 dstates', '1 dstate')
@@ -13,12 +13,12 @@ from ssh_abduction.data.errors import brief
 
 
 def counted(number: float, things: str) -> str:
-    """8 dstates, 1 dstate."""
+    """A number with its noun: 8 dstates, 1 dstate."""
     return f"{number} {things.removesuffix('s') if number == 1 else things}"
 
 
 def that_differ(value: Any) -> dict[str, str]:
-    """The fields of a dataclass that are shown and are not what they are unless somebody says so, each with its repr, cut where it is long."""
+    """The short reprs of those fields of a dataclass that differ from their defaults."""
     told = {}
     for field in fields(value):
         usual = field.default_factory() if field.default_factory is not MISSING else field.default
@@ -28,5 +28,6 @@ def that_differ(value: Any) -> dict[str, str]:
 
 
 def shortly(value: Any) -> str:
-    """A dataclass as a call that makes it, with the fields alone that are not what they are unless somebody says so."""
-    return f"{type(value).__name__}({', '.join(f'{name}={text}' for name, text in that_differ(value).items())})"
+    """A dataclass as the call that makes it, with the fields that differ from their defaults."""
+    fields_told = ", ".join(f"{name}={text}" for name, text in that_differ(value).items())
+    return f"{type(value).__name__}({fields_told})"
