@@ -1,4 +1,4 @@
-"""Each axiom by itself: a trace on which leaving out just this axiom changes the answer."""
+"""Each axiom alone: a trace on which leaving out this axiom changes the answer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ GATEWAYS = PLAIN.replace(star="gateways")
 NONE = None  # no map
 Answer = tuple[tuple[int, int, int] | None, int]
 
-# axiom: theory, trace, openings or bearings at each step, the counts and the number of minimal maps with the axiom, and without it
+# For each axiom: a theory, a trace, the openings or bearings at each step; and the counts and the
+# number of minimal maps with the axiom, and without it.
 CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     "functional_view": (PLAIN, "b L a", "", ((2, 1, 0), 1), ((1, 1, 0), 1)),
     "deterministic": (PLAIN, "a R a R b R a", "", ((3, 1, 0), 2), ((2, 1, 0), 1)),
@@ -100,7 +101,7 @@ CASES: dict[str, tuple[Theory, str, str, Answer, Answer]] = {
     ),
 }
 
-MOVED = {"one_pose": [(0.0, 0.0, -math.pi / 2)]}  # the displacements that an axiom is about
+MOVED = {"one_pose": [(0.0, 0.0, -math.pi / 2)]}  # displacements for axioms about them
 
 
 def trace_of(
@@ -151,9 +152,7 @@ def test_an_axiom_has_a_sentence_and_a_source(axiom: Any) -> None:
 def test_every_violation_in_the_encodings_belongs_to_an_axiom(level: str) -> None:
     text = (encodings.folder() / f"{level}.lp").read_text()
     names = {axiom.name for axiom in encodings.axioms() if axiom.level == level}
-    without_a_rule = {
-        "planar",
-        "one_star",
-    }  # what evidence refuses once there is a map, and what is nothing but pairs of steps
+    # Python checks `planar` on whole maps, and `one_star` on pairs of steps.
+    without_a_rule = {"planar", "one_star"}
     assert set(re.findall(r"violation\((\w+),t\) :-", text)) - {"N"} == names - without_a_rule
     assert set(re.findall(r"% @axiom\((\w+)\)", text)) == names

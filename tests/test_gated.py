@@ -1,4 +1,4 @@
-"""Maps without a search where stars are at any angles, and where there are rules of one's own."""
+"""Greedy maps for gateways at any angles (guesses/gated.py), and for rules of users."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def drive(world: str, seed: int, steps: int = 24) -> Trace:
 
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize("homing", [True, False])
-def test_what_grows_by_stars_is_a_map(world: str, homing: bool) -> None:
+def test_a_greedy_map_satisfies_all_axioms(world: str, homing: bool) -> None:
     for seed in range(2):
         trace = drive(world, seed)
         theory = Theory.topological().resolve(trace)
@@ -53,7 +53,7 @@ def test_what_grows_by_stars_is_a_map(world: str, homing: bool) -> None:
 
 
 @pytest.mark.parametrize("world", ["junction of 5", "any angles"])
-def test_there_is_a_map_of_stars_at_any_angles_when_the_time_is_over(world: str) -> None:
+def test_a_greedy_map_is_returned_when_time_is_up(world: str) -> None:
     trace = drive(world, 0, 40)
     with patch.multiple(solver, OVERTIME=100.0):
         solution = solve(trace, time_limit=1e-6)
@@ -62,7 +62,7 @@ def test_there_is_a_map_of_stars_at_any_angles_when_the_time_is_over(world: str)
     assert len(solution.maps[0].dstates) < len(trace)  # known places are tried, too
 
 
-def test_evidence_keeps_a_place_from_being_taken_for_another() -> None:
+def test_evidence_keeps_two_places_apart() -> None:
     trace = Trace.from_steps("aba", ["travel", "around"], stars=[[0, 120], [180], [0]])
     back = Trace.from_steps(
         "abaa", ["travel", "around", "travel"], stars=[[0, 120], [180], [0], [180, 300]]
@@ -77,15 +77,18 @@ def test_evidence_keeps_a_place_from_being_taken_for_another() -> None:
 
 
 KEPT = {
-    "brief": "% @axiom(brief) No dstate is seen again much later.\n#program step(t).\nviolation(brief,t) :- same(I,t), t-I > 60.",
+    "brief": "% @axiom(brief) No dstate is seen again much later.\n"
+    "#program step(t).\nviolation(brief,t) :- same(I,t), t-I > 60.",
     "a constraint": "#program step(t).\n:- same_place(0,t), t > 90.",
-    "at the end": "% @axiom(few) Few paths.\n#program check(t).\nviolation(few,t) :- query(t), along(_,900,_).",
+    "at the end": "% @axiom(few) Few paths.\n"
+    "#program check(t).\nviolation(few,t) :- query(t), along(_,900,_).",
     "a choice": "{ lit }.\n#program step(t).\n:- not lit, same(_,t).",
     "order": "% @axiom(order) x\n#program step(t).\nviolation(order,t) :- before(H,P,P), at(t,P).",
 }
 BROKEN = {
     "all steps": "% @axiom(never) x\n#program step(t).\nviolation(never,t) :- view(t,_).",
-    "at the end": "% @axiom(many) x\n#program check(t).\nviolation(many,t) :- query(t), along(_,1,pos).",
+    "at the end": "% @axiom(many) x\n"
+    "#program check(t).\nviolation(many,t) :- query(t), along(_,1,pos).",
     "a place": "#program step(t).\n:- at(t,P), P > 0.",
     "a course": "#program step(t).\n:- same_course(_,t).",
 }
@@ -96,7 +99,7 @@ def ruled(text: str, theory: Theory) -> Theory:
 
 
 @pytest.mark.parametrize("name", KEPT)
-def test_there_is_a_map_with_own_rules_when_the_time_is_over(name: str) -> None:
+def test_a_map_that_satisfies_own_rules_is_returned_when_time_is_up(name: str) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
     theory = ruled(KEPT[name], Theory.topological())
     with patch.multiple(solver, OVERTIME=100.0):
@@ -106,7 +109,7 @@ def test_there_is_a_map_with_own_rules_when_the_time_is_over(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_no_map_is_given_that_breaks_own_rules(name: str) -> None:
+def test_no_map_that_breaks_own_rules_is_returned(name: str) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
     with patch.multiple(solver, OVERTIME=100.0):
         assert solve(trace, ruled(BROKEN[name], Theory.topological()), time_limit=1e-6).maps == ()
@@ -128,8 +131,8 @@ READ = [
 @pytest.mark.parametrize(
     ("level", "body"), [("causal", READ[0]), *(("topological", body) for body in READ)]
 )
-def test_rules_are_kept_by_those_maps_that_clingo_lists(body: str, level: str) -> None:
-    """Of all maps without the rule, those keep it that clingo finds with it."""
+def test_own_rules_hold_in_the_maps_that_clingo_lists(body: str, level: str) -> None:
+    """The maps without the rule that satisfy it are those that clingo finds with the rule."""
     plain = getattr(Theory, level)().replace(prefer=())
     theory = ruled(f"#program step(t).\n:- {body}.", plain)
 
@@ -144,7 +147,7 @@ def test_rules_are_kept_by_those_maps_that_clingo_lists(body: str, level: str) -
 
 
 @pytest.mark.parametrize("body", ["founded(S,t)", "used(H,t)", "violation(deterministic,t)"])
-def test_rules_that_read_what_a_map_does_not_show_are_not_asked(body: str) -> None:
+def test_rules_about_atoms_that_maps_lack_cannot_be_asked(body: str) -> None:
     assert not can_be_asked(
         ruled(f"#program step(t).\n:- {body}.", Theory.topological()).resolve(SMALL)
     )

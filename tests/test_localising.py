@@ -1,4 +1,4 @@
-"""Where visits are in a map of some of them."""
+"""Visits localised in a map of some of them (steps/localising.py)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def charted(walk: Walk) -> FramedChart:
 
 
 def true_states(walk: Walk, chart: FramedChart) -> list[State]:
-    """Of each visit the cell, and how the robot faced as it arrived."""
+    """The cell of each visit, and the heading in which the robot arrived."""
     at: dict[int, tuple[int, int, int]] = {}
     for node, (x, y, heading) in zip(chart.node_of, walk.truth, strict=True):  # type: ignore[misc]
         visit, slot = chart.facing[node]
@@ -46,8 +46,8 @@ def labels(chart: FramedChart, found: Located) -> list[int]:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_what_a_true_map_of_some_visits_says_of_the_others_is_true(seed: int) -> None:
-    """As long as it says nothing, it has to know more of them; and few are enough."""
+def test_a_true_map_of_some_visits_tells_the_states_of_all(seed: int) -> None:
+    """The map asks for more visits until it tells all states. It does not need all visits."""
     walk = maze(3, 3, steps=1000, seed=seed, stars=True)
     chart = charted(walk)
     states = true_states(walk, chart)
@@ -63,7 +63,7 @@ def test_what_a_true_map_of_some_visits_says_of_the_others_is_true(seed: int) ->
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> None:
-    """What it takes for the states of all visits is a map; and what it misses, with what led there, no state of it explains."""
+    """If the map tells all states, they make a map; else it misses visits that it does not have."""
     walk = maze(3, 3, steps=400, seed=seed, stars=True)
     chart = charted(walk)
     for steps in (40, 100, 200):
@@ -82,7 +82,7 @@ def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> N
             for j in at
             if at[i] // 4 == at[j] // 4
         ):
-            continue  # what came later tells them apart
+            continue  # later steps show that the map is wrong
         found = located(chart, at)
         if found.missed:
             assert set(found.missed) - set(at)
@@ -93,7 +93,7 @@ def test_a_map_of_a_beginning_explains_all_visits_or_misses_some(seed: int) -> N
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
-    """All its minimal maps, as when clingo is told of all visits."""
+    """It has the same minimal maps as when clingo is given all visits."""
     trace = maze(3, 3, steps=800, seed=seed, stars=True).trace
     search = Search(trace, max_maps=None)
     with patch.object(same, "FIRST_PAIRS", 500):
@@ -110,7 +110,7 @@ def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
 
 @pytest.mark.parametrize(("seed", "steps", "guesses"), [(1, 700, 1), (3, 500, 2)])
 def test_the_beginning_of_a_long_trace_is_guessed(seed: int, steps: int, guesses: int) -> None:
-    """And the rest follows from it, or twice as many visits are guessed, until all are. Either way it is a map with paths."""
+    """The number of guessed visits doubles until the rest follows. The result has paths."""
     walk = maze(3, 3, steps=steps, seed=seed, stars=True)
     chart = charted(walk)
     guessed: list[int] = []
@@ -136,7 +136,7 @@ def test_the_beginning_of_a_long_trace_is_guessed(seed: int, steps: int, guesses
     assert len(set(found)) <= 1.05 * len(set(walk.truth))
 
 
-def test_a_beginning_is_a_chart_of_fewer_steps() -> None:
+def test_a_beginning_is_the_chart_of_a_prefix() -> None:
     walk = maze(3, 3, steps=200, seed=1, stars=True)
     chart = charted(walk)
     steps = next(t for t, node in enumerate(chart.node_of) if chart.facing[node][0] == 20)
@@ -145,8 +145,8 @@ def test_a_beginning_is_a_chart_of_fewer_steps() -> None:
     assert chart.beginning(len(chart.stars)) == chart
 
 
-def test_what_is_tracked_is_true() -> None:
-    """By a true map of a beginning; what leads elsewhere is not known."""
+def test_tracked_states_are_true() -> None:
+    """The map is a true one of the first visits. States at other places are unknown."""
     walk = maze(5, 5, steps=1000, seed=1, stars=True)
     chart = charted(walk)
     states = true_states(walk, chart)
@@ -165,12 +165,12 @@ def test_what_is_tracked_is_true() -> None:
 
 
 def test_places_of_labels_are_numbered_without_gaps() -> None:
-    """A state that no visit is at would fit anything."""
+    """A state without visits would fit any visit."""
     walk = maze(3, 3, steps=300, seed=1, stars=True)
     chart = charted(walk)
     truth = dict(zip(chart.node_of, walk.truth, strict=True))
     states = states_of(chart, numbered(truth[node] for node in range(len(chart.seen))))
     assert {state // 4 for state in states} == set(range(max(states) // 4 + 1))
-    turned: dict[int, int] = {}  # how the frame of each place is turned
+    turned: dict[int, int] = {}  # the rotation of the frame of each place
     for state, true in zip(states, true_states(walk, chart), strict=True):
         assert turned.setdefault(state // 4, (true - state) % 4) == (true - state) % 4

@@ -155,6 +155,7 @@ class _Map:
             contradicted at the end of its prediction.
         """
         self._check()
+        # Keep the two longest predictions, to compare them in the end.
         best, most, next_most = None, 0, 0
         for dstate in self._like.get(self._seen[step], ()):
             if link:

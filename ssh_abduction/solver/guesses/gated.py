@@ -59,6 +59,7 @@ def gated_map(
     growing = _Growing.of(trace.steps[0])
     axioms = frozenset(theory.axioms)
     for t, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True), 1):
+        # Keep the first option that evidence and the stars of the two places allow.
         for option in growing.options(action, step, homing):
             look_at_clock()
             other = growing.copy()
@@ -167,6 +168,7 @@ class _Growing:
             for x in self.dstates
             if x.place == s.place and x.path is not None and x.direction is not None
         ]
+        # At a place, no two dstates have one course.
         taken = {(x.path, x.direction) for x in there}
         yield from (
             (x.path, -x.direction)
@@ -312,6 +314,7 @@ class _Growing:
     def _seen_at(
         self, place: int
     ) -> tuple[list[Sight], dict[tuple[Sight, Sight], tuple[Action, ...]]]:
+        # A sight knows whether it is the first of its dstate, and of its place.
         sights: dict[_Seen, Sight] = {}
         shown: set[int] = set()
         for (s, star), step in self.sights[place].items():

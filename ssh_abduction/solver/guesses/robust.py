@@ -82,6 +82,7 @@ class Machine:
                 contradicted += 1
                 continue
             merges += 1
+            # The ends of equal actions are merged, too.
             work += [
                 (self.goes[p, action], self.goes[q, action])
                 for action in self.actions
@@ -276,6 +277,7 @@ class Explainer:
 
     def _told(self, machine: Machine, labels: Sequence[int]) -> Explained:
         """The explanation by these labels, with its faults and costs."""
+        # A step is at fault if its view, or where its action leads, differs from the machine.
         misread = [t for t, s in enumerate(labels) if machine.shows[s] != self.seen[t]]
         leads = [
             machine.goes.get((s, action)) for s, action in zip(labels, self.actions, strict=False)

@@ -287,6 +287,7 @@ class FramedChart(Chart):
         steps = next(
             (step for step, node in enumerate(self.node_of) if node >= nodes), len(self.node_of)
         )
+        # Nodes are numbered by their visits, so a beginning has the first nodes.
         links = tuple(link for link in self.links if max(link[0], link[2]) < nodes)
         elsewhere, away, excluded = (
             frozenset(pair for pair in pairs if max(pair) < nodes)

@@ -162,6 +162,7 @@ def _turned_by(action: Action, first: Frame) -> int:
         slot = first.nth(action.turn, action.gateway)
         return 0 if slot is None else _about(first.bearings[slot], first.spreads[slot])
     if action.turn == "around":
+        # A half turn, or the turn to the slot declared opposite to the one that the robot faces.
         faced = next((k for k in range(first.slots) if first.faces(k)), None)
         behind = None if faced is None else first.opposite[faced]
         return 1 << 180 | (

@@ -119,6 +119,7 @@ class _Localiser:
         stretches = 0
         for visit in range(1, len(self._slots)):
             before, possible = possible, self._after(possible, visit - 1)
+            # The three cases in which a visit is missed.
             if not possible or self._is_unknown(before, visit - 1) or self._is_new(possible, visit):
                 missed.update(self._stretch_up_to(visit))
                 stretches += 1

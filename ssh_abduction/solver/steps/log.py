@@ -109,6 +109,7 @@ class Log:
                 break
             label = following
             found.append(label)
+            # Evidence can contradict the dstate, too.
             if t in self.pairs.asked_for and not self.pairs.allow(t, found, place_of):
                 found.pop()
                 outcome = Outcome.CONTRADICTED

@@ -1,4 +1,4 @@
-"""Long traces followed by a map of their beginning (following.py)."""
+"""Long traces localised in a map of their first steps (guesses/continuing.py)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.instances import maze
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.guesses import continuing as following
+from ssh_abduction.solver.guesses import continuing
 from ssh_abduction.solver.guesses.continuing import followed
 from ssh_abduction.solver.guesses.merging import thinned
 from ssh_abduction.solver.steps.chart import Chart, numbered
@@ -25,15 +25,15 @@ CAUSAL = Theory.causal()
 
 @settings(max_examples=30)
 @given(traces(max_steps=30), st.data())
-def test_what_a_map_is_followed_to_is_a_map(trace: Trace, data: st.DataObject) -> None:
-    """Also where the map of the beginning is wrong, or robots are told to be where few steps say so. What evidence says of steps is not known there."""
+def test_the_result_is_a_map(trace: Trace, data: st.DataObject) -> None:
+    """The given map may be wrong, and few steps may settle a link. Evidence is left out."""
     trace = trace.without_displacements()
     beginning = trace.prefix(data.draw(st.integers(1, len(trace))))
     settings = {
         name: data.draw(st.integers(1, 4)) for name in ("SETTLED", "FOUND", "AHEAD", "LOOKED")
     }
     with patch.multiple(
-        following,
+        continuing,
         WALKS=data.draw(st.integers(0, 30)),
         MANY=data.draw(st.integers(1, 10)),
         **settings,
@@ -44,8 +44,8 @@ def test_what_a_map_is_followed_to_is_a_map(trace: Trace, data: st.DataObject) -
 
 
 @pytest.mark.parametrize(("steps", "kept"), [(500, False), (800, True), (1200, True)])
-def test_a_map_that_lacks_links_is_followed_to_the_map_of_all(steps: int, kept: bool) -> None:
-    """The map of the robot's first steps is that of what it did; where it says too little, a link is taken for clear that is wrong, and what was known around it is forgotten."""
+def test_a_map_that_lacks_links_leads_to_a_map_of_all_steps(steps: int, kept: bool) -> None:
+    """The labels are kept if the map says enough; else a wrong link is settled and forgotten."""
     walk = maze(4, 4, steps=6000, seed=1)
     known, log = numbered(walk.truth[:steps]), Log(walk.trace, CAUSAL)
     assert len(log.replay(known).labels) < len(walk.trace)
@@ -58,16 +58,16 @@ def test_a_map_that_lacks_links_is_followed_to_the_map_of_all(steps: int, kept: 
     assert len(set(thin)) <= len(set(walk.truth))
 
 
-def test_a_map_of_a_beginning_that_says_little_is_given_up() -> None:
+def test_a_map_of_too_few_steps_is_given_up() -> None:
     walk = maze(4, 4, steps=6000, seed=1)
     assert followed(Log(walk.trace, CAUSAL), numbered(walk.truth[:10])) is None
 
 
-def test_the_last_steps_of_a_map_are_where_actions_lead() -> None:
-    """Nothing that the map knows is asked again."""
+def test_a_map_with_all_links_is_only_replayed() -> None:
+    """Known links are followed without a prediction."""
     walk = maze(3, 3, steps=2000, seed=0)
     log = Log(walk.trace, CAUSAL)
-    with patch.object(following._Map, "_predicting", side_effect=AssertionError):
+    with patch.object(continuing._Map, "_predicting", side_effect=AssertionError):
         labels = followed(log, numbered(walk.truth[:1500]))
     leads = {
         (here, action): there
