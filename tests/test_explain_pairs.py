@@ -15,9 +15,12 @@ from strategies import TOYS, theories, traces
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.cli import main
 from ssh_abduction.data import TraceError
+from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.derivation import Derivation
-from ssh_abduction.explain.no_map import Axioms, Piece
-from ssh_abduction.explain.pairs import PairExplanation, Verdict, explain_pair, explain_trace
+from ssh_abduction.explain.mend import explain_trace
+from ssh_abduction.explain.pairs import explain_pair
+from ssh_abduction.explain.piece import Piece
+from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.theory.encodings import axioms
@@ -345,5 +348,5 @@ def test_what_was_interrupted_is_said_so(
     RECTANGLE.prefix(5).save(tmp_path / "rectangle.jsonl")
     assert main(["explain", str(tmp_path / "rectangle.jsonl"), "0", "4"]) == 130
     assert capsys.readouterr().out.endswith(
-        "different dstates in every map\nwhich axioms it takes was not found out (interrupted)\n"
+        "different dstates in every map\nno argument was found (interrupted)\n"
     )

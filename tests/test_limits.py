@@ -19,7 +19,8 @@ from worlds import rectangle
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.proof import check_bound
-from ssh_abduction.explain.no_map import Axioms, Interrupted, Piece
+from ssh_abduction.explain.axioms import Axioms, Interrupted
+from ssh_abduction.explain.piece import Piece
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.asp.control import Control

@@ -29,7 +29,8 @@ from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import SolverError, TheoryError, TraceError
 from ssh_abduction.data.errors import AbductionError
-from ssh_abduction.explain.no_map import Interrupted, explain
+from ssh_abduction.explain.axioms import Interrupted
+from ssh_abduction.explain.no_map import explain
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.solver import Progress, Search, Status, prefixes
 from ssh_abduction.solver import search as solver_module

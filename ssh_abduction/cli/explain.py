@@ -11,13 +11,9 @@ from ssh_abduction.cli.outcome import dump, on_ctrl_c
 from ssh_abduction.data.errors import AbductionError, MapError, named
 from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain.pairs import (
-    PairExplanation,
-    PairQuestion,
-    TraceExplanation,
-    TraceQuestion,
-    Verdict,
-)
+from ssh_abduction.explain.mend import TraceExplanation, TraceQuestion
+from ssh_abduction.explain.pairs import PairQuestion
+from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.solver import Stop, theory_in
 from ssh_abduction.theory.theory import Theory
 

@@ -1,23 +1,22 @@
-"""Why two steps are different dstates, why a trace has no map, and what would mend it."""
+"""Explain whether two steps are one dstate, why a trace has no map, and what would mend it."""
 
 from ssh_abduction import lazy_names
 
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
+    from ssh_abduction.explain.mend import explain_trace
     from ssh_abduction.explain.no_map import Explanation, explain, why_apart
-    from ssh_abduction.explain.pairs import explain_pair, explain_trace
+    from ssh_abduction.explain.pairs import explain_pair
 
 _HOMES = {
+    "mend": ("explain_trace",),
     "no_map": (
         "Explanation",
         "explain",
         "why_apart",
     ),
-    "pairs": (
-        "explain_pair",
-        "explain_trace",
-    ),
+    "pairs": ("explain_pair",),
 }
 __all__ = [
     "Explanation",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain.pairs import PairExplanation, explain_pair
+from ssh_abduction.explain.pairs import explain_pair
+from ssh_abduction.explain.verdict import PairExplanation
 from ssh_abduction.solver import Solution, Watch, solve
 from ssh_abduction.theory.theory import Theory
 

@@ -13,8 +13,10 @@ import time
 from collections.abc import Iterator
 
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.explain.no_map import Axioms, Interrupted, Piece
-from ssh_abduction.explain.pairs import SMALL, UNCUT, PairExplanation, Side, Verdict
+from ssh_abduction.explain.axioms import Axioms, Interrupted
+from ssh_abduction.explain.pairs import SMALL, UNCUT
+from ssh_abduction.explain.piece import Piece
+from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import Cost, Status, facts, solve
 from ssh_abduction.theory.theory import Theory

@@ -1,0 +1,415 @@
+"""Find an argument why two steps are different dstates in every map, or one dstate in every map.
+
+>>> from ssh_abduction import Theory, Trace
+>>> from ssh_abduction.explain.piece import Piece
+>>> actions = ["right", "travel", "right", "travel"]
+>>> trace = Trace.from_steps(views=["v0", "v1", "v2", "v3", "v0"], actions=actions)
+>>> theory = Theory.topological().resolve(trace)
+>>> argument = derive(Piece.of(trace, theory, range(5)), trace, 0, 4, one=False)
+>>> for part in argument.summary.split("; "):
+...     print(part)
+step 0 is at a place on the path that steps 1 and 2 define
+step 4 would be at a place to the right of that path
+no place on a path lies right or left of it
+
+The argument rests on a minimal set of axioms and steps. Its conclusions come from clingo, which
+finds those that hold in all maps that satisfy the axioms named so far. So each line is a
+consequence of the lines and axioms before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import clingo
+
+from ssh_abduction.checker.checker import check, unchecked
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.explain.axioms import Assumption, Axioms
+from ssh_abduction.explain.derivation import Derivation, Inference, Link, clashes_of
+from ssh_abduction.explain.piece import Piece
+from ssh_abduction.explain.wording import Words, that_path
+from ssh_abduction.solver import facts
+
+# An argument about at most this many steps may mention all of them. In a longer piece it mentions
+# only the steps that the axioms name, to keep the number of conclusions small.
+FEW_STEPS = 14
+# Axioms that give a dstate one value of something. A map shows one value only, so these axioms
+# should hold in a map for the checker.
+SHOWN = ("one_place", "one_course", "one_heading", "functional_view", "deterministic")
+# Preferred conclusions, if one of several suffices as a premise.
+_PREFERRED = (
+    "on",
+    "right",
+    "left",
+    "one_dstate",
+    "two_dstates",
+    "one_place",
+    "two_places",
+    "one_course",
+    "opposite",
+    "ahead",
+    "branch_right",
+    "branch_left",
+)
+
+
+def derive(
+    piece: Piece,
+    trace: Trace,
+    first: int,
+    second: int,
+    *,
+    one: bool,
+    stop: Callable[[], bool] = lambda: False,
+) -> Derivation:
+    """Find an argument that two steps are one dstate in all maps, or in none.
+
+    The caller has to know that this is so.
+
+    Args:
+        piece: Steps of the trace that suffice.
+        trace: The whole trace, whose displacements count.
+        first: The earlier step of the pair.
+        second: The later step.
+        one: Whether the steps are one dstate.
+        stop: Called now and then; if it returns True, Interrupted is raised.
+    """
+    return Argument(piece, trace, first, second, one, stop).derivation()
+
+
+@dataclass(frozen=True)
+class _Line:
+    """The new conclusions of some links and the lines before; none if these contradict each other.
+
+    Attributes:
+        group: The links: axioms and steps.
+        conclusions: What follows from them.
+        supposed: Whether the line holds only under the supposition.
+    """
+
+    group: tuple[tuple[str, int], ...]
+    conclusions: frozenset[clingo.Symbol]
+    supposed: bool
+
+
+class Argument:
+    """Finds an argument. Steps are counted in the piece until they are put into words."""
+
+    def __init__(
+        self,
+        piece: Piece,
+        trace: Trace,
+        first: int,
+        second: int,
+        one: bool,
+        stop: Callable[[], bool],
+    ) -> None:
+        self._piece, self._trace, self._one = piece, trace, one
+        self._pair = piece.steps.index(first), piece.steps.index(second)
+        self._axioms = Axioms(piece, stop, relaxed=True)
+        self._supposed: Assumption = (facts.are_one(*self._pair), not one)
+        order = piece.theory.axioms
+        clash = self._axioms.smallest_clash([self._supposed])
+        self._links = sorted(clash, key=lambda link: (order.index(link[0]), link[1]))
+        self._axioms.tell_of(self._named_steps())
+        self._lines: list[_Line] = []
+        self._born: dict[clingo.Symbol, int] = {}  # the first line of each conclusion
+        self._words = Words(piece, trace)
+
+    def _named_steps(self) -> Iterable[int]:
+        """The steps that the argument speaks of."""
+        size = len(self._piece.steps)
+        if size <= FEW_STEPS or self._piece.theory.level == "causal":
+            return range(size)
+        first, second = self._pair
+        named = {t for _, step in self._links for t in (step - 1, step, step - second + first)} | {
+            first,
+            second,
+        }
+        return [t for t in named if 0 <= t < size]
+
+    def derivation(self) -> Derivation:
+        """The argument in words."""
+        self._draw_all()
+        inferences, summary = self._told()
+        first, second = (self._piece.steps[k] for k in self._pair)
+        supposed = any(inference.supposed for inference in inferences)
+        supposition = (
+            f"steps {first} and {second} are {'different dstates' if self._one else 'one dstate'}"
+            if supposed
+            else None
+        )
+        return Derivation(
+            self._piece.steps,
+            first,
+            second,
+            self._one,
+            tuple(self._checked_links()),
+            inferences,
+            supposition,
+            summary,
+        )
+
+    # Which conclusions follow from the links, in which order
+
+    def _draw_all(self) -> None:
+        """Order the links such that each one, with those before it, gives a new conclusion.
+
+        First conclude what holds in every map. If that does not settle the pair, or only by several
+        links at once, suppose the opposite and go on until there is a contradiction.
+        """
+        goal = facts.conclusion("one_dstate" if self._one else "two_dstates", *self._pair)
+        left = list(self._links)
+        for supposed in (False, True):
+            assumed = [self._supposed] if supposed else []
+            placed = [link for link in self._links if link not in left]
+            known = self._axioms.consequences(_active(placed), assumed, self._born)
+            self._add((), known, supposed)
+            while left:
+                group = self._next(placed, left, assumed, known) or (
+                    tuple(left) if supposed else None
+                )
+                if group is None:
+                    break
+                placed += group
+                left = [link for link in left if link not in group]
+                if supposed and not self._axioms.consistent(_active(placed), assumed):
+                    self._lines.append(_Line(group, frozenset(), supposed))
+                    return
+                known = self._axioms.consequences(_active(placed), assumed, known)
+                self._add(group, known, supposed)
+                if goal in self._born:
+                    if len(self._support(goal)[1]) == len(group):
+                        return
+                    # Several links at once settle the pair. The supposition gives smaller steps.
+                    self._lines, self._born, left = [], {}, list(self._links)
+                    break
+
+    def _next(
+        self,
+        placed: Sequence[tuple[str, int]],
+        left: Sequence[tuple[str, int]],
+        assumed: Sequence[Assumption],
+        known: frozenset[clingo.Symbol],
+    ) -> tuple[tuple[str, int], ...] | None:
+        """The first link that gives a new conclusion."""
+        for link in left:
+            active = _active([*placed, link])
+            if assumed and not self._axioms.consistent(active, assumed):
+                return (link,)
+            if self._axioms.consequences(active, assumed, known) - known:
+                return (link,)
+        return None
+
+    def _add(
+        self, group: tuple[tuple[str, int], ...], known: frozenset[clingo.Symbol], supposed: bool
+    ) -> None:
+        new = known - self._born.keys()
+        if new:
+            self._born.update(dict.fromkeys(new, len(self._lines)))
+            self._lines.append(_Line(group, new, supposed))
+
+    # What of it the argument needs
+
+    def _told(self) -> tuple[tuple[Inference, ...], str]:
+        """The lines that the argument needs, each after its premises, and the summary."""
+        last = self._lines[-1]
+        goal = (
+            None
+            if not last.conclusions
+            else facts.conclusion("one_dstate" if self._one else "two_dstates", *self._pair)
+        )
+        order: list[clingo.Symbol | None] = []
+        premises: dict[clingo.Symbol | None, list[clingo.Symbol]] = {}
+        links: dict[clingo.Symbol | None, tuple[tuple[str, int], ...]] = {}
+
+        def visit(conclusion: clingo.Symbol | None) -> None:
+            if conclusion in premises:
+                return
+            premises[conclusion], links[conclusion] = self._support(conclusion)
+            for premise in sorted(
+                premises[conclusion], key=lambda premise: facts.read_conclusion(premise)[1]
+            ):
+                visit(premise)
+            order.append(conclusion)
+
+        visit(goal)
+        # what holds in every map comes first
+        order.sort(key=lambda conclusion: self._line_of(conclusion).supposed)
+        # conclusions from the same links and premises share a line
+        numbers: dict[clingo.Symbol | None, int] = {}
+        lines: list[
+            tuple[list[clingo.Symbol | None], tuple[int, ...], tuple[tuple[str, int], ...]]
+        ] = []
+        for conclusion in order:
+            before = tuple(sorted({numbers[p] for p in premises[conclusion] if p in numbers}))
+            if (
+                lines
+                and lines[-1][1:] == (before, links[conclusion])
+                and self._line_of(lines[-1][0][0]) is self._line_of(conclusion)
+            ):
+                lines[-1][0].append(conclusion)
+            else:
+                lines.append(([conclusion], before, links[conclusion]))
+            numbers[conclusion] = len(lines) - 1
+        inferences = tuple(self._inference(*told) for told in lines)
+        return inferences, self._summary(goal, premises, links)
+
+    def _line_of(self, conclusion: clingo.Symbol | None) -> _Line:
+        return self._lines[-1 if conclusion is None else self._born[conclusion]]
+
+    def _support(
+        self, conclusion: clingo.Symbol | None
+    ) -> tuple[list[clingo.Symbol], tuple[tuple[str, int], ...]]:
+        """A minimal set of earlier conclusions that a conclusion follows from, and its links.
+
+        The links are those of its line, and earlier ones that are needed again.
+        """
+        line = self._line_of(conclusion)
+        number = len(self._lines) - 1 if conclusion is None else self._born[conclusion]
+        known = [
+            (symbol, True)
+            for symbol, born in self._born.items()
+            if born < number and (line.supposed or not self._lines[born].supposed)
+        ]
+        known.sort(key=lambda assumption: self._rank(assumption[0]))
+        earlier = [link for before in self._lines[:number] for link in before.group]
+        given = [
+            *([(conclusion, False)] if conclusion is not None else []),
+            *([self._supposed] if line.supposed else []),
+            *known,
+        ]
+        core = self._axioms.core(_active(line.group), given)
+        if core is None:
+            core = self._axioms.core(
+                _active(line.group), [*given, *((facts.active(*link), True) for link in earlier)]
+            )
+        needed = {symbol for symbol, _ in core or ()}
+        again = tuple(link for link in earlier if facts.active(*link) in needed)
+        return [
+            symbol for symbol, _ in core or () if symbol in self._born and symbol != conclusion
+        ], again + line.group
+
+    def _rank(self, symbol: clingo.Symbol) -> tuple[bool, bool, int, int, tuple[int, ...]]:
+        """Sort key of premises; those of lower rank are preferred.
+
+        What holds in every map should be about the first step of the pair, and what is supposed
+        about the second one.
+        """
+        name, steps = facts.read_conclusion(symbol)
+        supposed = self._lines[self._born[symbol]].supposed
+        preferred = _PREFERRED.index(name) if name in _PREFERRED else len(_PREFERRED)
+        return (
+            supposed and self._pair[0] in steps and steps != self._pair,
+            set(steps).isdisjoint(self._pair),
+            preferred,
+            self._born[symbol],
+            steps,
+        )
+
+    # Words
+
+    def _inference(
+        self,
+        conclusions: Sequence[clingo.Symbol | None],
+        premises: tuple[int, ...],
+        needed: Sequence[tuple[str, int]],
+    ) -> Inference:
+        line = self._line_of(conclusions[0])
+        known = [symbol for symbol, born in self._born.items() if born <= self._lines.index(line)]
+        self._words.know(known)
+        said = [facts.read_conclusion(c) for c in conclusions if c is not None]
+        says = tuple(dict.fromkeys(self._words.of(c, would=line.supposed) for c in said)) or (
+            "that is a contradiction",
+        )
+        because = tuple(
+            dict.fromkeys(self._words.reason(axiom, t, said, self._pair) for axiom, t in needed)
+        )
+        links = clashes_of((axiom, self._piece.steps[t]) for axiom, t in needed)
+        return Inference(
+            says,
+            because or ("by what is supposed" if line.supposed else "by the trace alone",),
+            links,
+            premises,
+            line.supposed,
+        )
+
+    def _summary(
+        self,
+        goal: clingo.Symbol | None,
+        premises: dict[clingo.Symbol | None, list[clingo.Symbol]],
+        links: dict[clingo.Symbol | None, tuple[tuple[str, int], ...]],
+    ) -> str:
+        """The last inference with two premises or more, and its axioms."""
+        conclusion = goal
+        while len(premises[conclusion]) == 1:
+            conclusion = premises[conclusion][0]
+        self._words.know(self._born)
+        if not premises[conclusion]:
+            conclusion = goal
+        # the supposition itself says these about the pair
+        obvious = (self._pair, ("one_place", "one_dstate", "two_dstates"))
+        told = [
+            self._words.of(facts.read_conclusion(p), would=self._lines[self._born[p]].supposed)
+            for p in sorted(
+                premises[conclusion],
+                key=lambda p: (self._lines[self._born[p]].supposed, facts.read_conclusion(p)[1]),
+            )
+            if not (
+                facts.read_conclusion(p)[1] == obvious[0]
+                and facts.read_conclusion(p)[0] in obvious[1]
+            )
+        ]
+        said = [] if conclusion is None else [facts.read_conclusion(conclusion)]
+        reasons = [
+            self._words.reason(axiom, t, said, self._pair, short=True)
+            for axiom, t in links[conclusion]
+        ]
+        return that_path("; ".join(dict.fromkeys([*told, *reasons])))
+
+    # Is each link needed?
+
+    def _checked_links(self) -> Iterable[Link]:
+        """The links in the order of the argument, each with a map that breaks it and few others."""
+        theory = self._piece.theory
+        names = {axiom for axiom, _ in self._links} | set(unchecked(theory))
+        left_out = [axiom for axiom in theory.axioms if axiom not in names]
+        own = {axiom.name for rules in theory.rules for axiom in rules.axioms}
+        of_argument = theory.replace(
+            without=[
+                *dict.fromkeys([*theory.without, *(name for name in left_out if name not in own)])
+            ]
+        )
+        ordered = list(dict.fromkeys(link for line in self._lines for link in line.group))
+        for axiom, t in [*ordered, *(link for link in self._links if link not in ordered)]:
+            found = self._map_without((axiom, t))
+            yield Link(
+                axiom, self._piece.steps[t], found, check(self._piece.trace, found, of_argument)
+            )
+
+    def _map_without(self, link: tuple[str, int]) -> SSHMap:
+        """A map in which the other links hold, and the axioms in SHOWN as far as possible."""
+        supposed = [self._supposed]
+        active = _active(other for other in self._links if other != link)
+        for axiom in SHOWN:
+            several = [
+                symbol
+                for symbol in self._axioms.instances
+                if str(symbol.arguments[0]) == axiom and symbol != facts.active(*link)
+            ]
+            for some in ([several], [[symbol] for symbol in several]):
+                for more in some:
+                    if not set(more) <= set(active) and self._axioms.consistent(
+                        [*active, *more], supposed
+                    ):
+                        active += more
+        found = self._axioms.map_with(active, supposed)
+        assert found is not None
+        return found
+
+
+def _active(links: Iterable[tuple[str, int]]) -> list[clingo.Symbol]:
+    return [facts.active(axiom, t) for axiom, t in links]

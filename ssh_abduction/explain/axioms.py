@@ -1,0 +1,439 @@
+"""The axioms of a piece of a trace in clingo, which can be switched on and off step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import clingo
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.explain.piece import Piece, displacement_of
+from ssh_abduction.solver import facts
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.evidence import Displacement, Equality, Planar, evidence_of
+
+# Seconds between two calls of `stop` while clingo solves.
+POLL = 0.05
+# Steps that are grounded between two calls of `stop`.
+AT_A_TIME = 8
+# At most this many refused returns that end at one step get a sentence.
+MOST_SENTENCES = 3
+
+# An atom and whether it is true.
+Assumption: TypeAlias = tuple[clingo.Symbol, bool]
+# Equalities that cannot all hold.
+Refusal: TypeAlias = frozenset[Equality]
+
+
+class Interrupted(Exception):  # noqa: N818 - not an error
+    """The caller's `stop` returned True."""
+
+
+class _Answer(NamedTuple):
+    """A model of clingo: the dstate and place of each step, and the map they make.
+
+    If axioms are relaxed, the map may break some of them.
+    """
+
+    labels: tuple[int, ...]
+    places: tuple[int | None, ...]
+    ssh_map: SSHMap
+
+    def has(self, equalities: Collection[Equality]) -> bool:
+        """Whether all these equalities hold in the model."""
+        named = {"dstate": self.labels, "place": self.places}
+        return all((named[e.of][e.first] == named[e.of][e.second]) == e.holds for e in equalities)
+
+
+class _Seen(NamedTuple):
+    """A model of clingo in the course of an argument.
+
+    Attributes:
+        conclusions: The conclusions that hold in it.
+        broken: The `active` atoms of the axioms and steps that it breaks.
+        one: The atoms of the pairs of steps that are one dstate.
+    """
+
+    conclusions: frozenset[clingo.Symbol]
+    broken: frozenset[clingo.Symbol]
+    one: frozenset[clingo.Symbol]
+
+    @classmethod
+    def of(cls, model: clingo.Model) -> _Seen:
+        return cls(*facts.read_argument(model))
+
+    def suits(self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]) -> bool:
+        """Whether these axioms and assumptions hold in it."""
+        return self.broken.isdisjoint(active) and all(
+            (symbol in self.one) == true for symbol, true in assumed
+        )
+
+
+def _forget(_: clingo.Model) -> None:
+    """Ignore a model, where only its existence matters."""
+
+
+class Axioms:
+    """The axioms of a piece of a trace, in clingo.
+
+    Some evidence can only refuse a whole map. Such a refusal is added as a constraint, and clingo
+    is asked again.
+    """
+
+    def __init__(self, piece: Piece, stop: Callable[[], bool], *, relaxed: bool = False) -> None:
+        """Ground the axioms.
+
+        Args:
+            piece: The piece of a trace.
+            stop: Called now and then; if it returns True, Interrupted is raised.
+            relaxed: Whether each axiom can be switched on or off at each step.
+        """
+        trace, theory = piece.trace, piece.theory
+        self._trace, self._theory, self._first = trace, theory, piece.steps[0]
+        self._evidence = evidence_of(theory)
+        self._stop = stop
+        self._refusals = 0  # constraints that were added since
+        self._conclusions: list[clingo.Symbol] = []
+        self._seen: list[_Seen] = []
+        self._last_core: tuple[int, ...] = ()  # clingo's literals of the last unsat core
+        self._control = clingo.Control(
+            ["--warn=none", *(["--heuristic=Domain"] if relaxed else [])]
+        )
+        names = [name for name in facts.encoding_names(theory) if name != "preference"]
+        for name in [*names, "explain", "derivation"] if relaxed else names:
+            self._control.load(encodings.path(name))
+        last = len(trace) - 1
+        self._control.add(
+            "base",
+            [],
+            facts.theory_facts(
+                theory, len(trace) if relaxed else facts.most_paths(trace, theory, len(trace))
+            )
+            + facts.trace_facts(trace, theory, 0, len(trace)),
+        )
+        self._control.add("base", [], facts.own_rules(theory))
+        self._control.add("base", [], piece.facts)
+        parts = [
+            ("base", list[clingo.Symbol]()),
+            *(("step", facts.numbers(t)) for t in range(len(trace))),
+            ("check", facts.numbers(last)),
+        ]
+        for start in range(0, len(parts), AT_A_TIME):
+            if stop():
+                raise Interrupted
+            self._control.ground(parts[start : start + AT_A_TIME])
+        self._control.assign_external(facts.query(last), True)
+        self._control.assign_external(facts.run_by_steps(), True)
+        # Planarity is checked once, at the last step, and only if each dstate is at one place:
+        # otherwise there is nothing to draw.
+        pairs = (
+            (axiom, t)
+            for axiom in theory.axioms
+            for t in range(len(trace))
+            if axiom != Planar.axiom or t == last
+        )
+        self._pairs = {facts.active(axiom, t): (axiom, t) for axiom, t in pairs} if relaxed else {}
+        self._drawn = {facts.active(Planar.axiom, last)} & self._pairs.keys()
+        self._placed = [
+            symbol for symbol, (axiom, _) in self._pairs.items() if axiom == "one_place"
+        ]
+        if self._drawn:
+            self._control.add("placed", [], facts.rests_on(Planar.axiom, last, "one_place"))
+            self._control.ground([("placed", [])])
+
+    @property
+    def instances(self) -> tuple[clingo.Symbol, ...]:
+        """The `active` atom of each axiom and step, if the axioms are relaxed."""
+        return tuple(self._pairs)
+
+    def consistent(
+        self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()
+    ) -> bool:
+        """Whether there is a map.
+
+        Args:
+            active: If the axioms are relaxed, the `active` atoms of those that have to hold.
+            assumed: Atoms and whether they are true in the map.
+        """
+        return self.map_with(active, assumed) is not None
+
+    def map_with(
+        self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()
+    ) -> SSHMap | None:
+        """A map as `consistent` asks for, or None if there is none."""
+        while answer := self._answer(active, assumed):
+            refused = self._refused(answer, {self._pairs[symbol] for symbol in active})
+            if refused is None:
+                return answer.ssh_map
+            axiom, refusal = refused
+            self._forbid(
+                refusal,
+                facts.active(axiom, self._judged_at(axiom, refusal)) if self._pairs else None,
+            )
+        return None
+
+    def tell_of(self, steps: Iterable[int]) -> None:
+        """Make `consequences` speak about these steps (encodings/derivation.lp)."""
+        self._control.add("told_of", [], facts.told_of(steps))
+        self._control.ground([("told_of", []), ("conclusions", [])])
+        self._conclusions = facts.conclusions_of(self._control)
+        self._control.add("may_fail", [], facts.may_fail(self._conclusions))
+        self._control.ground([("may_fail", [])])
+
+    def consequences(
+        self,
+        active: Sequence[clingo.Symbol],
+        assumed: Sequence[Assumption] = (),
+        known: Collection[clingo.Symbol] = (),
+    ) -> frozenset[clingo.Symbol]:
+        """The conclusions that hold in all maps in which these axioms hold.
+
+        There has to be such a map.
+
+        Args:
+            active: The `active` atoms of the axioms and steps.
+            assumed: Atoms and whether they are true.
+            known: Conclusions that are known to hold.
+        """
+        # Clingo's cautious reasoning loses atoms under assumptions. So each query asks for a model
+        # in which some doubtful conclusion fails, until there is none.
+        found = frozenset(self._conclusions)
+        holding = active if self._drawn.isdisjoint(active) else [*active, *self._placed]
+        for answer in self._seen:
+            if answer.suits(holding, assumed):
+                found &= answer.conclusions
+
+        def keep(model: clingo.Model) -> None:
+            nonlocal found
+            seen = _Seen.of(model)
+            found &= seen.conclusions
+            if not self._refusals:  # else a model does not show every axiom that it breaks
+                self._seen.append(seen)
+
+        doubtful = found - frozenset(known)
+        for symbol in self._conclusions:
+            self._control.assign_external(facts.picked(symbol), symbol in doubtful)
+        while doubtful and self._solve(keep, active, [*assumed, (facts.some_fail(), True)]):
+            for symbol in doubtful - found:
+                self._control.assign_external(facts.picked(symbol), False)
+            doubtful &= found
+        return found
+
+    def core(
+        self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]
+    ) -> list[Assumption] | None:
+        """Find a minimal subset of the assumptions that contradicts these axioms.
+
+        Args:
+            active: The `active` atoms of the axioms and steps.
+            assumed: Atoms and whether they are true. Earlier ones are preferred.
+
+        Returns:
+            The subset, or None if the assumptions are consistent with the axioms.
+        """
+        # Bisect for the shortest prefix that contradicts the axioms together with what is needed.
+        # Its last assumption is needed. Unsat cores of clingo shorten the prefix.
+        needed: list[Assumption] = []
+        rest = list(assumed)
+        while self._solve(_forget, active, needed):
+            least, most = 0, len(rest)  # `most` of the rest suffice, `least` do not
+            if self._solve(_forget, active, [*rest, *needed]):
+                return None
+            most = min(most, 1 + max((rest.index(a) for a in self._of_last_core(rest)), default=-1))
+            while most - least > 1:
+                middle = (least + most) // 2
+                if self._solve(_forget, active, [*rest[:middle], *needed]):
+                    least = middle
+                else:
+                    most = min(
+                        middle,
+                        1
+                        + max(
+                            (rest.index(a) for a in self._of_last_core(rest[:middle])), default=-1
+                        ),
+                    )
+                    most = max(most, least + 1)
+            needed.append(rest[most - 1])
+            rest = rest[: most - 1]
+        return needed
+
+    def _of_last_core(self, assumed: Sequence[Assumption]) -> list[Assumption]:
+        """Those of these assumptions that are in the last unsat core."""
+        core = set(self._last_core)
+        literals = [
+            (assumption, self._control.symbolic_atoms[assumption[0]]) for assumption in assumed
+        ]
+        return [
+            (symbol, true)
+            for (symbol, true), atom in literals
+            if atom is None or atom.literal * (1 if true else -1) in core
+        ]
+
+    def _answer(
+        self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption] = ()
+    ) -> _Answer | None:
+        """A model of clingo in which these axioms hold."""
+        found: list[_Answer] = []
+
+        def keep(model: clingo.Model) -> None:
+            found.append(
+                _Answer(*facts.read_steps(model), facts.read_map(model, self._trace, self._theory))
+            )
+
+        return found[0] if self._solve(keep, active, assumed) else None
+
+    def _solve(
+        self,
+        keep: Callable[[clingo.Model], None],
+        active: Sequence[clingo.Symbol],
+        assumed: Sequence[Assumption],
+    ) -> bool:
+        """Whether there is a model. `keep` is called with each one found."""
+        if self._stop():
+            raise Interrupted
+        assumptions = [*((symbol, True) for symbol in active), *assumed]
+        with self._control.solve(assumptions=assumptions, on_model=keep, async_=True) as handle:
+            while not handle.wait(POLL):
+                if self._stop():
+                    handle.cancel()
+                    raise Interrupted
+            satisfiable = bool(handle.get().satisfiable)
+            self._last_core = () if satisfiable else tuple(handle.core())
+            return satisfiable
+
+    def _refused(
+        self, answer: _Answer, active: Collection[tuple[str, int]]
+    ) -> tuple[str, Refusal] | None:
+        """Equalities of a model that some evidence refuses, with the name of its axiom.
+
+        If the axioms are relaxed, the axiom has to be active at the last of the steps.
+        """
+        for evidence in self._evidence:
+            if not self._pairs:
+                found = [evidence.refuse(self._trace, answer.ssh_map)]
+            elif isinstance(evidence, Displacement):
+                found = [
+                    self._refused_together(evidence, answer, t)
+                    for axiom, t in sorted(active)
+                    if axiom == evidence.axiom
+                ]
+            else:
+                found = (
+                    [evidence.refuse(self._trace, answer.ssh_map)]
+                    if any(axiom == evidence.axiom for axiom, _ in active)
+                    else []
+                )
+            for refusal in filter(None, found):
+                if not self._pairs or (
+                    answer.has(refusal)
+                    and (evidence.axiom, self._judged_at(evidence.axiom, refusal)) in active
+                ):
+                    return evidence.axiom, refusal
+        return None
+
+    def _judged_at(self, axiom: str, refusal: Refusal) -> int:
+        """The step at which the axiom has to be active for this refusal."""
+        return len(self._trace) - 1 if axiom == Planar.axiom else _last_step(refusal)
+
+    def _refused_together(
+        self, displacement: Displacement, answer: _Answer, step: int
+    ) -> Refusal | None:
+        """Two returns of a model that are refused together, of which the later ends at `step`."""
+        if displacement.joint == 1:
+            return None
+        return displacement.returns_of(self._trace).refused_at(answer.labels, answer.places, step)
+
+    def _forbid(self, refusal: Refusal, where: clingo.Symbol | None = None) -> None:
+        """Add the constraint that not all equalities hold, if the atom `where` holds."""
+        name = f"told_{self._refusals}"
+        self._refusals += 1
+        self._control.add(name, [], facts.forbidden_equalities(refusal, where))
+        self._control.ground([(name, [])])
+
+    def sentences(self, clash: Sequence[tuple[str, int]]) -> tuple[str, ...]:
+        """What displacements say about the returns in a clash, as `Explanation.sentences`.
+
+        The other axioms of the clash have models, and each of them has a return that is refused.
+        The clearest refused return is forbidden until no model is left.
+        """
+        displacement = displacement_of(self._theory)
+        steps = [t for axiom, t in clash if displacement and axiom == displacement.axiom]
+        if not displacement or not steps:
+            return ()
+        returns = displacement.returns_of(self._trace)
+        said: dict[int, list[tuple[float, str]]] = {t: [] for t in steps}
+        others = [
+            symbol
+            for symbol, pair in self._pairs.items()
+            if pair in clash and pair[0] != displacement.axiom
+        ]
+        while answer := self._answer(others):
+            alone = [
+                e for t in steps for e in returns.refused_alone_at(answer.labels, answer.places, t)
+            ]
+            if alone:
+                clearest = max(alone, key=returns.excess)
+                refusal: Refusal | None = frozenset([clearest])
+                found = (
+                    returns.excess(clearest),
+                    returns.why_apart(clearest.first, clearest.second, self._first) or "",
+                )
+            else:
+                refusal = next(
+                    filter(None, (self._refused_together(displacement, answer, t) for t in steps)),
+                    None,
+                )
+                found = 0.0, returns.why_not_both(refusal or (), self._first)
+            if refusal is None:
+                break
+            said[_last_step(refusal)].append(found)
+            self._forbid(refusal)
+        clearest_first = (sorted(said[t], reverse=True)[:MOST_SENTENCES] for t in sorted(steps))
+        return tuple(dict.fromkeys(sentence for found in clearest_first for _, sentence in found))
+
+    def smallest_clash(self, assumed: Sequence[Assumption] = ()) -> list[tuple[str, int]]:
+        """A minimal set of pairs of axiom and step that leaves no map.
+
+        There are many such sets. To get a short one, whole axioms are dropped before single steps,
+        once in the order of the axioms and once in reverse, and the smaller result is returned.
+        """
+        found = [
+            self._shrunk(list(order), assumed) for order in (self._pairs, reversed(self._pairs))
+        ]
+        shortest = min(
+            found, key=lambda pairs: (len({self._pairs[p][0] for p in pairs}), len(pairs))
+        )
+        return [self._pairs[symbol] for symbol in shortest]
+
+    def _shrunk(
+        self, kept: list[clingo.Symbol], assumed: Sequence[Assumption]
+    ) -> list[clingo.Symbol]:
+        """The pairs that are left after dropping, in their order, all that are not needed."""
+        # the last unsat core: as long as all of it is kept, clingo need not be asked
+        core: set[clingo.Symbol] | None = None
+
+        def clash(some: list[clingo.Symbol]) -> bool:
+            nonlocal core
+            if core is None or not core <= set(some):
+                if self.consistent(some, assumed):
+                    return False
+                core = {
+                    symbol for symbol, _ in self._of_last_core([(symbol, True) for symbol in some])
+                }
+            return True
+
+        for axiom in dict.fromkeys(self._pairs[symbol][0] for symbol in kept):
+            fewer = [symbol for symbol in kept if self._pairs[symbol][0] != axiom]
+            if clash(fewer):
+                kept = fewer
+        for symbol in tuple(kept):
+            fewer = [other for other in kept if other != symbol]
+            if clash(fewer):
+                kept = fewer
+        return kept
+
+
+def _last_step(refusal: Refusal) -> int:
+    """The last step that these equalities are about."""
+    return max(max(e.first, e.second) for e in refusal)

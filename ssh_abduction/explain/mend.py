@@ -1,0 +1,293 @@
+"""Explain why a trace has no map, and which single observation would mend it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ssh_abduction.data.deprecated import renamed_parameters
+from ssh_abduction.data.errors import AbductionError
+from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View
+from ssh_abduction.explain.axioms import Axioms
+from ssh_abduction.explain.no_map import Explanation, explain
+from ssh_abduction.explain.piece import Piece
+from ssh_abduction.explain.question import Question
+from ssh_abduction.solver import Status, Stop
+from ssh_abduction.theory.theory import ASSERTIONS, Theory, checked_theory
+
+NEW_VIEW = "a view never seen"
+# Share of the time that is left for each search of the whole trace.
+SHARE = 0.45
+
+
+@renamed_parameters("limit", "memory")
+def explain_trace(
+    trace: Trace,
+    theory: Theory | None = None,
+    *,
+    time_limit: float | None = None,
+    memory_limit: int | None = None,
+) -> TraceExplanation:
+    """Explain why a trace has no map, and which single observation would mend it.
+
+    An observation is a view, a star, an action, a displacement, or an asserted pair of steps. Each
+    one in the clashing stretch is replaced by other values from the trace, or dropped. It is a mend
+    if the whole trace then has a map.
+
+    Args:
+        trace: The trace, with views.
+        theory: The theory; Theory.topological() if None.
+        time_limit: Seconds, as for `explain_pair`.
+        memory_limit: MiB, as for `explain_pair`.
+    """
+    return TraceQuestion(
+        trace, checked_theory(theory), time_limit=time_limit, memory_limit=memory_limit
+    ).answer()
+
+
+@dataclass(frozen=True, slots=True)
+class Mend:
+    """An observation without which the trace has a map.
+
+    Attributes:
+        step: The step of the observation; the later step of an asserted pair.
+        kind: view, star, action, displacement; or same, different, elsewhere for an asserted pair.
+        seen: What the trace says.
+        instead: A value that leaves a map; None if it is enough to drop the observation.
+        proven: Whether the whole changed trace is known to have a map, not only the stretch.
+    """
+
+    step: int
+    kind: str
+    seen: str
+    instead: str | None
+    proven: bool
+
+    def __str__(self) -> str:
+        if self.kind in ASSERTIONS:
+            what = f"without the assertion about steps {self.seen} ({self.kind})"
+        elif self.instead is None:
+            what = f"if the {self.kind} at step {self.step}, {self.seen}, were wrong"
+        else:
+            what = f"if the {self.kind} at step {self.step} were {self.instead}, not {self.seen}"
+        return f"{what}, {'the trace' if self.proven else 'at least that stretch'} would have a map"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `explain --json` prints it."""
+        return {
+            "step": self.step,
+            "kind": self.kind,
+            "seen": self.seen,
+            "instead": self.instead,
+            "proven": self.proven,
+            "sentence": str(self),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class TraceExplanation:
+    """Why a trace has no map, and which single observations would mend it.
+
+    Attributes:
+        possible: Whether the trace has a map; None if a limit ended the search before.
+        clash: A minimal clash; None if the trace has a map or the search ended before.
+        mends: The single observations without which there is a map, by step.
+        complete: Whether all observations of the clashing stretch were tried.
+        stopped: The limit that ended the search, if one did.
+    """
+
+    possible: bool | None
+    clash: Explanation | None
+    mends: tuple[Mend, ...]
+    complete: bool
+    stopped: Stop | None
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The answer in words."""
+        if self.possible:
+            return ("the trace has a map; name two steps to ask whether they are one dstate",)
+        if self.clash is None:
+            return (f"it is unknown whether the trace has a map ({self.stopped or 'no proof'})",)
+        mends = tuple(map(str, self.mends))
+        if not mends and self.complete:
+            mends = ("no change of a single observation in that stretch leaves a map",)
+        elif not self.complete:
+            mends += (f"not all observations were tried ({self.stopped})",)
+        return (str(self.clash), *self.clash.sentences, *mends)
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `explain --json` prints it."""
+        return {
+            "possible": self.possible,
+            "sentences": list(self.sentences),
+            "clash": self.clash.to_dict() if self.clash else None,
+            "mends": [mend.to_dict() for mend in self.mends],
+            "complete": self.complete,
+            **({"stopped": self.stopped} if self.stopped else {}),
+        }
+
+
+class TraceQuestion(Question[TraceExplanation]):
+    """Asks why a trace has no map, and what would mend it. Parameters as in `explain_trace`."""
+
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory | None = None,
+        *,
+        time_limit: float | None = None,
+        memory_limit: int | None = None,
+    ) -> None:
+        super().__init__(trace, theory, time_limit, memory_limit)
+        self._possible: bool | None = None
+        self._clash: Explanation | None = None
+        self._mends: list[Mend] = []
+        self._complete = False
+
+    def known(self, why: Stop | None = None) -> TraceExplanation:
+        """What is known so far."""
+        mends = tuple(sorted(self._mends, key=lambda mend: (mend.step, mend.kind)))
+        return TraceExplanation(
+            self._possible, self._clash, mends, self._complete, why or self.stopped
+        )
+
+    def _find_out(self) -> None:
+        search = self._solved(self.trace, self.theory, 1, self._watch.left() * SHARE)
+        for _ in search:
+            self._possible = True
+            break
+        self._ended(search)
+        if self._possible:
+            return
+        self._clash = explain(self.trace, self.theory, self._over)
+        self._possible = self._clash is None
+        if self._clash is None:
+            return
+        stretch = range(self._clash.first, self._clash.last + 1)
+        for step, kind, seen, changes in self._observations(stretch):
+            for instead, trace, theory in changes:
+                if self._over():
+                    return
+                piece = Piece.of(trace, theory, stretch)
+                if not self._suits(trace, theory) or not Axioms(piece, self._over).consistent():
+                    continue
+                found = self._has_map(trace, theory)
+                if found is not False:
+                    self._mends.append(Mend(step, kind, seen, instead, proven=bool(found)))
+                    break
+        self._complete = True
+
+    def _suits(self, trace: Trace, theory: Theory) -> bool:
+        """Whether the changed trace still has what the theory reads."""
+        try:
+            theory.resolve(trace)
+        except AbductionError:
+            return False
+        return True
+
+    def _has_map(self, trace: Trace, theory: Theory) -> bool | None:
+        """Whether a whole trace has a map; None if there is no answer in time."""
+        search = self._solved(trace, theory, 1, self._watch.left() * SHARE)
+        found = next(iter(search), None)
+        self._ended(search)
+        return (
+            True if found is not None else False if search.status is Status.UNSATISFIABLE else None
+        )
+
+    def _observations(
+        self, stretch: range
+    ) -> Iterator[tuple[int, str, str, Iterable[tuple[str | None, Trace, Theory]]]]:
+        """Each observation of a stretch: its step, kind, value, and what it could have been.
+
+        Each alternative is the other value in words, and the changed trace and theory.
+        """
+        trace, theory = self.trace, self.theory
+        for t in stretch:
+            step = trace.steps[t]
+            yield t, "view", repr(step.view), self._with_views(t)
+            if step.star is not None and theory.star != "none":
+                yield t, "star", _star(step), self._with_stars(t)
+            if t < stretch[-1] and step.action is not None:
+                yield t, "action", repr(step.action.name), self._with_actions(t)
+            if t > stretch[0] and step.displacement is not None and theory.displacement == "use":
+                unknown = _with_step(trace, t, replace(step, displacement=None, covariance=None))
+                yield (
+                    t,
+                    "displacement",
+                    str(tuple(round(x, 3) for x in step.displacement)),
+                    [(None, unknown, theory)],
+                )
+        for name in ASSERTIONS:
+            pairs = getattr(theory, name)
+            for pair in pairs:
+                if set(pair) <= set(stretch):
+                    left = theory.replace(
+                        **{name: tuple(other for other in pairs if other != pair)}
+                    )
+                    yield pair[1], name, f"{pair[0]} and {pair[1]}", [(None, trace, left)]
+
+    def _with_views(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
+        step = self.trace.steps[t]
+        views = [
+            view
+            for view in dict.fromkeys(self.trace.views)
+            if view is not None and view != step.view
+        ]
+        new: View = next(name for name in _names("new view") if name not in views)
+        for view in views:
+            yield repr(view), _with_step(self.trace, t, replace(step, view=view)), self.theory
+        yield NEW_VIEW, _with_step(self.trace, t, replace(step, view=new)), self.theory
+
+    def _with_stars(self, t: int) -> Iterator[tuple[str, Trace, Theory]]:
+        step = self.trace.steps[t]
+        for star in dict.fromkeys(
+            other.star for other in self.trace.steps if other.star is not None
+        ):
+            if star != step.star:
+                changed = replace(step, star=star)
+                yield _star(changed), _with_step(self.trace, t, changed), self.theory
+
+    def _with_actions(self, t: int) -> Iterator[tuple[str | None, Trace, Theory]]:
+        step = self.trace.steps[t]
+        known = {action.name: action for action in self.trace.actions}
+        if self.theory.level == "topological":
+            kinds = {(action.kind, action.turn) for action in known.values()}
+            known |= {
+                a.name: a
+                for a in STANDARD_ACTIONS.values()
+                if (a.kind, a.turn) not in kinds and a.name not in known
+            }
+        for action in known.values():
+            if step.action is not None and action.name != step.action.name:
+                yield (
+                    repr(action.name),
+                    _with_step(self.trace, t, replace(step, action=action)),
+                    self.theory,
+                )
+        yield (
+            None,
+            _with_step(self.trace, t, replace(step, action=Action.that_slipped(t))),
+            self.theory,
+        )
+
+
+def _with_step(trace: Trace, t: int, step: Step) -> Trace:
+    return replace(trace, steps=(*trace.steps[:t], step, *trace.steps[t + 1 :]))
+
+
+def _names(stem: str) -> Iterator[str]:
+    """Names that begin with a stem."""
+    yield stem
+    number = 1
+    while True:
+        number += 1
+        yield f"{stem} {number}"
+
+
+def _star(step: Step) -> str:
+    return str(step.to_json()["star"])

@@ -1,0 +1,228 @@
+"""The answer to the question whether two steps are one dstate, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from ssh_abduction.explain.derivation import Derivation
+from ssh_abduction.explain.no_map import Explanation
+from ssh_abduction.solver import Cost, Stop
+from ssh_abduction.theory.theory import Theory
+
+
+class Verdict(Enum):
+    """What the maps of a trace say about two steps."""
+
+    # different dstates, or one dstate, in every consistent map
+    DIFFERENT = "different"
+    SAME = "same"
+    # in every minimal map, but not known to hold in every map
+    DIFFERENT_IN_MINIMAL = "different in every minimal map"
+    SAME_IN_MINIMAL = "same in every minimal map"
+    # one dstate in some minimal maps, different dstates in others
+    DISAGREE = "rivals disagree"
+    # the trace has no map
+    NO_MAP = "no map"
+    # a limit ended the search
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """What is known about the maps in which two steps are one dstate, or in which they differ.
+
+    Attributes:
+        possible: Whether there is such a map; None if unknown.
+        cost: The cost of the best known one; None if none is known.
+        proven: Whether no such map costs less.
+        maps: How many of the listed minimal maps are such.
+    """
+
+    possible: bool | None = None
+    cost: Cost | None = None
+    proven: bool = False
+    maps: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `explain --json` prints it."""
+        return {
+            "possible": self.possible,
+            "cost": self.cost.to_dict() if self.cost else None,
+            "proven": self.proven,
+            "maps": self.maps,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class PairExplanation:
+    """Whether two steps are one dstate, and why.
+
+    Attributes:
+        first: The earlier step.
+        second: The later step.
+        verdict: What the maps say.
+        same: What is known about the maps in which the steps are one dstate.
+        different: What is known about the maps in which they are different dstates.
+        listed: Whether all minimal maps were listed, so that `maps` of both sides counts all.
+        derivation: The argument for what holds in every map; None if there is none in time.
+        clash: Why the trace has no map, if it has none.
+        stopped: The limit that ended the search, if one did.
+        theory: The theory, settled for the trace.
+    """
+
+    first: int
+    second: int
+    verdict: Verdict
+    same: Side
+    different: Side
+    listed: bool
+    derivation: Derivation | None
+    clash: Explanation | None
+    stopped: Stop | None
+    theory: Theory = field(repr=False)
+
+    @property
+    def proven(self) -> bool:
+        """Whether the verdict is final."""
+        return self.verdict is not Verdict.UNKNOWN
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The verdict in words, and the cost of the best map that contradicts it."""
+        pair = f"steps {self.first} and {self.second}"
+        verdict = {
+            Verdict.DIFFERENT: f"{pair} are different dstates in every map",
+            Verdict.SAME: f"{pair} are one dstate in every map",
+            Verdict.DIFFERENT_IN_MINIMAL: f"{pair} are different dstates in every minimal map",
+            Verdict.SAME_IN_MINIMAL: f"{pair} are one dstate in every minimal map",
+            Verdict.DISAGREE: f"{pair} are one dstate in some minimal maps, and different dstates "
+            "in others",
+            Verdict.NO_MAP: f"no map satisfies the axioms, so nothing is known about {pair}",
+            Verdict.UNKNOWN: f"it is unknown whether {pair} are one dstate "
+            f"({self.stopped or 'no proof'})",
+        }[self.verdict]
+        return (verdict, *self._of_maps(), *self._of_costs())
+
+    def _of_maps(self) -> Iterator[str]:
+        """How many maps there are of each kind, or why there is none."""
+        maps = self.same.maps + self.different.maps
+        if self.verdict is Verdict.DISAGREE and maps > 1:
+            of = f"{'the' if self.listed else 'the first'} {maps} minimal maps"
+            numbers = f"one dstate in {self.same.maps}, different in {self.different.maps}"
+            yield f"of {of}, the steps are {numbers}"
+        if self.verdict is Verdict.NO_MAP and self.clash:
+            yield str(self.clash)
+        if self.verdict is Verdict.UNKNOWN:
+            for side, equal in ((self.same, "="), (self.different, "≠")):
+                if side.cost:
+                    cost = _in_words(side.cost, self.theory.priorities)
+                    yield f"a map with step {self.first} {equal} step {self.second} has {cost}"
+
+    def _of_costs(self) -> Iterator[str]:
+        """The cost of the best map that contradicts the verdict."""
+        lost, won, equal = (
+            (self.same, self.different, "=")
+            if self.verdict is Verdict.DIFFERENT_IN_MINIMAL
+            else (self.different, self.same, "≠")
+        )
+        if self.verdict not in (Verdict.DIFFERENT_IN_MINIMAL, Verdict.SAME_IN_MINIMAL):
+            return
+        rival = f"with step {self.first} {equal} step {self.second}"
+        if lost.possible is False:
+            yield f"no map {rival} satisfies the axioms"
+        elif lost.cost is None or won.cost is None:
+            yield f"it is unknown whether there is a map {rival}"
+        else:
+            known = "the best map" if lost.proven else "the best map found"
+            yield f"{known} {rival} has {_difference(lost.cost, won.cost, self.theory)}"
+
+    @property
+    def assuming(self) -> dict[str, str]:
+        """The cost of assuming that the steps are one dstate, and that they are not, in words.
+
+        The keys are `same` and `different`.
+        """
+        sides = {"same": self.same, "different": self.different}
+        best = min(
+            (s.cost for s in sides.values() if s.cost),
+            key=lambda cost: cost.preferred_by(self.theory),
+            default=None,
+        )
+        told = {}
+        for name, side in sides.items():
+            other = self.different if side is self.same else self.same
+            if side.possible is False:
+                told[name] = "no map satisfies the axioms"
+            elif other.possible is False:
+                told[name] = "costs nothing, as it holds in every map"
+            elif side.cost is None or best is None:
+                told[name] = "its cost is unknown"
+            elif side.cost.preferred_by(self.theory) == best.preferred_by(self.theory):
+                known = "costs nothing" if side.proven else "no map is known that costs less"
+                told[name] = f"{known}: {_in_words(side.cost, self.theory.priorities)}"
+            else:
+                known = "" if side.proven else "at most, "
+                told[name] = f"{known}{_difference(side.cost, best, self.theory)}"
+        return told
+
+    def __str__(self) -> str:
+        lines = list(self.sentences)
+        if self.derivation:
+            lines.append(str(self.derivation))
+        elif self.verdict in (Verdict.DIFFERENT, Verdict.SAME):
+            why = self.stopped or "it takes too many steps"
+            lines.append(f"no argument was found ({why})")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `explain --json` prints it."""
+        return {
+            "steps": [self.first, self.second],
+            "verdict": self.verdict.value,
+            "sentences": list(self.sentences),
+            "same": self.same.to_dict(),
+            "different": self.different.to_dict(),
+            "listed": self.listed,
+            "derivation": self.derivation.to_dict() if self.derivation else None,
+            "clash": self.clash.to_dict() if self.clash else None,
+            **({"stopped": self.stopped} if self.stopped else {}),
+        }
+
+
+def _counts(cost: Cost, names: Iterable[str]) -> Iterator[tuple[str, float]]:
+    """The preferred counts of a cost, by name."""
+    for name in names:
+        yield ("tenths", cost.tenths / 10) if name == "tenths" else (name, getattr(cost, name))
+
+
+def _in_words(cost: Cost, names: Iterable[str]) -> str:
+    """The preferred counts of a cost in words."""
+    return (
+        ", ".join(f"{number:g} {_noun(name, number)}" for name, number in _counts(cost, names))
+        or "no count is preferred"
+    )
+
+
+def _noun(name: str, number: float) -> str:
+    noun = "dstates with its faults" if name == "tenths" else name
+    return noun.removesuffix("s") if number == 1 and name != "tenths" else noun
+
+
+def _difference(lost: Cost, won: Cost, theory: Theory) -> str:
+    """Compare the cost of a map with a better one.
+
+    Name the first preferred count in which they differ, and the equal counts before it.
+    """
+    same: list[str] = []
+    for (name, one), (_, other) in zip(
+        _counts(lost, theory.priorities), _counts(won, theory.priorities), strict=True
+    ):
+        if one != other:
+            return f"{one:g} {_noun(name, one)}, not {other:g}" + (
+                f", with {' and '.join(same)}" if same else ""
+            )
+        same.append(f"{one:g} {_noun(name, one)}")
+    return f"{_in_words(lost, theory.priorities)}, as many as the minimal maps"

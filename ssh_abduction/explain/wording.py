@@ -1,0 +1,161 @@
+"""Arguments in words: conclusions and axioms as English clauses."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+
+import clingo
+
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.explain.no_map import why_apart
+from ssh_abduction.explain.piece import Piece
+from ssh_abduction.solver import facts
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.theory import EXCUSED
+
+# Axioms that the action before a step breaks.
+OF_ACTIONS = EXCUSED["slipped"] | {"branch_side"}
+
+_WORDS = {
+    "one_dstate": "steps {0} and {1} {are} one dstate",
+    "two_dstates": "steps {0} and {1} {are} different dstates",
+    "one_place": "steps {0} and {1} {are} at one place",
+    "two_places": "steps {0} and {1} {are} at different places",
+    "along": "step {0} {is} along a path",
+    "along_none": "step {0} {is} along no path",
+    "one_course": "steps {0} and {1} {are} along one path, in one direction",
+    "opposite": "steps {0} and {1} {are} along one path, in opposite directions",
+    "two_paths": "steps {0} and {1} {are} along different paths",
+    "on": "step {0} {is} at a place on {path1}",
+    "ahead": "the place of step {1} {is} ahead of that of step {0} on {path2}",
+    "branch_right": "{path1} {leaves} to the right of {path0}",
+    "branch_left": "{path1} {leaves} to the left of {path0}",
+    "right": "step {0} {is} at a place to the right of {path1}",
+    "left": "step {0} {is} at a place to the left of {path1}",
+    "turned": "steps {0} and {1} {are} at one place, and step {1} {faces} {turn} step {0}",
+}
+# How a step faces that is turned by 0 to 3 quarters clockwise from another one.
+_TURNED = (
+    "the same way as",
+    "a quarter to the right of",
+    "the opposite way of",
+    "a quarter to the left of",
+)
+
+
+class Words:
+    """Turns conclusions and axioms into English clauses."""
+
+    def __init__(self, piece: Piece, trace: Trace) -> None:
+        self._piece, self._trace = piece, trace
+        own = {axiom.name: axiom.sentence for rules in piece.theory.rules for axiom in rules.axioms}
+        self._sentences = {axiom.name: axiom.sentence for axiom in encodings.axioms()} | own
+        self._courses: set[tuple[int, int]] = set()
+
+    def know(self, conclusions: Iterable[clingo.Symbol]) -> None:
+        """Name paths by the pairs of steps along them in these conclusions."""
+        self._courses = {
+            (steps[0], steps[1])
+            for name, steps in map(facts.read_conclusion, conclusions)
+            if name == "one_course"
+        }
+
+    def of(self, conclusion: tuple[str, tuple[int, ...]], *, would: bool) -> str:
+        """A conclusion as a clause, with `would` if it is only supposed."""
+        name, steps = conclusion
+        if name in (
+            "one_dstate",
+            "one_place",
+            "two_places",
+            "two_dstates",
+            "one_course",
+            "opposite",
+            "two_paths",
+        ):
+            steps = tuple(sorted(steps))
+        turn = ""
+        if name == "turned":
+            steps, turn = steps[:2], _TURNED[steps[2]]
+        shown = [str(self._piece.steps[t]) for t in steps]
+        paths = {f"path{k}": self._path(t) for k, t in enumerate(steps)}
+        verbs = (
+            {"is": "would be", "are": "would be", "leaves": "would leave", "faces": "would face"}
+            if would
+            else {}
+        )
+        return _WORDS[name].format(
+            *shown,
+            turn=turn,
+            **paths,
+            **{verb: verbs.get(verb, verb) for verb in ("is", "are", "leaves", "faces")},
+        )
+
+    def _path(self, t: int) -> str:
+        """The path of a step of the piece, named by a known travel along it if there is one."""
+        pairs = sorted(
+            (j - i, abs(i - t), i, j) for i, j in self._courses if t in (i, j) and j == i + 1
+        )
+        if not pairs:
+            return f"the path of step {self._piece.steps[t]}"
+        _, _, i, j = pairs[0]
+        return f"the path that steps {self._piece.steps[i]} and {self._piece.steps[j]} define"
+
+    def reason(
+        self,
+        axiom: str,
+        t: int,
+        said: Sequence[tuple[str, tuple[int, ...]]],
+        pair: tuple[int, int],
+        *,
+        short: bool = False,
+    ) -> str:
+        """Why an axiom at a step of the piece gives these conclusions.
+
+        Args:
+            axiom: The name of the axiom.
+            t: The step, counted in the piece.
+            said: The conclusions.
+            pair: The steps that the argument is about.
+            short: Whether to give only the sentence of the axiom.
+        """
+        steps, sentence = self._piece.steps, self._sentences.get(axiom, axiom).rstrip(".")
+        sentence = sentence[:1].lower() + sentence[1:]
+        if short:
+            return sentence
+        if axiom in OF_ACTIONS and t and (action := self._piece.trace.steps[t - 1].action):
+            return f"{sentence}, and the action of step {steps[t - 1]} is {action.name!r}"
+        pairs = [
+            s
+            for name, s in said
+            if name in ("one_dstate", "two_dstates", "two_places", "one_place")
+        ] or [tuple(sorted(pair))]
+        i, j = next((s for s in pairs if t in s), pairs[0])[:2]
+        if axiom == "functional_view":
+            seen = self._piece.trace.views
+            named = (i, j) if t in (i, j) and seen[i] != seen[j] else (t,)
+            return (
+                f"{sentence}, and {', '.join(f'step {steps[k]} sees {seen[k]!r}' for k in named)}"
+            )
+        if axiom == "one_pose" and (
+            apart := why_apart(
+                self._trace,
+                steps[i],
+                steps[j],
+                self._piece.theory.replace(same=(), different=(), elsewhere=()),
+            )
+        ):
+            return f"{sentence}; {apart}"
+        return sentence
+
+
+def that_path(sentence: str) -> str:
+    """Replace the second mention of a path by `that path`."""
+    seen = set[str]()
+
+    def name(match: re.Match[str]) -> str:
+        again = match[0] in seen
+        seen.add(match[0])
+        return "that path" if again and len(seen) == 1 else match[0]
+
+    return re.sub(r"the path that steps \d+ and \d+ define", name, sentence)
