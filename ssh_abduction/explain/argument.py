@@ -323,7 +323,7 @@ class Argument:
         self._words.know(known)
         said = [facts.read_conclusion(c) for c in conclusions if c is not None]
         says = tuple(dict.fromkeys(self._words.of(c, would=line.supposed) for c in said)) or (
-            "that is a contradiction",
+            "this is a contradiction",
         )
         because = tuple(
             dict.fromkeys(self._words.reason(axiom, t, said, self._pair) for axiom, t in needed)
@@ -331,7 +331,7 @@ class Argument:
         links = clashes_of((axiom, self._piece.steps[t]) for axiom, t in needed)
         return Inference(
             says,
-            because or ("by what is supposed" if line.supposed else "by the trace alone",),
+            because or ("by the supposition" if line.supposed else "by the trace alone",),
             links,
             premises,
             line.supposed,
