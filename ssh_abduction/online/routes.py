@@ -1,4 +1,4 @@
-"""Routes: which actions lead from one dstate or place of a map to another, and which views to expect on the way.
+"""Routes: the actions that lead from one dstate or place to another, and the views to expect.
 
 >>> from ssh_abduction import Theory, Trace, route, solve
 >>> loop = Trace.from_steps(["a", "b", "c", "a", "b"], ["east", "east", "west", "east"])
@@ -8,50 +8,49 @@
 >>> print(found.sentence)
 from dstate 0 to dstate 2: 2 actions
 
-The Spatial Semantic Hierarchy knows two levels to plan at (Kuipers 2000, "The Spatial Semantic Hierarchy"). At the *causal* level a route is a chain of links: each of its actions was
-taken there before. At the *topological* level it is a chain of places and paths: a path leads both ways, and at a place the robot can turn to each path of it. So a route by places may lead
-where no chain of links does, as back along a street that was driven one way alone. What it then asks for was not tried: such moves are marked, and a turn that the map has no action for is left open.
+The Spatial Semantic Hierarchy knows two levels to plan at (Kuipers 2000, "The Spatial Semantic
+Hierarchy"). At the *causal* level a route is a chain of links: each of its actions was taken there
+before. At the *topological* level it is a chain of places and paths: a path leads both ways, and at
+a place the robot can turn to each path of it. So a route by places may lead where no chain of links
+does, as back along a street that was driven one way only. The moves that were never tried are
+marked, and a turn that the map has no action for is left open.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
-
-import networkx as nx
+from typing import Any, NoReturn
 
 from ssh_abduction.data.checks import a_list
-from ssh_abduction.data.errors import MapError, brief, is_whole, printable
+from ssh_abduction.data.errors import MapError, brief, printable
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import View
 from ssh_abduction.data.words import counted
-from ssh_abduction.output.layout import located
+from ssh_abduction.online.move_graph import MoveGraph, Node
 from ssh_abduction.rivals.listing import Listing, Maps
 
-if TYPE_CHECKING:
-    from ssh_abduction.data.maps import DState, Pose
-
 BY = ("actions", "places", "metres")
-# A dstate by its number, or a course of a place that no dstate of the map faces: (place, path, direction).
-Node: TypeAlias = "int | tuple[int, int, int]"
-# What is added to a move of a route by places so that fewer actions win among routes of equally many places, and known moves among equally many actions.
-KNOWN_MOVE, UNTRIED_MOVE, OPEN_TURN = 1.0, 1.5, 2.5
-MICROMETRE = 1e-6  # what an action counts in a route by metres: so that of equally long routes the one with the fewest actions is taken
 
 
 @dataclass(frozen=True, slots=True)
 class Move:
     """One move of a route, and where it ends.
 
-    action     what to do; None where the robot has to turn to another path, and the map has no action for that turn
-    known      whether the robot did this before, as a link of the map says; else the paths of the map imply it
-    dstate     where the move ends; None where the robot was never there facing that way
-    view       the view to expect there; None where the map does not know it
-    place, path, direction  where that is, and which way the robot faces then; None where the map has none
-    metres     how far the move leads in a straight line; None where the map has no poses
+    Attributes:
+        action: What to do; None if the robot has to turn to another path and the map has no action
+            for that turn.
+        known: Whether a link says the move, so that the robot did it before. Else the paths of the
+            map imply it.
+        dstate: Where the move ends; None if the robot was never there facing that way.
+        view: The view to expect there; None if the map does not know it.
+        place: The place there; None if the map has none.
+        path: The path that the robot faces along there; None if the map has none.
+        direction: The direction along this path.
+        metres: The length of the move in a straight line; None if the map has no poses.
     """
 
     action: str | None
@@ -64,6 +63,7 @@ class Move:
     metres: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
+        """The move as plain data."""
         return {name: getattr(self, name) for name in self.__slots__ if name != "metres"} | (
             {} if self.metres is None else {"metres": round(self.metres, 4)}
         )
@@ -73,15 +73,18 @@ class Move:
 class Route:
     """The shortest route through a map.
 
-    map     the number of the map, from 1
-    by      what the route has the fewest of: actions, places, or metres
-    start   the dstate that it begins at
-    goal    the dstate or the place that it leads to, in words
-    view, place  what is seen at the start, and where that is; the place is None where the map has none
-    moves   what to do, and what is seen after it
-    agree   numbers of the listed maps in which these actions, begun where the robot was at `start`, lead along links to the same views; empty for a route with a
-            move that was never tried, as no links tell what comes then
-    maps    how many maps are listed
+    Attributes:
+        map: The number of the map, from 1.
+        by: What the route has the fewest of: actions, places, or metres.
+        start: The dstate that it begins at.
+        goal: The dstate or the place that it leads to, in words.
+        view: What is seen at the start.
+        place: The place of the start; None if the map has none.
+        moves: What to do, and what is seen after it.
+        agree: The numbers of the listed maps in which these actions lead along links to the same
+            views, from where the robot was at `start`. Empty for a route with a move that was
+            never tried.
+        maps: How many maps are listed.
     """
 
     map: int
@@ -175,318 +178,57 @@ def route(
 ) -> Route:
     """The shortest route from one dstate or place to another.
 
-    maps   a solution, maps of one trace, or one map
-    start  the number of a dstate, or a place as "p3"; None for where the robot was at its last step
-    goal   the number of a dstate, or a place as "p3": any dstate there
-    by     "actions" or "metres": through links, so that each move was made before. "places": the fewest travels along the paths of the map, whether they were driven that way or not
-    avoid  dstates and places that the route may not touch; places as "p3"
-    map    which map: its number, from 1, or its id
+    Args:
+        maps: A solution, maps of one trace, or one map.
+        start: The number of a dstate, or a place as "p3"; None for where the robot was last.
+        goal: The number of a dstate, or a place as "p3": any dstate there.
+        by: "actions" or "metres" go through links, so that each move was made before. "places" has
+            the fewest travels along the paths of the map, whether or not they were driven that way.
+        avoid: Dstates, and places as "p3", that the route may not touch.
+        map: Which map: its number, from 1, or its id.
 
-    Raises MapError where there is no such dstate, place or map, where no route exists, and where metres are asked of a map without poses.
+    Raises:
+        MapError: There is no such dstate, place or map, no route exists, or metres are asked of a
+            map without poses.
     """
     if not isinstance(by, str) or by not in BY:
         raise MapError(
-            f"by: expected {', '.join(BY[:-1])} or {BY[-1]}, got {brief(by)}; say what the route shall have the fewest of"
+            f"by: expected {', '.join(BY[:-1])} or {BY[-1]}, got {brief(by)}; "
+            "say what the route shall have the fewest of"
         )
     listing = Listing.of(maps)
     number = listing.number(str(map))
-    return _Roads(listing.maps[number], by).route(start, goal, avoid, number, listing.maps)
-
-
-class _Roads:
-    """One map as a graph of moves."""
-
-    def __init__(self, ssh_map: SSHMap, by: str) -> None:
-        self.map, self.by = ssh_map, by
-        self.poses = located(ssh_map)
-        if by == "metres" and self.poses is None:
+    ssh_map = listing.maps[number]
+    graph = MoveGraph(ssh_map, by)
+    here, _ = graph.nodes(ssh_map.labels[-1] if start is None else start, "from")
+    there, told = graph.nodes(goal, "to")
+    if told.startswith("place"):
+        there = graph.nodes_at_places_of(there)
+    closed = _closed(graph, avoid)
+    for nodes, name in ((here, "from"), (there, "to")):
+        if nodes <= closed:
             raise MapError(
-                "by: expected actions or places, got metres: the map has no poses; solve a trace with displacements, or take --by actions"
+                f"avoid: expected other dstates and places than those of {name}, got the same; "
+                "take it out of what is avoided"
             )
-        if by == "places" and not ssh_map.paths:
-            raise MapError(
-                "by: expected actions or metres, got places: the map has no paths; solve with --theory topological, or take --by actions"
-            )
-        self.travel, self.around = self._only_action(onward=True), self._only_action(onward=False)
-        self.graph = self._graph()
-
-    def route(
-        self,
-        start: int | str | None,
-        goal: int | str,
-        avoid: Iterable[int | str],
-        number: int,
-        maps: Sequence[SSHMap],
-    ) -> Route:
-        here, _ = self._nodes(self.map.labels[-1] if start is None else start, "from")
-        there, told = self._nodes(goal, "to")
-        if told.startswith("place"):
-            wanted = {self._place(node) for node in there}
-            there = {node for node in self.graph if self._place(node) in wanted}
-        closed: set[Node] = set()
-        for i, name in enumerate(
-            [avoid]
-            if isinstance(avoid, str | int)
-            else a_list("avoid", avoid, MapError, what="dstates and places")
-        ):
-            closed |= self._nodes(name, f"avoid[{i}]")[0]
-        for nodes, name in ((here, "from"), (there, "to")):
-            if nodes <= closed:
-                raise MapError(
-                    f"avoid: expected other dstates and places than those of {name}, got the same; take it out of what is avoided"
-                )
-        way = self._shortest(here - closed, there - closed, closed)
-        if way is None:
-            self._raise_no_route(here, there, closed, told)
-        moves = tuple(self._move(a, b) for a, b in pairwise(way))
-        first = way[0]
-        assert isinstance(first, int)  # routes begin at dstates
-        agree = self._agreeing(first, moves, maps) if all(move.known for move in moves) else ()
-        return Route(
-            number + 1,
-            self.by,
-            first,
-            told,
-            self.map.dstates[first].view,
-            self.map.dstates[first].place,
-            moves,
-            agree,
-            len(maps),
-        )
-
-    def _graph(self) -> nx.DiGraph[Any]:
-        graph: nx.DiGraph[Any] = nx.DiGraph()
-        graph.add_nodes_from(s.id for s in self.map.dstates)
-        for source, action, target in sorted(
-            self.map.links, reverse=True
-        ):  # of several actions between two dstates the first by name stays
-            if source != target:
-                graph.add_edge(
-                    source, target, action=action, cost=self._cost(source, target, KNOWN_MOVE)
-                )
-        if self.by == "places":
-            self._add_implied(graph)
-        return graph
-
-    def _add_implied(self, graph: nx.DiGraph[Any]) -> None:
-        """What the paths of the map imply: paths lead both ways, and at a place the robot can turn to each path."""
-        facing: dict[Node, Node] = {}
-        for s in reversed(self.map.dstates):
-            if s.place is not None and s.path is not None and s.direction is not None:
-                facing[s.place, s.path, s.direction] = s.id
-        at: dict[int, set[Node]] = {}
-        for s in self.map.dstates:
-            if s.place is not None:
-                at.setdefault(s.place, set()).add(s.id)
-        for path in self.map.paths:
-            for place in path.order:
-                at.setdefault(place, set()).update(
-                    facing.get((place, path.id, way), (place, path.id, way)) for way in (1, -1)
-                )
-            for p, q in pairwise(path.order):
-                for a, b, way in ((p, q, 1), (q, p, -1)):
-                    self._imply(
-                        graph,
-                        facing.get((a, path.id, way), (a, path.id, way)),
-                        facing.get((b, path.id, way), (b, path.id, way)),
-                        self.travel,
-                    )
-        for courses in at.values():
-            for course in courses:
-                for other in courses - {course}:
-                    self._imply(
-                        graph,
-                        course,
-                        other,
-                        self.around if self._is_around(course, other) else None,
-                    )
-
-    def _imply(
-        self, graph: nx.DiGraph[Any], source: Node, target: Node, action: str | None
-    ) -> None:
-        if not graph.has_edge(source, target):
-            graph.add_edge(
-                source,
-                target,
-                action=action,
-                implied=True,
-                cost=self._cost(source, target, UNTRIED_MOVE if action else OPEN_TURN),
-            )
-
-    def _is_around(self, source: Node, target: Node) -> bool:
-        """Whether two courses of one place are the two ways along one path."""
-        (_, path, way), (_, other, other_way) = self._course(source), self._course(target)
-        return path is not None and path == other and way != other_way
-
-    def _cost(self, source: Node, target: Node, move: float) -> float:
-        if self.by == "actions":
-            return 1.0
-        if self.by == "metres":
-            return (self._metres(source, target) or 0.0) + MICROMETRE
-        # A route has no more moves than there are courses, so that one travel costs more than all turns that it might spare.
-        return move + (
-            OPEN_TURN
-            * (len(self.map.dstates) + 2 * sum(len(path.order) for path in self.map.paths))
-            if self._place(source) != self._place(target)
-            else 0.0
-        )
-
-    def _only_action(self, *, onward: bool) -> str | None:
-        """The action that moves onward along paths from place to place, or the one that turns around on a path, if there is one alone."""
-        ends = [
-            (self.map.dstates[s], action, self.map.dstates[x]) for s, action, x in self.map.links
-        ]
-        names = {
-            action
-            for s, action, x in ends
-            if s.path is not None
-            and s.path == x.path
-            and (s.place != x.place if onward else s.direction != x.direction)
-        }
-        return names.pop() if len(names) == 1 else None
-
-    def _nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
-        """The dstates that are meant, and how to call them. Raises MapError that names the range."""
-        count = len(self.map.dstates)
-        text = str(name)
-        if isinstance(name, str) and text[:1] == "p" and _is_number(text[1:]):
-            place = int(text[1:])
-            members: set[Node] = {s.id for s in self.map.dstates if s.place == place}
-            if not members:
-                known = sorted({s.place for s in self.map.dstates if s.place is not None})
-                there = (
-                    f"p{known[0]} to p{known[-1]}"
-                    if known
-                    else "a dstate, as the map has no places"
-                )
-                raise MapError(
-                    f"{field}: expected {there}, got {brief(text)}; ssh-abduction show lists them"
-                )
-            return members, f"place {place}"
-        if (is_whole(name) or (isinstance(name, str) and _is_number(text))) and 0 <= int(
-            text
-        ) < count:
-            return {int(text)}, f"dstate {int(text)}"
-        places = f", or a place as p{self.map.places[0]}" if self.map.places else ""
-        raise MapError(
-            f"{field}: expected a dstate, 0 to {count - 1}{places}, got {brief(name)}; ssh-abduction show lists them"
-        )
-
-    def _shortest(self, here: set[Node], there: set[Node], closed: set[Node]) -> list[Node] | None:
-        places = {
-            self._place(node)
-            for node in closed
-            if all(s.id in closed for s in self.map.dstates if s.place == self._place(node))
-        }
-        graph = self.graph.subgraph(
-            [
-                node
-                for node in self.graph
-                if node not in closed and not (isinstance(node, tuple) and node[0] in places)
-            ]
-        )
-        cost, way = nx.multi_source_dijkstra(graph, here, weight="cost")
-        found = min(((cost[node], str(node), node) for node in there if node in cost), default=None)
-        return None if found is None else way[found[2]]
-
-    def _raise_no_route(
-        self, here: set[Node], there: set[Node], closed: set[Node], told: str
-    ) -> NoReturn:
-        if closed and self._shortest(here, there, set()) is not None:
-            raise MapError(
-                f"avoid: expected a way round what is avoided, got none to {told}; avoid less"
-            )
-        mend = (
-            "take --by places, which may lead where the robot has not driven, or drive on"
-            if self.by != "places" and self.map.paths
-            else "drive on: next says what to try"
-        )
-        reached = len({node for node in self._reached(here) if isinstance(node, int)})
-        raise MapError(
-            f"to: expected one of the {counted(reached, 'dstates')} that known links lead to, got {told}; {mend}"
-        )
-
-    def _reached(self, here: set[Node]) -> set[Node]:
-        return set(nx.multi_source_dijkstra_path_length(self.graph, here))
-
-    def _move(self, source: Node, target: Node) -> Move:
-        edge = self.graph.edges[source, target]
-        known = "implied" not in edge
-        place, path, direction = self._course(target)
-        if isinstance(target, tuple):
-            return Move(
-                edge["action"],
-                known,
-                None,
-                None,
-                place,
-                path,
-                direction,
-                self._metres(source, target),
-            )
-        return Move(
-            edge["action"],
-            known,
-            target,
-            self.map.dstates[target].view,
-            place,
-            path,
-            direction,
-            self._metres(source, target),
-        )
-
-    def _course(self, node: Node) -> tuple[int | None, int | None, int | None]:
-        if isinstance(node, tuple):
-            return node
-        s = self.map.dstates[node]
-        return s.place, s.path, s.direction
-
-    def _place(self, node: Node) -> int:
-        """The place of a node; of a dstate without one, a number of its own."""
-        place = self._course(node)[0]
-        return -1 - int(node) if place is None and isinstance(node, int) else int(place or 0)
-
-    def _metres(self, source: Node, target: Node) -> float | None:
-        if self.poses is None:
-            return None
-        a, b = (self._pose(node, self.poses) for node in (source, target))
-        return math.hypot(a.x - b.x, a.y - b.y)
-
-    def _pose(self, node: Node, poses: Sequence[Pose]) -> Pose:
-        if isinstance(node, int):
-            return poses[node]
-        return poses[next(s.id for s in self.map.dstates if s.place == node[0])]
-
-    def _agreeing(
-        self, start: int, moves: Sequence[Move], maps: Sequence[SSHMap]
-    ) -> tuple[int, ...]:
-        """The numbers of the maps in which the moves, from wherever the robot was when this map has it at the start, lead to the same views."""
-        steps = [t for t, label in enumerate(self.map.labels) if label == start]
-        agree = []
-        for i, rival in enumerate(maps):
-            leads = {(source, action): target for source, action, target in rival.links}
-            if all(
-                _leads_to(leads, rival.dstates, label, moves)
-                for label in {rival.labels[t] for t in steps}
-            ):
-                agree.append(i + 1)
-        return tuple(agree)
-
-
-def _leads_to(
-    leads: dict[tuple[int, str], int], dstates: Sequence[DState], dstate: int, moves: Sequence[Move]
-) -> bool:
-    """Whether the links of a map lead from a dstate along these moves, to the views that they expect."""
-    for move in moves:
-        target = leads.get((dstate, move.action or ""))
-        if target is None or dstates[target].view != move.view:
-            return False
-        dstate = target
-    return True
-
-
-def _is_number(text: str) -> bool:
-    return text.isascii() and text.isdecimal() and len(text) < 10
+    way = graph.shortest(here - closed, there - closed, closed)
+    if way is None:
+        _raise_no_route(graph, here, there, closed, told)
+    moves = tuple(_move(graph, a, b) for a, b in pairwise(way))
+    first = way[0]
+    assert isinstance(first, int)  # routes begin at dstates
+    is_known = all(move.known for move in moves)
+    return Route(
+        map=number + 1,
+        by=by,
+        start=first,
+        goal=told,
+        view=ssh_map.dstates[first].view,
+        place=ssh_map.dstates[first].place,
+        moves=moves,
+        agree=_agreeing(ssh_map, first, moves, listing.maps) if is_known else (),
+        maps=len(listing.maps),
+    )
 
 
 def told_action(move: Move) -> str:
@@ -496,3 +238,82 @@ def told_action(move: Move) -> str:
     if move.path is None:
         return "(turn)"
     return f"(turn to path {move.path}{'+' if move.direction == 1 else '-'})"
+
+
+def _closed(graph: MoveGraph, avoid: Iterable[int | str]) -> set[Node]:
+    """The nodes that a route may not touch."""
+    names: Iterable[int | str] = (
+        [avoid]
+        if isinstance(avoid, str | int)
+        else a_list("avoid", avoid, MapError, what="dstates and places")
+    )
+    closed: set[Node] = set()
+    for i, name in enumerate(names):
+        closed |= graph.nodes(name, f"avoid[{i}]")[0]
+    return closed
+
+
+def _move(graph: MoveGraph, source: Node, target: Node) -> Move:
+    """A move along an edge of the graph."""
+    place, path, direction = graph.course(target)
+    dstate = target if isinstance(target, int) else None
+    return Move(
+        action=graph.action(source, target),
+        known=graph.is_known(source, target),
+        dstate=dstate,
+        view=None if dstate is None else graph.map.dstates[dstate].view,
+        place=place,
+        path=path,
+        direction=direction,
+        metres=graph.metres(source, target),
+    )
+
+
+def _raise_no_route(
+    graph: MoveGraph,
+    here: AbstractSet[Node],
+    there: AbstractSet[Node],
+    closed: AbstractSet[Node],
+    told: str,
+) -> NoReturn:
+    """Say why there is no route, and what to do about it."""
+    if closed and graph.shortest(here, there, set()) is not None:
+        raise MapError(
+            f"avoid: expected a way round what is avoided, got none to {told}; avoid less"
+        )
+    mend = "drive on: next says what to try"
+    if graph.by != "places" and graph.map.paths:
+        mend = "take --by places, which may lead where the robot has not driven, or drive on"
+    reached = counted(graph.dstates_from(here), "dstates")
+    raise MapError(
+        f"to: expected one of the {reached} that known links lead to, got {told}; {mend}"
+    )
+
+
+def _agreeing(
+    ssh_map: SSHMap, start: int, moves: Sequence[Move], maps: Sequence[SSHMap]
+) -> tuple[int, ...]:
+    """The numbers of the maps in which the moves lead to the same views.
+
+    In each map they begin at the dstates where the robot was when `ssh_map` has it at `start`.
+    """
+    steps = [t for t, label in enumerate(ssh_map.labels) if label == start]
+    agree = []
+    for i, rival in enumerate(maps, 1):
+        leads = {(source, action): target for source, action, target in rival.links}
+        starts = {rival.labels[t] for t in steps}
+        if all(_leads_to(leads, rival, label, moves) for label in starts):
+            agree.append(i)
+    return tuple(agree)
+
+
+def _leads_to(
+    leads: dict[tuple[int, str], int], ssh_map: SSHMap, dstate: int, moves: Sequence[Move]
+) -> bool:
+    """Whether the links of a map lead from a dstate along these moves, to the views expected."""
+    for move in moves:
+        target = leads.get((dstate, move.action or ""))
+        if target is None or ssh_map.dstates[target].view != move.view:
+            return False
+        dstate = target
+    return True

@@ -1,0 +1,238 @@
+"""One map as a graph of moves: its links, and what its paths imply."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Set as AbstractSet
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import networkx as nx
+
+from ssh_abduction.data.errors import MapError, brief, is_whole
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.output.layout import located
+
+if TYPE_CHECKING:
+    from ssh_abduction.data.maps import Pose
+
+# A dstate by its number; or a course (place, path, direction) that no dstate of the map faces.
+Node: TypeAlias = "int | tuple[int, int, int]"
+# Costs of moves in a route by places. Among routes of equally many places fewer actions win, and
+# among equally many actions known moves.
+KNOWN_MOVE, UNTRIED_MOVE, OPEN_TURN = 1.0, 1.5, 2.5
+# Cost of an action in a route by metres, so that fewer actions win among routes of equal length.
+MICROMETRE = 1e-6
+
+
+class MoveGraph:
+    """One map as a graph of moves.
+
+    Args:
+        ssh_map: The map.
+        by: What a route shall have the fewest of: "actions", "places" or "metres".
+
+    Raises:
+        MapError: The map has no poses for "metres", or no paths for "places".
+
+    Attributes:
+        map: The map.
+        by: See above.
+    """
+
+    def __init__(self, ssh_map: SSHMap, by: str) -> None:
+        self.map, self.by = ssh_map, by
+        self._poses = located(ssh_map)
+        if by == "metres" and self._poses is None:
+            raise MapError(
+                "by: expected actions or places, got metres: the map has no poses; "
+                "solve a trace with displacements, or take --by actions"
+            )
+        if by == "places" and not ssh_map.paths:
+            raise MapError(
+                "by: expected actions or metres, got places: the map has no paths; "
+                "solve with --theory topological, or take --by actions"
+            )
+        # A travel costs more than all turns that it might spare: a route has no more moves than
+        # there are courses.
+        courses = 2 * sum(len(path.order) for path in ssh_map.paths)
+        self._travel_cost = OPEN_TURN * (len(ssh_map.dstates) + courses)
+        self._graph = self._of_links()
+        if by == "places":
+            self._add_implied()
+
+    def nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
+        """The dstates that a name means, and what to call them.
+
+        Args:
+            name: The number of a dstate, or a place as "p3".
+            field: The parameter, for messages.
+
+        Raises:
+            MapError: There is no such dstate or place. The message names the range.
+        """
+        count, text = len(self.map.dstates), str(name)
+        if isinstance(name, str) and text[:1] == "p" and _is_number(text[1:]):
+            return self._dstates_at(int(text[1:]), field), f"place {int(text[1:])}"
+        is_number = is_whole(name) or (isinstance(name, str) and _is_number(text))
+        if is_number and 0 <= int(text) < count:
+            return {int(text)}, f"dstate {int(text)}"
+        places = f", or a place as p{self.map.places[0]}" if self.map.places else ""
+        raise MapError(
+            f"{field}: expected a dstate, 0 to {count - 1}{places}, got {brief(name)}; "
+            "ssh-abduction show lists them"
+        )
+
+    def nodes_at_places_of(self, nodes: AbstractSet[Node]) -> set[Node]:
+        """All nodes at the places of some nodes."""
+        places = {self._place(node) for node in nodes}
+        return {node for node in self._graph if self._place(node) in places}
+
+    def shortest(
+        self, here: AbstractSet[Node], there: AbstractSet[Node], closed: AbstractSet[Node]
+    ) -> list[Node] | None:
+        """The shortest way from some nodes to others without closed ones; None if none exists."""
+        # A place is closed where all its dstates are. Then its other courses are closed, too.
+        closed_places = {
+            self._place(node)
+            for node in closed
+            if all(s.id in closed for s in self.map.dstates if s.place == self._place(node))
+        }
+        graph = self._graph.subgraph(
+            node
+            for node in self._graph
+            if node not in closed and not (isinstance(node, tuple) and node[0] in closed_places)
+        )
+        cost, way = nx.multi_source_dijkstra(graph, here, weight="cost")
+        found = min(((cost[node], str(node), node) for node in there if node in cost), default=None)
+        return None if found is None else way[found[2]]
+
+    def dstates_from(self, here: AbstractSet[Node]) -> int:
+        """How many dstates moves lead to from some nodes."""
+        reached = nx.multi_source_dijkstra_path_length(self._graph, here)
+        return sum(isinstance(node, int) for node in reached)
+
+    def action(self, source: Node, target: Node) -> str | None:
+        """The action of a move; None for a turn that the map has no action for."""
+        action: str | None = self._graph.edges[source, target]["action"]
+        return action
+
+    def is_known(self, source: Node, target: Node) -> bool:
+        """Whether a link says a move, and not only the paths of the map."""
+        return not self._graph.edges[source, target]["implied"]
+
+    def course(self, node: Node) -> tuple[int | None, int | None, int | None]:
+        """The place, path and direction of a node; None where it has none."""
+        if isinstance(node, tuple):
+            return node
+        s = self.map.dstates[node]
+        return s.place, s.path, s.direction
+
+    def metres(self, source: Node, target: Node) -> float | None:
+        """The length of a move in a straight line; None where the map has no poses."""
+        if self._poses is None:
+            return None
+        a, b = (self._pose(node, self._poses) for node in (source, target))
+        return math.hypot(a.x - b.x, a.y - b.y)
+
+    def _of_links(self) -> nx.DiGraph[Any]:
+        """The graph of the links between dstates."""
+        graph: nx.DiGraph[Any] = nx.DiGraph()
+        graph.add_nodes_from(s.id for s in self.map.dstates)
+        # In reverse, so that of several actions between two dstates the first by name stays.
+        for source, action, target in sorted(self.map.links, reverse=True):
+            if source != target:
+                cost = self._cost(source, target, KNOWN_MOVE)
+                graph.add_edge(source, target, action=action, implied=False, cost=cost)
+        return graph
+
+    def _add_implied(self) -> None:
+        """Add what the paths of the map imply.
+
+        Paths lead both ways, and at a place the robot can turn to each path.
+        """
+        travel, around = self._only_action(onward=True), self._only_action(onward=False)
+        facing: dict[Node, Node] = {}  # the first dstate of each course
+        at: dict[int, set[Node]] = {}  # the nodes of each place
+        for s in self.map.dstates:
+            if s.place is not None:
+                at.setdefault(s.place, set()).add(s.id)
+                if s.path is not None and s.direction is not None:
+                    facing.setdefault((s.place, s.path, s.direction), s.id)
+        for path in self.map.paths:
+            ahead, back = (
+                [facing.get((place, path.id, way), (place, path.id, way)) for place in path.order]
+                for way in (1, -1)
+            )
+            for place, *courses in zip(path.order, ahead, back, strict=True):
+                at.setdefault(place, set()).update(courses)
+            for (here, there), (other, before) in zip(pairwise(ahead), pairwise(back), strict=True):
+                self._imply(here, there, travel)
+                self._imply(before, other, travel)
+        for courses_here in at.values():
+            for course in courses_here:
+                for other in courses_here - {course}:
+                    self._imply(course, other, around if self._is_around(course, other) else None)
+
+    def _imply(self, source: Node, target: Node, action: str | None) -> None:
+        """Add a move that the paths of the map imply, unless a link says it."""
+        if not self._graph.has_edge(source, target):
+            cost = self._cost(source, target, UNTRIED_MOVE if action else OPEN_TURN)
+            self._graph.add_edge(source, target, action=action, implied=True, cost=cost)
+
+    def _is_around(self, source: Node, target: Node) -> bool:
+        """Whether two courses of one place are the two ways along one path."""
+        (_, path, way), (_, other, other_way) = self.course(source), self.course(target)
+        return path is not None and path == other and way != other_way
+
+    def _cost(self, source: Node, target: Node, move: float) -> float:
+        """The cost of a move; `move` is its cost in a route by places within one place."""
+        if self.by == "actions":
+            return 1.0
+        if self.by == "metres":
+            return (self.metres(source, target) or 0.0) + MICROMETRE
+        travels = self._place(source) != self._place(target)
+        return move + (self._travel_cost if travels else 0.0)
+
+    def _only_action(self, *, onward: bool) -> str | None:
+        """The action that moves along paths, if there is exactly one; else None.
+
+        Args:
+            onward: Whether from place to place, or turning around.
+        """
+        dstates, names = self.map.dstates, set()
+        for source, action, target in self.map.links:
+            s, x = dstates[source], dstates[target]
+            moves = s.place != x.place if onward else s.direction != x.direction
+            if s.path is not None and s.path == x.path and moves:
+                names.add(action)
+        return names.pop() if len(names) == 1 else None
+
+    def _dstates_at(self, place: int, field: str) -> set[Node]:
+        """The dstates at a place. Raises MapError if it has none."""
+        members: set[Node] = {s.id for s in self.map.dstates if s.place == place}
+        if not members:
+            known = sorted({s.place for s in self.map.dstates if s.place is not None})
+            there = "a dstate, as the map has no places"
+            if known:
+                there = f"p{known[0]} to p{known[-1]}"
+            raise MapError(
+                f"{field}: expected {there}, got {brief(f'p{place}')}; "
+                "ssh-abduction show lists them"
+            )
+        return members
+
+    def _place(self, node: Node) -> int:
+        """The place of a node; a number of its own for a dstate without one."""
+        place = self.course(node)[0]
+        return -1 - int(node) if place is None and isinstance(node, int) else int(place or 0)
+
+    def _pose(self, node: Node, poses: tuple[Pose, ...]) -> Pose:
+        """The pose of a node; for a course, of the first dstate at its place."""
+        if isinstance(node, int):
+            return poses[node]
+        return poses[next(s.id for s in self.map.dstates if s.place == node[0])]
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdecimal() and len(text) < 10
