@@ -156,3 +156,18 @@ def test_every_violation_in_the_encodings_belongs_to_an_axiom(level: str) -> Non
     without_a_rule = {"planar", "one_star"}
     assert set(re.findall(r"violation\((\w+),t\) :-", text)) - {"N"} == names - without_a_rule
     assert set(re.findall(r"% @axiom\((\w+)\)", text)) == names
+
+
+def test_a_long_axiom_comment_goes_on_in_indented_lines() -> None:
+    text = "% @axiom(long) A sentence that\n%   goes on.\n%   [a source; X] if star=frame\n% Not of it.\n"
+    (axiom,) = encodings.axioms_in(text, "own")
+    assert axiom.sentence == "A sentence that goes on."
+    assert axiom.source == "a source; X"
+    assert axiom.conditions == ("star=frame",)
+
+
+def test_lines_of_encodings_have_at_most_100_characters() -> None:
+    files = list(encodings.folder().rglob("*.lp"))
+    assert files
+    for file in files:
+        assert max(map(len, file.read_text(encoding="utf-8").splitlines())) <= 100, file
