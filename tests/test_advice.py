@@ -39,6 +39,7 @@ SAID_BY = {
     "ssh_abduction/explain/pairs.py": ("explain",),
     "ssh_abduction/page/server.py": ("view",),
     "ssh_abduction/online/move_graph.py": ("route",),
+    "ssh_abduction/online/routes.py": ("route",),
     "ssh_abduction/solver/search.py": ("solve",),
     "ssh_abduction/theory": WITH_THEORY,
 }

@@ -1,4 +1,4 @@
-"""The labels that maps give to the steps of a trace, for a recogniser to learn from."""
+"""The dstate of each step, by a map, for a recogniser to learn from."""
 
 from __future__ import annotations
 
@@ -23,16 +23,30 @@ class LearnerError(AbductionError, ValueError):
 
 
 class AmbiguousMapWarning(UserWarning):
-    """Several minimal maps remain, and only the labels that they agree on are learnt from; or the map is not proven minimal."""
+    """The labels may be wrong or incomplete.
+
+    Several maps are minimal and disagree, or the map is not proven minimal, or another trace cannot
+    be placed on it.
+    """
 
 
 def labels_of(
     maps: Sequence[SSHMap], choose: int | None = None, complete: bool = True, proven: bool = True
 ) -> NDArray[np.intp]:
-    """The label of each step, (n,): its dstate in the chosen map; or, if none is chosen, in the first map, and -1 where the maps disagree.
+    """The label of each step, (n,): its dstate in the chosen map, or in the first.
 
-    Maps agree on a step if the first step at its dstate is the same in all of them. Warns if no map is chosen and they do not agree
-    everywhere, if there may be more (`complete` is false), or if they are not `proven` minimal. Raises LearnerError where no map or no label is left.
+    If no map is chosen the label is -1 where the maps disagree. They agree on a step if the first
+    step at its dstate is the same in all maps. An AmbiguousMapWarning says if they do not agree
+    everywhere, if there may be more maps, or if they are not proven minimal.
+
+    Args:
+        maps: Maps of one trace.
+        choose: Index of the map to take; None takes what all maps agree on.
+        complete: Whether these are all minimal maps.
+        proven: Whether they are proven minimal.
+
+    Raises:
+        LearnerError: There is no map, or the maps agree on no label.
     """
     if not maps:
         raise LearnerError(
@@ -46,22 +60,24 @@ def labels_of(
     for i, ssh_map in enumerate(maps):
         if len(ssh_map.labels) != len(labels):
             raise LearnerError(
-                f"maps: expected maps of one trace, {len(labels)} labels each, got {len(ssh_map.labels)} in map {i + 1}; solve one trace"
+                f"maps: expected maps of one trace, {len(labels)} labels each, "
+                f"got {len(ssh_map.labels)} in map {i + 1}; solve one trace"
             )
     first = [_first_steps(ssh_map) for ssh_map in maps]
     agreed = np.all([f == first[0] for f in first], axis=0)
     if not proven:
-        unsure = f"the map of {len(maps[0].dstates)} dstates is the best that was found, and not proven minimal"
         warnings.warn(
-            f"{unsure}: its labels may be wrong; give more time, or look for bad views",
+            f"the map of {len(maps[0].dstates)} dstates is the best that was found, and not proven "
+            "minimal: its labels may be wrong; give more time, or look for bad views",
             AmbiguousMapWarning,
             stacklevel=2,
         )
     elif not agreed.all() or not complete:
-        told = f"{'' if complete else 'at least '}{len(maps)} minimal map{'' if len(maps) == 1 else 's'}"
-        unsure = f"{told} remain{'s' if len(maps) == 1 else ''}, and agree on {agreed.sum()} of {len(agreed)} labels"
+        one = len(maps) == 1
+        told = f"{'' if complete else 'at least '}{len(maps)} minimal map{'' if one else 's'}"
         warnings.warn(
-            f"{unsure}: only these are learnt from; choose a map, or explore more",
+            f"{told} remain{'s' if one else ''}, and agree on {agreed.sum()} of {len(agreed)} "
+            "labels: only these are learnt from; choose a map, or explore more",
             AmbiguousMapWarning,
             stacklevel=2,
         )
@@ -71,7 +87,7 @@ def labels_of(
 
 
 def map_of(solution: Solution, choose: int | None = None) -> tuple[SSHMap, NDArray[np.intp]]:
-    """The map that is learnt from, and its labels, (n,), as `labels_of` gives them."""
+    """The map to learn from, and its labels, (n,), as `labels_of` gives them."""
     labels = labels_of(solution.maps, choose, solution.complete, solution.status is Status.OPTIMAL)
     return solution.maps[choose or 0], labels
 
@@ -83,12 +99,21 @@ def labels_of_all(
     views: NDArray[np.intp],
     features: Any = None,
 ) -> NDArray[np.intp]:
-    """The label of each step of several traces, (n,): of the longest trace its labels, as the map was made for it, and of the others what the map tells.
+    """The label of each step of several traces, (n,); -1 where there is none.
 
-    `features` are those by which images are compared, as in `recogniser`. A step without a view, which is -1 among `views` (n,), has no label (-1). Warns where another trace contradicts the map, or cannot be placed on it.
+    The longest trace has its own labels, as the map was made for it. The others are followed on the
+    map. An AmbiguousMapWarning names each trace that cannot be placed on it.
+
+    Args:
+        ssh_map: The map of the longest trace.
+        labels: The labels of the longest trace.
+        traces: Traces with n steps in all.
+        views: The view of each step, (n,); -1 where an image has none. Such a step has no label.
+        features: Makes of images what is compared, as in `recogniser`.
     """
     if len(traces.each) == 1:
         return np.where(views == NOISE, -1, labels)
+    # A recogniser of the longest trace says which dstates the other images look like.
     own = traces.parts(traces.images)[traces.longest]
     looks = (
         recogniser(features=features)
@@ -100,9 +125,10 @@ def labels_of_all(
         if i == traces.longest:
             part[:] = labels
         elif (part < 0).all():
-            text = f"trace {i}: the map of the longest trace does not tell where any of its {len(part)} steps is"
             warnings.warn(
-                f"{text}: it is not learnt from; drive it longer, or where the longest one was",
+                f"trace {i}: the map of the longest trace does not tell where any of its "
+                f"{len(part)} steps is: it is not learnt from; "
+                "drive it longer, or where the longest one was",
                 AmbiguousMapWarning,
                 stacklevel=3,
             )
@@ -112,10 +138,13 @@ def labels_of_all(
 def labels_on(
     ssh_map: SSHMap, traces: Traces, views: NDArray[np.intp], looks: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """The dstate of each step of all traces, (n,), where the map tells it, else -1.
+    """The dstate of each step of all traces, (n,), where the map tells it; else -1.
 
-    views  (n,) of the steps, -1 where there is none
-    looks  (n,) dstates that the images look like: dstates that are not among these are not told
+    Args:
+        ssh_map: The map.
+        traces: Traces with n steps in all.
+        views: The view of each step, (n,); -1 where there is none.
+        looks: The dstate that each image looks like, (n,). Others are not told.
     """
     parts = zip(traces.each, traces.parts(views), traces.parts(looks), strict=True)
     found = np.concatenate(
@@ -127,10 +156,12 @@ def labels_on(
 def _followed(
     ssh_map: SSHMap, trace: Trace, views: Sequence[int], looks: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """The dstate of each step of a trace that may begin anywhere on a map: of all beginnings that no view contradicts, the one that fits most images.
+    """The dstate of each step of a trace that may begin anywhere on a map, (m,).
 
-    Where an action was never tried in a dstate, a way is lost: from there on it tells nothing (-1), and contradicts nothing. Where two ways fit equally many
-    images, or none fits half of the images that it tells of, nothing is told.
+    Of all beginnings that no view contradicts, the one that fits most images is taken. A way is
+    lost where an action was never tried in a dstate: from there on it tells nothing (-1) and
+    contradicts nothing. If two ways fit equally many images, or none fits half of the images that
+    it tells of, nothing is told.
     """
     leads = {(here, action): there for here, action, there in ssh_map.links}
     ways = []
@@ -156,6 +187,6 @@ def _followed(
 
 
 def _first_steps(ssh_map: SSHMap) -> NDArray[np.intp]:
-    """For each step, (n,), the first step at its dstate."""
+    """The first step at the dstate of each step, (n,)."""
     _, first, dstates = np.unique(ssh_map.labels, return_index=True, return_inverse=True)
     return np.asarray(first[dstates], np.intp)

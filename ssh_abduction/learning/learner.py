@@ -1,4 +1,6 @@
-"""The bootstrap loop of Kuipers & Beeson (2002), Figure 1: images, views, map, labels, recogniser.
+"""The bootstrap loop: images, views, map, labels, recogniser.
+
+Reference: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", Figure 1.
 
 >>> from simulator.tours import simulate
 >>> from simulator.world import World
@@ -43,21 +45,42 @@ __all__ = [
     "labels_of",
 ]
 
+_log = log_of(__name__)
+
 
 class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
-    """Learns to recognise places from a trace of images and actions, without being told any place. An estimator, as scikit-learn has them.
+    """Learns to recognise places from images and actions, without being told any place.
 
-    theory     the axioms; Theory.topological() by default
-    clusterer  makes views of images: a ViewClusterer, or a clusterer of scikit-learn's. It is cloned. ViewClusterer(random_state=0) by default,
-               and with `isolated=10` where the theory allows views that are misread: images that are like no others then have no view, and disbelieving them costs little
-    choose     the index of the map to take where several remain; None takes the labels on which all of them agree
-    time_limit seconds for finding the map
-    features   makes of images what is clustered and compared: a transformer of scikit-learn's kind, cloned. None for reciprocals of ranges, and for a PanoramaTransformer of panoramas
+    It is an estimator, as scikit-learn has them. Of several traces all images make the views, the
+    longest trace makes the map, and the others are followed on it.
 
-    After `fit` there are features_, clusterer_, views_ and confidence_ (n,), solution_, map_, labels_ (n,) with -1 where the maps disagree or an image has no view,
-    recogniser_, which has not learnt from images that the map says are misread, and second_map_, the map of the runner-up, where another number of views is about as good and gives another map.
+    Args:
+        theory: The axioms; Theory.topological() by default.
+        clusterer: Makes views of images: a ViewClusterer, or a clusterer of scikit-learn. It is
+            cloned. By default ViewClusterer(random_state=0). Where the theory allows misread views
+            it has `isolated=10`: then images that are like no others have no view, and
+            disbelieving them costs little.
+        choose: Index of the map to take if several are minimal; None takes the labels on which all
+            of them agree.
+        time_limit: Seconds for finding the map; None for no limit.
+        features: Makes of images what is clustered and compared: a transformer of scikit-learn. It
+            is cloned. By default reciprocals of ranges, or a PanoramaTransformer for panoramas.
 
-    Of several traces all images make the views, the longest trace makes the map, and the others are followed on it; n counts their steps, one after the other.
+    Attributes:
+        features_: The fitted features.
+        clusterer_: The fitted clusterer.
+        views_: The view of each step, (n,); -1 for an image without a view. n counts the steps of
+            all traces, one after the other.
+        confidence_: How sure each view is, (n,), from 0 to 1.
+        solution_: The minimal maps of the longest trace.
+        map_: The map that is learnt from.
+        second_map_: The map of the runner-up, if another number of views is about as good and gives
+            another map; else None.
+        labels_: The dstate of each step, (n,); -1 where the maps disagree or the image has no view.
+        recogniser_: The recogniser. It learns from no image that the map says is misread.
+
+    Reference:
+        Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", Figure 1.
     """
 
     @renamed_parameters("limit")
@@ -69,86 +92,114 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         time_limit: float | None = None,
         features: Any = None,
     ) -> None:
-        self.theory, self.clusterer, self.choose, self.time_limit, self.features = (
-            theory,
-            clusterer,
-            choose,
-            time_limit,
-            features,
-        )
+        self.theory, self.clusterer, self.features = theory, clusterer, features
+        self.choose, self.time_limit = choose, time_limit
 
     def fit(self, X: Trace | Sequence[Trace], y: Any = None) -> BootstrapLearner:
-        """Run the loop on a trace, or on several. Raises LearnerError, PerceptionError, TraceError."""
+        """Run the loop on a trace, or on several.
+
+        Raises:
+            LearnerError: There is no map, or no label is left to learn from.
+            PerceptionError: The images cannot be clustered.
+            TraceError: A trace lacks what the theory needs.
+        """
         traces, theory = Traces.of(X), checked_theory(self.theory)
-        seen = self._look(traces, ISOLATED if theory.misread else None)
-        self.solution_ = solve(seen.each[seen.longest], theory, time_limit=self.time_limit)
-        self.map_, mapped = map_of(self.solution_, self.choose)
-        log_of(__name__).info("a map of %d dstates", len(self.map_.dstates))
-        self.second_map_ = warn_of_second_map(
-            seen.each[seen.longest], self.solution_.maps, theory, self.time_limit
-        )
-        self.labels_ = labels_of_all(self.map_, mapped, seen, self.views_, self.features_)
-        sure = self.labels_ >= 0
-        sure[
-            traces.at_longest([fault.step for fault in self.map_.faults if fault.kind == "misread"])
-        ] = False
-        log_of(__name__).info("a recogniser of %d images", sure.sum())
+
+        # 1. Views: cluster the images.
+        self.features_ = self._new_features(traces).fit(traces.images)
+        vectors = self.features_.transform(traces.images)
+        self.clusterer_ = self._new_clusterer(theory).fit(vectors)
+        self.views_, self.confidence_ = self.clusterer_.labels_, self.clusterer_.confidence_
+        warn_of_doubts(self.views_, self.confidence_, self.clusterer_.quality_[self.clusterer_.k_])
+        _log.info("%d images, %d views", len(traces.images), self.clusterer_.k_)
+
+        # 2. Map: find the minimal maps of the longest trace.
+        second_views = self.clusterer_.runner_up_labels_
+        seen = traces.with_views(vectors, self.views_, second_views, self.confidence_)
+        longest = seen.each[seen.longest]
+        self.solution_ = solve(longest, theory, time_limit=self.time_limit)
+        self.map_, own_labels = map_of(self.solution_, self.choose)
+        self.second_map_ = warn_of_second_map(longest, self.solution_.maps, theory, self.time_limit)
+        _log.info("a map of %d dstates", len(self.map_.dstates))
+
+        # 3. Labels: the map tells the dstate of each image.
+        self.labels_ = labels_of_all(self.map_, own_labels, seen, self.views_, self.features_)
+
+        # 4. Recogniser: learn from the images whose label is sure.
+        misread = [fault.step for fault in self.map_.faults if fault.kind == "misread"]
+        is_sure = self.labels_ >= 0
+        is_sure[traces.at_longest(misread)] = False
         self.recogniser_ = recogniser(features=self.features_).fit(
-            traces.images[sure], self.labels_[sure]
+            traces.images[is_sure], self.labels_[is_sure]
         )
+        _log.info("a recogniser of %d images", is_sure.sum())
         return self
 
     def predict(self, X: Trace | Sequence[Trace] | ArrayLike) -> NDArray[np.intp]:
-        """The dstates, ids of `map_`, at which images (m, d), or those of traces, were taken. Raises LearnerError before `fit`."""
+        """The dstates, as ids of `map_`, at which images were taken, (m,).
+
+        Args:
+            X: Images, (m, d), or traces with m steps in all.
+
+        Raises:
+            LearnerError: The learner has not learnt yet.
+        """
         if not hasattr(self, "recogniser_"):
             raise LearnerError(
                 "learner: expected one that has learnt, got a new one; call fit with a trace first"
             )
-        return np.asarray(
-            self.recogniser_.predict(Traces.of(X).images if Traces.are(X) else X), np.intp
-        )
+        images = Traces.of(X).images if Traces.are(X) else X
+        return np.asarray(self.recogniser_.predict(images), np.intp)
 
     def score(self, X: Trace | Sequence[Trace] | ArrayLike, y: ArrayLike | None = None) -> float:
-        """The share of images that are recognised: as the dstates `y` (m,), or, where these are not given, as those on the way of each trace on the map.
+        """The share of images that are recognised.
 
-        Of the ways that no view contradicts it is the one that fits most images. Steps whose dstate it does not tell do not count; LearnerError where there are no others.
+        Args:
+            X: Images, (m, d), or traces with m steps in all.
+            y: The true dstates, (m,). Without them each trace is followed on the map: of the ways
+                that no view contradicts, the one that fits most images tells the dstates. Steps
+                whose dstate it does not tell do not count.
+
+        Raises:
+            LearnerError: The dstate of no step is known, or `y` has another shape.
         """
         found = self.predict(X)
         if y is None and not Traces.are(X):
             raise LearnerError(
-                "y: expected the dstates of the images, got none; give them, or traces, which are followed on the map"
+                "y: expected the dstates of the images, got none; "
+                "give them, or traces, which are followed on the map"
             )
         true = np.asarray(self._followed(Traces.of(X), found) if y is None else y)
         if true.shape != found.shape:
             raise LearnerError(
-                f"y: expected {len(found)} dstates, one an image, got an array of shape {true.shape}"
+                f"y: expected {len(found)} dstates, one an image, "
+                f"got an array of shape {true.shape}"
             )
         if not (true >= 0).any():
             raise LearnerError(
-                "traces: expected some steps whose dstate the map tells, got none; score a trace of the same world"
+                "traces: expected some steps whose dstate the map tells, got none; "
+                "score a trace of the same world"
             )
         return float(np.mean(found[true >= 0] == true[true >= 0]))
 
-    def _look(self, traces: Traces, isolated: float | None) -> Traces:
-        """The traces with their views, and, where there is one, with those of the runner-up."""
-        usual = ViewClusterer(random_state=0, isolated=isolated)
-        self.features_ = (
-            traces.features
-            if self.features is None
-            else cloned("features", self.features, "transform")
-        ).fit(traces.images)
-        images = self.features_.transform(traces.images)
-        self.clusterer_ = as_view_clusterer(
-            usual if self.clusterer is None else cloned("clusterer", self.clusterer)
-        ).fit(images)
-        self.views_, self.confidence_ = self.clusterer_.labels_, self.clusterer_.confidence_
-        log_of(__name__).info("%d images, %d views", len(traces.images), self.clusterer_.k_)
-        warn_of_doubts(self.views_, self.confidence_, self.clusterer_.quality_[self.clusterer_.k_])
-        return traces.with_views(
-            images, self.views_, self.clusterer_.runner_up_labels_, self.confidence_
-        )
+    def _new_features(self, traces: Traces) -> Any:
+        """What makes features of images, not fitted yet."""
+        if self.features is None:
+            return traces.features
+        return cloned("features", self.features, "transform")
+
+    def _new_clusterer(self, theory: Theory) -> ViewClusterer:
+        """The clusterer, not fitted yet."""
+        if self.clusterer is not None:
+            return as_view_clusterer(cloned("clusterer", self.clusterer))
+        return ViewClusterer(random_state=0, isolated=ISOLATED if theory.misread else None)
 
     def _followed(self, traces: Traces, looks: NDArray[np.intp]) -> NDArray[np.intp]:
-        """The dstate of each step, by the map: -1 where it does not tell. `looks` are the dstates that the images look like."""
+        """The dstate of each step by the map, (m,); -1 where it does not tell.
+
+        Args:
+            traces: Traces with m steps in all.
+            looks: The dstates that the images look like, (m,).
+        """
         views = self.clusterer_.predict(self.features_.transform(traces.images))
         return labels_on(self.map_, traces, views, looks)

@@ -1,8 +1,9 @@
-"""The map of the runner-up: whether the map would be another one, had the images been clustered into the second best number of views.
+"""The map of the runner-up: does the second best number of views give another map?
 
-The number of views is chosen by how well they separate the images, and no map tells whether that was right: with too few views a small, proven and wrong map
-comes out. So where a second number of views is nearly as good, its views are kept beside the chosen ones, as the field `runner_up` of each step, and the
-map that they give is looked at, too.
+The number of views is chosen by how well they separate the images, and no map tells whether that
+was right: too few views give a small, proven and wrong map. So where a second number of views is
+nearly as good, its views are kept beside the chosen ones, in the field `runner_up` of each step,
+and their map is compared.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ssh_abduction.solver import Solution, Status, solve
 from ssh_abduction.theory.theory import Theory
 
 FIELD = "runner_up"
-# Seconds that may be spent on the second map, where nothing else limits them: it is a warning, and not what was asked for.
+# At most this many seconds are spent on the second map: it is only a warning.
 SECONDS = 5.0
 
 
@@ -28,11 +29,13 @@ class RunnerUpWarning(UserWarning):
 
 @dataclass(frozen=True)
 class SecondMap:
-    """What the views of the runner-up give, where it is not the map that the chosen views give.
+    """The map of the runner-up, where it is another one.
 
-    views, other_views  how many there are of the chosen views, and of those of the runner-up
-    dstates             of the map that the chosen views give; None where they give none
-    solution            for the views of the runner-up
+    Attributes:
+        views: How many views were chosen.
+        other_views: How many views the runner-up has.
+        dstates: How many dstates the map of the chosen views has; None if they have no map.
+        solution: The solution for the views of the runner-up.
     """
 
     views: int
@@ -53,39 +56,41 @@ class SecondMap:
                 if self.solution.status is Status.UNSATISFIABLE
                 else "have no map that was found in time"
             )
+        amount = "few" if self.views < self.other_views else "many"
         return (
-            f"{self.views} views may be too {'few' if self.views < self.other_views else 'many'}: {self.other_views} also separate the images well, "
-            f"and {other}; cluster the images into {self.other_views} views to see it (cluster --k {self.other_views}), or log more images"
+            f"{self.views} views may be too {amount}: {self.other_views} also separate the images "
+            f"well, and {other}; cluster the images into {self.other_views} views to see it "
+            f"(cluster --k {self.other_views}), or log more images"
         )
 
 
 def with_runner_up(trace: Trace, views: Iterable[View] | None) -> Trace:
-    """The trace with the views of the runner-up at its steps, or, for None, without any that it may have had. Raises TraceError."""
-    if views is None:
-        return replace(
-            trace,
-            steps=tuple(
-                replace(s, extra={k: v for k, v in s.extra.items() if k != FIELD})
-                for s in trace.steps
-            ),
-        )
-    seen = trace.with_views(views).views
-    return replace(
-        trace,
-        steps=tuple(
-            replace(s, extra={**s.extra, FIELD: v}) for s, v in zip(trace.steps, seen, strict=True)
-        ),
-    )
+    """The trace with the views of the runner-up at its steps; None removes them.
+
+    Raises:
+        TraceError: The views are malformed.
+    """
+    others = [{k: v for k, v in step.extra.items() if k != FIELD} for step in trace.steps]
+    if views is not None:
+        seen = trace.with_views(views).views
+        others = [{**extra, FIELD: v} for extra, v in zip(others, seen, strict=True)]
+    steps = (replace(s, extra=extra) for s, extra in zip(trace.steps, others, strict=True))
+    return replace(trace, steps=tuple(steps))
 
 
 def runner_up(trace: Trace) -> Trace | None:
-    """The trace with the views of the runner-up as its views; None where it has no runner-up. Raises TraceError where only some steps have one."""
+    """The trace with the views of the runner-up as its views; None if it has no runner-up.
+
+    Raises:
+        TraceError: Only some steps have a view of the runner-up.
+    """
     if not any(FIELD in step.extra for step in trace.steps):
         return None
     for i, step in enumerate(trace.steps):
         if FIELD not in step.extra:
             raise TraceError(
-                f"{trace.at(i)}: {FIELD}: expected a view, as other steps have one, got none; cluster the images again"
+                f"{trace.at(i)}: {FIELD}: expected a view, as other steps have one, got none; "
+                "cluster the images again"
             )
     try:
         return trace.with_views(step.extra[FIELD] for step in trace.steps)
@@ -100,11 +105,17 @@ def second_map(
     limit: float | None = None,
     memory: int | None = None,
 ) -> SecondMap | None:
-    """The map of the runner-up, where it is none of `maps`, which the views of the trace give; None where there is no runner-up, or it gives one of these.
+    """The map of the runner-up, if it is another one; else None.
 
-    limit   seconds; SECONDS where that is less, or where it is None
-    memory  MiB, as in `solve`
-    Raises TraceError where the views of the runner-up are malformed.
+    Args:
+        trace: A trace with the views of the runner-up.
+        maps: The minimal maps of the chosen views.
+        theory: The theory that they were found with.
+        limit: Seconds, at most SECONDS; None takes SECONDS.
+        memory: MiB, as in `solve`.
+
+    Raises:
+        TraceError: The views of the runner-up are malformed.
     """
     other = runner_up(trace)
     if other is None:
@@ -128,7 +139,7 @@ def second_map(
 def warn_of_second_map(
     trace: Trace, maps: Sequence[SSHMap], theory: Theory | None, limit: float | None
 ) -> SecondMap | None:
-    """The same, with a RunnerUpWarning where there is one."""
+    """The map of the runner-up, if it is another one, with a RunnerUpWarning."""
     found = second_map(trace, maps, theory, limit)
     if found:
         warnings.warn(found.sentence, RunnerUpWarning, stacklevel=3)
@@ -136,5 +147,5 @@ def warn_of_second_map(
 
 
 def partition(ssh_map: SSHMap) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
-    """What a map says of the steps: which are one dstate, and which are at one place. Both are numbered by first visit."""
+    """The dstate and the place of each step, both numbered by first visit."""
     return tuple(ssh_map.labels), tuple(ssh_map.dstates[label].place for label in ssh_map.labels)
