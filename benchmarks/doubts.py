@@ -151,7 +151,7 @@ def found(trace: Trace, by: str) -> Found:
         (
             re.search(r"\((?:image) ([\d, ]+)", str(w.message))
             for w in said
-            if "like those of no view" in str(w.message)
+            if "fit no view" in str(w.message)
         ),
         None,
     )

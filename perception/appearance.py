@@ -76,6 +76,7 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
             raise PerceptionError(
                 f"floor: expected a number of 0 or more, got {brief(self.floor)}; change it"
             )
+        # The shape comes from the user, the images from a file: they may not fit.
         if np.prod(self.shape_) != images.shape[1]:
             rows, columns, colours = self.shape_
             raise PerceptionError(

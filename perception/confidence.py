@@ -108,6 +108,7 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
     number, counts = np.unique(of, return_inverse=True, return_counts=True)[1:]
     size = counts[number]
     usual = float(np.median(size[of != NOISE])) if (of != NOISE).any() else 0.0
+    # Rare views are doubtful only if the median view was seen often.
     rare = size <= (max(RARE * usual, FEW) if usual >= SEEN else 0)
     doubtful = np.flatnonzero((of == NOISE) | rare | ((certain < SURE) & (size > 1)))
     if len(doubtful):
@@ -115,8 +116,8 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
             ", …" if len(doubtful) > NAMED else ""
         )
         text = (
-            f"{len(doubtful)} of {len(of)} images are like those of no view, or of a view that "
-            f"was hardly ever seen (image {named})"
+            f"{len(doubtful)} of {len(of)} images fit no view, or a view that "
+            f"was rarely seen (image {named})"
         )
         warnings.warn(
             (

@@ -40,6 +40,7 @@ def images_of(trace: Trace) -> NDArray[np.float64]:
         raise PerceptionError(
             f"{trace.at(0)}: image: expected at least one range, got none; log what the robot saw"
         )
+    # All images must have the length of the first one.
     for i, beams in enumerate(lengths):
         if beams != lengths[0]:
             mend = "give every image the same number of beams"
@@ -59,6 +60,7 @@ def images_held(trace: Trace) -> list[NDArray[np.float64] | None]:
     held = [step.image for step in trace.steps]
     if not any(isinstance(image, int) for image in held):
         return [None if image is None else np.array(image, dtype=float) for image in held]
+    # A whole number is the index of a row in the sidecar file.
     table = _sidecar(trace)
     rows: list[NDArray[np.float64] | None] = []
     for i, image in enumerate(held):

@@ -216,6 +216,7 @@ def spanning_tree(X: ArrayLike) -> SpanningTree:
             np.concatenate([edges, picks[added]]),
             np.concatenate([lengths, np.sqrt(squares[added])]),
         )
+        # Components for the next round.
         links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
         components = connected_components(links, directed=False)[1].astype(np.intp)
     order = np.argsort(lengths, kind="stable")
@@ -254,6 +255,7 @@ class _Cells:
         parts = list(_halves(images, np.arange(len(images))))
         self.order = np.concatenate(parts)
         self.images = images[self.order]
+        # Centred images have small norms, which keeps rounding errors small.
         self.images -= self.images.mean(axis=0)
         self.norms = np.einsum("ij,ij->i", self.images, self.images)
         self.starts = np.cumsum([0, *(len(p) for p in parts)])
@@ -267,6 +269,7 @@ class _Cells:
             ]
         )
         self.first, self.second = np.triu_indices(len(parts))
+        # Bound: distance of the centres minus both radii; 0 within a cell.
         apart = np.concatenate(
             [np.sqrt(_squares(centres[i:] - centres[i])) for i in range(len(parts))]
         )

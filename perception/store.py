@@ -124,6 +124,7 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
             "versions": versions,
         }
     )
+    # Refuse now what `load` would refuse later.
     if foreign := _foreign(data=data):
         raise PerceptionError(
             f"{path}: expected a model of types that can be read back, got {', '.join(foreign)}"

@@ -339,6 +339,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 f"n_init: expected at most {MOST_STARTS} starts, got {brief(self.n_init)}; a "
                 "few dozen are many"
             )
+        # scikit-learn takes seeds of 32 bits.
         if self.random_state is not None and not isinstance(
             self.random_state, np.random.RandomState
         ):

@@ -163,6 +163,7 @@ def _cut(walls: Array, opening: Opening) -> Array:
     starts, ends = opening.frame(walls[:, :2]), opening.frame(walls[:, 2:])
     half = np.array([opening.width / 2, opening.depth / 2 + DEPTH])
     way = ends - starts
+    # Shares of each wall at which it enters and leaves the slab of each axis.
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half - starts) / way, (half - starts) / way
     still = way == 0

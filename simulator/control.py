@@ -163,6 +163,7 @@ def climb(driver: Driver, turned: bool = False) -> None:
     for attempt in range(TRIES):
         seen = driver.see(STILL)
         to_go, offset = seen.to_go(reach), seen.offset(reach)
+        # Turning cannot correct a distance from the line: back off and approach again.
         aside = abs(offset) if offset is not None else 0.0
         if (
             aside > tolerance.aside

@@ -72,6 +72,7 @@ class Drive:
             more: Other fields of the truth.
         """
         visits: list[dict[str, Any]] = []
+        # Consecutive scans at one place are one visit.
         for number, place in enumerate(scans):
             if place is not None:
                 if not visits or visits[-1]["place"] != place:
@@ -176,6 +177,7 @@ class Recorder:
         """
         if self.scans[-1][1][-1:] != [len(self.poses) - 1]:
             self.scans[-1][1].append(len(self.poses) - 1)
+        # Generators 2 and 3 of this seed; others are used for the drive itself.
         sight, wheels = (np.random.default_rng([seed, k]) for k in (2, 3))
         poses = np.array(self.poses)
         numbers = [number for _, part in self.scans for number in part]

@@ -193,6 +193,7 @@ class Pilot:
                     "none",
                     "give another reach",
                 )
+            # Done at the fixed point, or if there is none.
             if place.fixed is None or abs(place.fixed) <= self.driver.tolerance.close:
                 break
             self._go(place.fixed)

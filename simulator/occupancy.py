@@ -110,6 +110,7 @@ def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
             SimulatorWarning,
             stacklevel=4,
         )
+    # Images begin at the top, maps at the bottom.
     return path.stem, _edges(occupied[::-1], fields.resolution, fields.origin)
 
 

@@ -93,6 +93,7 @@ class Odometer:
         ahead, left, turned = _motions(poses)
         way = np.hypot(ahead, left)
         noise = rng.normal(size=(4, len(way)))
+        # Noise grows with the square root of the distance or turn.
         told_ahead = (1 + self.scale) * ahead + self.along * np.sqrt(way) * noise[0]
         told_left = (1 + self.scale) * left + self.across * np.sqrt(way) * noise[1]
         told_turn = (
@@ -118,6 +119,7 @@ class Odometer:
             zip(readings, *_motions(readings), strict=False)
         ):
             way, cos, sin = np.hypot(ahead, left), np.cos(start[2]), np.sin(start[2])
+            # Jacobians of the next pose by this pose and by the motion.
             by_pose = np.array(
                 [
                     [1.0, 0.0, -sin * ahead - cos * left],

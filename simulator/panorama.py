@@ -118,6 +118,7 @@ class Paint:
         for i, (degree, offset, length) in enumerate(
             zip(degrees.tolist(), offsets.tolist(), lengths.tolist(), strict=True)
         ):
+            # Clutter moves, so its texture must not depend on its position.
             if i >= walls:
                 found.append(("clutter", degree % 180, round(100 * length)))
             else:
@@ -127,6 +128,7 @@ class Paint:
     def texture(self, key: tuple[Any, ...]) -> Array:
         """The numbers of a texture, (13 + 6 WAVES,), as in `_albedo`."""
         an_instance("key", key, tuple, SimulatorError, mend="take one of Paint.keys")
+        # A checksum of the key as seed gives the same texture in each process.
         rng = np.random.default_rng([self.seed, zlib.crc32(repr(key).encode())])
         base, stripe, skirting = (
             rng.uniform(0.25, 0.75, 3),
@@ -192,6 +194,7 @@ class Camera:
                 "camera.hours: expected two, at which a run begins and ends, got "
                 f"{brief(self.hours)}; give both"
             )
+        # The class is frozen; hours may have come as a list.
         object.__setattr__(self, "hours", hours)
         for name, value, most in (
             ("hours", hours[0], 24.0),

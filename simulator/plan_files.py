@@ -68,6 +68,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tupl
         ) from None
     except ValueError as error:
         raise SimulatorError(f"{named(path)}: expected a plan: {error}; check the path") from None
+    # Entities can blow up to gigabytes.
     if b"<!ENTITY" in data:
         raise SimulatorError(
             f"{named(path)}: expected a plan without entities of its own, got some; write them out"
@@ -122,6 +123,7 @@ class _Reader:
         return rooms, doors
 
     def wrong(self, name: str, expected: str, value: object) -> SimulatorError:
+        """The error that a part of the plan is wrong."""
         return SimulatorError(
             f"{self.where}: {name}: expected {expected}, got "
             f"{'none' if value is None else brief(value)}; mend it"
@@ -141,6 +143,7 @@ class _Reader:
         return METRES[unit] * length / pixels
 
     def room(self, space: Element, where: str, scale: float) -> Room:
+        """The room of a space."""
         if not (name := space.get("id")):
             raise self.wrong(f"{where}.id", "a text", name)
         corners = tuple(
@@ -152,6 +155,7 @@ class _Reader:
     def pair(
         self, portal: Element, numbers: Mapping[str, int], here: int, where: str
     ) -> tuple[int, int]:
+        """The two rooms of a portal, in ascending order."""
         names = [target.text or "" for target in portal.findall("target/id")]
         rooms = sorted({numbers[name] for name in names if name in numbers})
         if len(names) != 2 or len(rooms) != 2 or here not in rooms:
@@ -159,6 +163,7 @@ class _Reader:
         return rooms[0], rooms[1]
 
     def middle(self, line: Element, scale: float) -> Point:
+        """The middle of a line."""
         ends = [self.point(point, "linesegment", scale) for point in line.findall("point")]
         if not ends:
             raise self.wrong("linesegment", "points", None)
@@ -173,6 +178,7 @@ class _Reader:
         )
 
     def number(self, text: str | None, where: str) -> float:
+        """A number of at most a million."""
         try:
             value = float(text or "")
         except ValueError:

@@ -162,6 +162,7 @@ def _drive(
     passed: Counter[int] = Counter()
     while True:
         found = plan.gateways[stand.room]
+        # Go back only in a dead end.
         choices = [k for k, g in enumerate(found) if g.door != came_by] or list(range(len(found)))
         least = min(passed[found[k].door] for k in choices)
         goal = int(chance.choice([k for k in choices if passed[found[k].door] == least]))

@@ -171,6 +171,7 @@ class Plan:
         }
         kept: list[int] = []
         taken: list[list[float]] = [[] for _ in self.rooms]
+        # Keep a door if it is far enough from the kept doors of both rooms.
         for number in sorted(range(len(self.doors)), key=far):
             rooms = self.doors[number].rooms
             if all(

@@ -192,6 +192,7 @@ class Round:
             ways.append(within)
             labels += [room] * len(within)
             if goal is not None:
+                # The middle of a passage is in the door; the room changes there.
                 through = rooms.through(goal, room)
                 middle = len(through) // 2
                 doors.append((len(labels) + middle, goal))

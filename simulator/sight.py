@@ -140,6 +140,7 @@ def _finer(points: Array, reach: float) -> float:
             line = _line(points[:, v], _spacing(points[:, u]), chosen)
             if line is None:
                 continue
+            # Slope of the points on the line; slopes of both axes must have one sign.
             on = chosen & (np.abs(points[:, v] - line) < THICK)
             a, b = points[on, u], points[on, v]
             spread = float(((a - a.mean()) ** 2).sum())

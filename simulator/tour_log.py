@@ -137,6 +137,7 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
     along, across, heading = (
         np.sum([np.diag(r.covariance) for r in reports], axis=0) if reports else np.zeros(3)
     )
+    # Choose relative errors that reproduce the total variance of all reports.
     share = 1 / ways if ways else 0.0
     offset, tilt = (
         (tolerance.close / math.sqrt(3), tolerance.straight / math.sqrt(3))

@@ -95,6 +95,7 @@ def simulate(
     driver = _driver(world, tours, seed, laser, body, tolerance)
     body, tolerance = driver.robot.body, driver.tolerance
     log = Log(driver.robot)
+    # The camera has noise of its own, so that the drive is the same without it.
     eye = Eye(
         camera, len(world.segments), np.random.default_rng([seed, 1]), tours * len(world.route)
     )
@@ -167,6 +168,7 @@ def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
+        # The driver knows the walls, but not the furniture of this tour.
         space = FreeSpace.of(world.segments, driver.robot.body.radius)
         for number, stop in enumerate(world.route, tour * len(world.route)):
             yield number, stop
@@ -219,6 +221,7 @@ def _driver(
         )
     body = body or Body()
     x, y, _ = world.start
+    # The robot must fit where it starts.
     if not world.holds(x, y) or world.clearance(x, y) < body.radius:
         raise SimulatorError(
             f"{world.name}: start: expected a place {body.radius} m off the walls, got ({x}, "
@@ -285,6 +288,7 @@ def _at_junctions(
         if tour:
             driver.world = world.arranged(driver.rng)
         for number, action in enumerate(world.route, tour * len(world.route)):
+            # Makes the report whose covariance is used below.
             displacement = log.displacement()
             yield Step(
                 image=eye.image(driver, driver.look(STILL), number),
@@ -312,7 +316,9 @@ def _evenly(
     leg_began = due = 0.0
     leg = 0
 
+    # Called after each stride of a travel.
     def look(driver: Driver) -> None:
+        """Log an image if one is due."""
         nonlocal due
         if driver.robot.driven >= due:
             spot = (

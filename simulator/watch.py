@@ -77,13 +77,14 @@ class Watch:
             raise SimulatorError(f"{error} ({where}){self._because(before)}") from None
         after = self.driver.robot.pose
         expected = self._expected(name, before)
+        # The control law believes that it arrived; the truth may differ.
         if expected and self._is_elsewhere(expected, after):
             at = self.world.places[expected]
             raise SimulatorError(
                 f"{self.world.name}: {where}: expected the robot to come to {_at(expected, at)}, "
                 f"got it {_at('', after)}, "
-                f"{math.dist(at, after[:2]):.1f} m off; so it drives another route than it was "
-                f"told{self._because(before)}"
+                f"{math.dist(at, after[:2]):.1f} m off; so it drives another "
+                f"route{self._because(before)}"
             )
         if place == len(self.world.route) - 1:
             self._ended(tour, after)
@@ -100,6 +101,7 @@ class Watch:
             f"{self.world.name}: tour {tour + 1}: expected it to end where it began, "
             f"{_at('', self._home)}, got its end {_at('', pose)}, {_off(self._home, pose)}"
         )
+        # Further tours would start from a wrong pose.
         if self.tours == 1:
             warnings.warn(
                 f"{text}; it cannot be driven again from there", SimulatorWarning, stacklevel=2
@@ -127,6 +129,7 @@ class Watch:
             return None
         if action in TURNS:
             return here.place
+        # The next place straight ahead on the same path.
         ahead = []
         for state in self.world.dstates:
             x, y, _ = between(here.pose, state.pose)
@@ -180,6 +183,7 @@ class Watch:
         if self.driver.laser.noise > BLURRED:
             noise = 100 * self.driver.laser.noise
             yield f"ranges err by {noise:.0f} cm (give the laser less noise)"
+        # Causes that lie in the start pose.
         start = world.nearest(world.start)
         if start and (away := math.dist(start.pose[:2], world.start[:2])) > self._near:
             yield (

@@ -115,6 +115,7 @@ class World:
                 "world.own_reach", self.own_reach, SimulatorError, NEAREST, FARTHEST, what="metres"
             )
         one_of("world.angles", self.angles, get_args(Angles), SimulatorError)
+        # The class is frozen; lists become tuples.
         for name, kind in (("clutter", Clutter), ("route", str), ("dstates", TrueDState)):
             members = all_instances(
                 f"world.{name}",
@@ -207,6 +208,7 @@ class World:
             SimulatorError: An argument has no such form.
         """
         reader = WorldReader(self.name)
+        # The reader names the argument in its errors.
         world = self
         if start is not None:
             try:

@@ -107,6 +107,7 @@ class WorldReader:
             raise self.wrong(
                 "polygons", "at least one wall in polygons, segments, arcs or occupancy", []
             )
+        # Places are those of dstates and those listed; routes may also lead through other points.
         segments = np.vstack(walls)
         dstates = tuple(
             self.dstate(s, f"dstates[{i}]") for i, s in enumerate(self.list(data, "dstates"))
@@ -134,23 +135,27 @@ class WorldReader:
         }
 
     def name(self, value: Any) -> str:
+        """A text."""
         if not isinstance(value, str):
             raise self.wrong("name", "a text", value)
         return value
 
     def wrong(self, name: str, expected: str, value: Any) -> SimulatorError:
+        """The error that a field is wrong."""
         return SimulatorError(
             f"{self.where}: {name}: expected {expected}, got {brief(value)}; mend it "
             "(docs/worlds.md)"
         )
 
     def list(self, data: Mapping[str, Any], name: str) -> list[Any]:
+        """A field that is a list; empty if it is missing."""
         value = data.get(name, [])
         if not isinstance(value, list):
             raise self.wrong(name, "a list", value)
         return value
 
     def numbers(self, value: Any, count: int, name: str) -> Array:
+        """An array of this many finite numbers."""
         good = isinstance(value, list) and len(value) == count
         if not good or not all(is_finite(x) and abs(x) <= FARTHEST for x in value):
             raise self.wrong(name, f"{count} finite numbers, of at most {FARTHEST:,.0f}", value)
@@ -216,6 +221,7 @@ class WorldReader:
         return moved
 
     def points(self, value: Any, name: str) -> dict[str, Point]:
+        """Points by name."""
         if not isinstance(value, Mapping):
             raise self.wrong(name, "an object of names and points [x, y]", value)
         if clash := next((text for text in value if text in ACTIONS or "," in text), None):
@@ -244,21 +250,25 @@ class WorldReader:
         return tuple(value)
 
     def reach(self, value: Any) -> float:
+        """The reach in metres."""
         if not is_finite(value) or not NEAREST <= value <= FARTHEST:
             raise self.wrong("reach", f"metres above 0, {NEAREST} to {FARTHEST:,.0f}", value)
         return float(value)
 
     def angles(self, value: Any, walls: Array) -> Angles:
+        """The angles of streets, by default from the walls."""
         if value not in (None, "right", "any"):
             raise self.wrong("angles", '"right" or "any"', value)
         chosen: Angles = value or ("right" if are_square(walls) else "any")
         return chosen
 
     def pose(self, value: Any, name: str) -> tuple[float, float, float]:
+        """A pose, whose heading is in degrees in the file."""
         x, y, degrees = self.numbers(value, 3, name)
         return float(x), float(y), math.radians(degrees)
 
     def clutter(self, value: Any, name: str) -> Clutter:
+        """A movable polygon."""
         if not isinstance(value, Mapping):
             raise self.wrong(name, "an object with a polygon", value)
         moves = self.numbers(value.get("moves", [0, 0]), 2, f"{name}.moves")
@@ -272,6 +282,7 @@ class WorldReader:
         )
 
     def dstate(self, value: Any, name: str) -> TrueDState:
+        """A true dstate."""
         if not isinstance(value, Mapping) or value.get("direction") not in (1, -1):
             raise self.wrong(
                 name, "an object with name, place, path, direction 1 or -1, pose", value

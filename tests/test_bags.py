@@ -526,4 +526,4 @@ def test_import_takes_several_topics(tmp_path: Path, capsys: pytest.CaptureFixtu
         )
         == 1
     )
-    assert "expected a robot that drives, got a way of 0.7 m" in capsys.readouterr().err
+    assert "expected a robot that drives, got a drive of 0.7 m" in capsys.readouterr().err

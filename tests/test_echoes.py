@@ -1,4 +1,4 @@
-"""What ranges mean that are no wall, and what is said if the way by scans is not the way by odometry."""
+"""What ranges mean that are no wall, and what is said if scan matching and odometry disagree."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def test_a_mount_for_several_lasers_is_refused(drive: tuple[Scan, ...]) -> None:
 def doubt(scans: tuple[Scan, ...]) -> str:
     log = RobotLog(scans, source="drive")
     log, track, notes = tracked(log)
-    assert sum("The way by scans" in note for note in notes) <= 1
+    assert sum("Scan matching and odometry" in note for note in notes) <= 1
     return disagreement(log, track) or ""
 
 
@@ -237,7 +237,7 @@ def test_one_warning_is_enough_where_the_odometer_explains_it(drive: tuple[Scan,
     lost = tuple(replace(scan, odometry=(0.0, 0.0, 0.0)) for scan in drive)
     _, _, notes = tracked(RobotLog(lost, source="drive"))
     assert any("odometry is missing there" in note for note in notes)
-    assert not any("The way by scans" in note for note in notes)
+    assert not any("Scan matching and odometry" in note for note in notes)
 
 
 @pytest.mark.parametrize("verb", ["import", "map"])
@@ -256,14 +256,14 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
     for note in (
         "Scans are those of",
         "Ranges of 5 m repeat",
-        "The way by scans is not the way by odometry",
+        "Scan matching and odometry disagree",
     ):
         assert said.count(f"warning: {note}") == 1
     if verb == "map":
         for file in ("run.json", "report.html"):
             text = (tmp_path / "out" / file).read_text()
             assert "Ranges of 5 m repeat" in text
-            assert "The way by scans is not" in text
+            assert "Scan matching and odometry disagree" in text
             assert "\x1b" not in text
     else:
         main(
@@ -283,7 +283,7 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
         said = capsys.readouterr().err
         assert "Scans are those of" in said
         assert "repeat" not in said
-        assert "The way by scans" not in said
+        assert "Scan matching and odometry" not in said
 
 
 def test_a_field_of_view_that_a_log_does_not_say_is_noted(

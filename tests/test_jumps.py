@@ -162,7 +162,7 @@ def test_poses_that_alternate_nearby_are_said(scans: tuple[Scan, ...]) -> None:
         moved((1.0, 0.8, 0.05), scan.odometry) if draw.random() < 0.5 else scan.odometry
         for scan in scans
     ]
-    assert "The odometry goes to and fro" in told(by(scans, poses))[1]
+    assert "The odometry goes back and forth" in told(by(scans, poses))[1]
 
 
 @pytest.mark.parametrize("block", [1, 10])
@@ -189,5 +189,5 @@ def test_scans_that_turn_otherwise_than_the_odometer_are_said(
     track, notes = told(
         stepwise(scans, lambda i, step: (step[0], step[1], step[2] + (2.0 if i == 70 else 0.0)))
     )
-    assert "Scans turn otherwise than the odometry, once: at scan 70" in notes
+    assert "Scans turn differently from the odometry, once: at scan 70" in notes
     assert track.way[-1] == pytest.approx(metres, abs=3)

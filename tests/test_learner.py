@@ -263,9 +263,7 @@ def test_an_image_that_is_noise_is_not_learnt_from(run: Trace) -> None:
             replace(run.steps[-1], image=tuple(0.7 * r for r in run.steps[-1].image)),
         ),
     )
-    with pytest.warns(
-        ImageWarning, match=r"1 of 96 images are like those of no view.*\(image 95\)"
-    ):
+    with pytest.warns(ImageWarning, match=r"1 of 96 images fit no view.*\(image 95\)"):
         learner = BootstrapLearner(VIEWS_ALONE, DBSCAN(eps=1.5), time_limit=100).fit(odd)
     assert (learner.views_[-1], learner.confidence_[-1], learner.labels_[-1]) == (-1, 0, -1)
     assert (learner.labels_[:-1] >= 0).all()
@@ -841,7 +839,7 @@ def test_bad_images_are_disbelieved_where_views_may_be_misread(kind: str) -> Non
             replace(s, image=tuple(i.tolist())) for s, i in zip(trace.steps, images, strict=True)
         ),
     )
-    with pytest.warns(ImageWarning, match="3 of 64 images are like those of no view"):
+    with pytest.warns(ImageWarning, match="3 of 64 images fit no view"):
         learner = BootstrapLearner(Theory.topological().replace(misread=1.5)).fit(spoilt)
     assert one_to_one(np.array(learner.map_.labels), true_dstates(trace))
     assert np.flatnonzero(learner.labels_ < 0).tolist() == bad

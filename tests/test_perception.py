@@ -503,9 +503,7 @@ def test_doubtful_images_and_views_are_said() -> None:
     for index, label, certain in ((7, 9, 0.99), (8, 1, 0.6), (9, -1, 0.0)):
         labels, trust = truth.copy(), sure.copy()
         labels[index], trust[index] = label, certain
-        with pytest.warns(
-            ImageWarning, match=rf"1 of 60 images are like those of no view.*\(image {index}\)"
-        ):
+        with pytest.warns(ImageWarning, match=rf"1 of 60 images fit no view.*\(image {index}\)"):
             warn_of_doubts(labels, trust, 3.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -187,7 +187,7 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
     if found.parted:
         differences.append(f"they part in {found.parted} of {found.of} stretches of a metre")
     return (
-        f"The way by scans is not the way by odometry: {'; '.join(differences)}. The map may be "
+        f"Scan matching and odometry disagree: {'; '.join(differences)}. The map may be "
         f"wrong. Likely causes: {'; '.join(causes)}."
     )
 

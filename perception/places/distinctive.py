@@ -86,6 +86,8 @@ class Visit:
 
 @dataclass(frozen=True, eq=False)
 class _Vote:
+    """The vote of a milestone for a place with this middle."""
+
     scan: int
     middle: Array
 

@@ -188,6 +188,7 @@ def _visit(
     same, middle = passes[number], middles[number]
     came = _bearing(middle, middles[number - 1]) if number > 0 else None
     went = _bearing(middle, middles[number + 1]) if number < len(passes) - 1 else None
+    # Coming back to the door before means leaving by the door of arrival.
     if (
         came is not None
         and went is not None

@@ -106,12 +106,12 @@ def import_log(
     if len(track.breaks) > MOST_BREAKS * len(log):
         raise LogError(
             f"{named(log.source)}: expected a log of one drive, got {len(log)} scans of which "
-            f"{len(track.breaks)} show nothing of what the one before them shows; sort it by "
+            f"{len(track.breaks)} show nothing that the previous scan shows; sort it by "
             f"time, or cut it into drives{_besides(notes)}"
         )
     if track.way[-1] < 1.0:
         raise LogError(
-            f"{named(log.source)}: expected a robot that drives, got a way of "
+            f"{named(log.source)}: expected a robot that drives, got a drive of "
             f"{track.way[-1]:.1f} m; take a longer log{_besides(notes)}"
         )
     with _timed(seconds, "scale"):
@@ -196,7 +196,7 @@ def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
     return jumps.in_unit(log, count), [
         (
             "The odometry does not count metres: its usual step between two scans would be "
-            f"{usual:.0f} m. It is read as {found}, as then it is like the way by scans, "
+            f"{usual:.0f} m. It is read as {found}, which agrees with scan matching: "
             f"{usual / count:.2f} m a step."
         )
     ]
@@ -220,6 +220,7 @@ def with_views(trace: Trace) -> Trace:
     if len(images) <= most or (images == images[0]).all():
         views, sure = np.zeros(len(images), int), np.ones(len(images))
     else:
+        # A warning about images would not help a user who gave a log.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ImageWarning)
             clusterer = ViewClusterer(k_max=most, by="trimmed", random_state=0).fit(images)

@@ -137,22 +137,21 @@ def said_of(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> lis
         notes.append(
             f"The odometry stands still in {len(still)} steps, from scan {still[0]} "
             f"({_where(log, still[0])}) on, while the scans show that the robot moved: it was "
-            "carried, or the odometer "
-            "hung. The trace has no displacement across."
+            "carried, or the odometer hung. The trace has no displacement across."
         )
     if track.breaks:
         notes.append(
             f"The scans show nothing of what was seen before, {_times(len(track.breaks))}: from "
             f"scan {track.breaks[0]} ({_where(log, track.breaks[0])}) on. The robot may have been "
             "carried "
-            "there, so that what comes after is mapped as a way of its own."
+            "there. The rest is mapped as a separate drive."
         )
     if turned:
         first, angle = turned[0]
         notes.append(
-            f"Scans turn otherwise than the odometry, {_times(len(turned))}: at scan {first} "
+            f"Scans turn differently from the odometry, {_times(len(turned))}: at scan {first} "
             f"({_where(log, first)}) by {abs(math.degrees(angle)):.0f} degrees. The track "
-            "turns as the scans do."
+            "follows the scans."
         )
     return notes
 
@@ -164,6 +163,7 @@ def said_of_whole(log: RobotLog) -> list[str]:
         usual_step(log),
         float(_far(log, 2).sum() / max(2 * _far(log, 1).sum(), 1e-9)),
     )
+    # A wrong unit explains poses that go back and forth, so it is reported alone.
     if far_apart > LONG:
         notes.append(
             f"The usual step between two scans is {far_apart:.0f} m by the odometry: it does "
@@ -171,8 +171,8 @@ def said_of_whole(log: RobotLog) -> list[str]:
         )
     elif to_and_fro < TO_AND_FRO and far_apart > 0:
         notes.append(
-            "The odometry goes to and fro: over every second scan its way is "
-            f"{100 * to_and_fro:.0f} % of that over every scan. Two programs may publish it, "
+            "The odometry goes back and forth: over every second scan it is "
+            f"{100 * to_and_fro:.0f} % as long as over all scans. Two programs may publish it, "
             "or the log is not in order."
         )
     missing = stands_still(log) if len(log) > 1 else np.zeros(1, bool)

@@ -166,6 +166,7 @@ class LocalMaps:
 
     def _move(self, begin: int, end: int) -> None:
         """Move the window to the scans begin … end - 1, adding and subtracting counts."""
+        # Start anew unless the new window continues the old one.
         if begin < self._begin or begin >= self._end:
             self._passed[:], self._met[:] = 0, 0
             self._window.clear()

@@ -80,6 +80,7 @@ def opened(path: Path, format: str) -> Iterator[Files]:
             else:
                 files = Files(format)
                 _open_part(path, files, folder, stack)
+                # The user may have meant the whole drive.
                 files.notes += _beside(path)
         except OSError as error:
             check_room(error, named(path))
@@ -252,6 +253,7 @@ def _beside(path: Path) -> list[str]:
     number, _ = _number(path)
     if number < 0 or not NAMES.search(path.name):
         return []
+    # Other parts of the same drive in the same folder.
     with_it = sorted(
         (
             part

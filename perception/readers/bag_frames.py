@@ -58,6 +58,7 @@ def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
     frames: Frames = {}
     topics = set(bag.topics(*TRANSFORMS))
     fixed = {topic for topic in topics if topic.endswith("tf_static")}
+    # Static transforms come first, so that the ancestors of the scans' frames are known.
     for group, is_static in ((fixed, True), (topics - fixed, False)):
         for connection, number, recorded, message in bag.messages(group):
             if isinstance(message, Damage):

@@ -144,6 +144,7 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
                 f"{brief(name)}; those in the bag: {listed}"
             )
         return match[0]
+    # No name was given, so the topic must be unique.
     if len(counts) > 1:
         several = ", once for each that is to be read" if option == "scan" else ""
         raise LogError(
@@ -196,6 +197,7 @@ def _odometer(
     if len(tracks) > 1:
 
         def told(source: tuple[str, str, str]) -> str:
+            """A source as a note names it."""
             odom, base, sender = source
             return f"from {odom} to {base}{f' by {sender}' if sender else ''}"
 
@@ -231,6 +233,7 @@ def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
     sources = sources_of(track)
     if len(sources) == 1:
         return track
+    # The distance of the first two sources tells how bad it is.
     table = track.table()
     first, second = (Track() for _ in range(2))
     for number in sources[0]:

@@ -133,8 +133,8 @@ def meaning_of(found: Found, survey: Survey, kind: str, source: str, notes: list
         return "restarts"
     if survey.wandered > (1 - MOST_SCANS) * survey.scans:
         notes.append(
-            f"The first pose in {kind} wanders from the second: the first is taken for a "
-            "corrected one, the second for odometry."
+            f"The first pose in {kind} wanders from the second: the first is used as "
+            "the corrected pose, the second as odometry."
         )
         return "first corrected"
     return "raw"
@@ -146,10 +146,11 @@ def _meaning_beside_graph(
     """What the poses of the scans mean if there are vertices. Raises LogError."""
     if graph.share_at_vertices(survey.poses) < MOST_SCANS:
         notes.append(
-            f"The poses in {kind} differ from those of VERTEX2: the former are taken for "
-            "odometry, the latter for corrected ones."
+            f"The poses in {kind} differ from those of VERTEX2: the former are used as "
+            "odometry, the latter as corrected poses."
         )
         return "raw"
+    # Corrected poses without edges give no odometry.
     if not graph.edges:
         raise LogError(
             f"{source}: expected odometry, got corrected poses alone (VERTEX2, and the same "
@@ -202,7 +203,7 @@ def reach_of(found: Found, survey: Survey, kind: str, assumed: dict[str, str]) -
     )
     assumed["no_return"] = (
         "The log does not say how far the laser reaches. By its largest range, "
-        f"{survey.most:g} m, which came {survey.repeated} times, it is {reach:g} m."
+        f"{survey.most:g} m, which occurs {survey.repeated} times, it is {reach:g} m."
     )
     return reach
 
@@ -281,6 +282,7 @@ def _count(survey: Survey, line: ScanLine) -> None:
         return
     survey.poses.extend(line.second)
     survey.same += line.first == line.second
+    # A constant difference of the poses is the mount; a large change means a correction.
     mount = between(line.second, line.first)
     survey.mount = survey.mount or mount
     x, y, angle = between(survey.mount, mount)

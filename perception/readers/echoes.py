@@ -83,6 +83,7 @@ class Told:
                 "name the angle that the beams cover"
             )
         if self.mount is not None:
+            # A pose may be any sequence of three numbers.
             values = tuple(self.mount) if isinstance(self.mount, Sequence | np.ndarray) else ()
             if (
                 len(values) != 3

@@ -59,6 +59,7 @@ class Graph:
 
     @cached_property
     def chain(self) -> Chain:
+        """Odometry at each vertex, chained from the edges."""
         poses: list[Pose] = [(0.0, 0.0, 0.0)]
         gaps: list[int] = []
         for (start, _), (end, _) in zip(self.vertices, self.vertices[1:], strict=False):

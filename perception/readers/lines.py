@@ -130,6 +130,7 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
         "bzip2": bz2.BZ2File,
         "xz": lzma.LZMAFile,
     }
+    # Python has no zstd before 3.14.
     if found == "zstd":
         if (zstd := zstd_module()) is None:
             raise LogError(
@@ -186,6 +187,7 @@ def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
             if len(line) <= LONGEST_LINE:
                 yield number, line if number > 1 else line.removeprefix(BOM_UTF8)
                 continue
+            # Skip the rest of a line that is too long.
             while line and not line.endswith(b"\n"):
                 line = stream.readline(LONGEST_LINE)
             yield number, None

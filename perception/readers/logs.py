@@ -82,6 +82,7 @@ def read_log(
             f"damaged, first: {damaged[0].what if damaged else 'none'}"
         )
     meant, found_out = understood(scans, told)
+    # What the user said need not be assumed.
     assumed = (note for option, note in reading.assumed.items() if getattr(told, option) is None)
     log = RobotLog(
         meant,
@@ -141,6 +142,7 @@ def _reading(
         with bag_topics.opened(path, "ros2") as bag:
             yield bags.read(bag, topics, odom_topic)
         return
+    # A file is a log in lines or a bag, by its content.
     with opened(path) as file:
         found = format or _format(file, named(path))
         if found in LINES:
@@ -171,6 +173,7 @@ def _format(file: IO[bytes], source: str) -> str:
         longest = LONGEST_LINE if line is None else longest
         if len(head) > HEAD:
             break
+    # Nothing but lines that are too long, or nothing at all.
     if not head:
         got = f"lines of more than {longest // 2**20} MiB" if longest else "an empty file"
         raise LogError(f"{source}: expected a robot's log, got {got}; formats: {formats}")

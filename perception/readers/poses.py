@@ -65,6 +65,7 @@ class Poses:
 
     @classmethod
     def of(cls, track: Track, by_stamp: bool) -> Poses:
+        """Sort a track by one of its two clocks."""
         table = track.table()
         times = table[:, 0 if by_stamp else 1]
         order = np.argsort(times, kind="stable")
@@ -73,10 +74,12 @@ class Poses:
         return cls(times[order], poses)
 
     def at(self, time: float) -> Pose:
+        """The interpolated pose at a time."""
         x, y, heading = (float(np.interp(time, self.times, self.poses[:, i])) for i in range(3))
         return x, y, math.remainder(heading, math.tau)
 
     def tells(self, time: float) -> bool:
+        """Whether the poses cover a time, or nearly do."""
         return bool(self.times[0] - BESIDE <= time <= self.times[-1] + BESIDE)
 
 
@@ -98,6 +101,7 @@ def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
         for name, times in topics.items()
         if (text := _wrong_recording(name, times, bool(wrong)))
     ]
+    # Clocks that are fine by themselves may still disagree.
     if not held and not wrong:
         wrong = _apart(topics)
     if not wrong and not held:
@@ -168,12 +172,13 @@ def _apart(topics: Mapping[str, Array]) -> list[str]:
     )
     said = []
     for name, (when, ahead) in others:
+        # Lead of this clock relative to that of the first topic, over time.
         off = ahead - np.interp(when, *reference)
         worst = int(np.abs(off).argmax())
         if abs(off[worst]) > SAME_CLOCK:
             since = when[int(np.argmax(np.abs(off) > SAME_CLOCK))]
             said.append(
-                f"beside those of {first}, those of {name} are {off[0]:+.1f} s off at first "
+                f"relative to those of {first}, those of {name} are {off[0]:+.1f} s off at first "
                 f"and {off[-1]:+.1f} s at last, at most {off[worst]:+.1f} s, and more than "
                 f"{SAME_CLOCK:g} s from {since:.0f} s on"
             )

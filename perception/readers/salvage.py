@@ -115,11 +115,13 @@ class Salvage:
 
 
 def _mcap(path: Path) -> Iterator[Message]:
+    """The intact messages of an MCAP file."""
     kinds: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
     with path.open("rb") as file:
         file.seek(8)
         for kind, data in _mcap_records(file, os.fstat(file.fileno()).st_size):
+            # Schemas name message kinds, channels refer to schemas, messages to channels.
             if kind == SCHEMA:
                 kinds[struct.unpack_from("<H", data)[0]] = _text(data, 2)[0]
             elif kind == CHANNEL:
@@ -149,6 +151,7 @@ def _mcap_records(stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
 
 
 def _ros1(path: Path) -> Iterator[Message]:
+    """The intact messages of a ROS 1 bag."""
     connections: dict[int, tuple[str, str, str]] = {}
     with path.open("rb") as file:
         file.readline()
@@ -157,6 +160,7 @@ def _ros1(path: Path) -> Iterator[Message]:
             if kind not in (CONNECTION, ROS1_MESSAGE):
                 continue
             number = struct.unpack("<I", header[b"conn"])[0]
+            # Connections name topic, kind and sender; messages refer to them.
             if kind == CONNECTION:
                 told = _fields(data)
                 package, _, name = told[b"type"].decode().partition("/")
@@ -179,6 +183,7 @@ def _ros1_records(stream: IO[bytes], size: int) -> Iterator[tuple[dict[bytes, by
         data = stream.read(min(length, size))
         return data, len(data) == length
 
+    # A record is a header and its data, each after its length. A chunk holds records.
     whole = True
     while whole:
         header, whole = part()
@@ -194,6 +199,7 @@ def _ros1_records(stream: IO[bytes], size: int) -> Iterator[tuple[dict[bytes, by
 
 
 def _sqlite(path: Path) -> Iterator[Message]:
+    """The intact messages of a SQLite file of ROS 2."""
     with closing(
         sqlite3.connect(f"file:{quote(str(path))}?mode=ro&immutable=1", uri=True)
     ) as database:

@@ -150,6 +150,7 @@ def _carmen_lines(scan: Scan, time: float) -> str:
     stamp = f"{time:.6f} localhost {time:.6f}\n"
     odometry = _numbers(scan.odometry)
     laser = scan.laser
+    # CARMEN has no infinity: an unknown reach lies just beyond all ranges.
     reach = (
         laser.reach
         if math.isfinite(laser.reach)
@@ -185,6 +186,7 @@ def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float6
     is_ros1 = path.suffix == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     transforms = "tf2_msgs/msg/TFMessage"
+    # The type store of ROS 1 lacks this message.
     if transforms not in store.fielddefs:
         store.register(
             get_types_from_msg("geometry_msgs/TransformStamped[] transforms", transforms)
@@ -270,9 +272,11 @@ class _Maker:
         self.types, self.stamp, self.numbering = types, stamp, numbering
 
     def header(self, frame: str) -> Any:
+        """A header with the time."""
         return self.types["std_msgs/msg/Header"](stamp=self.stamp, frame_id=frame, **self.numbering)
 
     def transform(self, parent: str, child: str, pose: Pose) -> Any:
+        """A TFMessage with one transform."""
         geometry = "geometry_msgs/msg/"
         move = self.types[geometry + "Transform"](
             translation=self.vector(pose[0], pose[1]), rotation=self.turned(pose[2])
@@ -283,7 +287,9 @@ class _Maker:
         return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
 
     def odometry(self, pose: Pose, covariance: NDArray[np.float64]) -> Any:
+        """An Odometry message with a covariance in the plane."""
         geometry, unknown = "geometry_msgs/msg/", np.zeros(36)
+        # ROS has six dimensions; only those of the plane are known.
         known = np.zeros((6, 6))
         known[np.ix_(PLANAR, PLANAR)] = covariance
         at = self.types[geometry + "Pose"](
@@ -301,6 +307,7 @@ class _Maker:
         )
 
     def scan(self, ranges: NDArray[np.float64], laser: Laser) -> Any:
+        """A LaserScan message."""
         return self.types["sensor_msgs/msg/LaserScan"](
             header=self.header(LASER),
             angle_min=laser.first,
@@ -315,9 +322,11 @@ class _Maker:
         )
 
     def vector(self, x: float, y: float) -> Any:
+        """A vector in the plane."""
         return self.types["geometry_msgs/msg/Vector3"](x=x, y=y, z=0.0)
 
     def turned(self, angle: float) -> Any:
+        """The quaternion of a rotation about z."""
         return self.types["geometry_msgs/msg/Quaternion"](
             x=0.0, y=0.0, z=math.sin(angle / 2), w=math.cos(angle / 2)
         )
