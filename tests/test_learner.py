@@ -35,7 +35,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import Step
 from ssh_abduction.data.errors import TraceError
-from ssh_abduction.evaluation.paper.claims import (
+from ssh_abduction.evaluation.paper.experiments import (
     EXPERIMENTS,
     Run,
     claims,

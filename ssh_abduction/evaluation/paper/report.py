@@ -24,7 +24,7 @@ from ssh_abduction.data import program
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.evaluation.paper import figures
-from ssh_abduction.evaluation.paper.claims import (
+from ssh_abduction.evaluation.paper.experiments import (
     EXPERIMENTS,
     VIEWS_ALONE,
     WITH_STARS,
