@@ -35,17 +35,17 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import Step
 from ssh_abduction.data.errors import TraceError
+from ssh_abduction.evaluation.paper.claim_table import claims, summary
 from ssh_abduction.evaluation.paper.experiments import (
     EXPERIMENTS,
+    FoundMaps,
     Run,
-    claims,
     measure,
     one_to_one,
-    outcome,
     rate,
-    summary,
     true_dstates,
 )
+from ssh_abduction.evaluation.paper.notches import outcome
 from ssh_abduction.learning.learner import (
     AmbiguousMapWarning,
     BootstrapLearner,
@@ -805,10 +805,11 @@ def test_a_summary_counts_the_seeds_in_which_a_claim_holds(measured: Run) -> Non
     bad = replace(
         good,
         seed=1,
-        k=5,
-        uncertainty={**good.uncertainty, 5: 0.9},
-        cost={"dstates": 9, "places": 4, "paths": 4},
-        right=False,
+        clustering=replace(
+            good.clustering, k=5, uncertainty={**good.clustering.uncertainty, 5: 0.9}
+        ),
+        by_views=FoundMaps({"dstates": 9, "places": 4, "paths": 4}, good.by_views.maps),
+        labelling=replace(good.labelling, right=False),
     )
     table = {row["claim"]: row for row in summary("notched-rectangle", [good, bad])}
     assert table["U at that k"]["holds"] == 1

@@ -1,4 +1,4 @@
-"""The figures of a reproduction, drawn from what was computed. Needs matplotlib (the extra `plot`)."""
+"""Draws figures with matplotlib (the extra `plot`): those of a reproduction, and of verbs."""
 
 from __future__ import annotations
 
@@ -19,25 +19,24 @@ from simulator.world import World
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.evaluation.paper.experiments import Outcome
+from ssh_abduction.evaluation.paper.notches import Outcome
 from ssh_abduction.output import plot
 
 BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"
 
 
 def require_matplotlib() -> None:
-    """Raises AbductionError where nothing can be drawn: to be asked before hours of work, not after."""
+    """Raise AbductionError if nothing can be drawn. Call it before hours of work, not after."""
     try:
         importlib.import_module("matplotlib")
     except ImportError:
         raise AbductionError(
             "plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'"
         ) from None
-    except (
-        Exception
-    ) as error:  # of its settings, such as MPLBACKEND, which it reads when it is loaded
+    except Exception as error:  # matplotlib reads settings such as MPLBACKEND when it is loaded
         raise AbductionError(
-            f"plot: expected matplotlib to load, got {type(error).__name__}: {error}; mend its settings"
+            f"plot: expected matplotlib to load, got {type(error).__name__}: {error}; "
+            "mend its settings"
         ) from None
 
 
@@ -99,9 +98,13 @@ def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None
 
 
 def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None:
-    """The entropy of each belief, and how probable it is that the robot is nowhere; steps at which it was lost or nowhere are shaded.
+    """The entropy of each belief, and the probability that the robot is nowhere.
 
-    beliefs  as `Belief.to_dict` gives them
+    Steps at which the robot was lost or nowhere are shaded.
+
+    Args:
+        path: The file to write.
+        beliefs: As `Belief.to_dict` gives them.
     """
     pyplot = _pyplot()
     figure, (upper, lower) = pyplot.subplots(
@@ -185,7 +188,14 @@ def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]])
 def draw_views(
     path: str | Path, images: NDArray[np.float64], views: NDArray[Any], truth: NDArray[Any]
 ) -> None:
-    """The images of each view on top of each other, as the robot sees them, and which dstates they are of."""
+    """The images of each view on top of each other, as the robot sees them.
+
+    Args:
+        path: The file to write.
+        images: Ranges in metres, (n, d).
+        views: The view of each image, (n,).
+        truth: The true dstate of each image, (n,), for the titles.
+    """
     names = sorted(set(views.tolist()))
     columns = min(5, len(names))
     rows = math.ceil(len(names) / columns)
@@ -218,10 +228,15 @@ def draw_telling(
     labels: NDArray[Any],
     found: Mapping[tuple[int, int], TellingFeatures],
 ) -> None:
-    """Which beams tell pairs of dstates apart: a row for each pair, a column for each method, over the median scan of each of the two.
+    """Which beams tell pairs of dstates apart, over the median scan of each of the two.
 
-    ranges  (n, d) metres, over the half circle ahead, the first at the right
-    labels  (n,) the dstate of each
+    Each pair has a row, and each method a column.
+
+    Args:
+        path: The file to write.
+        ranges: Ranges in metres, (n, d), over the half circle ahead, the first at the right.
+        labels: The dstate of each scan, (n,).
+        found: For each pair what tells it apart.
     """
     methods = list(next(iter(found.values())).methods)
     figure, grid = _pyplot().subplots(
@@ -258,7 +273,7 @@ def draw_telling(
 
 
 def draw_map(path: str | Path, ssh_map: SSHMap) -> None:
-    """Places, and paths as streets through them, where its dstates are or, without poses, in one layout of many."""
+    """Places, and paths as streets through them, at the poses of the map or in a layout."""
     _pyplot()
     figure = plot(ssh_map).figure
     _save(figure, path)
@@ -293,7 +308,13 @@ def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
 
 
 def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[float, float]) -> None:
-    """k, U, map and recognition rate over notch and spread. Frames mark where all is as in the paper; the cross is this world and robot."""
+    """k, U, map and recognition rate over notch and spread of poses.
+
+    Args:
+        path: The file to write.
+        outcomes: One for each notch and spread. Frames mark those where all is as in the paper.
+        here: The notch and the scale of this world and robot. A cross marks them.
+    """
     notches = sorted({o.notch for o in outcomes})
     scales = sorted({o.scale for o in outcomes})
     cell = {(o.notch, o.scale): o for o in outcomes}
@@ -362,5 +383,5 @@ def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[flo
 
 
 def as_in_paper(o: Outcome) -> bool:
-    """Four views, U = 1, the right map, and full recognition."""
+    """Whether there are four views, U = 1, the right map, and full recognition."""
     return o.k == 4 and o.uncertainty > 1 - 1e-9 and o.right and o.rate > 0.999

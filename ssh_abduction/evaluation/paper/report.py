@@ -1,4 +1,4 @@
-"""A reproduction as a folder: figures, one page, the data, and what made them."""
+"""Writes a reproduction of the paper as a folder: figures, a page, data, and what made them."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from ssh_abduction.data import program
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.evaluation.paper import figures
+from ssh_abduction.evaluation.paper.claim_table import summary
 from ssh_abduction.evaluation.paper.experiments import (
     EXPERIMENTS,
     VIEWS_ALONE,
     WITH_STARS,
-    Outcome,
     Run,
     measure,
-    outcome,
-    summary,
-    to_dict,
     true_dstates,
 )
+from ssh_abduction.evaluation.paper.notches import Outcome, outcome
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output import to_svg
 from ssh_abduction.solver import workers
 
-NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)  # metres
-SCALES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # times the spread that hill-climbing leaves
+# Depths of the notch in metres.
+NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)
+# Multiples of the spread of poses that hill-climbing leaves.
+SCALES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
 
 def reproduce(
@@ -53,24 +53,38 @@ def reproduce(
     on_done: Callable[[str], None] = lambda _: None,
     on_table: Callable[[list[dict[str, Any]]], None] = lambda _: None,
 ) -> list[dict[str, Any]]:
-    """Run an experiment for all seeds, and write everything into a folder. Returns the table of claims. Raises AbductionError.
+    """Run an experiment for all seeds, and write everything into a folder.
 
-    on_done   is told what was done, `steps` times
-    on_table  is given the table once all data is written, before anything is drawn: a picture that fails loses nothing
+    Args:
+        name: The name of the experiment.
+        seeds: The seeds of all noise.
+        folder: Where to write. It is made if it does not exist.
+        jobs: How many processes work at once; -1 for one a processor.
+        outcomes: Whether to run other notches and spreads of the notched rectangle.
+        on_done: Called with a sentence after each of the `steps`.
+        on_table: Called with the table once all data is written, before anything is drawn. So a
+            picture that fails loses nothing.
+
+    Returns:
+        The table of claims.
+
+    Raises:
+        AbductionError: There is no such experiment, no seed, or no matplotlib, or a process died.
     """
     if name not in EXPERIMENTS:
         raise AbductionError(f"experiment: expected one of {', '.join(EXPERIMENTS)}, got {name!r}")
     if not seeds:
         raise AbductionError("seeds: expected at least one, got none; write 0-19")
-    figures.require_matplotlib()
+    figures.require_matplotlib()  # now, and not after hours of work
     folder.mkdir(parents=True, exist_ok=True)
     runs: list[Run] = []
     for run in _each(measure, [(name, seed) for seed in seeds], jobs):
         runs.append(run)
         on_done(f"seed {run.seed}")
+    # The data comes first, the pictures last.
     table = summary(name, runs)
     _dump(folder / "claims.json", table)
-    _dump(folder / "runs.json", [to_dict(run) for run in runs])
+    _dump(folder / "runs.json", [asdict(run) for run in runs])
     _dump(folder / "configuration.json", _configuration(name, seeds, outcomes))
     found: list[Outcome] = []
     if outcomes and name == "notched-rectangle":
@@ -90,22 +104,27 @@ def reproduce(
 
 
 def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
-    """The results of `work` for these tasks, in their order, from as many processes as asked for. Raises what `work` raises, and KeyboardInterrupt."""
+    """The results of `work` for these tasks, in their order, from `jobs` processes.
+
+    Raises what `work` raises, and KeyboardInterrupt.
+    """
     processes = min(effective_n_jobs(jobs), len(tasks))
     if processes == 1:
         for task in tasks:
             result = work(*task)
-            if program.raised:  # a search that is interrupted ends with its best answer so far, and that is none for the paper's claims
+            # An interrupted search returns its best answer, which says nothing of the claims.
+            if program.raised:
                 raise KeyboardInterrupt
             yield result
         return
-    ready: dict[int, Any] = {}  # results whose turn has not come
+    ready: dict[int, Any] = {}  # results that wait for earlier ones
     turn = 0
     numbered = [(number, work, task) for number, task in enumerate(tasks)]
     for answer in workers.answers(_done, numbered, processes, lambda: False, None, 0.0):
         if isinstance(answer, workers.Lost):
             raise AbductionError(
-                "process: expected an answer, got killed, as happens when memory runs out; take fewer --jobs"
+                "process: expected an answer, got killed, as happens when memory runs out; "
+                "take fewer --jobs"
             )
         number, ready[number] = answer
         while turn in ready:
@@ -119,7 +138,7 @@ def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int)
 def _done(
     number: int, work: Callable[..., Any], task: tuple[Any, ...], _: Callable[[], bool]
 ) -> tuple[int, Any]:
-    """The result of `work`, or what it raised, in a process that does nothing else."""
+    """The result of `work`, or what it raised, in a process of its own."""
     try:
         return number, work(*task)
     except Exception as error:
@@ -127,15 +146,13 @@ def _done(
 
 
 def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:
-    """How often `on_done` will be called: for a progress bar."""
-    return (
-        len(seeds)
-        + 1
-        + (len(NOTCHES) * len(SCALES) if outcomes and name == "notched-rectangle" else 0)
-    )
+    """How often `on_done` will be called, for a progress bar."""
+    has_outcomes = outcomes and name == "notched-rectangle"
+    return len(seeds) + 1 + (len(NOTCHES) * len(SCALES) if has_outcomes else 0)
 
 
 def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> None:
+    """Draw the figures of one run."""
     e = EXPERIMENTS[name]
     world = World.named(e.world)
     trace = simulate(world, e.tours, run.seed)
@@ -143,7 +160,8 @@ def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> 
     learner = BootstrapLearner(VIEWS_ALONE).fit(trace)
     figures.draw_world(folder / "world.png", world, [step.truth["pose"] for step in trace.steps])
     figures.draw_views(folder / "views.png", images_of(trace), learner.views_, true_dstates(trace))
-    figures.draw_quality(folder / "quality.png", run.quality, run.uncertainty, run.k)
+    found = run.clustering
+    figures.draw_quality(folder / "quality.png", found.quality, found.uncertainty, found.k)
     figures.draw_learning(folder / "learning.png", {"labels from the map": run.curve})
     figures.draw_spread(folder / "spread.png", run.spread)
     starred = BootstrapLearner(WITH_STARS).fit(trace)
@@ -154,10 +172,12 @@ def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> 
 
 
 def _configuration(name: str, seeds: Sequence[int], outcomes: bool) -> dict[str, Any]:
+    """What makes the reproduction again."""
     packages = ("ssh-abduction", "clingo", "numpy", "scipy", "scikit-learn", "networkx")
     return {
         "experiment": name,
-        "command": f"ssh-abduction reproduce {name} --seeds {','.join(map(str, seeds))}{'' if outcomes else ' --no-outcomes'}",
+        "command": f"ssh-abduction reproduce {name} --seeds {','.join(map(str, seeds))}"
+        f"{'' if outcomes else ' --no-outcomes'}",
         **asdict(EXPERIMENTS[name]),
         "seeds": list(seeds),
         "laser": asdict(Laser()),
@@ -173,16 +193,21 @@ def _dump(path: Path, value: Any) -> None:
     write_file(path, f"{json.dumps(value, indent=1, ensure_ascii=False)}\n".encode())
 
 
-# What of an experiment is not as in the paper, or not known to be. The pages of the paper were not at hand, only its text.
+# How the experiments differ from the paper's. Only its text was at hand, not its pages.
 DIFFERENCES = {
     "notched-rectangle": (
-        "The notch: the paper's room has its notch at a corner; here it is a recess in a wall, 1.2 m wide and 3 cm deep. Notches at a corner are in docs/reproduction.md.",
-        "The room: 4 m by 2 m, with the robot 0.6 m from the walls, is a choice of ours. In a room a tenth longer and wider M chooses another k.",
-        "The images: each is the median of nine scans, beam by beam. With single scans, lost beams among them, M chooses another k.",
+        "The notch: the paper's room has its notch at a corner; here it is a recess in a wall, "
+        "1.2 m wide and 3 cm deep. Notches at a corner are in docs/reproduction.md.",
+        "The room: 4 m by 2 m, with the robot 0.6 m from the walls, is a choice of ours. In a room "
+        "a tenth longer and wider M chooses another k.",
+        "The images: each is the median of nine scans, beam by beam. With single scans, lost beams "
+        "among them, M chooses another k.",
         "As in the paper: 50 circuits of 8 dstates, 400 images.",
     ),
     "taylor-hall": (
-        "The hallway: its shape is drawn in the paper and not told. Here a main street of four places has three dead ends to one side; counts of dstates, places and paths are the paper's.",
+        "The hallway: its shape is drawn in the paper and not told. Here a main street of four "
+        "places has three dead ends to one side; counts of dstates, places and paths are the "
+        "paper's.",
         "The clutter, and all lengths, are choices of ours.",
         "The images: each is the median of nine scans, beam by beam.",
         "As in the paper: 10 tours of 24 images at 20 dstates, 240 images.",
@@ -193,11 +218,13 @@ FIGURES = {
     "notched-rectangle": [
         (
             "world.png",
-            "Figure 2: the notched rectangle. Walls, true dstates (arrows) and where images were taken.",
+            "Figure 2: the notched rectangle. Walls, true dstates (arrows) and where images were "
+            "taken.",
         ),
         (
             "views.png",
-            "Ours: the views. Images of each cluster on top of each other, the robot at the triangle, facing up.",
+            "Ours: the views. Images of each cluster on top of each other, the robot at the "
+            "triangle, facing up.",
         ),
         ("quality.png", "Figure 3: M and U against the number of clusters."),
         ("map.svg", "Ours: the minimal map, from the views alone."),
@@ -207,27 +234,32 @@ FIGURES = {
         ),
         (
             "spread.png",
-            "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by tour.",
+            "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by "
+            "tour.",
         ),
         (
             "outcomes.png",
-            "Ours: where the method works. Frames: all as in the paper (4 views, U = 1, right map, full recognition). Cross: this robot.",
+            "Ours: where the method works. Frames: all as in the paper (4 views, U = 1, right map, "
+            "full recognition). Cross: this robot.",
         ),
     ],
     "taylor-hall": [
         (
             "world.png",
-            "Figure 5: the hallway. Walls, clutter (orange), true dstates (arrows) and where images were taken.",
+            "Figure 5: the hallway. Walls, clutter (orange), true dstates (arrows) and where "
+            "images were taken.",
         ),
         (
             "views.png",
-            "Ours: the views. Images of each cluster on top of each other, the robot at the triangle, facing up.",
+            "Ours: the views. Images of each cluster on top of each other, the robot at the "
+            "triangle, facing up.",
         ),
         ("quality.png", "Figure 6, left: M and U against the number of clusters."),
         ("map.svg", "Ours: the minimal map, from the views alone."),
         (
             "map-with-openings.svg",
-            "Ours: the minimal map when the openings that the robot saw at each place are used too.",
+            "Ours: the minimal map when the openings that the robot saw at each place are used "
+            "too.",
         ),
         (
             "learning.png",
@@ -235,20 +267,24 @@ FIGURES = {
         ),
         (
             "spread.png",
-            "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by tour.",
+            "Ours: errors do not add up. The largest offset from a dstate's mean pose, tour by "
+            "tour.",
         ),
     ],
 }
 
 
 def _page(name: str, runs: Sequence[Run], table: Sequence[dict[str, Any]], folder: Path) -> str:
+    """The page, with the figures that are in the folder."""
     rows = "\n".join(
-        f"<tr class='{'ours' if row['ours'] else 'paper'}'><td>{escape(claimed(row))}</td><td>{escape(row['paper'])}</td><td>{escape(spread_of(row))}</td>"
+        f"<tr class='{'ours' if row['ours'] else 'paper'}'><td>{escape(claimed(row))}</td>"
+        f"<td>{escape(row['paper'])}</td><td>{escape(spread_of(row))}</td>"
         f"<td>{row['holds']} of {row['seeds']}</td></tr>"
         for row in table
     )
     shown = "\n".join(
-        f'<figure><img src="{file}" alt="{escape(text)}"><figcaption>{escape(text)}</figcaption></figure>'
+        f'<figure><img src="{file}" alt="{escape(text)}">'
+        f"<figcaption>{escape(text)}</figcaption></figure>"
         for file, text in FIGURES[name]
         if (folder / file).exists()
     )
@@ -256,14 +292,23 @@ def _page(name: str, runs: Sequence[Run], table: Sequence[dict[str, Any]], folde
     title = World.named(EXPERIMENTS[name].world).name
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>Bootstrap learning: {escape(title)}</title>
-<style>body{{font:15px/1.5 Helvetica,Arial,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:#222}}
-table{{border-collapse:collapse}}td,th{{padding:.25em .8em;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}}
+<style>
+body{{font:15px/1.5 Helvetica,Arial,sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}
+body{{color:#222}}
+table{{border-collapse:collapse}}
+td,th{{padding:.25em .8em;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}}
 .ours td{{color:#555;font-style:italic}}
-figure{{display:inline-block;margin:1em 1em 1em 0;vertical-align:top;max-width:28em}}img{{max-width:100%}}figcaption{{font-size:13px;color:#555}}</style></head>
+figure{{display:inline-block;margin:1em 1em 1em 0;vertical-align:top;max-width:28em}}
+img{{max-width:100%}}
+figcaption{{font-size:13px;color:#555}}
+</style></head>
 <body><h1>{escape(title)}: claim, paper, here</h1>
-<p>Kuipers &amp; Beeson, “Bootstrap Learning for Place Recognition”, AAAI 2002. {len(runs)} seeds; figures are of seed {runs[0].seed}.
+<p>Kuipers &amp; Beeson, “Bootstrap Learning for Place Recognition”, AAAI 2002. {len(runs)} seeds;
+figures are of seed {runs[0].seed}.
 The world, the robot and its laser were fixed before the seeds were run, on other seeds.
-Figures have the paper's numbers, by the order of its text, as its pages were not at hand; figures and rows of our own are marked as ours: the paper does not have them. All can be made again: <code>configuration.json</code> says with what.</p>
+Figures have the paper's numbers, by the order of its text, as its pages were not at hand.
+Figures and rows that the paper does not have are marked as ours.
+All can be made again: <code>configuration.json</code> says with what.</p>
 <table><tr><th>claim</th><th>paper</th><th>here</th><th>holds in seeds</th></tr>
 {rows}
 </table>
@@ -282,7 +327,7 @@ def claimed(row: dict[str, Any]) -> str:
 
 
 def spread_of(row: dict[str, Any]) -> str:
-    """Our figure: one text where the seeds agree, else the commonest texts."""
+    """What came out: one text where the seeds agree, else the commonest texts."""
     values = list(row["here"].values())
     counted = sorted(set(values), key=values.count, reverse=True)
     if len(counted) == 1:
