@@ -71,7 +71,7 @@ def driven(plans: Path, seeds: int, runs: Path) -> Iterator[Path]:
                 "ssh_abduction",
                 "simulate",
                 str(plan),
-                "--as",
+                "--format",
                 "carmen",
                 "--seed",
                 str(seed),
@@ -102,7 +102,8 @@ def by_map(log: Path, runs: Path) -> Events:
             str(log),
             "-o",
             str(folder),
-            "--no-ladder",
+            "--set",
+            "ladder=false",
         ]
         done = subprocess.run(
             command, check=False, capture_output=True

@@ -6,7 +6,7 @@
     python benchmarks/truth.py --family taylor-hall [--seeds 20] [--stars]
 
 A map is true if its labels are the true dstates up to renaming, and its places the true places. Flags of the noise are the fields of Odometry: the noise that is drawn, and that the trace
-says it has; in Taylor Hall the robot has its own. `--scale-error` and `--bend-error` add errors that repeat. With `--displacement none` the solver is not told of
+says it has; in Taylor Hall the robot has its own. `--scale-error` and `--bend-error` add errors that repeat. With `--set displacement=none` the solver is not told of
 displacements. Seeds begin at `--first`. A row for each trace, and the sum below.
 """
 

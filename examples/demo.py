@@ -32,7 +32,9 @@ def main() -> None:
     print(f"\nmap 1 is drawn in {picture}")
     print("\na simulated robot drives through a house with doors, and its log is mapped")
     log = folder / "house.log"
-    main_of_the_shell(["simulate", "doors", "--as", "carmen", "--every", "0.5", "-o", str(log)])
+    main_of_the_shell(
+        ["simulate", "doors", "--format", "carmen", "--set", "every=0.5", "-o", str(log)]
+    )
     main_of_the_shell(["map", str(log), "-o", str(folder / "house"), "--again"])
     print(f"look at {folder / 'house' / 'report.html'}")
 

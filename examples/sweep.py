@@ -37,12 +37,12 @@ THEORIES = {
     "as it suits": [],
     "stars and sides": ["--theory", "topological"],
     "no stars": ["--theory", "topological", "--star", "none"],
-    "no sides": ["--theory", "topological", "--boundary", "none"],
-    "no stars, no sides": ["--star", "none", "--boundary", "none"],
-    "planar": ["--planar"],
-    "next place": ["--next-place"],
-    "one return at a time": ["--joint", "1"],
-    "paths first": ["--prefer", "dstates,paths,places"],
+    "no sides": ["--theory", "topological", "--set", "boundary=none"],
+    "no stars, no sides": ["--star", "none", "--set", "boundary=none"],
+    "planar": ["--set", "planar=true"],
+    "next place": ["--set", "next_place=true"],
+    "one return at a time": ["--set", "joint=1"],
+    "paths first": ["--set", "prefer=dstates,paths,places"],
 }
 
 
@@ -113,7 +113,7 @@ def drive(world: str, seed: int, folder: Path) -> Path:
     log = folder / "logs" / f"{Path(world).name.partition('.')[0]}-{seed}.log"
     if not log.exists():
         log.parent.mkdir(parents=True, exist_ok=True)
-        shell(["simulate", world, "--as", "carmen", "--seed", str(seed), "-o", str(log), "-q"])
+        shell(["simulate", world, "--format", "carmen", "--seed", str(seed), "-o", str(log), "-q"])
     return log
 
 

@@ -68,7 +68,7 @@ class Odometer:
         """Scale the noise to `along`, keeping its proportions. Raises SimulatorError."""
         if not is_finite(along) or not 0 <= along <= WORST:
             raise SimulatorError(
-                f"--odometry-noise: expected a number from 0 to {WORST:g}, got "
+                f"odometry_noise: expected a number from 0 to {WORST:g}, got "
                 f"{brief(along)}; with 1 the robot is a metre off after one metre"
             )
         usual = Odometer()

@@ -90,7 +90,7 @@ def simulate(
     if world.by_places:
         raise SimulatorError(
             f"{world.name}: route: expected actions, got places, to which a robot drives that "
-            "logs scans all along; write --as carmen, or give a route of actions"
+            "logs scans all along; write --format carmen, or give a route of actions"
         )
     driver = _driver(world, tours, seed, laser, body, tolerance)
     body, tolerance = driver.robot.body, driver.tolerance

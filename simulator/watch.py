@@ -155,7 +155,7 @@ class Watch:
         if world.own_reach is not None and world.own_reach != world.reach:
             yield (
                 f"reach is {world.reach:g} m, and the world's own is {world.own_reach:g} m (leave "
-                "--reach out)"
+                "--set reach out)"
             )
         elif (half := self._half_width(before)) and not (
             0.6 * half if world.angles == "any" else 0.0
@@ -170,7 +170,7 @@ class Watch:
                 '"angles": "any")'
             )
         for what, value, mend in (
-            ("the odometry errs", body.odometry, "give less --odometry-noise"),
+            ("the odometry errs", body.odometry, "give less --set odometry_noise"),
             ("a motion errs", body.slip, "give the body less slip"),
         ):
             if value > NOISY:
@@ -178,7 +178,7 @@ class Watch:
         if abs(body.bend) > math.radians(2):
             yield (
                 f"the odometry bends by {math.degrees(body.bend):.1f} degrees in each metre (give "
-                "less --bend-error)"
+                "less --set bend_error)"
             )
         if self.driver.laser.noise > BLURRED:
             noise = 100 * self.driver.laser.noise

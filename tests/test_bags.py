@@ -500,10 +500,10 @@ def test_import_takes_several_topics(tmp_path: Path, capsys: pytest.CaptureFixtu
             [
                 "import",
                 str(path),
-                "--scan-topic",
-                "/front",
-                "--scan-topic",
-                "/none",
+                "--set",
+                "scan_topic=/front",
+                "--set",
+                "scan_topic=/none",
                 "-o",
                 str(tmp_path / "t"),
             ]
@@ -516,10 +516,10 @@ def test_import_takes_several_topics(tmp_path: Path, capsys: pytest.CaptureFixtu
             [
                 "import",
                 str(path),
-                "--scan-topic",
-                "/front",
-                "--scan-topic",
-                "/rear",
+                "--set",
+                "scan_topic=/front",
+                "--set",
+                "scan_topic=/rear",
                 "-o",
                 str(tmp_path / "t"),
             ]

@@ -31,12 +31,12 @@ from ssh_abduction.theory import Speedups
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ENDLESS = [
-    "--boundary",
-    "none",
-    "--path-order",
-    "partial",
-    "--prefer",
-    "",
+    "--set",
+    "boundary=none",
+    "--set",
+    "path_order=partial",
+    "--set",
+    "prefer=",
     "-n",
     "0",
 ]  # a theory in which slow.jsonl has maps without end
@@ -170,7 +170,7 @@ def test_json_lines_are_the_single_objects(
     assert (broken["trace"], broken["status"]) == ("broken.jsonl", "error")
     assert broken["error"].startswith("broken.jsonl:2: line: expected one JSON object")
     (traces / "maps.json").write_text(json.dumps(lines[2]))
-    assert main(["check", "quick.jsonl", "maps.json"]) == 0  # a line is what the other verbs read
+    assert main(["check", "maps.json", "quick.jsonl"]) == 0  # a line is what the other verbs read
 
 
 def test_everywhere_the_same(
@@ -220,7 +220,7 @@ def test_wrong_choices_are_one_line(
         (["quick.jsonl", "-"], r"-: expected files .* got standard input; save it to a file"),
         (["-", "--jobs", "2"], r"-: expected files .* got standard input; save it to a file"),
         (
-            [*both, "--theory", "causal", "--boundary", "strict"],
+            [*both, "--theory", "causal", "--set", "boundary=strict"],
             r"boundary: expected none with level=causal.*",
         ),
         (
@@ -353,7 +353,17 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
     monkeypatch.setattr(mapping, "MapQuestion", KilledOnce)
     assert (
         main(
-            ["simulate", "notched-rectangle", "--as", "carmen", "--every", "0.5", "-q", "-o", quick]
+            [
+                "simulate",
+                "notched-rectangle",
+                "--format",
+                "carmen",
+                "--set",
+                "every=0.5",
+                "-q",
+                "-o",
+                quick,
+            ]
         )
         == 0
     )
@@ -364,7 +374,8 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
         deadly,
         "-o",
         str(tmp_path / "runs"),
-        "--no-ladder",
+        "--set",
+        "ladder=false",
         "--time-limit",
         "1000",
         "--scheduler",

@@ -37,16 +37,16 @@ CHOICES = [
     "",
     "-n 2",
     "--time-limit 1e-9",
-    "--time-limit 1e-9 --without-speedups greedy",
+    "--time-limit 1e-9 --set without_speedups=greedy",
     "--theory circumscriptive",
     "--theory causal",
-    "--boundary none --path-order partial --prefer paths,places,dstates",
-    "--boundary defeasible",
-    "--boundary defeasible --prefer dstates,excuses",
-    "--prefer places",
-    "--prefer= -n 3",
-    "--without on_path -n 3",
-    "--without path_order_total,order_asymmetric --prefer paths -n 3",
+    "--set boundary=none --set path_order=partial --set prefer=paths,places,dstates",
+    "--set boundary=defeasible",
+    "--set boundary=defeasible --set prefer=dstates,excuses",
+    "--set prefer=places",
+    "--set prefer= -n 3",
+    "--set without=on_path -n 3",
+    "--set without=path_order_total,order_asymmetric --set prefer=paths -n 3",
 ]
 
 
@@ -230,7 +230,7 @@ def test_maps_that_are_not_equally_good_are_named(
 ) -> None:
     path = str(tmp_path / "trace.jsonl")
     rectangle(24).save(path)
-    data = answer(path, capsys, "--boundary", "none")
+    data = answer(path, capsys, "--set", "boundary=none")
     worse = answer(path, capsys)["maps"][0]
     data["maps"].append(worse)
     data["count"] += 1

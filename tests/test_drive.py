@@ -329,7 +329,7 @@ def test_a_route_of_places_that_cannot_be_driven(tmp_path: Path) -> None:
     ):
         record(World.load(tmp_path / "world.json"))
     with pytest.raises(
-        SimulatorError, match=r"route: expected actions, got places, .*; write --as carmen"
+        SimulatorError, match=r"route: expected actions, got places, .*; write --format carmen"
     ):
         simulate(World.load(tmp_path / "world.json"))
 
@@ -428,12 +428,12 @@ def test_simulate_writes_logs_that_can_be_read(
             [
                 "simulate",
                 str(tmp_path / "school.xml"),
-                "--as",
+                "--format",
                 "carmen",
-                "--scale-error",
-                "0.1",
-                "--every",
-                "2",
+                "--set",
+                "scale_error=0.1",
+                "--set",
+                "every=2",
                 "-o",
                 str(tmp_path / "run.log.gz"),
             ]
@@ -456,7 +456,7 @@ def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
     """The covariance of the pose grows from zero, as the odometer has it."""
     rosbags = pytest.importorskip("rosbags.highlevel")
     bag = tmp_path / "run.bag"
-    assert main(["simulate", "triangle", "--route", "A,B", "--as", "bag", "-o", str(bag)]) == 0
+    assert main(["simulate", "triangle", "--route", "A,B", "--format", "bag", "-o", str(bag)]) == 0
     log = read_log(bag)
     with rosbags.AnyReader([bag], default_typestore=None) as reader:
         messages = [
@@ -476,24 +476,33 @@ def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["school.xml"], "school.xml: expected --as carmen or --as bag beside a floor plan"),
         (
-            ["school.xml", "--as", "carmen", "--reach", "1"],
+            ["school.xml"],
+            "school.xml: expected --format carmen or --format bag beside a floor plan",
+        ),
+        (
+            ["school.xml", "--format", "carmen", "--set", "reach=1"],
             "--reach: expected none beside a floor plan",
         ),
-        (["triangle", "--as", "carmen", "--no-stars"], "--no-stars: expected none beside --as"),
         (
-            ["triangle", "--as", "carmen", "--images", "panoramas"],
-            "--images panoramas: expected none beside --as",
+            ["triangle", "--format", "carmen", "--set", "stars=false"],
+            "stars=false: expected none beside --format",
         ),
-        (["triangle", "--as", "carmen", "--hours", "7,19"], "--hours: expected none beside --as"),
         (
-            ["triangle", "--as", "carmen", "--every", "0"],
+            ["triangle", "--format", "carmen", "--images", "panoramas"],
+            "--images panoramas: expected none beside --format",
+        ),
+        (
+            ["triangle", "--format", "carmen", "--set", "hours=7,19"],
+            "hours: expected none beside --format",
+        ),
+        (
+            ["triangle", "--format", "carmen", "--set", "every=0"],
             "every: expected metres, 0.01 or more, got 0",
         ),
         (
-            ["triangle", "--as", "carmen", "--odometry-noise", "nan"],
-            "--odometry-noise: expected a number from 0 to 1, got nan",
+            ["triangle", "--format", "carmen", "--set", "odometry_noise=nan"],
+            "odometry_noise: expected a number from 0 to 1, got nan",
         ),
     ],
 )

@@ -92,7 +92,7 @@ def test_a_range_that_repeats_is_no_return(
     scans, notes = understood(written(drive, say, reach), Told())
     assert len(notes) == 1
     assert re.search(
-        r"Ranges of \d\.?\d* m repeat in \d+ % of the beams, and hardly any are longer.*--no-return",
+        r"Ranges of \d\.?\d* m repeat in \d+ % of the beams, and hardly any are longer.*--set no_return",
         notes[0],
     )
     for scan, true in zip(scans, drive, strict=True):
@@ -140,7 +140,7 @@ def test_a_reach_of_nothing_is_that_of_the_largest_range(drive: tuple[Scan, ...]
 @pytest.mark.parametrize("value", [0.0, math.nan, -1.0, 0.05])
 def test_zeros_beside_long_beams_are_free(drive: tuple[Scan, ...], value: float) -> None:
     scans, notes = understood(written(drive, constant(value), nearest=0.1), Told())
-    assert re.search(r"\d+ % of the beams are .*nothing came back.*--zero-is unknown", notes[0])
+    assert re.search(r"\d+ % of the beams are .*nothing came back.*--set zero_is=unknown", notes[0])
     for scan, true in zip(scans, drive, strict=True):
         assert np.array_equal(np.isinf(scan.ranges), true.ranges > SEES)
 
@@ -153,7 +153,7 @@ def test_zeros_at_random_are_unknown(drive: tuple[Scan, ...], value: float) -> N
         Told(),
     )
     (note,) = (note for note in notes if "of the beams are" in note)
-    assert re.search(r"\d+ % of the beams are .*nothing is known there.*--zero-is free", note)
+    assert re.search(r"\d+ % of the beams are .*nothing is known there.*--set zero_is=free", note)
     assert all(np.isnan(scan.ranges).any() for scan in scans)
 
 
@@ -228,7 +228,7 @@ def test_a_laser_that_hangs_upside_down_is_said(drive: tuple[Scan, ...]) -> None
 def test_a_wrong_mount_is_said_with_the_likely_one(drive: tuple[Scan, ...], angle: float) -> None:
     """The laser truly looks ahead."""
     said = doubt(tuple(Told(mount=(0, 0, angle)).placed(scan) for scan in drive))
-    (looks,) = map(float, re.findall(r"--mount=0,0,(-?\d+)\)", said))
+    (looks,) = map(float, re.findall(r"--set mount=0,0,(-?\d+)\)", said))
     assert abs(looks) <= 10
 
 
@@ -249,7 +249,7 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
     out = [
         "-o",
         str(tmp_path / "out"),
-        *(["--no-ladder", "--time-limit", "5"] if verb == "map" else []),
+        *(["--set", "ladder=false", "--time-limit", "5"] if verb == "map" else []),
     ]
     main([verb, str(path), *out])
     said = capsys.readouterr().err
@@ -273,11 +273,11 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
                 *out,
                 "--fov",
                 "180",
-                "--no-return",
-                "5",
-                "--mount=0,0,0",
-                "--zero-is",
-                "unknown",
+                "--set",
+                "no_return=5",
+                "--set=mount=0,0,0",
+                "--set",
+                "zero_is=unknown",
             ]
         )
         said = capsys.readouterr().err
@@ -313,10 +313,10 @@ def test_a_field_of_view_that_a_log_does_not_say_is_noted(
     [
         ["--fov", "0"],
         ["--fov", "x"],
-        ["--mount", "1,2"],
-        ["--no-return", "-1"],
-        ["--zero-is", "wall"],
-        ["--mount=1,2,nan"],
+        ["--set", "mount=1,2"],
+        ["--set", "no_return=-1"],
+        ["--set", "zero_is=wall"],
+        ["--set=mount=1,2,nan"],
     ],
 )
 def test_nonsense_in_the_shell_is_refused(

@@ -266,6 +266,11 @@ def test_maps_without_poses_have_a_layout(to: str, level: str) -> None:
         with pytest.raises(MapError, match="DOT has a node a dstate"):
             export_map(ssh_map, to, level=level)
         return
+    if to == "svg":
+        with pytest.raises(MapError, match="level: expected none for svg"):
+            export_map(ssh_map, to, level=level)
+        assert export_map(ssh_map, to).startswith("<svg")
+        return
     text = export_map(ssh_map, to, level=level)
     count = 4 if level == "places" else len(ssh_map.dstates)
     if to == "nav2":
@@ -348,7 +353,7 @@ def test_the_command_writes_what_python_makes(
     assert len(nodes) == 4
     assert capsys.readouterr().err == ""
     solve(rectangle(8)).maps[0].save(file)
-    assert main(["export", file, "--to", "tmap2", "--name", "hall"]) == 0
+    assert main(["export", file, "--to", "tmap2", "--set", "name=hall"]) == 0
     printed = capsys.readouterr()
     assert checked_tmap2(printed.out)["pointset"] == "hall"
     assert "positions are of a layout" in printed.err

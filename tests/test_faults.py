@@ -355,7 +355,7 @@ def test_in_the_shell(
         {"step": 9, "kind": "misread", "seen": "v0", "expected": "v1", "cost": 1.5}
     ]
     assert answer["cost"]["faults"] == 1.5
-    assert main(["check", "trace.jsonl", "maps.json"]) == 0
+    assert main(["check", "maps.json", "trace.jsonl"]) == 0
     assert main(["check", "--bound", "trace.jsonl", "maps.json"]) == 1
     assert "bound: expected a theory without faults" in capsys.readouterr().err
 

@@ -39,7 +39,7 @@ ANSWER = {
     "evaluate",
     "recognise",
     "simulate",
-    "localize",
+    "localise",
 }
 
 WORLD = {
@@ -69,15 +69,15 @@ COMMANDS: dict[str, list[str]] = {
         "facts FILE",
         "check FILE maps.json",
         "check FILE maps.json --bound",
-        "localize maps.json FILE",
+        "localise maps.json FILE",
     ],
     "imaged.jsonl": [
         "cluster FILE -o out --k 2",
         "evaluate imaged-maps.json FILE",
         "train FILE imaged-maps.json -o out",
-        "learning-curve FILE imaged-maps.json --folds 2",
+        "learning-curve FILE imaged-maps.json --set folds=2",
         "recognise recogniser.skops FILE",
-        "localize imaged-maps.json FILE --recogniser recogniser.skops",
+        "localise imaged-maps.json FILE --recogniser recogniser.skops",
     ],
     "indexed.jsonl": ["recognise recogniser.skops FILE", "cluster FILE -o - --k 2"],
     "images.npz": [
@@ -86,35 +86,39 @@ COMMANDS: dict[str, list[str]] = {
     ],
     "images.npy": [
         "recognise recogniser.skops npy.jsonl",
-        "train npy.jsonl imaged-maps.json -o out",
+        "train imaged-maps.json npy.jsonl -o out",
     ],
     "maps.json": [
         "show FILE",
         "show FILE --map 1",
-        "show FILE --dot",
+        "export FILE --to dot",
         "show FILE --svg",
-        "show FILE --graphml",
+        "export FILE --to graphml",
     ]
     + 2
     * [
-        "check trace.jsonl FILE",
-        "check trace.jsonl FILE --bound",
-        "localize FILE trace.jsonl --trace trace.jsonl --json",
+        "check FILE trace.jsonl",
+        "check FILE trace.jsonl --bound",
+        "localise FILE trace.jsonl --trace trace.jsonl --json",
     ],
     "imaged-maps.json": [
         "train imaged.jsonl FILE -o out",
         "evaluate FILE imaged.jsonl --json",
-        "learning-curve imaged.jsonl FILE --folds 2 --json",
+        "learning-curve FILE imaged.jsonl --set folds=2 --json",
         "train imaged.jsonl FILE -o out --map 1",
     ],
-    "world.json": ["simulate FILE -o out --no-stars"],
-    "map.yaml": ["simulate FILE -o out --start=1.5,1.5,0 --route right --reach 0.6 --no-stars"],
-    "map.pgm": ["simulate map.yaml -o out --start=1.5,1.5,0 --route right --reach 0.6 --no-stars"],
+    "world.json": ["simulate FILE -o out --set stars=false"],
+    "map.yaml": [
+        "simulate FILE -o out --set start=1.5,1.5,0 --route right --set reach=0.6 --set stars=false"
+    ],
+    "map.pgm": [
+        "simulate map.yaml -o out --set start=1.5,1.5,0 --route right --set reach=0.6 --set stars=false"
+    ],
     "recogniser.skops": 2
     * [
         "recognise FILE imaged.jsonl",
         "recognise FILE imaged.jsonl --json",
-        "localize imaged-maps.json imaged.jsonl --recogniser FILE --json",
+        "localise imaged-maps.json imaged.jsonl --recogniser FILE --json",
     ],
 }
 
@@ -251,7 +255,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             code, out, _ = run(f"solve {trace}.jsonl --json {choice}")
             assert code == 0
             Path(f"{maps}.json").write_text(out)
-        assert run("train imaged.jsonl imaged-maps.json -o recogniser.skops")[0] == 0
+        assert run("train imaged-maps.json imaged.jsonl -o recogniser.skops")[0] == 0
     return folder
 
 

@@ -466,7 +466,7 @@ def test_maps_with_headings_in_degrees_survive_files(
     tour.trace.save(tmp_path / "t.jsonl")
     assert main(["solve", str(tmp_path / "t.jsonl"), "--json"]) == 0
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)
-    assert main(["check", str(tmp_path / "t.jsonl"), str(tmp_path / "maps.json")]) == 0
+    assert main(["check", str(tmp_path / "maps.json"), str(tmp_path / "t.jsonl")]) == 0
     assert main(["show", str(tmp_path / "maps.json"), "--svg", str(tmp_path / "map.svg")]) == 0
     (ssh_map,) = maps_of(read_json(tmp_path / "maps.json"), "maps.json")
     assert {s.heading for s in ssh_map.dstates} == {0, 120, 240}

@@ -302,23 +302,23 @@ def test_the_shell_tells_what_tells_dstates_apart(
     learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)).fit(run)
     run.with_views(learner.views_.tolist()).save(views)
     maps.write_text(json.dumps(learner.map_.to_dict()))
-    assert main(["tell-apart", str(views), str(maps), "--plot", str(tmp_path / "beams.png")]) == 0
+    assert main(["tell-apart", str(maps), str(views), "--plot", str(tmp_path / "beams.png")]) == 0
     out = capsys.readouterr().out.splitlines()
     assert [line.split()[:3] for line in out[1:]] == [
         [f"{i},", str(i + 4), "1.000"] for i in range(4)
     ]
     assert (tmp_path / "beams.png").read_bytes().startswith(b"\x89PNG")
-    assert main(["tell-apart", str(views), str(maps), "--dstates", "0,1", "--json"]) == 0
+    assert main(["tell-apart", str(maps), str(views), "--dstates", "0,1", "--json"]) == 0
     (told,) = json.loads(capsys.readouterr().out)
     assert (told["dstates"], len(told["margin"]), sum(told["linear"])) == (
         [0, 1],
         180,
         pytest.approx(1),
     )
-    assert main(["tell-apart", str(views), str(maps), "--dstates", "0,99"]) == 1
+    assert main(["tell-apart", str(maps), str(views), "--dstates", "0,99"]) == 1
     assert "expected at least two images of 99, got 0" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        main(["tell-apart", str(views), str(maps), "--dstates", "0"])
+        main(["tell-apart", str(maps), str(views), "--dstates", "0"])
     assert "expected two dstates with a comma between them" in capsys.readouterr().err
 
 
@@ -367,7 +367,7 @@ def test_the_shell_says_it_too(
     said = "ssh-abduction: warning: 2 views may be too few: 4 also separate the images well, and give another map, of 8 dstates instead of 6"
     run, views = str(tmp_path / "run.jsonl"), str(tmp_path / "views.jsonl")
     large_room.save(run)
-    assert main(["cluster", run, "-o", views, "--k-max", "6"]) == 0
+    assert main(["cluster", run, "-o", views, "--set", "k_max=6"]) == 0
     clustered = capsys.readouterr()
     assert clustered.err.startswith(said)
     marks = [line.split()[3:] for line in clustered.out.splitlines()[1:4]]
@@ -597,8 +597,8 @@ def test_from_simulation_to_recognition_in_the_shell(
                 path("run.jsonl"),
                 "-o",
                 path("views.jsonl"),
-                "--k-max",
-                "8",
+                "--set",
+                "k_max=8",
                 "--plot",
                 path("fig.png"),
             ]
@@ -612,7 +612,7 @@ def test_from_simulation_to_recognition_in_the_shell(
     assert main(["solve", path("views.jsonl"), "--json"]) == 0
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)
     assert (
-        main(["train", path("views.jsonl"), path("maps.json"), "-o", path("recogniser.skops")]) == 0
+        main(["train", path("maps.json"), path("views.jsonl"), "-o", path("recogniser.skops")]) == 0
     )
     assert "8 dstates learnt from 80 images" in capsys.readouterr().out
     assert main(["evaluate", path("maps.json"), path("views.jsonl")]) == 0
@@ -624,8 +624,8 @@ def test_from_simulation_to_recognition_in_the_shell(
         main(
             [
                 "learning-curve",
-                path("views.jsonl"),
                 path("maps.json"),
+                path("views.jsonl"),
                 "--json",
                 "--plot",
                 path("curve.png"),
@@ -636,7 +636,7 @@ def test_from_simulation_to_recognition_in_the_shell(
     curve = json.loads(capsys.readouterr().out)
     assert curve["sizes"][-1] == 80
     assert curve["mean"][-1] > 0.8
-    assert main(["learning-curve", path("views.jsonl"), path("maps.json")]) == 0
+    assert main(["learning-curve", path("maps.json"), path("views.jsonl")]) == 0
     assert capsys.readouterr().out.splitlines()[0].split() == [
         "images",
         "recognised",
@@ -718,7 +718,7 @@ def test_errors_of_the_wings_are_one_line(
         (["cluster", str(trace), "-o", str(tmp_path / "x")], "image: expected one, got none"),
         (["cluster", str(one), "-o", str(tmp_path / "x")], "minimum of 2 is required"),
         (
-            ["train", str(trace), str(tmp_path / "maps.json"), "-o", str(tmp_path / "x")],
+            ["train", str(tmp_path / "maps.json"), str(trace), "-o", str(tmp_path / "x")],
             "expected labels for the 2 steps",
         ),
         (["recognise", str(tmp_path / "cut.skops"), str(trace)], "expected a .skops file"),
@@ -750,7 +750,8 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
         "500",
         "--jobs",
         "1",
-        "--no-outcomes",
+        "--set",
+        "outcomes=false",
         "-o",
         str(tmp_path),
     ]

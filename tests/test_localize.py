@@ -620,12 +620,12 @@ def files(tmp_path: Path) -> Path:
 def test_localize_in_the_shell(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     maps, other = str(files / "maps.json"), str(files / "other.jsonl")
     expected = [b.to_dict() for b in Localiser(SSHMap.load(maps)).beliefs(Trace.load(other))]
-    assert main(["localize", maps, other, "--json", "--plot", str(files / "beliefs.png")]) == 0
+    assert main(["localise", maps, other, "--json", "--plot", str(files / "beliefs.png")]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["beliefs"] == [{"step": i, **belief} for i, belief in enumerate(expected)]
     assert told["chances"] == {"misread": 0.01, "slipped": 0.01, "unmapped": 0.1, "reentered": 0.1}
     assert (files / "beliefs.png").read_bytes().startswith(b"\x89PNG")
-    assert main(["localize", maps, other]) == 0
+    assert main(["localise", maps, other]) == 0
     head, columns, *rows = capsys.readouterr().out.splitlines()
     assert "lost at step" in head
     assert "the belief collapsed at step 15" in head
@@ -643,14 +643,15 @@ def test_localize_in_the_shell(files: Path, capsys: pytest.CaptureFixture[str]) 
     assert (
         main(
             [
-                "localize",
+                "localise",
                 maps,
                 other,
                 "--trace",
                 str(files / "mapped.jsonl"),
-                "--zero-one",
-                "--misread",
-                "0.2",
+                "--set",
+                "zero_one=true",
+                "--set",
+                "misread=0.2",
                 "--json",
             ]
         )
@@ -670,12 +671,12 @@ def test_localize_takes_one_of_several_maps_and_says_so(
     )
     other = (files / "other.jsonl").read_bytes()
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(other)))
-    assert main(["localize", str(several), "-"]) == 0
+    assert main(["localise", str(several), "-"]) == 0
     assert (
         "several.json: the first of 2 maps is taken; choose one with --map"
         in capsys.readouterr().err
     )
-    assert main(["localize", str(several), str(files / "other.jsonl"), "--map", "2", "--json"]) == 0
+    assert main(["localise", str(several), str(files / "other.jsonl"), "--map", "2", "--json"]) == 0
     told = capsys.readouterr()
     assert (json.loads(told.out)["map"], json.loads(told.out)["dstates"], told.err) == (2, 3, "")
 
@@ -693,7 +694,7 @@ def test_localize_reads_images_and_recognise_says_nowhere(
         "--recogniser",
         str(files / "r.skops"),
     ]
-    assert main(["localize", *words, "--json"]) == 0
+    assert main(["localise", *words, "--json"]) == 0
     beliefs = json.loads(capsys.readouterr().out)["beliefs"]
     assert [b["dstate"] for b in beliefs[:4]] == [0, 1, 2, 0]
     assert beliefs[-1]["verdict"] == "nowhere"
@@ -716,7 +717,10 @@ def test_localize_says_what_is_wrong_in_one_line(
             "none.json: maps: expected one to localise in, got none",
         ),
         ([maps, other, "--map", "2"], "--map: expected 1 to 1, got 2"),
-        ([maps, other, "--misread", "2"], "misread: expected a probability from 0 to 1, got 2.0"),
+        (
+            [maps, other, "--set", "misread=2"],
+            "misread: expected a probability from 0 to 1, got 2.0",
+        ),
         (
             [maps, other, "--trace", other],
             "maps.json: map: labels: expected 30, one for each step of the trace",
@@ -732,7 +736,7 @@ def test_localize_says_what_is_wrong_in_one_line(
         ([maps, other, "--recogniser", maps], "expected a .skops file"),
         ([other, maps], "other.jsonl: expected a file of maps, got a trace"),
     ]:
-        assert main(["localize", *words]) == 1, words
+        assert main(["localise", *words]) == 1, words
         captured = capsys.readouterr()
         assert message in captured.err
         assert captured.err.count("\n") == 1

@@ -48,10 +48,10 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
             [
                 "simulate",
                 "taylor-hall",
-                "--as",
+                "--format",
                 "carmen",
-                "--every",
-                "0.5",
+                "--set",
+                "every=0.5",
                 "--seed",
                 "1",
                 "-q",
@@ -78,7 +78,8 @@ def runs(hall: Path) -> Path:
                 str(bad),
                 "-o",
                 str(hall.parent / "runs"),
-                "--no-ladder",
+                "--set",
+                "ladder=false",
                 "--time-limit",
                 "1000",
             ]
@@ -191,7 +192,19 @@ def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(
 ) -> None:
     bad = hall.with_name("bad.log")
     assert (
-        main(["map", str(hall), str(bad), "-o", str(runs), "--no-ladder", "--time-limit", "1000"])
+        main(
+            [
+                "map",
+                str(hall),
+                str(bad),
+                "-o",
+                str(runs),
+                "--set",
+                "ladder=false",
+                "--time-limit",
+                "1000",
+            ]
+        )
         == 1
     )
     told = capsys.readouterr()
@@ -205,11 +218,11 @@ def test_a_run_is_done_once_and_bad_logs_do_not_stop_the_others(
     [
         ([], "none", "none"),
         (["--theory", "topological"], "auto", "strict"),
-        (["--star", "auto", "--boundary", "strict"], "auto", "strict"),
+        (["--star", "auto", "--set", "boundary=strict"], "auto", "strict"),
         (["--star", "auto"], "auto", "none"),
         (["--misread", "1.5"], "none", "none"),
         (["--theory", "topological", "--star", "none"], "none", "strict"),
-        (["--level", "causal"], "none", "none"),
+        (["--set", "level=causal"], "none", "none"),
     ],
 )
 def test_flags_are_laid_over_the_theory_that_suits_the_walls(
@@ -417,13 +430,13 @@ def test_doors_have_no_scale(
                 str(hall.with_name("none")),
                 "--places",
                 "doors",
-                "--radius",
-                "5",
+                "--set",
+                "radius=5",
             ]
         )
         == 1
     )
-    assert "--radius: expected none with --places doors, got 5" in capsys.readouterr().err
+    assert "radius: expected none with --places doors, got 5" in capsys.readouterr().err
 
 
 def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> None:

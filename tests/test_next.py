@@ -425,7 +425,7 @@ def test_the_shell_says_of_which_maps_it_knows_nothing(
 ) -> None:
     assert main(["solve", ACES, "-n", "2", "--json"]) == 0
     (tmp_path / "maps.json").write_text(capsys.readouterr().out)
-    assert main(["next", ACES, str(tmp_path / "maps.json")]) == 0
+    assert main(["next", str(tmp_path / "maps.json"), ACES]) == 0
     said = capsys.readouterr()
     assert "these 2 maps are not known to be all minimal ones" in said.err
     assert said.out.startswith(
@@ -441,14 +441,14 @@ def test_errors_of_the_shell_are_one_line(
     none.write_text('{"maps": []}')
     for words, message in [
         (
-            [ACES, maps],
+            [maps, ACES],
             f"{maps}: maps[0]: labels: expected 23, one for each step of the trace, got 41; solve this trace",
         ),
-        ([maps, trace], f"{maps}:1: header: expected a trace, got maps"),
+        ([maps, maps], f"{maps}:1: header: expected a trace, got maps"),
         ([trace, trace], f"{trace}: expected maps, got a trace"),
-        ([trace, str(none)], f"{none}: maps: expected one to seek an experiment for, got none"),
+        ([str(none), trace], f"{none}: maps: expected one to seek an experiment for, got none"),
         (
-            [trace, maps, "--time-limit", "0"],
+            [maps, trace, "--time-limit", "0"],
             "--time-limit: expected a number of seconds above 0, got 0.0",
         ),
     ]:

@@ -150,10 +150,10 @@ def test_no_name_is_no_file(words: str, capsys: pytest.CaptureFixture[str]) -> N
     "words",
     [
         "train x y -o=--",
-        "learning-curve x y --folds=--",
+        "learning-curve x y --set folds=--",
         "show x --map=--",
         "solve x --rules=--",
-        "check x y --prefer=--",
+        "check x y --set prefer=--",
     ],
 )
 def test_two_dashes_are_no_value(words: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -167,7 +167,19 @@ def test_every_verb_that_writes_writes_into_a_pipe(
 ) -> None:
     run = tmp_path / "run.jsonl"
     assert (
-        main(["simulate", "notched-rectangle", "--tours", "2", "--no-stars", "-o", str(run)]) == 0
+        main(
+            [
+                "simulate",
+                "notched-rectangle",
+                "--tours",
+                "2",
+                "--set",
+                "stars=false",
+                "-o",
+                str(run),
+            ]
+        )
+        == 0
     )
     views = tmp_path / "views.jsonl"
     assert main(["cluster", str(run), "--k", "4", "-o", str(views)]) == 0
@@ -178,8 +190,8 @@ def test_every_verb_that_writes_writes_into_a_pipe(
     for words in (
         ["simulate", "notched-rectangle", "--route", "around,around", "-o"],
         ["cluster", str(run), "--k", "4", "-o"],
-        ["train", str(views), str(maps), "-o"],
-        ["learning-curve", str(views), str(maps), "--map", "1", "--folds", "2", "--plot"],
+        ["train", str(maps), str(views), "-o"],
+        ["learning-curve", str(maps), str(views), "--map", "1", "--set", "folds=2", "--plot"],
     ):
         pipe, got = tmp_path / "pipe.png", []
         os.mkfifo(pipe)
@@ -205,7 +217,13 @@ def learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
     (tmp_path / "t.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert main(["solve", str(tmp_path / "t.jsonl"), "--theory", "causal", "--json"]) == 0
     (tmp_path / "m.json").write_text(capsys.readouterr().out)
-    return ["learning-curve", str(tmp_path / "t.jsonl"), str(tmp_path / "m.json"), "--folds", "2"]
+    return [
+        "learning-curve",
+        str(tmp_path / "m.json"),
+        str(tmp_path / "t.jsonl"),
+        "--set",
+        "folds=2",
+    ]
 
 
 def test_matplotlib_is_looked_for_before_anything_is_done(
@@ -253,7 +271,7 @@ def test_a_picture_that_fails_loses_nothing(
         main(
             [
                 "cluster",
-                learnt[1],
+                learnt[2],
                 "--k",
                 "2",
                 "-o",
@@ -428,8 +446,8 @@ def test_what_would_steer_a_terminal_is_escaped(
         *(
             ["solve", str(trace)],
             ["solve", str(trace), str(trace)],
-            ["check", str(trace), str(maps)],
-            ["check", ACES, str(maps)],
+            ["check", str(maps), str(trace)],
+            ["check", str(maps), ACES],
         ),
         *(
             ["show", str(maps)],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import gzip
 import http.client
 import json
@@ -23,6 +22,7 @@ import pytest
 from ssh_abduction import Localiser, Solution, SSHMap, Theory, Trace, solve, view_page
 from ssh_abduction.cli import main
 from ssh_abduction.cli.options import add_theory, flags_of, theory_of
+from ssh_abduction.cli.parsing import Parser
 from ssh_abduction.data import Action, DState, MapError, Step, TraceError
 from ssh_abduction.data.maps import Fault, Fit, MapPath, Pose
 from ssh_abduction.explain.pairs import explain_pair
@@ -226,7 +226,7 @@ def cielab(rgb: Any) -> Any:
 
 
 def test_flags_of_a_theory_make_it_again() -> None:
-    parser = argparse.ArgumentParser()
+    parser = Parser()
     add_theory(parser)
     for theory in (
         Theory.topological(),
@@ -292,11 +292,11 @@ def test_view_writes_a_page_with_beliefs(
     maps, run, page = (str(tmp_path / name) for name in ("maps.json", "it's.jsonl", "page.html"))
     solve(trace, Theory.causal()).save(maps)
     trace.save(run)
-    assert main(["localize", maps, run, "--json"]) == 0
+    assert main(["localise", maps, run, "--json"]) == 0
     (tmp_path / "beliefs.json").write_text(capsys.readouterr().out)
     assert main(["view", maps, run, "--belief", str(tmp_path / "beliefs.json"), "-o", page]) == 0
     shown = shown_in(page)
-    assert main(["view", maps, run, "--localize", run, "-o", page]) == 0
+    assert main(["view", maps, run, "--run", run, "-o", page]) == 0
     again = shown_in(page)
     assert shown["replays"][0]["beliefs"]["0"] == again["replays"][0]["beliefs"]["0"]
     assert shown["flags"] == " --theory causal"
@@ -305,7 +305,9 @@ def test_view_writes_a_page_with_beliefs(
         (["--serve"], "expected the trace that was mapped"),
         (["--belief", maps], "beliefs: expected a list"),
     ):
-        assert main(["view", maps, *([run] if wrong[1:] else []), *wrong, "--no-open"]) == 1
+        assert (
+            main(["view", maps, *([run] if wrong[1:] else []), *wrong, "--set", "open=false"]) == 1
+        )
         assert said in capsys.readouterr().err
 
 

@@ -260,7 +260,7 @@ def test_panoramas_in_the_shell(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    drive = "simulate notched-rectangle --tours 2 --images panoramas --textures repeated --paint-seed 5 --hours 8,18 --no-stars"
+    drive = "simulate notched-rectangle --tours 2 --images panoramas --set textures=repeated --set paint_seed=5 --set hours=8,18 --set stars=false"
     assert main([*drive.split(), "-o", "run.jsonl"]) == 0
     trace = Trace.load("run.jsonl")
     assert (trace.images, trace.extra["panorama"], trace.steps[3].image) == (
@@ -271,28 +271,28 @@ def test_panoramas_in_the_shell(
     camera = Camera(paint=Paint(5, repeated=True), hours=(8.0, 18.0))
     inline = simulate(ROOM, 2, stars=False, camera=camera)
     assert np.array_equal(images_of(trace), images_of(inline))
-    assert main(["cluster", "run.jsonl", "--k-max", "5", "-o", "views.jsonl"]) == 0
+    assert main(["cluster", "run.jsonl", "--set", "k_max=5", "-o", "views.jsonl"]) == 0
     assert main(["solve", "views.jsonl", "--json"]) == 0
     out = capsys.readouterr().out
     (tmp_path / "maps.json").write_text(out[out.index("{") :])
-    assert main(["train", "views.jsonl", "maps.json", "-o", "r.skops"]) == 0
+    assert main(["train", "maps.json", "views.jsonl", "-o", "r.skops"]) == 0
     assert main(["recognise", "r.skops", "run.jsonl", "--json"]) == 0
     assert len(set(capsys.readouterr().out.split("[")[1].strip("]\n ").split(", "))) == 8
-    assert main(["tell-apart", "views.jsonl", "maps.json"]) == 1
+    assert main(["tell-apart", "maps.json", "views.jsonl"]) == 1
     assert "expected a trace with ranges" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--hours 7,19", "--hours: expected --images panoramas beside it"),
-        ("--textures unique", "--textures: expected --images panoramas beside it"),
+        ("--set hours=7,19", "hours: expected --images panoramas beside it"),
+        ("--set textures=unique", "textures: expected --images panoramas beside it"),
         (
-            "--images panoramas --hours noon",
-            "--hours: expected two hours with a comma between them, as 7,19, got 'noon'",
+            "--images panoramas --set hours=noon",
+            "hours: expected two hours with a comma between them, as 7,19, got 'noon'",
         ),
         (
-            "--images panoramas --hours 7,nan",
+            "--images panoramas --set hours=7,nan",
             "camera.hours: expected a number from 0 to 24, got nan",
         ),
     ],

@@ -199,10 +199,10 @@ def test_map_that_is_interrupted_says_so_and_is_done_again(
             [
                 "simulate",
                 "notched-rectangle",
-                "--as",
+                "--format",
                 "carmen",
-                "--every",
-                "0.5",
+                "--set",
+                "every=0.5",
                 "-q",
                 "-o",
                 str(log),
@@ -225,9 +225,9 @@ def test_map_that_is_interrupted_says_so_and_is_done_again(
     assert (run["interrupted"], run["ladder"], run["status"]) == (True, [], "optimal")
     assert "The run was interrupted" in (runs / "report.html").read_text()
     assert Solution.load(runs / "maps.json").maps
-    assert main(["map", str(log), "-o", str(runs), "--no-ladder"]) == 0
+    assert main(["map", str(log), "-o", str(runs), "--set", "ladder=false"]) == 0
     assert json.loads((runs / "run.json").read_text())["interrupted"] is False
-    assert main(["map", str(log), "-o", str(runs), "--no-ladder"]) == 0
+    assert main(["map", str(log), "-o", str(runs), "--set", "ladder=false"]) == 0
     assert "done already" in capsys.readouterr().out
 
 

@@ -192,7 +192,7 @@ def test_check_bound_on_the_command_line(
     maps.write_text(json.dumps(data))
     assert main(["check", "--bound", str(trace), str(maps)]) == 1
     assert "certificate: expected one beside the maps" in capsys.readouterr().err
-    assert main(["check", "--bound", "--without", "deterministic", str(trace), str(maps)]) == 1
+    assert main(["check", "--bound", "--set", "without=deterministic", str(trace), str(maps)]) == 1
     assert "which the proof rests on" in capsys.readouterr().err
 
 
@@ -204,9 +204,9 @@ def test_a_verdict_on_another_theory_or_trace_is_not_believed(
     rectangle(400).save(trace)
     assert main(["solve", str(trace), "--json"]) == 0
     maps.write_text(capsys.readouterr().out)
-    assert main(["check", "--bound", "--prefer", "dstates", str(trace), str(maps)]) == 0
+    assert main(["check", "--bound", "--set", "prefer=dstates", str(trace), str(maps)]) == 0
     assert "the maps have 8: no map has fewer" in capsys.readouterr().out
-    assert main(["check", "--bound", "--boundary", "none", str(trace), str(maps)]) == 0
+    assert main(["check", "--bound", "--set", "boundary=none", str(trace), str(maps)]) == 0
     shown = capsys.readouterr().out
     assert (
         "clingo's verdict on 4 dstates and more is left out: the file is of another theory" in shown

@@ -185,11 +185,11 @@ def test_a_view_cannot_steer_the_terminal_by_the_log(
         ("slove trace.jsonl", "solve"),
         ("chek trace.jsonl maps.json", "check"),
         ("recognize r x", "recognise"),
-        ("localise maps.json x", "localize"),
+        ("localse maps.json x", "localise"),
         ("solve trace.jsonl --tme-limit 5", "--time-limit"),
         ("solve trace.jsonl --tme-limit=5", "--time-limit"),
         ("solve trace.jsonl --star gateway", "gateways"),
-        ("show maps.json --grapml", "--graphml"),
+        ("export maps.json --to grapml", "graphml"),
         ("completion bsh", "bash"),
     ],
 )

@@ -104,7 +104,7 @@ def test_a_dstate_that_was_never_seen_has_no_view(
     ):
         assert main([words[0], str(tmp_path / "maps.json"), *words[1:]]) == 0
         assert "None" not in capsys.readouterr().out
-    assert main(["check", str(tmp_path / "trace.jsonl"), str(tmp_path / "maps.json")]) == 0
+    assert main(["check", str(tmp_path / "maps.json"), str(tmp_path / "trace.jsonl")]) == 0
     assert (
         main(["check", "--bound", str(tmp_path / "trace.jsonl"), str(tmp_path / "maps.json")]) == 1
     )

@@ -293,8 +293,8 @@ def test_what_the_shell_prints_is_what_is_saved(
         main(
             [
                 "check",
-                str(ROOT / "examples" / "aces3-route.jsonl"),
                 str(tmp_path / "saved.json"),
+                str(ROOT / "examples" / "aces3-route.jsonl"),
                 "--bound",
             ]
         )

@@ -261,7 +261,7 @@ def test_names_and_poses_are_judged_where_both_are_asked_for(
     arguments = ["evaluate", str(tmp_path / "map.json"), str(tmp_path / "trace.jsonl"), "--json"]
     told = [
         main(arguments) or json.loads(capsys.readouterr().out),
-        main([*arguments, "--near", "0.5"]) or json.loads(capsys.readouterr().out),
+        main([*arguments, "--set", "near=0.5"]) or json.loads(capsys.readouterr().out),
     ]
     assert "poses" not in told[0]
     assert told[0]["maps"][0]["place_recall"] == 1

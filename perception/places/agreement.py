@@ -175,12 +175,12 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
         side = "left" if looks >= 0 else "right"
         causes.append(
             f"the laser looks {abs(looks):.0f} degrees to the {side} of straight ahead "
-            f"(--mount={x:g},{y:g},{looks:.0f})"
+            f"(--set mount={x:g},{y:g},{looks:.0f})"
         )
     if not causes:
         causes = [
-            'a range that means "nothing came back" is read as a wall (--no-return, --zero-is)',
-            "the laser sits or looks elsewhere on the robot (--mount)",
+            'a range that means "nothing came back" is read as a wall (--set no_return, --set zero_is)',
+            "the laser sits or looks elsewhere on the robot (--set mount)",
             "its field of view is another (--fov)",
         ]
     causes.append("the odometer jumps, slips or is out of scale")

@@ -135,7 +135,7 @@ def import_log(
             f"{named(log.source)}: expected a way past junctions, corners or dead ends, got "
             f"{track.way[-1]:.0f} m without any at a radius of "
             f"{scale.radius:g} m; take a longer log, or a smaller radius "
-            f"(--radius){_besides(notes)}"
+            f"(--set radius){_besides(notes)}"
         )
     with _timed(seconds, "trace"):
         trace = to_trace(log, track, scale, visits, name)

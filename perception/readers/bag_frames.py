@@ -142,7 +142,7 @@ def mount_of(
         assumed["mount"] = (f"{assumed['mount']} " if "mount" in assumed else "") + (
             f"No transform leads from the robot ({base or 'a frame without a name'}) to its laser "
             f"({frame}): the laser is taken to sit in the robot's middle and to look ahead. "
-            "If it does not, say where it sits: --mount X,Y,DEGREES."
+            "If it does not, say where it sits: --set mount=X,Y,DEGREES."
         )
         return (0.0, 0.0, 0.0), False
     translation, rotation = np.zeros(3), np.eye(3)

@@ -157,7 +157,7 @@ def understood(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], tup
     if told.mount is not None and lasers > 1:
         raise LogError(
             f"mount: expected the scans of one laser, got those of {lasers}; leave it out "
-            "(--mount), or read the topic of one laser (--scan-topic)"
+            "(--set mount), or read the topic of one laser (--set scan_topic)"
         )
     placed = [told.placed(scan) for scan in scans]
     # A log may have several lasers. The number of beams of a laser may change from scan to scan.
@@ -241,7 +241,7 @@ def _surveyed(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
             f"Ranges of {reach:.4g} m repeat in {_percent(share)} of the beams, and hardly any are "
             f"longer{but}. "
             "They are taken to mean that nothing came back. If they are walls, "
-            "say how far the laser reaches: --no-return METRES."
+            "say how far the laser reaches: --set no_return=METRES."
         )
     if not math.isfinite(reach):
         # The largest range itself was measured, so the reach lies just above it.
@@ -254,7 +254,7 @@ def _surveyed(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
             notes.append(
                 "The log does not say how far the laser reaches. By its largest range it is "
                 f"{most:.4g} m. "
-                "If it reaches farther, or less far, say so: --no-return METRES."
+                "If it reaches farther, or less far, say so: --set no_return=METRES."
             )
     if told.zero_is is not None:
         return Meaning(reach, told.free), notes
@@ -337,7 +337,7 @@ def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset
             f"{_percent(count / beams)} of the beams are {kind}. The beams beside them are "
             f"{typical:.2g} m long, where "
             f"{usual:.2g} m is usual. So they are taken to mean that {taken}. If that is wrong, "
-            f"say --zero-is {other}."
+            f"say --set zero_is={other}."
         )
     return frozenset(free), notes
 

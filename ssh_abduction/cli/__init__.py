@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import difflib
 import errno
 import io
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from typing import Any, NoReturn
+from types import ModuleType
 
 from ssh_abduction.cli import (
     check,
@@ -30,7 +29,7 @@ from ssh_abduction.cli import (
     facts,
     import_log,
     ladder,
-    localize,
+    localise,
     map_logs,
     next_experiment,
     route,
@@ -43,6 +42,7 @@ from ssh_abduction.cli import (
 )
 from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli.parsing import Parser
 from ssh_abduction.cli.verbosity import add_verbosity, telling
 from ssh_abduction.data import program
 from ssh_abduction.data.errors import AbductionError, named, printable
@@ -60,6 +60,22 @@ MENDS = {
     errno.EISDIR: "take another name",
     errno.ENOTDIR: "take another name",
 }
+# The verbs by what they are for, as the help lists them.
+VERBS: Mapping[str, tuple[ModuleType, ...]] = {
+    "map: find the maps of a trace or a log": (solve, map_logs, import_log, cluster),
+    "ask: judge, compare and explain maps": (
+        check,
+        compare,
+        explain,
+        evaluate,
+        ladder,
+        next_experiment,
+    ),
+    "use: drive and localise by a map": (localise, route, show, export, view),
+    "learn: recognise places from images": (train,),
+    "make: simulated robots and the paper's experiments": (simulate, reproduction, examples),
+    "about: the axioms, their input, and your shell": (theory, facts, completion),
+}
 FOR_PROGRAMS = (
     "json",
     "facts",
@@ -69,58 +85,9 @@ FOR_PROGRAMS = (
 )  # forms that other programs read, in UTF-8 wherever they are printed
 
 
-class _Parser(argparse.ArgumentParser):
-    """Takes part in a name that is nearly one of those expected: it says which was perhaps meant."""
-
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
-        try:
-            super()._check_value(action, value)
-        except argparse.ArgumentError as error:
-            raise argparse.ArgumentError(
-                action, f"{error.message}{_meant(value, map(str, action.choices or ()))}"
-            ) from None
-
-    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """As argparse does, but what is unknown to a verb is an error of that verb, with the option that was perhaps meant."""
-        options, unknown = self.parse_known_args(args, namespace)
-        if unknown:
-            verb = self.verbs[options.verb] if getattr(options, "verb", None) else self
-            wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
-            verb.error(
-                f"unrecognized arguments: {' '.join(unknown)}{_meant(wrong.partition('=')[0], verb.names)}"
-            )
-        return options
-
-    @property
-    def verbs(self) -> Mapping[str, _Parser]:
-        """The parsers of the verbs."""
-        return next(
-            (
-                action.choices
-                for action in self._actions
-                if isinstance(action, argparse._SubParsersAction)
-            ),
-            {},
-        )
-
-    @property
-    def names(self) -> list[str]:
-        """The names of all options."""
-        return [name for action in self._actions for name in action.option_strings]
-
-    def error(self, message: str) -> NoReturn:
-        super().error(printable(message))  # which repeats what was typed
-
-
-def _meant(word: object, names: Iterable[str]) -> str:
-    """A question after the name that is nearest to a word, if one is near."""
-    near = difflib.get_close_matches(str(word), names, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
-
-
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """The parser of the whole command line."""
-    top = _Parser(
+    top = Parser(
         prog="ssh-abduction",
         description="From what a robot saw and did, find the map.",
         epilog="Exit codes: 0 minimal map proven; 1 error; 2 usage; 10 map without proof; 20 no map, or a map that breaks an axiom; "
@@ -128,31 +95,12 @@ def parser() -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
     verbs = top.add_subparsers(metavar="VERB", dest="verb", required=True)
-    for verb in (
-        solve,
-        check,
-        compare,
-        explain,
-        evaluate,
-        ladder,
-        localize,
-        next_experiment,
-        route,
-        export,
-        show,
-        facts,
-        theory,
-        simulate,
-        import_log,
-        map_logs,
-        cluster,
-        train,
-        view,
-        reproduction,
-        examples,
-        completion,
-    ):
-        verb.add_parser(verbs)
+    for modules in VERBS.values():
+        for verb in modules:
+            known = set(verbs.choices)
+            verb.add_parser(verbs)
+            group = next(title for title, members in VERBS.items() if members is modules)
+            top.groups[group] = (*top.groups.get(group, ()), *(set(verbs.choices) - known))
     for each in (top, *verbs.choices.values()):
         add_verbosity(each)
     return top
@@ -185,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The options. argparse takes the -- of --map=-- for the end of all options, and the option is left with an empty list."""
     top = parser()
-    options = top.parse_args(arguments)
+    options: argparse.Namespace = top.parse_args(arguments)
     for name, value in vars(options).items():
         if isinstance(value, list) and (not value or [] in value):
             top.error(f"{name}: expected a value, got '--'")
@@ -214,6 +162,8 @@ def _main(arguments: Sequence[str] | None) -> int:
             )
         with telling(options, for_programs), warnings.catch_warnings(record=True) as caught:
             try:
+                for note in options.notes:
+                    print(f"ssh-abduction: warning: {note}", file=sys.stderr)
                 with Guard(lambda: None, lambda _: ("", program.interrupted_code()), None, None):
                     code = int(options.run(options))
             finally:

@@ -10,7 +10,7 @@ from typing import Any
 from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.checker.claims import false_claims
 from ssh_abduction.checker.proof import check_bound
-from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.options import Verbs, add_theory, in_order, theory_of
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import MapError, brief, is_finite, printable
 from ssh_abduction.data.map_file import read_json
@@ -25,8 +25,8 @@ EXIT_VIOLATED = 20
 def add_parser(verbs: Verbs) -> None:
     text = "Check maps against a trace and the axioms, without clingo. Which named axiom fails, and at which steps?"
     parser = verbs.add_parser("check", help="do these maps satisfy the axioms?", description=text)
-    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument("maps", help="what solve --json printed, or one saved map")
+    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument(
         "--bound", action="store_true", help="check the proof that no map has fewer dstates, too"
     )
@@ -36,6 +36,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    in_order(options)
     trace = Trace.load(options.trace)
     data = read_json(options.maps)
     found = data.get("theory") if isinstance(data, dict) else None

@@ -28,11 +28,16 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "--k", type=int, help="number of views (default: the one with the largest M)"
     )
-    parser.add_argument(
-        "--k-max", type=int, metavar="K", help="largest number of views to try (default: 20)"
+    parser.add_setting(
+        "k_max", "largest number of views to try (default: 20)", type=int, metavar="K"
     )
-    by = "choose k by M, which stands on two distances, or by trimmed M, which compares medians of distances (default: M)"
-    parser.add_argument("--by", choices=("M", "trimmed"), default="M", help=by)
+    parser.add_setting(
+        "by",
+        "choose k by M, the ratio of two distances, or by trimmed M, the ratio of two medians of "
+        "distances (default: M)",
+        "M",
+        choices=("M", "trimmed"),
+    )
     parser.add_argument("--seed", type=seed, default=0, help="seed of k-means (default: 0)")
     parser.add_argument(
         "--plot",

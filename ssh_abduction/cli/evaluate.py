@@ -53,11 +53,11 @@ def add_parser(verbs: Verbs) -> None:
         help="what solve --json printed for this trace, or one saved map; - for standard input",
     )
     parser.add_argument("trace", help="trace file (JSON Lines) with truth")
-    parser.add_argument(
-        "--near",
+    parser.add_setting(
+        "near",
+        "judge by poses, too, and take poses within this distance for one place (default: 2)",
         type=float,
         metavar="METRES",
-        help="judge by poses, too, and take poses so near each other for one place (default: 2)",
     )
     parser.add_argument(
         "--relations",

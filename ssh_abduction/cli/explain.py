@@ -6,16 +6,15 @@ import argparse
 from typing import Any
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import Verbs, add_theory, read_maps, theory_of
+from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import dump, on_ctrl_c
-from ssh_abduction.data.errors import AbductionError, MapError, named
+from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.mend import TraceExplanation, TraceQuestion
 from ssh_abduction.explain.pairs import PairQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
-from ssh_abduction.solver import Stop, theory_in
-from ssh_abduction.theory.theory import Theory
+from ssh_abduction.solver import Stop
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
 
@@ -60,14 +59,7 @@ def add_parser(verbs: Verbs) -> None:
         metavar="MIB",
         help="stop when the process has used so much memory",
     )
-    parser.add_argument(
-        "--theory-of",
-        metavar="MAPS",
-        help="explain by the theory that this file of maps was made with",
-    )
-    add_theory(
-        parser, default="that of --theory-of; else topological, or causal with --level causal"
-    )
+    add_theory(parser)
     parser.epilog = "Exit codes: 0 explained; 20 the trace has no map; 30 not found out in time; 1, 2, 130 and 143 as for the other verbs."
     parser.set_defaults(run=run)
 
@@ -78,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
             f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are to be explained"
         )
     trace = Trace.load(options.trace)
-    theory = theory_of(options, _theory_in(options.theory_of) if options.theory_of else None)
+    theory = theory_of(options)
     limits: dict[str, Any] = {
         "time_limit": options.time_limit,
         "memory_limit": options.memory_limit,
@@ -104,16 +96,6 @@ def run(options: argparse.Namespace) -> int:
         answer = question.answer()
         guard.say(lambda: told(answer))
     return _exit_code(answer)
-
-
-def _theory_in(file: str) -> Theory:
-    """The theory that a file of maps was made with. Raises MapError."""
-    data = read_maps(file, mend="name the maps that were made of it")
-    if not isinstance(data, dict) or "theory" not in data:
-        raise MapError(
-            f"{named(file)}: theory: expected the theory that the maps were made with, got none; name it with --theory"
-        )
-    return theory_in(data["theory"], named(file))
 
 
 def _as_text(explanation: PairExplanation | TraceExplanation) -> str:

@@ -10,7 +10,7 @@ from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.trace import Trace
 
 # As ssh_abduction.output.export has them, which loads networkx, which would delay each verb.
-FORMATS = ("nav2", "tmap2", "graphml", "dot", "networkx-json")
+FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -34,12 +34,6 @@ def add_parser(verbs: Verbs) -> None:
         help="what nodes are (default: places for nav2 and tmap2, where the map has any, else dstates)",
     )
     parser.add_argument(
-        "--name", default="ssh-abduction", help="the name of the map (default: ssh-abduction)"
-    )
-    parser.add_argument(
-        "--frame", default="map", help="the coordinate frame of the positions (default: map)"
-    )
-    parser.add_argument(
         "--trace",
         metavar="TRACE",
         help="the trace that was mapped, which says how actions turn: for the layout of a map without poses",
@@ -51,6 +45,8 @@ def add_parser(verbs: Verbs) -> None:
         metavar="FILE",
         help="the file to write (default: standard output)",
     )
+    parser.add_setting("name", "the name of the map (default: ssh-abduction)", "ssh-abduction")
+    parser.add_setting("frame", "the coordinate frame of the positions (default: map)", "map")
     parser.set_defaults(run=run)
     parser.epilog = "Positions are metres, seen from the first dstate, where the map has poses; else they are of a layout, and this is said. docs/formats.md says what each file has."
 

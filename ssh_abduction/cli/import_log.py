@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, add_output, write
+from ssh_abduction.cli.parsing import Parser
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named
 
@@ -42,68 +43,60 @@ def add_parser(verbs: Verbs) -> None:
     parser.set_defaults(run=run)
 
 
-def add_reading(parser: argparse.ArgumentParser) -> None:
+def add_reading(parser: Parser) -> None:
     """Add the options that say how a log is read, and at which scale a building is looked at."""
     group = parser.add_argument_group("reading logs")
     group.add_argument(
         "--format", choices=FORMATS, help="format of the log (default: guessed from what is in it)"
     )
     group.add_argument(
-        "--scan-topic",
-        action="append",
-        metavar="TOPIC",
-        help="of a bag: the topic of the scans, where there are several; repeat it to read several lasers at once",
-    )
-    group.add_argument(
-        "--odom-topic",
-        metavar="TOPIC",
-        help="of a bag: the topic of the odometry, where there are several",
-    )
-    laser = parser.add_argument_group(
-        "the laser", "what the log does not say of it, or says wrongly"
-    )
-    laser.add_argument(
         "--fov",
         type=partial(_told, "fov"),
         metavar="DEGREES",
-        help="the angle that the beams cover; negative for a laser that hangs upside down (default: as the log says, and 180 where it does not)",
+        help="the angle that the beams cover; negative for a laser that hangs upside down "
+        "(default: as the log says, else 180)",
     )
-    laser.add_argument(
-        "--mount",
-        type=partial(_told, "mount"),
-        metavar="X,Y,DEGREES",
-        help="where the laser sits on the robot: metres ahead of its middle, metres to the left, and degrees to the left of straight ahead; "
-        "write --mount=X,Y,DEGREES where X is below 0 (default: as the log says, and 0,0,0 where it does not)",
-    )
-    laser.add_argument(
-        "--no-return",
-        type=partial(_told, "no_return"),
-        metavar="METRES",
-        help="ranges from here on mean that nothing came back (default: the laser's reach, or a range below it that repeats and is no wall)",
-    )
-    laser.add_argument(
-        "--zero-is",
-        choices=MEANINGS,
-        help="what a range of 0, below 0, below the laser's least range, or NaN means: nothing came back (free), or nothing is known (unknown) (default: free where the beams "
-        "beside them are long)",
-    )
-    scale = parser.add_argument_group(
-        "scale",
-        "which ways out of a place count; the log itself suggests it by the passages that the robot drove through",
-    )
-    scale.add_argument(
-        "--gateway", type=metres, metavar="M", help="the least width of a gateway, in metres"
-    )
-    scale.add_argument(
+    group.add_argument(
         "--places",
         choices=PLACES,
-        help="what the places are: where ways part or bend (junctions), or the doors that the robot drives through (doors) (default: doors where most of its way is wide and leads through doors often, and neither --gateway nor --radius is given; else junctions)",
+        help="what the places are: where ways part or bend (junctions), or the doors that the "
+        "robot drives through (doors) (default: doors where most of its way is wide and often "
+        "leads through doors, and neither gateway nor radius is set; else junctions)",
     )
-    scale.add_argument(
-        "--radius",
+    parser.add_setting(
+        "scan_topic",
+        "topic of the scans in a bag with several; set it again to read several lasers at once",
+        metavar="TOPIC",
+        many=True,
+    )
+    parser.add_setting("odom_topic", "topic of the odometry in a bag with several", metavar="TOPIC")
+    parser.add_setting(
+        "mount",
+        "where the laser sits on the robot: metres ahead of its middle, metres to the left, and "
+        "degrees to the left of straight ahead (default: as the log says, else 0,0,0)",
+        type=partial(_told, "mount"),
+        metavar="X,Y,DEGREES",
+    )
+    parser.add_setting(
+        "no_return",
+        "ranges from here on mean that nothing came back (default: the laser's reach, or a "
+        "shorter range that repeats and is no wall)",
+        type=partial(_told, "no_return"),
+        metavar="METRES",
+    )
+    parser.add_setting(
+        "zero_is",
+        "what a range of 0, below 0, below the laser's least range, or NaN means: nothing came "
+        "back (free), or nothing is known (unknown) (default: free where the beams beside it "
+        "are long)",
+        choices=MEANINGS,
+    )
+    parser.add_setting("gateway", "the least width of a gateway", type=metres, metavar="METRES")
+    parser.add_setting(
+        "radius",
+        "how far a way out must lead from the middle of a place",
         type=metres,
-        metavar="M",
-        help="how far a way out must lead from the middle of a place, in metres",
+        metavar="METRES",
     )
 
 
@@ -181,7 +174,7 @@ def doors_of(options: argparse.Namespace) -> bool | None:
     if options.places is None:
         return None
     doors = bool(options.places == "doors")
-    for name, given in (("--gateway", options.gateway), ("--radius", options.radius)):
+    for name, given in (("gateway", options.gateway), ("radius", options.radius)):
         if doors and given is not None:
             raise AbductionError(
                 f"{name}: expected none with --places doors, got {given:g}; it is about ways that part, so leave it out, or ask for junctions"

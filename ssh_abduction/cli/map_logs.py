@@ -6,6 +6,7 @@ import argparse
 
 from ssh_abduction.cli.import_log import add_reading
 from ssh_abduction.cli.options import Verbs, add_theory, output
+from ssh_abduction.cli.parsing import true_or_false
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -42,10 +43,12 @@ def add_parser(verbs: Verbs) -> None:
         metavar="S",
         help="seconds for the minimal maps (default: what is left of a twentieth of the time that the robot drove, and 5 at least)",
     )
-    parser.add_argument(
-        "--no-ladder",
-        action="store_true",
-        help="do not work out what each kind of evidence is worth",
+    parser.add_setting(
+        "ladder",
+        "whether to work out what each kind of evidence is worth (default: true)",
+        default=True,
+        type=true_or_false,
+        metavar="true|false",
     )
     parser.add_argument("--again", action="store_true", help="do again what is done already")
     many = parser.add_argument_group("many logs")

@@ -259,7 +259,7 @@ def run(options: argparse.Namespace) -> int:
         doors_of(options),
         options.time_limit,
         options.maps,
-        not options.no_ladder,
+        options.ladder,
     )
     folders, same = folders_of(options.logs, Path(options.output))
     for path, other in same.items():

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from ssh_abduction.cli.guard import Guard
-from ssh_abduction.cli.options import Verbs, add_theory, theory_of
+from ssh_abduction.cli.options import Verbs, add_theory, in_order, theory_of
 from ssh_abduction.cli.outcome import on_ctrl_c, warn
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import MapError, named, printable
@@ -38,11 +38,11 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser(
         "next", help="what should the robot do to tell these maps apart?", description=text
     )
-    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument(
         "maps",
         help="what solve --json printed for this trace, or one saved map; - for standard input",
     )
+    parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument(
         "--time-limit", type=float, metavar="S", help="stop after S seconds with the plan so far"
     )
@@ -66,6 +66,7 @@ def run(options: argparse.Namespace) -> int:
 
     check_limit("--time-limit", "seconds", options.time_limit)
     check_limit("--memory-limit", "MiB", options.memory_limit)
+    in_order(options)
     trace = Trace.load(options.trace)
     data = read_json(options.maps)
     maps = maps_of(data, str(options.maps))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import re
 import sys
 from collections.abc import Sequence
@@ -11,53 +12,48 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ssh_abduction.data.errors import AbductionError, MapError, named
+from ssh_abduction.cli.parsing import Parser, true_or_false
+from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.theory import (
     ASSERTIONS,
     CHOICES,
-    COUNTS,
-    EXCUSED,
     PRESETS,
     SETTLED,
     Theory,
 )
 
+# The fields of a theory that have a flag of their own. The others are settings.
+PRICES = ("misread", "slipped")
+FLAGS = ("star", *PRICES, "rules", *ASSERTIONS)
+
 Verbs = Any  # argparse's type for what add_subparsers returns is private
 
 
-def add_theory(
-    parser: argparse.ArgumentParser, default: str = "topological, or causal with --level causal"
-) -> None:
-    """Add --theory PRESET, and a flag for each field of Theory to lay over it."""
-    group = parser.add_argument_group("theory", "a preset, and choices laid over it")
-    group.add_argument("--theory", choices=PRESETS, help=f"preset (default: {default})")
-    for name, values in CHOICES.items():
-        group.add_argument(f"--{name.replace('_', '-')}", choices=values)
-    said = dict(re.findall(r"^ +(\w+)  +(.+)$", Theory.__doc__ or "", re.MULTILINE))
-    for field in fields(Theory):
-        if isinstance(field.default, bool) and field.name not in SETTLED:
-            group.add_argument(
-                f"--{field.name.replace('_', '-')}",
-                action=argparse.BooleanOptionalAction,
-                help=said.get(field.name),
-            )
-    group.add_argument("--reject", type=float, metavar="P", help=said.get("reject"))
-    group.add_argument("--joint", type=int, metavar="N", help=said.get("joint"))
-    for name in EXCUSED:
-        group.add_argument(f"--{name}", type=float, metavar="DSTATES", help=said.get(name))
+def add_theory(parser: Parser, default: str = "topological") -> None:
+    """Add the options that choose a theory: a preset or a file, and choices laid over it.
+
+    Args:
+        parser: The parser of a verb.
+        default: What the help says of the theory where none is named.
+    """
+    group = parser.add_argument_group("theory", "a preset or a file, and choices laid over it")
+    said = helps()
     group.add_argument(
-        "--prefer",
-        metavar="COUNTS",
-        help=f"what to minimise, first to last, of {', '.join(COUNTS)}; commas between",
+        "--theory",
+        metavar="PRESET|FILE",
+        help=f"{', '.join(PRESETS)}; or a .toml file of fields of a theory, or a file of maps, "
+        f"whose theory is taken (default: {default})",
     )
-    group.add_argument("--without", metavar="AXIOMS", help="leave these axioms out; commas between")
+    group.add_argument("--star", choices=CHOICES["star"], help=said["star"])
+    for name in PRICES:
+        group.add_argument(f"--{name}", type=float, metavar="DSTATES", help=said[name])
     group.add_argument(
         "--rules",
         action="append",
         metavar="FILE",
-        help="rules of your own, over the predicates of the encodings; may be given again",
+        help="add your own rules over the predicates of the encodings; may be given again",
     )
     for name, text in (
         ("same", "are one dstate"),
@@ -68,8 +64,28 @@ def add_theory(
             f"--{name}",
             action="append",
             metavar="I,J",
-            help=f"steps I and J {text}; may be given again",
+            help=f"say that steps I and J {text}; may be given again",
         )
+    for field in fields(Theory):
+        if field.name in FLAGS or field.name in SETTLED:
+            continue
+        details: dict[str, Any] = {"metavar": "NAMES"}
+        if field.name in CHOICES:
+            details = {"choices": CHOICES[field.name]}
+        elif isinstance(field.default, bool):
+            details = {"type": true_or_false, "metavar": "true|false"}
+        elif isinstance(field.default, int):
+            details = {"type": int, "metavar": "N"}
+        elif isinstance(field.default, float):
+            details = {"type": float, "metavar": "NUMBER"}
+        parser.add_setting(field.name, said[field.name], **details)
+
+
+def helps() -> dict[str, str]:
+    """What the docstring of Theory says of each of its fields."""
+    _, _, attributes = (Theory.__doc__ or "").partition("Attributes:")
+    entries = re.findall(r"^ {8}(\w+): (.+(?:\n {12}.+)*)", attributes, re.MULTILINE)
+    return {name: " ".join(text.split()).rstrip(".") for name, text in entries}
 
 
 def add_output(parser: argparse.ArgumentParser) -> None:
@@ -138,6 +154,18 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
         )
 
 
+def in_order(options: argparse.Namespace) -> None:
+    """Swap `maps` and `trace` where the trace was named first, as version 0.1.0 had it, and warn."""
+    if options.maps == "-" or not _is_trace(options.maps) or _is_trace(options.trace):
+        return
+    print(
+        "ssh-abduction: warning: a trace before its maps is deprecated; "
+        "name the maps first, and then the trace",
+        file=sys.stderr,
+    )
+    options.maps, options.trace = options.trace, options.maps
+
+
 def read_maps(file: str, mend: str = "name the maps first, and then the trace") -> Any:
     """The JSON in a file of maps. Raises MapError.
 
@@ -159,12 +187,40 @@ def _is_trace(file: str) -> bool:
 
 
 def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theory:
-    """The theory that the options ask for: over the preset, or over the one found where no preset is named. Raises TheoryError."""
+    """The theory that the options ask for.
+
+    Args:
+        options: The options of a verb with `add_theory`.
+        found: The theory to lay them over where none is named.
+
+    Raises:
+        TheoryError: A choice is wrong, or contradicts another one.
+        MapError: The file that --theory names is of no theory.
+    """
     chosen = choices_of(options)
-    if options.theory is None and found is not None:
+    named_theory: str | None = options.theory
+    if named_theory is None and found is not None:
         return found.replace(**chosen)
-    preset = "causal" if chosen.get("level") == "causal" else "topological"
-    return PRESETS[options.theory or preset]().replace(**chosen)
+    if named_theory is None:
+        named_theory = "causal" if chosen.get("level") == "causal" else "topological"
+    if named_theory in PRESETS:
+        return PRESETS[named_theory]().replace(**chosen)
+    if named_theory.endswith(".toml"):
+        return Theory.from_toml(named_theory).replace(**chosen)
+    if not (named_theory.endswith(".json") or Path(named_theory).is_file()):
+        near = difflib.get_close_matches(named_theory, PRESETS, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise TheoryError(
+            f"--theory: expected {', '.join(PRESETS)}, a .toml file, or a file of maps, "
+            f"got {brief(named_theory)}{hint}"
+        )
+    data = read_json(named_theory)
+    if not isinstance(data, dict) or data.get("theory") is None:
+        raise MapError(
+            f"{named(named_theory)}: theory: expected the theory that the maps were made with, got none; "
+            "take what solve --json printed"
+        )
+    return Theory.from_dict(data["theory"]).replace(**chosen)
 
 
 def choices_of(options: argparse.Namespace) -> dict[str, Any]:
@@ -192,17 +248,19 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
         ):  # the theory was made for a trace that has what the default asks for; this one may be another
             default = default.resolve(trace)
     for field in fields(Theory):
-        value, flag = getattr(theory, field.name), f"--{field.name.replace('_', '-')}"
+        value = getattr(theory, field.name)
         if value == getattr(default, field.name) or field.name in ("level", *SETTLED):
             continue
-        if isinstance(value, bool):
-            flags.append(flag if value else f"--no-{flag[2:]}")
-        elif field.name == "rules":
-            flags += [part for rules in value for part in (flag, rules.name)]
+        if field.name == "rules":
+            flags += [part for rules in value for part in ("--rules", rules.name)]
         elif field.name in ASSERTIONS:
-            flags += [part for i, j in value for part in (flag, f"{i},{j}")]
-        elif isinstance(value, tuple):
-            flags += [flag, ",".join(value)]
+            flags += [part for i, j in value for part in (f"--{field.name}", f"{i},{j}")]
         else:
-            flags += [flag, f"{value:g}" if isinstance(value, float) else str(value)]
+            text = ",".join(value) if isinstance(value, tuple) else str(value)
+            if isinstance(value, bool):
+                text = text.lower()
+            elif isinstance(value, float):
+                text = f"{value:g}"
+            own = [f"--{field.name}", text]
+            flags += own if field.name in FLAGS else ["--set", f"{field.name}={text}"]
     return flags

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ssh_abduction.cli.options import Verbs, output
+from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import AbductionError, brief, named
 
@@ -20,7 +21,9 @@ def add_parser(verbs: Verbs) -> None:
     parser = verbs.add_parser(
         "reproduce", help="the paper's experiments, end to end", description=text
     )
-    parser.add_argument("experiment", choices=("notched-rectangle", "taylor-hall"))
+    parser.add_argument(
+        "experiment", choices=("notched-rectangle", "taylor-hall"), help="the experiment"
+    )
     parser.add_argument("--seeds", default="0-19", help="seeds, as 0-19 or 1,5,7 (default: 0-19)")
     parser.add_argument(
         "--json",
@@ -28,11 +31,12 @@ def add_parser(verbs: Verbs) -> None:
         help="print each claim, the paper's figure and ours by seed, as JSON",
     )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
-    parser.add_argument(
-        "--outcomes",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="map outcomes over notch and spread",
+    parser.add_setting(
+        "outcomes",
+        "whether to map the outcomes over notch and spread (default: true)",
+        True,
+        type=true_or_false,
+        metavar="true|false",
     )
     parser.add_argument(
         "-o",

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, add_output, seed, write
+from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, named, printable
 
@@ -30,11 +31,15 @@ SHIPPED = (
     "doors",
 )
 
+FLAG: dict[str, Any] = {"type": true_or_false, "metavar": "true|false"}
+METRES: dict[str, Any] = {"type": float, "metavar": "METRES"}
+SHARE: dict[str, Any] = {"type": float, "metavar": "SHARE"}
+
 
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Drive tours through a world, and log an image, an action and the odometry at each dstate; views are left to cluster. "
-        "Or, with --as, log scans and odometry all along, as real robots do, and write the truth about places beside the log."
+        "Or, with --format, log scans and odometry all along, as real robots do, and write the truth about places beside the log."
     )
     parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
     parser.add_argument(
@@ -42,10 +47,11 @@ def add_parser(verbs: Verbs) -> None:
         help=f"{', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or a floor plan (.xml)",
     )
     parser.add_argument(
-        "--as",
+        "--format",
         dest="log",
         choices=("carmen", "bag"),
-        help="write a robot's log: lines of CARMEN, or a bag of ROS (.bag, .mcap, or a folder)",
+        help="write a robot's log instead of a trace: lines of CARMEN, or a bag of ROS "
+        "(.bag, .mcap, or a folder)",
     )
     parser.add_argument(
         "--tours",
@@ -56,75 +62,63 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument("--seed", type=seed, default=0, help="seed of all noise (default: 0)")
     parser.add_argument(
-        "--no-stars",
-        action="store_true",
-        help="do not log the openings that the robot sees at each place",
-    )
-    parser.add_argument(
-        "--every",
-        type=float,
-        metavar="M",
-        help="log an image each so many metres, rather than at dstates; with --as a scan (default: 0.25)",
-    )
-    parser.add_argument(
-        "--start",
-        metavar="X,Y,DEGREES",
-        help="another start than the world's; write --start=-1,2,90",
-    )
-    parser.add_argument(
         "--route",
         metavar="ACTIONS",
         help="another route than the world's; travel, right, left, around with commas",
     )
     parser.add_argument(
-        "--reach", type=float, metavar="M", help="metres from a wall at which the robot follows it"
-    )
-    errors = parser.add_argument_group(
-        "odometry", "how wrong the displacements are that the robot logs"
-    )
-    errors.add_argument(
-        "--odometry-noise",
-        type=float,
-        metavar="SHARE",
-        help="standard deviation, as a share of each motion (default: 0.02); with --as metres after one metre, the rest in proportion (default: 0.05)",
-    )
-    errors.add_argument(
-        "--scale-error",
-        type=float,
-        default=0.0,
-        metavar="SHARE",
-        help="all ways are reported longer by this (default: 0)",
-    )
-    errors.add_argument(
-        "--bend-error",
-        type=float,
-        default=0.0,
-        metavar="DEGREES",
-        help="drift of the heading in each metre (default: 0)",
-    )
-    camera = parser.add_argument_group(
-        "panoramas",
-        "what a camera sees that looks all around, for --images panoramas; they go to a file .npz beside the trace",
-    )
-    camera.add_argument(
         "--images",
         choices=("ranges", "panoramas"),
         default="ranges",
-        help="log ranges of the laser, or panoramas (default: ranges)",
+        help="log ranges of the laser, or panoramas of a camera that looks all around, which go "
+        "to a file .npz beside the trace (default: ranges)",
     )
-    camera.add_argument(
-        "--textures",
-        choices=("unique", "repeated"),
-        help="whether each wall has its own texture, or parallel ones the same (default: unique)",
-    )
-    camera.add_argument(
-        "--paint-seed", type=seed, metavar="SEED", help="seed of the textures (default: 0)"
-    )
-    camera.add_argument(
-        "--hours",
-        metavar="FROM,TO",
-        help="hours of the day at which the drive begins and ends (default: 12,12)",
-    )
+    for name, text, default, details in (
+        ("stars", "whether to log the openings at each place", True, FLAG),
+        (
+            "every",
+            "log an image each so many metres, not at dstates; a scan with --format (default: "
+            "0.25)",
+            None,
+            METRES,
+        ),
+        ("start", "another start than the world's", None, {"metavar": "X,Y,DEGREES"}),
+        ("reach", "how far from a wall the robot follows it", None, METRES),
+        (
+            "odometry_noise",
+            "standard deviation of the odometry, as a share of each motion (default: 0.02); with "
+            "--format metres after one metre, the rest in proportion (default: 0.05)",
+            None,
+            SHARE,
+        ),
+        ("scale_error", "all ways are reported longer by this share (default: 0)", 0.0, SHARE),
+        (
+            "bend_error",
+            "drift of the heading, in degrees a metre (default: 0)",
+            0.0,
+            {"type": float, "metavar": "DEGREES"},
+        ),
+        (
+            "textures",
+            "whether each wall has its own texture in panoramas, or parallel walls the same one "
+            "(default: unique)",
+            None,
+            {"choices": ("unique", "repeated")},
+        ),
+        (
+            "paint_seed",
+            "seed of the textures (default: 0)",
+            None,
+            {"type": seed, "metavar": "SEED"},
+        ),
+        (
+            "hours",
+            "hours of the day at which the drive begins and ends (default: 12,12)",
+            None,
+            {"metavar": "FROM,TO"},
+        ),
+    ):
+        parser.add_setting(name, text, default, **details)
     add_output(parser)
     parser.set_defaults(run=run)
 
@@ -140,7 +134,7 @@ def run(options: argparse.Namespace) -> int:
         return _write_log(options, _drive(options))
     if options.world.endswith(".xml"):
         raise AbductionError(
-            f"{named(options.world)}: expected --as carmen or --as bag beside a floor plan, as it has no route of actions; add that"
+            f"{named(options.world)}: expected --format carmen or --format bag beside a floor plan, as it has no route of actions; add that"
         )
     noise = Body.odometry if options.odometry_noise is None else options.odometry_noise
     body = Body(odometry=noise, scale=options.scale_error, bend=math.radians(options.bend_error))
@@ -151,7 +145,7 @@ def run(options: argparse.Namespace) -> int:
         options.tours,
         options.seed,
         body=body,
-        stars=not options.no_stars,
+        stars=options.stars,
         every=options.every,
         camera=camera,
     )
@@ -174,15 +168,15 @@ def _drive(options: argparse.Namespace) -> Drive:
 
     for name, given in (
         ("--images panoramas", options.images != "ranges"),
-        ("--textures", options.textures is not None),
-        ("--paint-seed", options.paint_seed is not None),
-        ("--hours", options.hours is not None),
-        ("--no-stars", options.no_stars),
+        ("textures", options.textures is not None),
+        ("paint_seed", options.paint_seed is not None),
+        ("hours", options.hours is not None),
+        ("stars=false", not options.stars),
         ("-o -", options.output == "-"),
     ):
         if given:
             raise AbductionError(
-                f"{name}: expected none beside --as, as a robot's log is a file of scans; leave it out"
+                f"{name}: expected none beside --format, as a robot's log is a file of scans; leave it out"
             )
     odometer = Odometer(scale=options.scale_error, bend=math.radians(options.bend_error))
     if options.odometry_noise is not None:
@@ -269,7 +263,7 @@ def _camera(options: argparse.Namespace) -> Camera | None:
         begin, end = (float(hour) for hour in options.hours.split(","))
     except ValueError:
         raise AbductionError(
-            f"--hours: expected two hours with a comma between them, as 7,19, got {options.hours!r}; write two"
+            f"hours: expected two hours with a comma between them, as 7,19, got {options.hours!r}; write two"
         ) from None
     return Camera(paint=paint, hours=(begin, end))
 

@@ -76,12 +76,6 @@ def add_parser(verbs: Verbs) -> None:
         help="stop after S seconds with the best answer so far",
     )
     parser.add_argument(
-        "--without-speedups",
-        default="",
-        metavar="NAMES",
-        help=f"leave these out, of {', '.join(SPEEDUPS)}; commas between",
-    )
-    parser.add_argument(
         "--memory-limit",
         type=int,
         metavar="MIB",
@@ -101,6 +95,12 @@ def add_parser(verbs: Verbs) -> None:
         help="solve on the workers of the Dask scheduler at this address, tcp://host:port",
     )
     add_theory(parser)
+    parser.add_setting(
+        "without_speedups",
+        f"speed-ups to leave out, with commas between: {', '.join(SPEEDUPS)}",
+        default="",
+        metavar="NAMES",
+    )
     parser.set_defaults(run=run)
 
 
@@ -259,7 +259,7 @@ def _lines(
         if explanation:
             yield from explanation.sentences
             first, last = search.trace.at(explanation.first), search.trace.at(explanation.last)
-            yield f"look at what was seen and done from {first} to {last}, or leave one of these axioms out: --without NAME"
+            yield f"look at what was seen and done from {first} to {last}, or leave one of these axioms out: --set without=NAME"
         return
     if solution.cost is None:
         if solution.partial:

@@ -7,7 +7,15 @@ import json
 import sys
 from typing import Any
 
-from ssh_abduction.cli.options import Verbs, check_number, check_picture, output, picture_file, seed
+from ssh_abduction.cli.options import (
+    Verbs,
+    check_number,
+    check_picture,
+    in_order,
+    output,
+    picture_file,
+    seed,
+)
 from ssh_abduction.cli.text import counted, table
 from ssh_abduction.data.errors import MapError, named
 from ssh_abduction.data.map_file import read_json
@@ -28,8 +36,8 @@ def add_parser(verbs: Verbs) -> None:
         help="how well a recogniser does with few and many images",
         description=text,
     )
-    curve.add_argument(
-        "--folds", type=int, default=10, help="parts of the cross-validation (default: 10)"
+    curve.add_setting(
+        "folds", "parts of the cross-validation (default: 10)", 10, type=int, metavar="N"
     )
     curve.add_argument("--seed", type=seed, default=0, help="seed of the folds (default: 0)")
     curve.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the learning curve")
@@ -53,10 +61,10 @@ def add_parser(verbs: Verbs) -> None:
     )
     apart.set_defaults(run=run_tell_apart)
     for parser in (train, curve, apart):
-        parser.add_argument("trace", help="trace file with images")
         parser.add_argument(
             "maps", help="what solve --json printed for this trace, or one saved map"
         )
+        parser.add_argument("trace", help="trace file with images")
         parser.add_argument(
             "--map",
             type=int,
@@ -99,6 +107,7 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
     from perception.images import images_of
     from ssh_abduction.learning.learner import labels_of
 
+    in_order(options)
     trace = Trace.load(options.trace)
     data = read_json(options.maps)
     maps = maps_of(data, str(options.maps))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, flags_of
+from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole, named
 
 if TYPE_CHECKING:
@@ -40,21 +41,14 @@ def add_parser(verbs: Verbs) -> None:
         "also replay this run of a robot, with the belief where it may be at each step, in each rival. It may be TRACE itself. It is localised by its views, or as "
         "--belief says"
     )
-    parser.add_argument("--localize", metavar="RUN", help=localised)
+    parser.add_argument("--run", dest="followed", metavar="RUN", help=localised)
     parser.add_argument(
         "--belief",
         metavar="FILE",
-        help="what localize --json printed of the run of --localize, or of TRACE",
+        help="what localise --json printed of the run of --run, or of TRACE",
     )
     serve = "serve the page on this computer alone, so that it can explain, and solve again under what is assumed; needs TRACE. Ctrl-C ends it"
     parser.add_argument("--serve", action="store_true", help=serve)
-    parser.add_argument(
-        "--port",
-        type=int,
-        default=0,
-        metavar="N",
-        help="with --serve, the port (default: any that is free)",
-    )
     parser.add_argument(
         "--time-limit",
         type=float,
@@ -62,8 +56,19 @@ def add_parser(verbs: Verbs) -> None:
         metavar="S",
         help="with --serve, seconds for an answer (default: 30)",
     )
-    parser.add_argument(
-        "--no-open", action="store_true", help="print where the page is, and do not open it"
+    parser.add_setting(
+        "port",
+        "with --serve, the port (default: any that is free)",
+        0,
+        type=int,
+        metavar="N",
+    )
+    parser.add_setting(
+        "open",
+        "whether to open the page in the browser (default: true)",
+        True,
+        type=true_or_false,
+        metavar="true|false",
     )
     parser.set_defaults(run=run)
     parser.epilog = "The page is one file that loads nothing from elsewhere. Without --serve it says which commands answer its questions."
@@ -86,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
             "--output: expected none with --serve, which writes no file; leave out one of the two"
         )
     if not 0 <= options.port <= 65535:
-        raise AbductionError(f"--port: expected 0 to 65535, got {options.port}; name a free port")
+        raise AbductionError(f"port: expected 0 to 65535, got {options.port}; name a free port")
     data = read_json(options.maps)
     source = "standard input" if options.maps == "-" else options.maps
     listing = Listing.from_dict(data, source)
@@ -115,7 +120,7 @@ def run(options: argparse.Namespace) -> int:
     file = options.output or _temporary()
     page.save(file)
     print(file)
-    if not options.output and not options.no_open:
+    if not options.output and options.open:
         _open(Path(file).absolute().as_uri())
     return 0
 
@@ -146,12 +151,12 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
     from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.content import Run
 
-    if options.localize is None and options.belief is None:
+    if options.followed is None and options.belief is None:
         return None
-    followed = Trace.load(options.localize) if options.localize is not None else trace
+    followed = Trace.load(options.followed) if options.followed is not None else trace
     if followed is None:
         raise AbductionError(
-            "--belief: expected the run that it is of, got none; name it with --localize, or give the trace that was mapped"
+            "--belief: expected the run that it is of, got none; name it with --run, or give the trace that was mapped"
         )
     if options.belief is None:
         from ssh_abduction.online.localiser import Localiser
@@ -170,7 +175,7 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     beliefs = told.get("beliefs") if isinstance(told, dict) else None
     if not isinstance(beliefs, list) or not all(isinstance(belief, dict) for belief in beliefs):
         raise MapError(
-            f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write them with localize --json"
+            f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write them with localise --json"
         )
     maps, number = maps_of(data, "maps"), told.get("map", 1)
     if not is_whole(number) or not 1 <= number <= len(maps):
@@ -183,7 +188,7 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
         )
     if len(beliefs) != len(followed):
         raise MapError(
-            f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, got {len(beliefs)}; name that run with --localize"
+            f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, got {len(beliefs)}; name that run with --run"
         )
     chosen, labels = maps[number - 1], maps[number - 1].renumbered().labels
     visited = dict.fromkeys([*chosen.labels, *range(len(chosen.dstates))])
@@ -226,11 +231,11 @@ def _serve(
         )
     except OSError as error:
         raise AbductionError(
-            f"--port: expected a free port, got {options.port}: {error.strerror}; name another one"
+            f"port: expected a free port, got {options.port}: {error.strerror}; name another one"
         ) from None
     with server:
         print(server.url, flush=True)
-        if not options.no_open:
+        if options.open:
             _open(server.url)
         try:
             server.serve_forever()

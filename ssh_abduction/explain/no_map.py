@@ -104,7 +104,7 @@ def explain(
     if theory.jumped:
         raise TheoryError(
             "jumped: expected displacements that hold where a trace is explained; "
-            "leave it out (--jumped)"
+            "leave it out (--set jumped=0)"
         )
     theory.check_steps(trace)
     check_rules(theory)

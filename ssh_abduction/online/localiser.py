@@ -194,7 +194,7 @@ class Localiser:
             raise TraceError(
                 f"{named(trace.source or 'trace')}: view: expected the views of the map, "
                 "got images only; train a recogniser on the map's labels, "
-                "and give it to localize --recogniser"
+                "and give it to localise --recogniser"
             )
         yield from (self._of_view(step.view) for step in trace)
 

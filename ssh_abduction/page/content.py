@@ -291,7 +291,7 @@ def _belief(belief: dict[str, Any], count: int) -> list[Any]:
             raise ValueError
     except (KeyError, TypeError, ValueError):
         raise MapError(
-            f"beliefs: expected verdict, nowhere and probabilities of dstates 0 to {count - 1}, as localize --json prints them, got something else; "
+            f"beliefs: expected verdict, nowhere and probabilities of dstates 0 to {count - 1}, as localise --json prints them, got something else; "
             "localise in these maps again"
         ) from None
     return [

@@ -101,7 +101,7 @@ def fault_front(
     check_limit("time_limit", "seconds", time_limit)
     if theory.jumped:
         raise TheoryError(
-            "jumped: expected no wrong displacements where faults are counted; leave it out (--jumped)"
+            "jumped: expected no wrong displacements where faults are counted; leave it out (--set jumped=0)"
         )
     if theory.level != "causal":
         raise TheoryError(
@@ -109,7 +109,7 @@ def fault_front(
         )
     if theory.rules or theory.without or theory.prefer not in (("dstates",), ("auto",)):
         raise TheoryError(
-            "front: expected the causal axioms alone, fewest dstates first; leave out --rules, --without and --prefer"
+            "front: expected the causal axioms alone, fewest dstates first; leave out --rules, --set without and --set prefer"
         )
     if not is_whole(most) or not 0 <= most <= 1000:
         raise TheoryError(f"front: expected a number of faults from 0 to 1000, got {brief(most)}")

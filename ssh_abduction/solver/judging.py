@@ -156,7 +156,7 @@ class Judging:
         where = f" at step {violation.steps[-1]}" if violation.steps else ""
         raise InternalError(
             f"internal error: a map that was found breaks {violation.axiom}{where} (trace {self._trace.digest}): {violation.message} "
-            "This is a defect of ssh-abduction, not of the trace; please report it with the trace, and try solve --without-speedups prefixes,names,ways"
+            "This is a defect of ssh-abduction, not of the trace; please report it with the trace, and try solve --set without_speedups=prefixes,names,ways"
         )
 
 

@@ -10,13 +10,17 @@
 from __future__ import annotations
 
 import math
+import os
+import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from ssh_abduction.data.checks import a_text, a_whole_number, an_instance, one_of
-from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_finite, is_whole
+from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_finite, is_whole, named
+from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.trace import Step, Trace, checked_trace
 from ssh_abduction.data.words import shortly
 from ssh_abduction.theory import encodings
@@ -59,6 +63,7 @@ EXCUSED = {
 }
 # A step of little confidence costs so many times the price, and one that is all sure so many times: no view is so sure that nothing else could be wrong instead.
 LEAST_SURE, MOST_SURE = 0.1, 5.0
+LARGEST_TOML = 2**20  # bytes
 DEAREST = 1000.0  # a fault costs so many dstates at most
 # So many returns, at most, may be tested together.
 MOST_JOINT = 2
@@ -89,35 +94,44 @@ CAUSAL = "Theory.causal() (--theory causal)"  # in error messages
 
 @dataclass(frozen=True)
 class Theory:
-    """A choice of axioms and of what is preferred. It is frozen, and made by a preset and `replace`, or field by field.
+    """A frozen choice of axioms and of what is minimised: a preset, `replace`, or field by field.
 
-    level            causal (dstates only) or topological (dstates, places, paths)
-    boundary         the axioms of right and left of a path: none, strict, or defeasible (pairs of paths may be excused)
-    symmetric_sides  paths cross, so that a turn tells four relations of sides rather than one
-    path_order       whether the order of the places of a path is partial or total
-    next_place       a travel leads to the next place of its path
-    all_on_paths     every dstate is along a path, even one that no travel starts or ends at
-    star             the openings seen at a place: none, alike (a dstate has one star, in tolerance; nothing is said of places), pattern
-                     (agree up to rotation), frame (agree when turned by the heading, and paths go straight on), gateways (the
-                     same in any directions, in tolerance); auto is frame where the trace has stars, and none elsewhere; frame is
-                     gateways where stars or turns do not fit right angles
-    displacement     whether displacements are evidence: none, use; auto uses them where the trace has any
-    reject           the probability, at most, that displacements refuse a true map of the trace
-    joint            so many returns are tested together, at most: 1 or 2
-    returns          how many returns of the trace may be true, among which `reject` is shared; 0 counts them in the trace
-    misread          how many dstates a view, or a star, costs that is not that of its dstate, to a tenth; 0 where none may be
-    slipped          how many dstates an action costs that did not do what its name says, to a tenth; 0 where none may be
-    jumped           how many dstates a displacement costs that is wrong altogether, as that of a robot which was carried away, to a tenth; 0 where none may be
-    planar           paths meet at places only: the map can be drawn in the plane, with turns right to the right, without a crossing
-    prefer           what is minimised, first to last: dstates, paths, places, and with boundary=defeasible excuses, which go first
-                     unless they are named; what is not named is not minimised. auto is dstates,places,paths where displacements are used,
-                     else dstates,paths,places
-    without          names of axioms left out, to see what they do
-    rules            a user's own rules: paths of files over the predicates of the encodings, or Rules
-    unknown_views    whether the view of some step is unknown; the trace says it
-    same, different, elsewhere  what a person knows of pairs of steps: that they are one dstate, that they are not, or that they are not even at one place
+    docs/theory.md has the axioms and their sources; `ssh-abduction theory` prints them.
 
-    The axioms and their sources are in docs/theory.md; `ssh-abduction theory` prints them.
+    Attributes:
+        level: Which maps are sought: causal ones (dstates only), or topological ones (dstates,
+            places and paths).
+        boundary: How the axioms of left and right of a path hold: not at all, strictly, or by
+            default, so that pairs of paths may be excused at a cost.
+        symmetric_sides: Whether paths cross, so that a turn tells four relations of sides, not one.
+        path_order: Whether the places of a path have a partial or a total order.
+        next_place: Whether a travel leads to the next place of its path.
+        all_on_paths: Whether every dstate is on a path, even one where no travel starts or ends.
+        star: How to read the gateways seen at a place. none: not at all. alike: a dstate has one
+            star, within tolerance. pattern: stars of a place agree up to a rotation. frame: they
+            agree when turned by the heading, and paths go straight on. gateways: like frame, in
+            any directions within tolerance. auto: frame if the trace has stars, else none. frame
+            becomes gateways if stars or turns do not fit right angles.
+        displacement: Whether displacements are evidence; auto uses them if the trace has any.
+        reject: The probability that displacements refuse a true map of the trace, at most.
+        joint: How many returns to a place are tested together, at most: 1 or 2.
+        returns: How many returns of the trace may be true, among which `reject` is shared; 0 counts
+            them in the trace.
+        misread: Cost in dstates of disbelieving a view or star, in tenths; 0 forbids it.
+        slipped: Cost in dstates of an action that did not do what its name says; 0 forbids it.
+        jumped: Cost in dstates of disbelieving a displacement, as when the robot was carried away;
+            0 forbids it.
+        planar: Whether paths meet at places only: the map can be drawn in the plane without a
+            crossing, with right turns to the right.
+        prefer: What to minimise, first to last, out of dstates, paths, places and excuses. Counts
+            that are not named are not minimised. auto is dstates,places,paths where displacements
+            are used, else dstates,paths,places.
+        without: Names of axioms to leave out, to see what they do.
+        rules: Your own rules: paths of files over the predicates of the encodings, or Rules.
+        unknown_views: Whether the view of some step is unknown. The trace decides it.
+        same: Pairs of steps known to be one dstate.
+        different: Pairs of steps known to be different dstates.
+        elsewhere: Pairs of steps known to be at different places.
     """
 
     level: Literal["causal", "topological"] = "topological"
@@ -204,7 +218,7 @@ class Theory:
             )
         if self.planar:
             raise TheoryError(
-                "planar: expected no planarity where faults are allowed; leave it out (--no-planar)"
+                "planar: expected no planarity where faults are allowed; leave it out (--set planar=false)"
             )
 
     def _check_numbers(self) -> None:
@@ -524,6 +538,46 @@ class Theory:
             **{str(k): tuple(v) if isinstance(v, list) else v for k, v in data.items()}
         )
 
+    @classmethod
+    def from_toml(cls, path: str | os.PathLike[str]) -> Theory:
+        """Read a theory from a TOML file with one field a line, such as `star = "frame"`.
+
+        Args:
+            path: The file. `preset = "causal"` in it names the preset that the other fields are
+                laid over. Files of `rules` are looked for beside it.
+
+        Raises:
+            TheoryError: The file cannot be read, or a field is wrong.
+        """
+        data = _read_toml(path)
+        preset = data.pop("preset", "causal" if data.get("level") == "causal" else "topological")
+        if not isinstance(preset, str) or preset not in PRESETS:
+            raise TheoryError(
+                f"{named(path)}: preset: expected one of {', '.join(PRESETS)}, got {brief(preset)}"
+            )
+        if isinstance(rules := data.get("rules"), list):
+            beside = Path(path).parent
+            data["rules"] = [
+                str(beside / file) if isinstance(file, str) else file for file in rules
+            ]
+        try:
+            return PRESETS[preset]().replace(
+                **{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+            )
+        except TheoryError as error:
+            raise TheoryError(f"{named(path)}: {error}") from None
+
+
+def _read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The fields in a TOML file. Raises TheoryError."""
+    try:
+        return tomllib.loads(read_at_most(path, LARGEST_TOML).decode("utf-8"))
+    except OSError as error:
+        why, mend = error.strerror or str(error), "name a .toml file"
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, ValueError) as error:
+        why, mend = str(error), 'write lines such as star = "frame"'
+    raise TheoryError(f"{named(path)}: expected a theory in TOML, got {why}; {mend}")
+
 
 def _checked_step(value: object) -> Step:
     return an_instance("step", value, Step, TraceError, mend="take one of trace.steps")
@@ -566,7 +620,8 @@ def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
 
 def _choice(name: str, value: str) -> str:
     """A choice as an error message names it: in Python, and in the shell."""
-    return f"{name}={value} (--{name} {value})"
+    flag = f"--{name} {value}" if name == "star" else f"--set {name}={value}"
+    return f"{name}={value} ({flag})"
 
 
 PRESETS: dict[str, Callable[[], Theory]] = {

@@ -177,7 +177,7 @@ def _configuration(name: str, seeds: Sequence[int], outcomes: bool) -> dict[str,
     return {
         "experiment": name,
         "command": f"ssh-abduction reproduce {name} --seeds {','.join(map(str, seeds))}"
-        f"{'' if outcomes else ' --no-outcomes'}",
+        f"{'' if outcomes else ' --set outcomes=false'}",
         **asdict(EXPERIMENTS[name]),
         "seeds": list(seeds),
         "laser": asdict(Laser()),

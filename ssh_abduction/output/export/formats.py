@@ -24,9 +24,10 @@ from ssh_abduction.output.export.nav2 import nav2
 from ssh_abduction.output.export.roads import Roads
 from ssh_abduction.output.export.tmap2 import tmap2
 from ssh_abduction.output.graphs import to_graphml, to_networkx
+from ssh_abduction.output.picture import to_svg
 from ssh_abduction.output.turns import Turns, degrees_of
 
-FORMATS = ("nav2", "tmap2", "graphml", "dot", "networkx-json")
+FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
 FOR_NAVIGATION = ("nav2", "tmap2")  # these need positions
 LEVELS = ("places", "dstates")
 
@@ -48,8 +49,8 @@ def export_map(
     Args:
         ssh_map: The map.
         to: "nav2", a route graph of Nav2 (GeoJSON); "tmap2", a topological map of LCAS's
-            topological_navigation (YAML); "graphml"; "dot", Graphviz; or "networkx-json", which
-            networkx.node_link_graph reads.
+            topological_navigation (YAML); "graphml"; "dot", Graphviz; "svg", a picture; or
+            "networkx-json", which networkx.node_link_graph reads.
         level: What nodes are, "places" or "dstates". None means places for nav2 and tmap2, if the
             map has any, and dstates otherwise.
         name: What the map is called; in tmap2 its pointset, too.
@@ -62,6 +63,12 @@ def export_map(
     checked_map(ssh_map)
     degrees_of(turns)
     one_of("to", to, FORMATS, MapError)
+    if to == "svg":
+        if level is not None:
+            raise MapError(
+                "level: expected none for svg, which shows places and dstates; leave it out"
+            )
+        return to_svg(ssh_map, turns)
     level = one_of("level", _level(ssh_map, to, level), LEVELS, MapError, mend="say what nodes are")
     for field, text in (("name", name), ("frame", frame)):
         if not isinstance(text, str) or not text or not is_writable(text):

@@ -1,4 +1,4 @@
-"""ssh-abduction localize MAPS TRACE: where in a known map was the robot at each step?"""
+"""ssh-abduction localise MAPS TRACE: where in a known map was the robot at each step?"""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from ssh_abduction.cli.options import Verbs, check_number, check_picture, picture_file, read_maps
+from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import LocaliserError, MapError, named
 from ssh_abduction.data.files import json_line
@@ -31,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
         "A robot that is kidnapped is found again, and one that is nowhere that the map knows is said to be nowhere."
     )
     parser = verbs.add_parser(
-        "localize", help="where in a known map is the robot?", description=text
+        "localise", help="where in a known map is the robot?", description=text
     )
     parser.add_argument(
         "maps", help="what solve --json printed for the trace that was mapped, or one saved map"
@@ -53,9 +54,6 @@ def add_parser(verbs: Verbs) -> None:
         metavar="FILE.skops",
         help="what train wrote for this map: read images instead of views",
     )
-    chances = parser.add_argument_group(
-        "chances", "how likely it is at each step that what the map says does not hold, from 0 to 1"
-    )
     said = {
         "misread": "what is seen is not of the dstate that the robot is at",
         "slipped": "the action leads elsewhere: it failed, or the robot was kidnapped",
@@ -63,9 +61,18 @@ def add_parser(verbs: Verbs) -> None:
         "reentered": "a robot that is at no dstate of the map is at one after its next action",
     }
     for name in CHANCES:
-        chances.add_argument(f"--{name}", type=float, metavar="P", help=said[name])
-    chances.add_argument(
-        "--zero-one", action="store_true", help="none of these: the map holds without exception"
+        parser.add_setting(
+            name,
+            f"the probability at each step that {said[name]}",
+            type=float,
+            metavar="P",
+        )
+    parser.add_setting(
+        "zero_one",
+        "whether all these probabilities are 0: the map holds without exception",
+        default=False,
+        type=true_or_false,
+        metavar="true|false",
     )
     parser.add_argument(
         "--plot",

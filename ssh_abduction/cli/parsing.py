@@ -1,0 +1,289 @@
+"""The parser of the command line: verbs in groups, settings by --set NAME=VALUE, and hints for misspelt names."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from ssh_abduction.data.errors import printable
+
+# Flags of version 0.1.0 whose value is now given in another way. Each still works in this version,
+# with a warning.
+REPLACED = {
+    "as": "format",
+    "theory-of": "theory",
+    "localize": "run",
+}
+OTHER_VERBS = {"localize": "localise"}
+DRAWN = ("dot", "graphml", "svg")  # what `show` drew, which is `export --to` now
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A choice that is made by --set NAME=VALUE.
+
+    Attributes:
+        name: Its name, with underscores.
+        help: What it means.
+        type: Makes the value of a text. Raises ValueError or argparse.ArgumentTypeError.
+        choices: The texts that are allowed; None if the type decides.
+        metavar: What stands for the value in the help.
+        many: Whether it may be given again, which makes a list.
+    """
+
+    name: str
+    help: str
+    type: Callable[[str], Any] = str
+    choices: tuple[str, ...] | None = None
+    metavar: str = "TEXT"
+    many: bool = False
+
+    @property
+    def shown(self) -> str:
+        """The setting as the help shows it: `star={auto,none}`."""
+        return f"{self.name}={'{' + ','.join(self.choices) + '}' if self.choices else self.metavar}"
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether the value is true or false."""
+        return self.type is true_or_false
+
+    def read(self, text: str) -> Any:
+        """The value that a text stands for. Raises argparse.ArgumentTypeError."""
+        if self.choices and text not in self.choices:
+            expected = " or ".join(filter(None, (", ".join(self.choices[:-1]), self.choices[-1])))
+            raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
+        try:
+            return self.type(text)
+        except ValueError:
+            expected = {int: "a whole number", float: "a number"}.get(self.type, "another value")  # type: ignore[call-overload]
+            raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}") from None
+
+
+def true_or_false(text: str) -> bool:
+    """The value of a setting that is on or off."""
+    if text not in ("true", "false"):
+        raise argparse.ArgumentTypeError(f"expected true or false, got {text!r}")
+    return text == "true"
+
+
+class _Set(argparse.Action):
+    """Reads NAME=VALUE into the setting of that name."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        assert isinstance(parser, Parser)
+        name, equals, text = str(values).partition("=")
+        setting = parser.settings.get(name.strip().replace("-", "_"))
+        if setting is None or not equals:
+            known = ", ".join(parser.settings)
+            hint = _meant(name, parser.settings)
+            raise argparse.ArgumentError(
+                self, f"expected NAME=VALUE with a name out of {known}, got {values!r}{hint}"
+            )
+        if text == "--":
+            raise argparse.ArgumentError(self, f"{setting.name}: expected a value, got '--'")
+        try:
+            value = setting.read(text)
+        except argparse.ArgumentTypeError as error:
+            raise argparse.ArgumentError(self, f"{setting.name}: {error}") from None
+        if setting.many:
+            value = [*(getattr(namespace, setting.name) or []), value]
+        setattr(namespace, setting.name, value)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser of argparse with settings, groups of verbs, and hints for misspelt names.
+
+    Attributes:
+        settings: The settings of this verb, by name.
+        groups: The verbs of this program, by the heading that the help lists them under.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.settings: dict[str, Setting] = {}
+        self.groups: dict[str, tuple[str, ...]] = {}
+
+    def add_setting(self, name: str, help_text: str, default: Any = None, **details: Any) -> None:
+        """Add a setting, whose value is an attribute of the options like that of a flag.
+
+        Args:
+            name: Its name, with underscores.
+            help_text: What it means.
+            default: Its value where it is not given.
+            details: Other fields of Setting.
+        """
+        if not self.settings:
+            self.add_argument(
+                "--set",
+                action=_Set,
+                dest=argparse.SUPPRESS,
+                metavar="NAME=VALUE",
+                help="change one of the settings listed below; may be given again",
+            )
+        self.settings[name] = Setting(name, help_text, **details)
+        self.set_defaults(**{name: default})
+
+    def format_help(self) -> str:
+        """The help of argparse, with the settings, and with the verbs in their groups."""
+        formatter = self._get_formatter()
+        formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
+        formatter.add_text(self.description)
+        for group in self._action_groups:
+            actions = [a for a in group._group_actions if not self._lists_verbs(a)]
+            formatter.start_section(group.title)
+            formatter.add_text(group.description)
+            formatter.add_arguments(actions)
+            formatter.end_section()
+        for title, names in self.groups.items():
+            verbs = [a for a in self._verb_actions() if a.dest in names]
+            self._add_section(formatter, title, [(a.dest, a.help or "") for a in verbs])
+        settings = [(setting.shown, setting.help) for setting in self.settings.values()]
+        if settings:
+            self._add_section(formatter, "settings, each given as --set NAME=VALUE", settings)
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
+
+    def _add_section(
+        self, formatter: argparse.HelpFormatter, title: str, rows: Iterable[tuple[str, str]]
+    ) -> None:
+        formatter.start_section(title)
+        for name, text in rows:
+            formatter.add_argument(argparse.Action([], name, metavar=name, help=text))
+        formatter.end_section()
+
+    def _lists_verbs(self, action: argparse.Action) -> bool:
+        return bool(self.groups) and isinstance(action, argparse._SubParsersAction)
+
+    def _verb_actions(self) -> Iterable[argparse.Action]:
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                yield from action._choices_actions
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            hint = _meant(value, map(str, action.choices or ()))
+            raise argparse.ArgumentError(action, f"{error.message}{hint}") from None
+
+    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        """As argparse does, but errors about unknown options come from the verb.
+
+        Flags of version 0.1.0 are replaced by what they are now. `notes` of the options says so.
+        """
+        notes: list[str] = []
+        words = self._with_replacements(list(sys.argv[1:] if args is None else args), notes)
+        options, unknown = self.parse_known_args(words, namespace)
+        options.notes = tuple(notes)
+        if unknown:
+            verb = self.verbs[options.verb] if getattr(options, "verb", None) else self
+            wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
+            hint = _meant(wrong.partition("=")[0], verb.names)
+            verb.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        return options
+
+    def _with_replacements(self, words: list[str], notes: list[str]) -> list[str]:
+        """The words of a command line, with flags of version 0.1.0 replaced. Notes say by what."""
+        at = next((i for i, word in enumerate(words) if not word.startswith("-")), None)
+        if at is None:
+            return words
+        if (now := OTHER_VERBS.get(words[at])) is not None:
+            notes.append(_note(words[at], now))
+            words = [*words[:at], now, *words[at + 1 :]]
+        verb = self.verbs.get(words[at])
+        if verb is None:
+            return words
+        if words[at] == "show" and any(w[2:].partition("=")[0] in DRAWN for w in words[at:]):
+            return _exported(words, at, notes)
+        done, rest = words[: at + 1], words[at + 1 :]
+        while rest:
+            word = rest.pop(0)
+            if word == "--":
+                return [*done, word, *rest]
+            done += verb._replacement(word, rest, notes) or [word]
+        return done
+
+    def _replacement(self, word: str, rest: list[str], notes: list[str]) -> list[str] | None:
+        """What stands for a flag of version 0.1.0; None if the word is no such flag.
+
+        Args:
+            word: The flag, perhaps with "=VALUE".
+            rest: The words behind it. The value is taken from there if it is not in the word.
+            notes: Takes a sentence for each flag that is replaced.
+        """
+        flag, equals, value = word.partition("=")
+        name = flag[2:].replace("-", "_")
+        if not flag.startswith("--") or flag in self.names:
+            return None
+        negative = name.removeprefix("no_")
+        on = self.settings.get(name)
+        off = self.settings.get(negative) if negative != name else None
+        if (on is not None and on.is_flag) or (off is not None and off.is_flag):
+            setting = f"{name}=true" if on is not None else f"{negative}=false"
+            notes.append(_note(flag, f"--set {setting}"))
+            return ["--set", setting]
+        new = REPLACED.get(flag[2:])
+        if (on is None and (new is None or f"--{new}" not in self.names)) or not (equals or rest):
+            return None
+        value = value if equals else rest.pop(0)
+        if on is not None:
+            notes.append(_note(flag, f"--set {name}={value}"))
+            return ["--set", f"{name}={value}"]
+        notes.append(_note(flag, f"--{new}"))
+        return [f"--{new}={value}"]
+
+    @property
+    def verbs(self) -> Mapping[str, Parser]:
+        """The parsers of the verbs."""
+        groups = (a.choices for a in self._actions if isinstance(a, argparse._SubParsersAction))
+        return next(groups, {})
+
+    @property
+    def names(self) -> list[str]:
+        """The names of all options."""
+        return [name for action in self._actions for name in action.option_strings]
+
+    def error(self, message: str) -> NoReturn:
+        """Print a message and the usage, and exit with code 2."""
+        super().error(printable(message))  # which repeats what was typed
+
+
+def _exported(words: list[str], at: int, notes: list[str]) -> list[str]:
+    """The `export` command that does what `show --dot`, `--graphml` or `--svg` did."""
+    kept, target = [], None
+    rest = words[at + 1 :]
+    while rest:
+        word = rest.pop(0)
+        flag, _, value = word.partition("=")
+        if not (flag.startswith("--") and flag[2:] in DRAWN):
+            kept.append(word)
+            continue
+        target = ["--to", flag[2:]]
+        if flag == "--svg" and not value and rest and rest[0].lower().endswith(".svg"):
+            value = rest.pop(0)
+        if value:
+            target += ["-o", value]
+    new = [*words[:at], "export", *kept, *(target or [])]
+    notes.append(_note(" ".join(words[at:]), " ".join(new[at:])))
+    return new
+
+
+def _note(old: str, new: str) -> str:
+    return f"{printable(old)} is deprecated; write {printable(new)}"
+
+
+def _meant(word: object, names: Iterable[str]) -> str:
+    """A question after the name that is nearest to a word, if one is near."""
+    near = difflib.get_close_matches(str(word), list(names), n=1)
+    return f"; did you mean {near[0]}?" if near else ""
