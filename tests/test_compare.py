@@ -31,8 +31,8 @@ from ssh_abduction.cli.text import compared
 from ssh_abduction.data import MapError
 from ssh_abduction.data.maps import DState, Fault, Fit, MapPath
 from ssh_abduction.rivals import Comparison, Listing, difference
-from ssh_abduction.rivals.comparison import Matter, Question
 from ssh_abduction.rivals.factors import deciding, independent
+from ssh_abduction.rivals.questions import Matter, Question
 from ssh_abduction.rivals.table import Table
 from ssh_abduction.solver import search as searching
 from ssh_abduction.solver.engines import framed, naming
@@ -288,7 +288,7 @@ def test_independent_choices_are_factors() -> None:
     found = compare(solution)
     assert found.product == "68 = 2 x 34"
     holds_of(found, solution.maps)
-    assert "  68 = 2 x 34: these choices are independent of each other" in list(compared(found))
+    assert "  68 = 2 x 34: each combination of these choices is a map" in list(compared(found))
 
 
 def of_streets(rng: random.Random, count: int, dstates: int, steps: int) -> list[SSHMap]:
@@ -502,7 +502,7 @@ def test_where_not_all_are_listed_the_backbone_says_what_all_share(
 def test_a_search_that_was_stopped_says_as_far_as_was_found_out() -> None:
     maps = solve(Trace.load(ACES3), max_maps=None).maps
     listing = Listing(maps[:2], minimal=2, complete=False, stopped="time limit")
-    assert compare(listing).sentence.endswith("as far as was found out: others may differ in more")
+    assert compare(listing).sentence.endswith("as far as is known: other maps may differ in more")
     assert compare(maps[:1]).sentence == "1 map"
 
 

@@ -10,7 +10,7 @@ from worlds import HEADINGS, Streets, streets
 
 from ssh_abduction import Explorer, Theory, Trace, solve
 from ssh_abduction.data import Action
-from ssh_abduction.rivals.tour import _doubted, next_tour
+from ssh_abduction.rivals.tour import next_tour, with_doubted_returns
 
 ENDS = [(1, 0, 0, 0), (0, 0, 1, 0)]
 TWO = streets(("a", "E", "b"))
@@ -109,15 +109,15 @@ def test_actions_that_say_nothing_of_themselves_are_tried_where_they_were_not() 
     assert next_tour(ssh_map, trace, theory=Theory.causal(), actions=["q"]) == ("q",)
 
 
-def test_returns_are_doubted_until_enough_was_seen_there() -> None:
+def test_returns_arewith_doubted_returns_until_enough_was_seen_there() -> None:
     explorer = Explorer(Streetwalker(RING, "a", "E"), time_limit=None)
     doubts = 0
     for _ in range(16):
         explorer.step()
         ssh_map, trace = explorer.solution.maps[0], explorer.trace
-        split = _doubted(ssh_map, trace, 4)
+        split = with_doubted_returns(ssh_map, trace, 4)
         pairs = {(a, b) for a, b in zip(split.labels, ssh_map.labels, strict=True)}
         assert len(pairs) == len(split.dstates)  # only ever divided
-        assert _doubted(ssh_map, trace, 0).labels == ssh_map.labels
+        assert with_doubted_returns(ssh_map, trace, 0).labels == ssh_map.labels
         doubts += len(split.places) > len(ssh_map.places)
     assert doubts

@@ -21,7 +21,7 @@ from ssh_abduction.theory.theory import Theory
 
 if TYPE_CHECKING:
     from ssh_abduction.rivals.consequences import Consequence
-    from ssh_abduction.rivals.explore import Experiment, Plan, Untried
+    from ssh_abduction.rivals.experiment import Experiment, Plan, Untried
 
 # So many columns of a table, and lines of a plan, are shown at most, as more cannot be taken in on a terminal; --json has all.
 SHOWN_COLUMNS, SHOWN_LINES = 6, 40
@@ -176,6 +176,6 @@ def _says(says: Consequence) -> tuple[str, str, str]:
 
 
 def _told_rivals(rivals: Sequence[int]) -> str:
-    from ssh_abduction.rivals.explore import told_rivals  # loads numpy
+    from ssh_abduction.rivals.experiment import told_rivals  # loads numpy
 
     return told_rivals(rivals)

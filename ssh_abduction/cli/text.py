@@ -15,7 +15,8 @@ from ssh_abduction.solver import Backbone, Solution, Status, stretches
 from ssh_abduction.theory.evidence import evidence_of
 
 if TYPE_CHECKING:
-    from ssh_abduction.rivals.comparison import Comparison, Matter
+    from ssh_abduction.rivals.comparison import Comparison
+    from ssh_abduction.rivals.questions import Matter
 
 # So many pairs of steps are told of, at most, as more cannot be taken in on a terminal.
 SHOWN_PAIRS = 12
@@ -168,9 +169,9 @@ def compared(found: Comparison) -> Iterator[str]:
     """What maps differ in, choice by choice, and which questions decide. Nothing where they do not differ."""
     number = {question: i for i, question in enumerate(found.deciding, 1)}
     if found.product:
-        yield f"  {found.product}: these choices are independent of each other"
+        yield f"  {found.product}: each combination of these choices is a map"
     for choice in found.choices:
-        yield f"  {counted(len(choice.options), 'ways')}: {depending(choice.differing)}"
+        yield f"  {counted(len(choice.options), 'options')} for {depending(choice.differing)}"
         asked = sorted(choice.questions, key=number.__getitem__)
         for question in asked[:SHOWN_QUESTIONS]:
             yes = [
@@ -193,14 +194,14 @@ def compared(found: Comparison) -> Iterator[str]:
                 for line in table([*(f"{number[q]}." for q in asked), "maps"], rows).splitlines()
             )
     if found.together:
-        yield f"  several of these together: {depending(found.together)}"
+        yield f"  these depend on several choices: {depending(found.together)}"
     if not found.deciding:
         return
     causes = sum(question.sort in ("faults", "dstates") for question in found.deciding)
     told = (
         "question 1 tells"
         if len(found.deciding) == 1
-        else f"questions 1 to {len(found.deciding)}, in this order, tell"
+        else f"questions 1 to {len(found.deciding)}, asked in this order, tell"
     )
     some = (
         f", and 1 to {causes} the {found.variants['dstates']} labelings"
@@ -208,7 +209,7 @@ def compared(found: Comparison) -> Iterator[str]:
         else ""
     )
     maps = "both maps" if len(found.ids) == 2 else f"all {counted(len(found.ids), 'maps')}"
-    yield f"  which steps decide: {told} {maps} apart{some}"
+    yield f"  {told} {maps} apart{some}"
 
 
 def depending(differing: Mapping[Matter, Sequence[int]]) -> str:

@@ -49,7 +49,8 @@ from ssh_abduction.evaluation import evaluate
 from ssh_abduction.online.abilities import Abilities
 from ssh_abduction.online.mapper import OnlineMapper
 from ssh_abduction.online.return_doubts import ReturnDoubts
-from ssh_abduction.rivals.explore import Experiment, next_experiment
+from ssh_abduction.rivals.experiment import Experiment
+from ssh_abduction.rivals.explore import next_experiment
 from ssh_abduction.rivals.tour import next_tour
 from ssh_abduction.solver import Solution, Status, check_limit, solve
 from ssh_abduction.theory.theory import Theory, checked_theory

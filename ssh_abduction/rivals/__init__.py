@@ -7,7 +7,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison, compare
     from ssh_abduction.rivals.differences import Difference, difference
-    from ssh_abduction.rivals.explore import Experiment, next_experiment
+    from ssh_abduction.rivals.experiment import Experiment
+    from ssh_abduction.rivals.explore import next_experiment
     from ssh_abduction.rivals.listing import Listing
 
 _HOMES = {
@@ -19,10 +20,8 @@ _HOMES = {
         "Difference",
         "difference",
     ),
-    "explore": (
-        "Experiment",
-        "next_experiment",
-    ),
+    "experiment": ("Experiment",),
+    "explore": ("next_experiment",),
     "listing": ("Listing",),
 }
 __all__ = [

@@ -1,10 +1,14 @@
 """What a map says of an action: where it leads where it was tried, and what follows for it where it was not.
 
-An action that was never tried in a dstate may still have an end that the axioms, or the order of a path, tell:
+An action that was never tried in a dstate may still have an end that the axioms, or the order of a
+path, tell:
 
-    a turn, where places have frames          to the slot that many quarters on (turn_rotates), whose dstate is known (one_dstate_per_heading), or whose star is that of the place, turned
-    a turn around, along a path               back along it (turn_around_reverses), where at most one dstate is (one_dstate_per_course)
-    a travel along a path                     to the next place in the order of the path. That is expected only: a map's order is one of several, and a place may be between that nobody saw
+    a turn, where places have frames          to the slot that many quarters on (turn_rotates),
+    whose dstate is known (one_dstate_per_heading), or whose star is that of the place, turned a
+    turn around, along a path               back along it (turn_around_reverses), where at most one
+    dstate is (one_dstate_per_course) a travel along a path                     to the next place in
+    the order of the path. That is expected only: a map's order is one of several, and a place may
+    be between that nobody saw
 """
 
 from __future__ import annotations
@@ -29,7 +33,8 @@ _OF_COURSES = frozenset({"turn_around_reverses", "one_dstate_per_course"})
 class Consequence:
     """What a map says of an action in a dstate.
 
-    how     link: it was tried; implied: the axioms tell; expected: the order of a path tells; open: nothing is known
+    how     link: it was tried; implied: the axioms tell; expected: the order of a path tells; open:
+        nothing is known
     dstate  where it leads, None where that is not known
     seen    what is seen there, as far as it is known
     """

@@ -6,8 +6,9 @@
 >>> print(found)
 dstates: in the first map steps 0–1 | 2 are two, in the other one steps 0 | 1–2 are two
 
-The steps of a dstate in one map may be at several dstates in the other one, whose steps may be at further dstates of the first one. What hangs together so
-is one `Change`, and all else is the same in both maps. Places, paths and courses are compared likewise.
+The steps of a dstate in one map may be at several dstates in the other one, whose steps may be at
+further dstates of the first one. What hangs together so is one `Change`, and all else is the same
+in both maps. Places, paths and courses are compared likewise.
 """
 
 from __future__ import annotations
@@ -94,10 +95,10 @@ class Difference:
     names    what the maps are called in words
     sizes    for both maps how many dstates, places, paths and links they have
     changes  steps that are grouped differently
-    links    for both maps the links that only it has, of those between dstates that are the same in both. A dstate is named by its first step
-    faults   for both maps what only it disbelieves
-    chi2     for both maps how well it closes, where both have a fit
-    has_places  for both maps whether it has places
+    links    for both maps the links that only it has, of those between dstates that are the same in
+    both. A dstate is named by its first step faults   for both maps what only it disbelieves chi2
+    for both maps how well it closes, where both have a fit has_places  for both maps whether it has
+    places
     """
 
     ids: tuple[str, str]
@@ -139,7 +140,8 @@ class Difference:
             told.append(f"places and paths: only in {self.names[self.has_places.index(True)]}")
         if self.chi2 and self.chi2[0] != self.chi2[1]:
             told.append(
-                f"fit: a chi-square of {self.chi2[0]:.1f} for {self.names[0]}, {self.chi2[1]:.1f} for {self.names[1]}"
+                f"fit: a chi-square of {self.chi2[0]:.1f} for {self.names[0]}, {self.chi2[1]:.1f} "
+                f"for {self.names[1]}"
             )
         return tuple(told)
 
@@ -187,7 +189,8 @@ def difference(
         raise MapError(f"names: expected two, one for each map, got {brief(names)}; name both")
     if len(first.labels) != len(other.labels):
         raise MapError(
-            f"maps: expected two of one trace, got one of {len(first.labels)} steps and one of {len(other.labels)}"
+            f"maps: expected two of one trace, got one of {len(first.labels)} steps and one of "
+            f"{len(other.labels)}"
         )
     first, other = first.renumbered(), other.renumbered()
     table = Table([first, other])
@@ -283,6 +286,12 @@ def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
 def _told(groups: Sequence[Steps], none: Steps) -> str:
     steps = [t for group in groups for t in group]
     number = NUMBERS[len(groups)] if len(groups) < len(NUMBERS) else str(len(groups))
-    told = f"{'step' if len(steps) == 1 else 'steps'} {' | '.join(map(stretches, groups))} {'is' if len(steps) == 1 else 'are'} {number}"
-    off = f"{'step' if len(none) == 1 else 'steps'} {stretches(none)} {'is' if len(none) == 1 else 'are'} none"
+    told = (
+        f"{'step' if len(steps) == 1 else 'steps'} {' | '.join(map(stretches, groups))} "
+        f"{'is' if len(steps) == 1 else 'are'} {number}"
+    )
+    off = (
+        f"{'step' if len(none) == 1 else 'steps'} {stretches(none)} "
+        f"{'is' if len(none) == 1 else 'are'} none"
+    )
     return " and ".join(([told] if groups else []) + ([off] if none else []))

@@ -1,14 +1,18 @@
 """Which questions decide between maps, and which of them are independent of each other.
 
-A question is a column of truth values, one a map. Some questions *decide* if no two maps give the same answers to all of them. They are chosen greedily: next comes
-the question that splits most pairs of maps that are not told apart yet, and of equal ones the earliest; then those are dropped again that the others
-make superfluous. No question can be left out of what remains, but a smaller choice may exist: to find the smallest is NP-hard (minimum test set, Garey & Johnson 1979, SP6).
+A question is a column of truth values, one a map. Some questions *decide* if no two maps give the
+same answers to all of them. They are chosen greedily: next comes the question that splits most
+pairs of maps that are not told apart yet, and of equal ones the earliest; then those are dropped
+again that the others make superfluous. No question can be left out of what remains, but a smaller
+choice may exist: to find the smallest is NP-hard (minimum test set, Garey & Johnson 1979, SP6).
 
-Maps, as answers to questions, are a set of rows. A choice is a set of questions, its *options* are the different answers to these. Choices are *independent* if each
-combination of their options is a map, so that the numbers of their options, multiplied, give the number of maps. There is one finest division of the
-questions into independent choices, and it is found so: a smallest set of choices that are not independent of each other, no part of which is dependent,
-lies within one choice of that division (if two independent ones shared it, its parts would be independent, and so would be the whole). So its members are made one,
-until all are independent.
+Maps, as answers to questions, are a set of rows. A choice is a set of questions, its *options* are
+the different answers to these. Choices are *independent* if each combination of their options is a
+map, so that the numbers of their options, multiplied, give the number of maps. There is one finest
+division of the questions into independent choices, and it is found so: a smallest set of choices
+that are not independent of each other, no part of which is dependent, lies within one choice of
+that division (if two independent ones shared it, its parts would be independent, and so would be
+the whole). So its members are made one, until all are independent.
 
 >>> import numpy as np
 >>> rows = np.array([[0, 0, 0], [0, 1, 1], [1, 0, 0], [1, 1, 1]], dtype=bool)
@@ -33,11 +37,14 @@ from ssh_abduction.rivals.table import Bools
 def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] = ()) -> list[int]:
     """Questions that tell all maps apart which questions can tell apart, chosen greedily, in the order in which they are chosen. None is superfluous.
 
-    columns  for each question, the most important first where they split equally, what each of the maps answers
-    tiers    for each question its tier: those of a higher one are asked only once those of lower ones tell nothing more apart. One tier by default
+    columns  for each question, the most important first where they split equally, what each of the
+    maps answers
+    tiers    for each question its tier: those of a higher one are asked only once those of lower
+        ones tell nothing more apart. One tier by default
     """
     groups = np.zeros(maps, dtype=np.intp)
-    # What a question splits becomes less as others are asked. So it need be counted again only when it seems to be the best one.
+    # What a question splits becomes less as others are asked. So it need be counted again only when
+    # it seems to be the best one.
     waiting = [
         (tier, -_split(column, groups), i)
         for i, (column, tier) in enumerate(zip(columns, tiers or [0] * len(columns), strict=True))
@@ -64,7 +71,8 @@ def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] =
 def independent(columns: Sequence[Bools] | Bools) -> list[list[int]]:
     """The finest division of questions into independent choices. The choices come in the order of their first questions.
 
-    columns  for each question, what each of the maps answers; maps that give the same answers throughout count once
+    columns  for each question, what each of the maps answers; maps that give the same answers
+    throughout count once
     """
     if not len(columns):
         return []

@@ -4,9 +4,9 @@
 >>> one = SSHMap((0, 0), (DState(0, "hall"),), ())
 >>> Listing.of([one]).steps
 2
->>> Listing.of([one, SSHMap((0,), (DState(0, "hall"),), ())])
+>>> Listing.of([one, SSHMap((0,), (DState(0, "hall"),), ())])  # doctest: +ELLIPSIS
 Traceback (most recent call last):
-ssh_abduction.data.errors.MapError: maps[1]: expected 2 steps, as maps[0] has, got 1; compare maps of one trace
+ssh_abduction.data.errors.MapError: maps[1]: expected 2 steps, as maps[0] has, got 1; ...
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ class Listing:
     """Maps of one trace, and what is known of the others.
 
     maps      the maps, in the order in which they are listed
-    minimal   how many of them, from the first one on, are minimal, as was proven; None where nobody says so
-    complete  whether no further minimal map exists; None where nobody says so
-    stopped   why listing ended before it was complete, where that is known
-    backbone  what all minimal maps share, as far as it was found out by reasoning or from all maps; None where that is not known
-    source    where the maps are from, as messages name it
+    minimal   how many of them, from the first one on, are minimal, as was proven; None where nobody
+    says so complete  whether no further minimal map exists; None where nobody says so stopped   why
+    listing ended before it was complete, where that is known backbone  what all minimal maps share,
+    as far as it was found out by reasoning or from all maps; None where that is not known source
+    where the maps are from, as messages name it
     """
 
     maps: tuple[SSHMap, ...]
@@ -67,7 +67,8 @@ class Listing:
             source = [source]
         if isinstance(source, str | os.PathLike | Mapping) or not isinstance(source, Iterable):
             raise MapError(
-                f"maps: expected a solution or maps, got {brief(source)}; read a file with Listing.load"
+                f"maps: expected a solution or maps, got {brief(source)}; read a file with "
+                "Listing.load"
             )
         maps = tuple(source)
         for i, ssh_map in enumerate(maps):
@@ -92,27 +93,32 @@ class Listing:
             if "id" in record and record["id"] != ssh_map.id:
                 mend = "the map was changed by hand: solve again, or leave the id out"
                 raise MapError(
-                    f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got {brief(record['id'])}; {mend}"
+                    f"{where}: maps[{i}]: id: expected {ssh_map.id}, as such a map has, got "
+                    f"{brief(record['id'])}; {mend}"
                 )
         if maps and "steps" in told and told["steps"] != len(maps[0].labels):
             raise MapError(
-                f"{where}: steps: expected {len(maps[0].labels)}, as map 1 has, got {brief(told['steps'])}; solve the trace again"
+                f"{where}: steps: expected {len(maps[0].labels)}, as map 1 has, got "
+                f"{brief(told['steps'])}; solve the trace again"
             )
         first_with: dict[str, int] = {}
         for i, ssh_map in enumerate(maps):
             if (known := first_with.setdefault(ssh_map.id, i)) != i:
                 raise MapError(
-                    f"{where}: maps[{i}]: expected another map, got that of maps[{known}] again; leave it out"
+                    f"{where}: maps[{i}]: expected another map, got that of maps[{known}] again; "
+                    "leave it out"
                 )
         theory = theory_in(told["theory"], where) if "theory" in told else None
         status, count = told.get("status"), told.get("count", len(maps))
         if status is not None and status not in [known.value for known in Status]:
             raise MapError(
-                f"{where}: status: expected one of {', '.join(known.value for known in Status)}, got {brief(status)}; solve again"
+                f"{where}: status: expected one of {', '.join(known.value for known in Status)}, "
+                f"got {brief(status)}; solve again"
             )
         if not is_whole(count) or count < 0:
             raise MapError(
-                f"{where}: count: expected how many minimal maps were found, got {brief(count)}; solve again"
+                f"{where}: count: expected how many minimal maps were found, got {brief(count)}; "
+                "solve again"
             )
         levels = told.get("levels")
         minimal: Any = len(maps)
@@ -121,7 +127,8 @@ class Listing:
             minimal = first.get("count") if isinstance(first, Mapping) else None
             if not is_whole(minimal) or not 0 < minimal <= len(maps):
                 raise MapError(
-                    f"{where}: levels: expected a list whose first entry counts the minimal maps, got {brief(levels)}; solve again"
+                    f"{where}: levels: expected a list whose first entry counts the minimal maps, "
+                    f"got {brief(levels)}; solve again"
                 )
         complete = told.get("complete")
         if complete is not None and not isinstance(complete, bool):
@@ -155,7 +162,8 @@ class Listing:
             if len(ssh_map.labels) != self.steps:
                 mend = "compare maps of one trace"
                 raise MapError(
-                    f"{self._name(i)}: expected {self.steps} steps, as {self._name(0)} has, got {len(ssh_map.labels)}; {mend}"
+                    f"{self._name(i)}: expected {self.steps} steps, as {self._name(0)} has, got "
+                    f"{len(ssh_map.labels)}; {mend}"
                 )
             if not one_view:
                 continue
@@ -173,14 +181,16 @@ class Listing:
         if other.steps != self.steps:
             mend = "compare maps of one trace"
             raise MapError(
-                f"{other.source}: expected {self.steps} steps, as the maps of {self.source} have, got {other.steps}; {mend}"
+                f"{other.source}: expected {self.steps} steps, as the maps of {self.source} have, "
+                f"got {other.steps}; {mend}"
             )
         for t, (here, there) in enumerate(
             zip(_seen(self.maps[0]), _seen(other.maps[0]), strict=True)
         ):
             if here != there:
                 raise MapError(
-                    f"{other.source}: expected the view {brief(here)} at step {t}, as the maps of {self.source} have, "
+                    f"{other.source}: expected the view {brief(here)} at step {t}, as the maps of "
+                    f"{self.source} have, "
                     f"got {brief(there)}; compare maps of one trace"
                 )
 
@@ -197,7 +207,8 @@ class Listing:
         found = [i for i, ssh_map in enumerate(self.maps) if ssh_map.id == text]
         if not found:
             raise MapError(
-                f"{self.source}: expected the number of a map, 1 to {len(self.maps)}, or its id, got {brief(text)}; see the file"
+                f"{self.source}: expected the number of a map, 1 to {len(self.maps)}, or its id, "
+                f"got {brief(text)}; see the file"
             )
         return found[0]
 
@@ -209,7 +220,8 @@ class Listing:
     ) -> None:
         step = next(t for t, (a, b) in enumerate(zip(first, seen, strict=True)) if a != b)
         raise MapError(
-            f"{self._name(i)}: expected the view {brief(first[step])} at step {step}, as {self._name(0)} has, got {brief(seen[step])}; "
+            f"{self._name(i)}: expected the view {brief(first[step])} at step {step}, as "
+            f"{self._name(0)} has, got {brief(seen[step])}; "
             "compare maps of one trace"
         )
 

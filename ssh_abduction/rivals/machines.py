@@ -1,14 +1,16 @@
 """Maps as machines: what each predicts from the current dstate on, along the links that it knows.
 
-Maps whose machines are equal predict the same for ever, so they are merged: of 780 rivals that differ in paths alone one machine is left.
+Maps whose machines are equal predict the same for ever, so they are merged: of 780 rivals that
+differ in paths alone one machine is left.
 
-A robot that follows links which all rivals know is, in each rival, at one dstate. These dstates together are a *joint state*: a row of numbers, one for each machine. From row to row
-numpy goes for all rows of one depth at once.
+A robot that follows links which all rivals know is, in each rival, at one dstate. These dstates
+together are a *joint state*: a row of numbers, one for each machine. From row to row numpy goes for
+all rows of one depth at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
@@ -53,6 +55,10 @@ class Seen:
         )
 
 
+# Names of the actions that a robot can do where this is seen.
+Can: TypeAlias = Callable[[Seen], Iterable[str]]
+
+
 def _entry(entry: Any) -> Any:
     return (
         entry.to_json()
@@ -77,9 +83,11 @@ def _star_text(star: Sequence[Any]) -> str:
 class Sights:
     """What the dstates of rival maps look like. Two dstates have the same number exactly if nobody can tell them apart by one look.
 
-    Without a trace that is their views. Stars are read as the theory reads them: four openings; turned in any way, where it does not say how stars are turned; and where they agree in
-    tolerance only, stars that could be one, directly or by way of others, count as one, so that no difference is promised which might not be seen. Where no theory is given, stars are
-    read unless some map has a dstate with two stars.
+    Without a trace that is their views. Stars are read as the theory reads them: four openings;
+    turned in any way, where it does not say how stars are turned; and where they agree in tolerance
+    only, stars that could be one, directly or by way of others, count as one, so that no difference
+    is promised which might not be seen. Where no theory is given, stars are read unless some map
+    has a dstate with two stars.
     """
 
     def __init__(self, maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> None:
@@ -187,8 +195,8 @@ def _classes(trace: Trace, steps: Sequence[int]) -> dict[int, int]:
 class Machine:
     """What a map predicts from the current dstate on.
 
-    sights  what is seen in each state, as a number of Sights; states are numbered by how they are reached, the current one is 0
-    ends    for each state, the state that each action leads to
+    sights  what is seen in each state, as a number of Sights; states are numbered by how they are
+    reached, the current one is 0 ends    for each state, the state that each action leads to
     """
 
     sights: tuple[int, ...]
@@ -201,8 +209,10 @@ def links_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
     for source, action, target in sorted(ssh_map.links):
         if found[source].setdefault(action, target) != target:
             raise MapError(
-                f"maps[{number}]: links: expected one dstate that {brief(action)} leads to from dstate {source}, "
-                f"got {found[source][action]} and {target}; take a theory with the axiom deterministic"
+                f"maps[{number}]: links: expected one dstate that {brief(action)} leads to from "
+                f"dstate {source}, "
+                f"got {found[source][action]} and {target}; take a theory with the axiom "
+                "deterministic"
             )
     return found
 

@@ -1,7 +1,8 @@
 """Maps of one trace as arrays, so that thousands of them are compared in seconds.
 
-Steps that are one dstate in all maps are a *class*, and stand in the first step of it. Of each sort (dstates, places, paths, courses) the table has
-for each map and class the first class that is one with it: so the numbers that maps give to their dstates, places and paths play no part.
+Steps that are one dstate in all maps are a *class*, and stand in the first step of it. Of each sort
+(dstates, places, paths, courses) the table has for each map and class the first class that is one
+with it: so the numbers that maps give to their dstates, places and paths play no part.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
@@ -33,7 +34,8 @@ class Table:
 
     firsts   the first step of each class
     classes  the class of each step
-    ones     for each sort that all maps have: for each map and class the first class that is one with it, NONE where there is no place, path or course
+    ones     for each sort that all maps have: for each map and class the first class that is one
+        with it, NONE where there is no place, path or course
     """
 
     def __init__(self, maps: Sequence[SSHMap]) -> None:
@@ -78,8 +80,9 @@ class Table:
         """Questions that tell maps apart: two classes, the earlier one first, and for each map whether they are one in it. Of a class with itself: whether it is
         along a path (at a place) at all.
 
-        Only such pairs are asked about in which the earlier class is the first one of its kind in some map. That is enough: where two maps differ in what a
-        class is one with, they differ in the first such class.
+        Only such pairs are asked about in which the earlier class is the first one of its kind in
+        some map. That is enough: where two maps differ in what a class is one with, they differ in
+        the first such class.
         """
         ones = self.ones[sort]
         for c in np.flatnonzero((ones != ones[0]).any(axis=0)).tolist():

@@ -1,0 +1,256 @@
+"""Experiments that tell rival maps apart, as values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ssh_abduction.data.errors import printable
+from ssh_abduction.rivals.consequences import Consequence
+from ssh_abduction.rivals.machines import Seen
+from ssh_abduction.solver import Stop, stretches
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """What some rivals, by number from 1, expect of an untried action."""
+
+    rivals: tuple[int, ...]
+    says: Consequence
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `next --json` prints it."""
+        return {"rivals": list(self.rivals), **self.says.to_dict()}
+
+
+@dataclass(frozen=True, slots=True)
+class Untried:
+    """An action that not all rivals have tried, and the way to it.
+
+    Attributes:
+        way: Actions along links that all rivals know.
+        action: The action after them.
+        expects: What the rivals expect of it.
+        worst: The greatest number of rivals that it may leave; it surely refutes the others.
+        pairs: The number of pairs of rivals that expect something different.
+    """
+
+    way: tuple[str, ...]
+    action: str
+    expects: tuple[Expectation, ...]
+    worst: int
+    pairs: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `next --json` prints it."""
+        expects = [expectation.to_dict() for expectation in self.expects]
+        return {
+            "way": list(self.way),
+            "action": self.action,
+            "worst": self.worst,
+            "pairs": self.pairs,
+            "expects": expects,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """How a plan goes on after an observation."""
+
+    seen: Seen
+    plan: Plan
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `next --json` prints it."""
+        return {"seen": self.seen.to_dict(), **self.plan.to_dict()}
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """An experiment as a tree: actions, and how to go on depending on what is seen after the last.
+
+    Attributes:
+        rivals: The rivals that are left, by number from 1.
+        actions: Actions along links that all of these know; empty if known links do not tell them
+            apart.
+        branches: For each predicted observation after the last action, the plan for the rivals that
+            are left.
+        untried: The most informative untried action, if known links do not tell the rivals apart or
+            one rival is left; None if there is none.
+    """
+
+    rivals: tuple[int, ...]
+    actions: tuple[str, ...] = ()
+    branches: tuple[Branch, ...] = ()
+    untried: Untried | None = None
+
+    @property
+    def worst(self) -> int:
+        """The number of rivals that are left in the worst case."""
+        return max((branch.plan.worst for branch in self.branches), default=len(self.rivals))
+
+    @property
+    def longest(self) -> int:
+        """The greatest number of actions."""
+        return len(self.actions) + max((branch.plan.longest for branch in self.branches), default=0)
+
+    @property
+    def leaves(self) -> Iterator[Plan]:
+        """The ends of the plan."""
+        if not self.branches:
+            yield self
+        for branch in self.branches:
+            yield from branch.plan.leaves
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `next --json` prints it."""
+        told: dict[str, Any] = {"rivals": list(self.rivals)}
+        if self.branches:
+            told |= {
+                "actions": list(self.actions),
+                "branches": [branch.to_dict() for branch in self.branches],
+            }
+        return told | ({"untried": self.untried.to_dict()} if self.untried else {})
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What some rivals, by number from 1, predict after each action of the experiment."""
+
+    rivals: tuple[int, ...]
+    seen: tuple[Seen, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `next --json` prints it."""
+        return {"rivals": list(self.rivals), "seen": [seen.to_dict() for seen in self.seen]}
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """What to do next to find out which of some rival maps is true.
+
+    Attributes:
+        count: The number of rivals.
+        alike: The rivals, by number from 1, in groups that predict the same along all their links.
+        predictions: What they predict after each of `plan.actions`, up to the first difference.
+        plan: The experiment as a tree.
+        sharing: What all rivals share: "dstates and places", "dstates", or "".
+        complete: Whether these are all minimal maps.
+        stopped: The limit that ended the search, if one did; then there may be a better plan.
+    """
+
+    count: int
+    alike: tuple[tuple[int, ...], ...]
+    predictions: tuple[Prediction, ...]
+    plan: Plan
+    sharing: str = ""
+    complete: bool = True
+    stopped: Stop | None = None
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """The actions up to the first difference in predictions.
+
+        If known links do not tell the rivals apart, the way to the untried action, and that action.
+        """
+        untried = self.plan.untried
+        return self.plan.actions or ((*untried.way, untried.action) if untried else ())
+
+    @property
+    def worst(self) -> int:
+        """The number of rivals that the plan leaves in the worst case."""
+        return self.plan.worst
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether there is nothing left to try.
+
+        No known link tells rivals apart, and the robot cannot reach an untried action.
+        """
+        return not self.actions and self.stopped is None
+
+    @property
+    def sentence(self) -> str:
+        """The experiment in a sentence."""
+        return _sentence(self)
+
+    @property
+    def warning(self) -> str | None:
+        """A warning if there may be more maps, or if a limit ended the search."""
+        told = []
+        if not self.complete:
+            known = (
+                f"these {self.count} maps may not be all minimal ones"
+                if self.count > 1
+                else "this map may not be the only minimal one"
+            )
+            told.append(f"{known}, and the experiment ignores others; list all (solve -n 0)")
+        if self.stopped:
+            told.append(
+                f"the search for the experiment was stopped ({self.stopped}); there may be a "
+                "better one"
+            )
+        return "; ".join(told) or None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As `ssh-abduction next --json` prints it (docs/formats.md)."""
+        return {
+            "count": self.count,
+            "complete": self.complete,
+            "summary": self.sentence,
+            "sharing": self.sharing,
+            "alike": [list(group) for group in self.alike],
+            "actions": list(self.actions),
+            "worst": self.worst,
+            "longest": self.plan.longest,
+            "predictions": [prediction.to_dict() for prediction in self.predictions],
+            "plan": self.plan.to_dict(),
+        } | ({"stopped": self.stopped} if self.stopped else {})
+
+
+def _sentence(experiment: Experiment) -> str:
+    plan, count = experiment.plan, experiment.count
+    if count == 1:
+        return f"1 map: there is nothing to tell apart; {_untried_in_words(plan.untried)}"
+    if plan.branches:
+        left = (
+            "leaves one of them"
+            if plan.worst == 1
+            else f"leaves {plan.worst} of them in the worst case, as known links tell no more"
+        )
+        told = f"{count} maps: after {_acts(plan.actions)} their predictions differ; this {left}"
+        if any(branch.plan.branches for branch in plan.branches):
+            told = f"{count} maps: after {_acts(plan.actions)} their predictions differ; the whole "
+            told += f"plan takes {plan.longest} actions at most and {left}"
+        is_greedy = len(experiment.alike) != 2
+        return f"{told} (another plan may be shorter or leave fewer)" if is_greedy else told
+    if experiment.stopped:
+        return f"{count} maps: no experiment was found in time"
+    links = "all links" if len(experiment.alike) == 1 else "all links that all of them know"
+    why = {
+        "dstates and places": ", as they have the same dstates and places and differ only in paths",
+        "dstates": ", as they have the same dstates",
+    }.get(experiment.sharing, "")
+    untried = _untried_in_words(plan.untried)
+    return f"{count} maps predict the same along {links}{why}; {untried}"
+
+
+def _untried_in_words(untried: Untried | None) -> str:
+    if untried is None:
+        return "known links lead to no untried action"
+    way = f", after {_acts(untried.way)}" if untried.way else ""
+    if untried.pairs:
+        return f"the most informative untried action is {printable(untried.action)}{way}"
+    several = sum(len(expectation.rivals) for expectation in untried.expects) > 1
+    none = "they expect the same of every untried action; " if several else ""
+    return f"{none}the nearest untried action is {printable(untried.action)}{way}"
+
+
+def _acts(actions: Sequence[str]) -> str:
+    return printable(", ".join(actions))
+
+
+def told_rivals(rivals: Sequence[int]) -> str:
+    """Numbers of rivals in words: map 1, or maps 1–3 and 7."""
+    return f"{'map' if len(rivals) == 1 else 'maps'} {stretches(rivals)}"

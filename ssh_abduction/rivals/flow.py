@@ -1,0 +1,196 @@
+"""Shortest walks through required moves and stances."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import coo_array
+
+from ssh_abduction.rivals.stances import Move
+
+T = TypeVar("T")
+# Seconds for a flow. If they are over, the robot goes to the nearest untried move.
+PATIENCE = 2.0
+# The greatest number of flows to seek. Later plans do what is cut off in the last one.
+ROUNDS = 8
+
+
+def shortest_walk(
+    moves: Sequence[Move], start: int, due: set[int], unseen: set[int]
+) -> tuple[str, ...]:
+    """The shortest walk that makes these moves and visits these stances, up to an unknown move.
+
+    Empty if there is no such walk, or if none is found in time. The order of the moves is Fleury's:
+    of those that do not cut off the rest, one with an unknown end goes first, as it tells most.
+    """
+    times = shortest_flow(moves, start, due, unseen)
+    if times is None:
+        return ()
+    left = {k: n for k, n in enumerate(times) if n}
+    actions: list[str] = []
+    at = start
+    while left:
+        choices = sorted(
+            (k for k in left if moves[k].source == at),
+            key=lambda k: (moves[k].how != "unknown", k not in due, k),
+        )
+        for k in choices:
+            after = {j: n - (j == k) for j, n in left.items() if n > (j == k)}
+            if {moves[j].source for j in after} <= reached_from(
+                [moves[j] for j in after], moves[k].target
+            ):
+                break
+        else:
+            return ()
+        actions.append(moves[k].action.name)
+        if moves[k].how == "unknown":
+            break
+        left, at = after, moves[k].target
+    return tuple(actions)
+
+
+def shortest_flow(
+    moves: Sequence[Move],
+    start: int,
+    due: set[int],
+    unseen: set[int],
+    rounds: int = ROUNDS,
+    patience: float = PATIENCE,
+) -> list[int] | None:
+    """Count how often the shortest walk makes each move.
+
+    A walk is a flow on the graph of moves: each stance is entered as often as it is left, except
+    for the first and the last one. `milp` of scipy finds a flow of least cost. If a part of it is
+    not connected to the start, a constraint forbids that, and the flow is sought again, as Dantzig,
+    Fulkerson & Johnson (1954) did for the travelling salesman.
+
+    Args:
+        moves: All moves.
+        start: The stance where the robot is.
+        due: Indices of the moves that the walk has to make.
+        unseen: Stances that the walk has to visit.
+        rounds: The greatest number of flows to seek. After the last one, the result is the part of
+            the flow that is connected to the start.
+        patience: Seconds for each flow. If they are over, the walk may not be the shortest.
+
+    Returns:
+        A count for each move; None if there is no walk, or none was found in time.
+    """
+    number = {n: i for i, n in enumerate(sorted(reached_from(moves, start)))}
+    m, size = len(moves), len(number)
+    sources, targets = (
+        np.array([number[n] for n in ends])
+        for ends in ([x.source for x in moves], [x.target for x in moves])
+    )
+    # columns: each move, and whether a stance is the last one
+    kinds = [np.arange(m), np.arange(m), m + np.arange(size)]
+    balance = coo_array(
+        (
+            np.r_[np.ones(m), -np.ones(m), -np.ones(size)],
+            (np.r_[targets, sources, np.arange(size)], np.concatenate(kinds)),
+        ),
+        (size, m + size),
+    ).tocsr()
+    enters = coo_array((np.ones(m), (targets, np.arange(m))), (size, m + size)).tocsr()
+    begins = -1.0 * (np.arange(size) == number[start])
+    rows = sorted(number[n] for n in unseen - {start})
+    rules = [
+        LinearConstraint(balance, begins, begins),
+        LinearConstraint(np.r_[np.zeros(m), np.ones(size)][None], 1, 1),
+        *([LinearConstraint(enters[rows], 1, np.inf)] if rows else []),
+    ]
+    costs = np.r_[[float(move.cost) for move in moves], np.zeros(size)]
+    bounds = Bounds(
+        np.r_[[float(k in due) for k in range(m)], np.zeros(size)],
+        np.r_[np.full(m, float(size)), np.ones(size)],
+    )
+    for _ in range(rounds):
+        found = milp(
+            costs,
+            constraints=rules,
+            integrality=np.ones(m + size),
+            bounds=bounds,
+            options={"time_limit": patience},
+        )
+        if found.x is None:
+            return None
+        times = np.round(found.x[:m]).astype(int)
+        used = [move for move, n in zip(moves, times, strict=True) if n]
+        parts = _parts_cut_off(used, start)
+        if not parts:
+            break
+        for part in parts:
+            entering = [
+                k for k, move in enumerate(moves) if move.target in part and move.source not in part
+            ]
+            rules.append(
+                LinearConstraint(
+                    coo_array(
+                        (np.ones(len(entering)), ([0] * len(entering), entering)), (1, m + size)
+                    ).tocsr(),
+                    1,
+                    np.inf,
+                )
+            )
+    near = reached_from([move for move, n in zip(moves, times, strict=True) if n], start)
+    return [int(n) if move.source in near else 0 for move, n in zip(moves, times, strict=True)]
+
+
+def _parts_cut_off(used: Sequence[Move], start: int) -> list[set[int]]:
+    """The connected parts of a flow that are not connected to the start, as sets of stances."""
+    near = reached_from(used, start)
+    left = [move for move in used if move.source not in near]
+    parts: list[set[int]] = []
+    while left:
+        part = reached_from(
+            [*left, *(replace(move, source=move.target, target=move.source) for move in left)],
+            left[0].source,
+        )
+        parts.append(part)
+        left = [move for move in left if move.source not in part]
+    return parts
+
+
+def nearest_of(
+    moves: Sequence[Move], start: int, due: set[int], unseen: set[int]
+) -> tuple[str, ...]:
+    """The way to the nearest of these moves and stances; empty if none can be reached."""
+    after: dict[int, list[int]] = {}
+    for k, move in sorted(enumerate(moves), key=lambda pair: pair[0] not in due):
+        after.setdefault(move.source, []).append(k)
+    ways: dict[int, tuple[str, ...]] = {start: ()}
+    queue = deque([start])
+    while queue:
+        n = queue.popleft()
+        for k in after.get(n, ()):
+            way = (*ways[n], moves[k].action.name)
+            if k in due or moves[k].target in unseen:
+                return way
+            if moves[k].target not in ways and moves[k].how != "unknown":
+                ways[moves[k].target] = way
+                queue.append(moves[k].target)
+    return ()
+
+
+def reached_from(moves: Iterable[Move], start: int) -> set[int]:
+    """The stances that moves lead to."""
+    return followed_from(((move.source, move.target) for move in moves), start)
+
+
+def followed_from(links: Iterable[tuple[T, T]], start: T) -> set[T]:
+    """All that links lead to from `start`, and `start` itself."""
+    after: dict[T, list[T]] = {}
+    for source, target in links:
+        after.setdefault(source, []).append(target)
+    found = {start}
+    queue = [start]
+    for n in queue:
+        new = {*after.get(n, ())} - found
+        found |= new
+        queue += new
+    return found

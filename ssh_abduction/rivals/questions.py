@@ -1,0 +1,183 @@
+"""Questions that tell maps of one trace apart.
+
+A question asks whether two steps are one dstate, at one place, along one path, or along one path in
+one direction. Questions to which all maps give the same answers, or opposite ones, are one
+question, which the earliest steps stand for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from ssh_abduction.data.errors import printable
+from ssh_abduction.data.maps import Fault, SSHMap
+from ssh_abduction.rivals.table import Bools, Table
+from ssh_abduction.solver import SORTS, stretches
+
+Matter: TypeAlias = Literal["faults", "dstates", "places", "paths", "courses"]
+
+MATTERS: tuple[Matter, ...] = ("faults", *SORTS)  # in the order of causes
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question that tells maps apart.
+
+    It asks whether two steps are one dstate, at one place, along one path, or along one path in one
+    direction; or whether the map disbelieves a step.
+
+    Attributes:
+        sort: What the question is about.
+        first: The earlier of the earliest two steps that it can be asked about. If both are the
+            same step, it asks whether the step is along a path (at a place) at all. For a fault
+            both are its step.
+        later: The later step.
+        yes: The number of maps that say yes.
+        here: The steps that are one with `first` in all maps.
+        there: The steps that are one with `later` in all maps.
+        places: For questions about paths, if all maps have the same places: the places of the steps
+            of `here` and of `there`.
+        fault: For questions about faults: the fault in the maps that say yes.
+    """
+
+    sort: Matter
+    first: int
+    later: int
+    yes: int
+    here: tuple[int, ...]
+    there: tuple[int, ...]
+    places: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+    fault: Fault | None = None
+
+    def __str__(self) -> str:
+        if self.fault:
+            return printable(str(self.fault))
+        verb = "is" if len(self.there) == 1 else "are"
+        if self.first == self.later:
+            what = "at a place" if self.sort == "places" else "along a path"
+            return f"{_steps(self.there)} {verb} {what}"
+        here, there = (
+            f"{_steps(steps)}{self._at(k)}" for k, steps in enumerate((self.here, self.there))
+        )
+        same = {
+            "dstates": f"at the dstate of {here}",
+            "places": f"at the place of {here}",
+            "paths": f"along the path of {here}",
+            "courses": f"along the path of {here} in the same direction",
+        }[self.sort]
+        return f"{there} {verb} {same}"
+
+    def _at(self, side: int) -> str:
+        places = self.places[side] if self.places else ()
+        return (
+            f" ({'place' if len(places) == 1 else 'places'} {stretches(places)})" if places else ""
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `compare --json` prints it."""
+        data: dict[str, Any] = {
+            "sort": self.sort,
+            "first": self.first,
+            "later": self.later,
+            "yes": self.yes,
+        }
+        data |= {"here": list(self.here), "there": list(self.there), "sentence": str(self)}
+        if self.places:
+            data["places"] = [list(places) for places in self.places]
+        if self.fault:
+            data["fault"] = {k: v for k, v in asdict(self.fault).items() if v is not None}
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A question with its answers.
+
+    Attributes:
+        question: The question.
+        column: The answer of each map.
+        steps: For each sort, the steps about which this question, or its opposite, asks.
+    """
+
+    question: Question
+    column: Bools
+    steps: dict[Matter, set[int]]
+
+
+def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> list[Asked]:
+    """All questions that tell maps apart, each once.
+
+    Args:
+        table: The maps as arrays.
+        maps: The maps.
+        same_places: Whether all maps have the same places.
+
+    Returns:
+        The questions in the order of causes; those about the earliest steps come first.
+    """
+    found: dict[bytes, Asked] = {}
+    faults = {fault for ssh_map in maps for fault in ssh_map.faults}
+    for fault in sorted(faults, key=lambda f: (f.step, f.kind, str(f.seen), str(f.expected))):
+        column = np.array([fault in ssh_map.faults for ssh_map in maps])
+        if not column.all():
+            at = (fault.step,)
+            yes = int(column.sum())
+            question = Question("faults", fault.step, fault.step, yes, at, at, fault=fault)
+            asked = found.setdefault(_key(column), Asked(question, column, {}))
+            asked.steps.setdefault("faults", set()).add(fault.step)
+    places = [maps[0].dstates[label].place for label in maps[0].labels] if same_places else []
+    steps_by_class = members_of(table.classes.tolist())
+    for sort in table.ones:
+        heads = table.heads(sort).tolist()
+        together = members_of(heads)
+        for c, d, column in table.questions(sort):
+            key = _key(column)
+            if key not in found:
+                sides = [
+                    sorted(t for k in together[heads[side]] for t in steps_by_class[k])
+                    for side in (c, d)
+                ]
+                stand = (
+                    [
+                        tuple(sorted({p for t in side if (p := places[t]) is not None}))
+                        for side in sides
+                    ]
+                    if places
+                    else []
+                )
+                question = Question(
+                    sort,
+                    first=int(table.firsts[c]),
+                    later=int(table.firsts[d]),
+                    yes=int(column.sum()),
+                    here=tuple(sides[0]),
+                    there=tuple(sides[1]),
+                    places=(stand[0], stand[1]) if stand and sort in ("paths", "courses") else None,
+                )
+                found[key] = Asked(question, column, {})
+            found[key].steps.setdefault(sort, set()).update(steps_by_class[d])
+    return sorted(
+        found.values(),
+        key=lambda a: (MATTERS.index(a.question.sort), a.question.later, a.question.first),
+    )
+
+
+def _key(column: Bools) -> bytes:
+    """A key that equal and opposite columns share. They belong to one question."""
+    return np.packbits(column ^ column[0]).tobytes()
+
+
+def members_of(numbers: Sequence[int]) -> dict[int, list[int]]:
+    """The positions of each number."""
+    members: dict[int, list[int]] = {}
+    for i, number in enumerate(numbers):
+        members.setdefault(number, []).append(i)
+    return members
+
+
+def _steps(steps: Sequence[int]) -> str:
+    return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"

@@ -1,0 +1,240 @@
+"""Stances: where a robot may stand and what it faces there, and the moves between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.star import Frame, Star
+from ssh_abduction.data.trace import Action, Step, Trace
+from ssh_abduction.rivals.consequences import OF_FRAMES, QUARTERS, is_possible
+from ssh_abduction.rivals.machines import Can, Seen, links_of
+from ssh_abduction.theory.theory import Theory
+
+How: TypeAlias = Literal["known", "implied", "expected", "unknown"]
+# The cost of an unknown move in actions: there, a turn, and back.
+THERE_AND_BACK = 3
+AROUND = Action.of("around")
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """An action from one stance to another, both by number.
+
+    `how` says how its end is known:
+
+    - known: the action was tried;
+    - implied: a turn whose end the axioms imply, as places have frames;
+    - expected: a turn, if turns go as far as stars say; or a travel back the way that the robot
+    came; - unknown: anything else. The plan needs an end: a travel is taken to come back through
+    the same
+      gateway, and another action to do nothing.
+    """
+
+    source: int
+    action: Action
+    target: int
+    how: How
+
+    @property
+    def cost(self) -> int:
+        """The cost in actions."""
+        return THERE_AND_BACK if self.how == "unknown" else 1
+
+    @property
+    def is_untried(self) -> bool:
+        """Whether a tour has to make it: an unknown move, or a travel expected to lead back."""
+        return self.how == "unknown" or (self.how == "expected" and self.action.kind != "turn")
+
+
+class Stances:
+    """Where a robot may stand, and what it faces there.
+
+    The first stances are the dstates of the map, by number. The others are a turn away from these
+    and were never seen.
+    """
+
+    def __init__(
+        self,
+        ssh_map: SSHMap,
+        trace: Trace,
+        theory: Theory,
+        actions: Sequence[Action],
+        can: Can | None,
+    ) -> None:
+        self._links = links_of(ssh_map, 0)
+        self._actions = {action.name: action for action in (*actions, *trace.actions)}
+        self._can = can
+        self._implies = theory.star == "frame" and theory.hard >= OF_FRAMES
+        first: dict[int, Step] = {}
+        for label, step in zip(ssh_map.labels, trace.steps, strict=True):
+            first.setdefault(label, step)
+        self._looks = [first[s.id] for s in ssh_map.dstates]
+        self._stars = [
+            Star.of(step.star) if step.star is not None and theory.star != "none" else None
+            for step in self._looks
+        ]
+        self._frames = [_frame(star) for star in self._stars]
+        # room, and degrees clockwise in it
+        self._at: list[tuple[int, float]] = [
+            (s.place or 0, 90.0 * (s.heading or 0)) for s in ssh_map.dstates
+        ]
+        if not self._implies or any(s.heading is None for s in ssh_map.dstates):
+            self._at = self._rooms()
+        self._in: dict[int, list[int]] = {}  # the stances in each room
+        for n, (room, _) in enumerate(self._at):
+            self._in.setdefault(room, []).append(n)
+        self._back: dict[int, int] = {}  # where a travel from a stance leads if it leads back
+
+    def moves(self) -> list[Move]:
+        """All moves from all stances. This adds stances that were never seen."""
+        for source, tried in self._links.items():
+            for name, target in tried.items():
+                if (
+                    self._actions[name].kind == "travel"
+                    and self._frames[source]
+                    and self._frames[target]
+                ):
+                    self._back.setdefault(self._around(target), self._around(source))
+        found: list[Move] = []
+        n = 0
+        while n < len(self._at):
+            found += (self._move(n, action) for action in self._possible(n))
+            n += 1
+        return found
+
+    def _rooms(self) -> list[tuple[int, float]]:
+        """The room of each dstate, and its degrees in the room.
+
+        Dstates that turns link are in one room. A turn says the degrees from one to the next.
+        """
+        turns: dict[int, list[tuple[int, float]]] = {n: [] for n in self._links}
+        for n, tried in self._links.items():
+            for name, target in tried.items():
+                degrees = (
+                    _degrees(self._actions[name], self._frames[n])
+                    if self._actions[name].kind == "turn"
+                    else None
+                )
+                if degrees is not None:
+                    turns[n].append((target, degrees))
+                    turns[target].append((n, -degrees))
+        at: dict[int, tuple[int, float]] = {}
+        for n in turns:
+            if n in at:
+                continue
+            at[n] = n, 0.0
+            queue = [n]
+            for source in queue:
+                for target, degrees in turns[source]:
+                    if target not in at:
+                        at[target] = n, (at[source][1] + degrees) % 360
+                        queue.append(target)
+        return [at[n] for n in sorted(at)]
+
+    def _possible(self, n: int) -> list[Action]:
+        """What the robot can do in a stance; what the star allows if the stance was never seen."""
+        if n < len(self._looks):
+            step = self._looks[n]
+            seen = Seen(step.view, step.star if self._stars[n] else None)
+            names = (
+                self._actions.keys() if self._can is None else {*self._can(seen), *self._links[n]}
+            )
+            return [
+                action
+                for name, action in self._actions.items()
+                if name in names and (name in self._links[n] or is_possible(action, seen))
+            ]
+        frame = self._frames[n]
+        assert frame is not None
+        return [
+            action
+            for action in self._actions.values()
+            if (
+                _faces(frame) is not None
+                if action.kind == "travel"
+                else action.kind == "turn" and _degrees(action, frame) is not None
+            )
+        ]
+
+    def _move(self, n: int, action: Action) -> Move:
+        """The move that an action makes from a stance."""
+        if n < len(self._links) and action.name in self._links[n]:
+            return Move(n, action, self._links[n][action.name], "known")
+        frame = self._frames[n]
+        if frame is not None and action.kind == "travel":
+            return (
+                Move(n, action, self._back[n], "expected")
+                if n in self._back
+                else Move(n, action, self._around(n), "unknown")
+            )
+        degrees = _degrees(action, frame) if action.kind == "turn" else None
+        if degrees is None:
+            return Move(n, action, n, "unknown")
+        return Move(
+            n,
+            action,
+            self._turned(n, degrees),
+            "implied" if self._implies and action.in_quarters else "expected",
+        )
+
+    def _around(self, n: int) -> int:
+        """The stance that a turn around leads to."""
+        degrees = _degrees(AROUND, self._frames[n])
+        assert degrees is not None
+        return self._turned(n, degrees)
+
+    def _turned(self, n: int, degrees: float) -> int:
+        """The stance after a turn by so many degrees clockwise.
+
+        It is a new one if no known stance is within the spread of the star's bearings.
+        """
+        (room, before), star, frame = self._at[n], self._stars[n], self._frames[n]
+        assert star is not None
+        assert frame is not None
+        goal = (before + degrees) % 360
+        near = min(self._in[room], key=lambda m: _apart(self._at[m][1], goal))
+        if _apart(self._at[near][1], goal) <= max(frame.spreads, default=0):
+            return near
+        self._at.append((room, goal))
+        self._in[room].append(len(self._at) - 1)
+        turned = Star(
+            tuple(
+                replace(gateway, bearing=(gateway.bearing - degrees) % 360)
+                for gateway in star.gateways
+            )
+        )
+        self._stars.append(turned)
+        self._frames.append(_frame(turned))
+        return len(self._at) - 1
+
+
+def _frame(star: Star | None) -> Frame | None:
+    return None if star is None else star.frames[0]
+
+
+def _faces(frame: Frame) -> int | None:
+    """The slot that the robot faces."""
+    return next((slot for slot in range(frame.slots) if frame.faces(slot)), None)
+
+
+def _degrees(action: Action, frame: Frame | None) -> float | None:
+    """How many degrees a turn goes clockwise, by the star; None if the star does not say."""
+    if frame is None or action.bearing is not None:
+        return action.bearing
+    if action.gateway is not None:
+        slot = frame.nth(action.turn, action.gateway)
+        return None if slot is None else frame.bearings[slot]
+    if action.turn == "around":
+        faced = _faces(frame)
+        opposite = None if faced is None else frame.opposite[faced]
+        behind = next((slot for slot in range(frame.slots) if frame.has_behind(slot)), opposite)
+        return 180.0 if behind is None else frame.bearings[behind if opposite is None else opposite]
+    return 90.0 * QUARTERS[action.turn or "right"]
+
+
+def _apart(one: float, other: float) -> float:
+    """Degrees between two directions."""
+    return abs((one - other + 180) % 360 - 180)
