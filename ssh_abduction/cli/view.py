@@ -13,7 +13,8 @@ from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole,
 
 if TYPE_CHECKING:
     from ssh_abduction.data.trace import Trace
-    from ssh_abduction.page.content import Called, Run
+    from ssh_abduction.page.content import Called
+    from ssh_abduction.page.replays import Run
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.theory.theory import Theory
 
@@ -149,7 +150,7 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
     """The run that is localised, if one was asked for. Raises AbductionError."""
     from ssh_abduction.data.trace import Trace
-    from ssh_abduction.page.content import Run
+    from ssh_abduction.page.replays import Run
 
     if options.followed is None and options.belief is None:
         return None
@@ -169,7 +170,7 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     """The run with the beliefs in a file. Raises MapError."""
     from ssh_abduction.data.map_file import read_json
     from ssh_abduction.data.maps import maps_of
-    from ssh_abduction.page.content import Run
+    from ssh_abduction.page.replays import Run
 
     told = read_json(file)
     beliefs = told.get("beliefs") if isinstance(told, dict) else None

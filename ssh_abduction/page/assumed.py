@@ -1,7 +1,8 @@
-"""What it costs to assume that two steps are one dstate, or that they are not: of as many pairs as there is time for, before anybody asks.
+"""The cost of assuming that two steps are one dstate, or different ones, before the user asks.
 
 >>> from ssh_abduction import Trace, solve
->>> trace = Trace.from_steps(["end", "hall", "end", "end", "hall", "end", "end"], ["travel", "travel", "around", "travel", "travel", "around"])
+>>> views = ["end", "hall", "end", "end", "hall", "end", "end"]
+>>> trace = Trace.from_steps(views, ["travel", "travel", "around"] * 2)
 >>> known = assumptions(Listing.of(solve(trace)), trace, Theory(), seconds=10)
 >>> known[0, 6]["different"], known[0, 1]["same"]
 ('7 dstates, not 6', 'no map satisfies the axioms')
@@ -27,13 +28,16 @@ Pair = tuple[int, int]
 def assumptions(
     listing: Listing, trace: Trace, theory: Theory, seconds: float
 ) -> dict[Pair, dict[str, str]]:
-    """By pairs of steps that all minimal maps have as one dstate, or all have as different ones: what either costs, in words, as `PairExplanation.assuming` has it.
+    """The costs for pairs of steps on which all minimal maps agree, as far as there is time.
 
-    listing  the minimal maps
-    theory   that which they are minimal by
-    seconds  after so many nothing more is sought: some pairs are not there then
+    Args:
+        listing: The minimal maps.
+        trace: Their trace.
+        theory: Their theory.
+        seconds: The time limit. Pairs for which there was no time are missing.
 
-    First it is asked which pairs of the first steps can be otherwise at all, which takes one grounding for all of them; then what the best such map costs, pair by pair.
+    Returns:
+        For each pair what "same" and "different" cost, in words, as `PairExplanation.assuming`.
     """
     end = time.monotonic() + seconds
     theory = theory.resolve(trace)
@@ -54,6 +58,7 @@ def assumptions(
         )
         known[pair] = told.assuming
 
+    # First find out which pairs can be otherwise at all. One grounding serves all of them.
     piece = Piece.of(trace, theory, range(len(trace) if len(trace) <= UNCUT else SMALL))
     try:
         axioms = Axioms(piece, lambda: time.monotonic() > end)
@@ -64,6 +69,7 @@ def assumptions(
                 tell(pair, one, Side(possible=False))
     except Interrupted:
         return known
+    # Then find the cost of the best such map, pair by pair.
     for pair, one in left:
         if (rest := end - time.monotonic()) <= 0:
             break
@@ -82,7 +88,7 @@ def assumptions(
 
 
 def _agreed(labels: list[tuple[int, ...]], steps: int) -> Iterator[tuple[Pair, bool]]:
-    """Pairs of the first steps of which all maps say the same, and what: whether they are one dstate."""
+    """The pairs of the first steps on which all maps agree, and whether these are one dstate."""
     for later in range(steps):
         for earlier in range(later):
             said = {of_map[earlier] == of_map[later] for of_map in labels}

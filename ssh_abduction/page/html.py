@@ -1,4 +1,4 @@
-"""The page as one HTML file: nothing is loaded from elsewhere, and no text of a trace is ever read as HTML."""
+"""The page as one HTML file, which loads nothing and never reads a text of a trace as HTML."""
 
 from __future__ import annotations
 
@@ -17,10 +17,24 @@ from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.map_file import write_map
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
-from ssh_abduction.page.content import Run, content_of
+from ssh_abduction.page.content import content_of
+from ssh_abduction.page.replays import Run
 from ssh_abduction.rivals.listing import Maps
 
 HERE = Path(__file__).parent
+# The parts of the script, in order.
+SCRIPTS = (
+    "base",
+    "maps",
+    "camera",
+    "figures",
+    "paint",
+    "choosing",
+    "replay",
+    "pairs",
+    "main",
+)
+# Characters of JSON that would end the script element, or a line of the script.
 ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
 
@@ -28,7 +42,8 @@ ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", 
 class Page:
     """A page about maps.
 
-    content  all that it shows, as plain data
+    Attributes:
+        content: What it shows, as plain data.
     """
 
     content: Mapping[str, Any] = field(repr=False)
@@ -39,11 +54,19 @@ class Page:
         return html_of(self.content)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the page as an HTML file. Raises MapError."""
+        """Write the page as an HTML file.
+
+        Raises:
+            MapError: If the file cannot be written.
+        """
         write_map(path, self.html, "page")
 
     def widget(self) -> Any:
-        """The page as a widget of notebooks. Raises MapError where anywidget is not installed."""
+        """The page as a widget of notebooks.
+
+        Raises:
+            MapError: If anywidget is not installed.
+        """
         from ssh_abduction.page.widget import widget_of
 
         return widget_of(self.html)
@@ -58,13 +81,17 @@ def view_page(
 ) -> Page:
     """A page that shows maps, what they share and where they differ.
 
-    source   a solution, or maps of one trace
-    trace    the trace that was mapped, for its actions and images
-    run      what the slider replays with a belief at each step; it may be the trace itself
-    beliefs  where the robot of this run may have been: gives for a map the beliefs over its dstates, one for each step, as `lambda m: Localiser(m).beliefs(run)` does;
-             or None, for a map in which it was not localised
+    Args:
+        source: A solution, or maps of one trace.
+        trace: The trace that was mapped, for its actions and images.
+        run: A run that the slider replays with a belief at each step; it may be the trace itself.
+        beliefs: A function that gives for a map the belief over its dstates at each step of the
+            run, such as `lambda m: Localiser(m).beliefs(run)`; None for a map in which the robot
+            was not localised.
 
-    Raises MapError for maps of several traces, or of another one than this, and for beliefs without a run, or the other way round.
+    Raises:
+        MapError: If the maps are of several traces or of another one than this, or only one of run
+            and beliefs is given.
     """
     for given in (trace, run):
         if given is not None:
@@ -73,24 +100,31 @@ def view_page(
         a_function("beliefs", beliefs, MapError, what="a function of a map")
     if (run is None) != (beliefs is None):
         raise MapError(
-            "beliefs: expected a run that they are of, and beliefs for a run, got one of the two; give both, or none"
+            "beliefs: expected a run that they are of, and beliefs for a run, "
+            "got one of the two; give both, or none"
         )
-    return Page(
-        content_of(source, trace, None if run is None or beliefs is None else Run(run, beliefs))
-    )
+    localised = None if run is None or beliefs is None else Run(run, beliefs)
+    return Page(content_of(source, trace, localised))
 
 
 def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:
-    """The page of this content; `served` says that a server answers its questions."""
-    style, script = _file("page.css"), _file("page.js")
+    """The page with this content.
+
+    Args:
+        content: The content, from `content_of`.
+        served: Whether a server answers its questions.
+    """
+    style = _file("page.css")
+    script = "\n".join(_file(f"script/{name}.js") for name in SCRIPTS)
     text = json.dumps(
         {**content, "served": served}, ensure_ascii=False, separators=(",", ":"), allow_nan=False
     )
     for character, escape in ESCAPED.items():
         text = text.replace(character, escape)
+    asked = "self" if served else "none"
     policy = (
-        f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; connect-src {chr(39) + 'self' + chr(39) if served else chr(39) + 'none' + chr(39)}; "
-        "base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; "
+        f"connect-src '{asked}'; base-uri 'none'; form-action 'none'"
     )
     page = _file("page.html")
     for name, value in {
@@ -111,4 +145,5 @@ def _file(name: str) -> str:
 
 
 def _digest(text: str) -> str:
+    """The digest by which a content security policy allows a script or style."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

@@ -1,6 +1,7 @@
-"""The images of a trace as the page draws them: ranges of a laser round the robot, or panoramas; short enough for a page, and all on one scale.
+"""The images of a trace for the page: ranges around the robot, or panoramas, all on one scale.
 
-A number is one character of a text, which compresses better than digits. The alphabet has none that HTML or JSON would escape.
+Each number is one character, which compresses better than digits. The alphabet has no character
+that HTML or JSON would escape.
 """
 
 from __future__ import annotations
@@ -20,21 +21,32 @@ from ssh_abduction.data.trace import Trace
 
 ALPHABET = "".join(chr(c) for c in range(35, 127) if chr(c) not in "&<>\\")
 LOST = "!"  # a beam that measured nothing
-MOST = 100_000  # characters that all images of a page may have together
-BEAMS, FEWEST = (
-    181,
-    24,
-)  # beams of an image that are shown, and how few they may become before images are left out
-PIXELS = (12, 90)  # rows and columns of a panorama that are shown
-FAR = 95  # the longest range that is drawn: this percentile of all ranges, as a single look down a long corridor would make all rooms small
+MOST = 100_000  # characters of all images of a page
+BEAMS, FEWEST = 181, 24  # the most beams of an image, and the fewest before images are left out
+PIXELS = (12, 90)  # the most rows and columns of a panorama
+# The percentile of all ranges that is the longest one drawn. The longest range of all may be a look
+# down a corridor, which would make all rooms small.
+FAR = 95
 HALF = 180.0
 
 
 def beams_of(trace: Trace, count: int) -> tuple[float, float]:
-    """The bearing of the first beam, and from each beam to the next, in degrees counterclockwise from straight ahead.
+    """The bearings of the beams of a trace.
 
-    The header's `beams` says it. Without it the beams are taken to go from the right to the left over the half circle ahead, as those of the usual scanners do: of an odd
-    number the first is straight to the right, of an even one half a beam from there. Raises TraceError.
+    The header's `beams` gives them. By default the beams cover the half circle ahead from the right
+    to the left, as those of most scanners. An odd number of beams begins straight to the right, an
+    even one half a beam from there.
+
+    Args:
+        trace: The trace.
+        count: The number of beams.
+
+    Returns:
+        The bearing of the first beam and the angle between beams, in degrees counterclockwise from
+        straight ahead.
+
+    Raises:
+        TraceError: If the header is wrong.
     """
     told = trace.extra.get("beams")
     if told is None:
@@ -49,18 +61,20 @@ def beams_of(trace: Trace, count: int) -> tuple[float, float]:
         or abs(step) * (count - 1) > 360 + 1e-6
     ):
         raise TraceError(
-            f'{named(trace.source or "trace")}: beams: expected {{"first": degrees, "step": degrees}}, counterclockwise from straight ahead, with which {count} beams '
-            f"go round once at most, got {brief(told)}; mend the header, or leave it out"
+            f'{named(trace.source or "trace")}: beams: expected {{"first": degrees, "step": '
+            f"degrees}}, counterclockwise from straight ahead, with which {count} beams go round "
+            f"once at most, got {brief(told)}; mend the header, or leave it out"
         )
     return float(first), float(step)
 
 
 def drawn_images(trace: Trace) -> dict[str, Any] | None:
-    """The images of a trace; None where there are none, or too many for a page.
+    """The images of a trace; None if there are none, or too many for a page.
 
-    kind    ranges, with `first` and `step` (degrees counterclockwise) and `reach` (metres that the last character of the alphabet stands for), or panorama, with
-            `rows`, `columns` and `colours`
-    images  for each step a text, or None
+    Returns:
+        `images`, a text or None for each step, and `kind`. The kind "ranges" has `first` and `step`
+        (degrees counterclockwise) and `reach` (the metres of the last character of the alphabet).
+        The kind "panorama" has `rows`, `columns` and `colours`.
     """
     try:
         held = images_held(trace)
@@ -92,7 +106,7 @@ def drawn_images(trace: Trace) -> dict[str, Any] | None:
 
 
 def _text(shares: NDArray[np.float64]) -> str:
-    """Numbers from 0 to 1 as characters: what is greater is as 1, and what is no number is LOST."""
+    """Numbers from 0 to 1 as characters. A larger number counts as 1, and NaN is LOST."""
     last = len(ALPHABET) - 1
     return "".join(
         LOST if math.isnan(x) else ALPHABET[round(last * min(max(x, 0.0), 1.0))]
@@ -103,7 +117,16 @@ def _text(shares: NDArray[np.float64]) -> str:
 def _panoramas(
     held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
 ) -> dict[str, Any] | None:
-    """Panoramas of so many characters each at most, made smaller by leaving out rows and columns; None where the header's shape is not theirs."""
+    """Panoramas with fewer rows and columns, so that each has at most a number of characters.
+
+    Args:
+        held: The image of each step.
+        shape: The rows, columns and colours, as the header has them.
+        each: The most characters of an image.
+
+    Returns:
+        The images; None if the header has another shape than they.
+    """
     if (
         not isinstance(shape, list)
         or len(shape) != 3

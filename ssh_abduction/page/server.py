@@ -1,9 +1,10 @@
-"""A server on this computer alone that answers the questions of the page: why, and what if.
+"""A server on this computer that answers the questions of the page: why, and what if.
 
-Only who knows the token in its address is answered, and only where the request names this computer as its host: so no other page in the browser can ask (DNS rebinding
-included), and no other computer.
+It answers only requests with the token in their address that name this computer as their host. So
+no other page in the browser can ask (not by DNS rebinding either), and no other computer.
 
-A question is answered in a process of its own. So it can be given up: when the page closes the connection, as it does when the user asks something else, that process is ended.
+Each question is answered in a process of its own. The server ends this process when the page closes
+the connection, as it does when the user asks something else.
 """
 
 from __future__ import annotations
@@ -26,25 +27,36 @@ from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page import answers
-from ssh_abduction.page.content import Called, Run, content_of
+from ssh_abduction.page.content import Called, content_of
 from ssh_abduction.page.html import html_of
+from ssh_abduction.page.replays import Run
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import LimitError, Watch, in_process
 from ssh_abduction.theory.theory import Theory
 
 LARGEST = 100_000  # bytes of a question
-LENGTH = re.compile("[0-9]{1,9}")  # how that number is written
-POLL = 0.1  # seconds after which it is looked whether who asked is still there
-# An answer has so many times its limit and so many seconds more, for the process to begin and for what cannot be interrupted, before the process is ended.
+LENGTH = re.compile("[0-9]{1,9}")  # of the header Content-Length
+POLL = 0.1  # seconds between looks at whether the connection is still open
+# The process of an answer is ended after NET times its time limit and MORE seconds, as it needs
+# time to start, and some work cannot be interrupted.
 NET, MORE = 1.2, 5.0
 
 
 class PageServer(ThreadingHTTPServer):
-    """Serves the page of maps, and answers its questions.
+    """Serves the page of maps and answers its questions.
 
-    url  where the page is, with its token
+    Args:
+        listing: The maps.
+        trace: Their trace.
+        theory: Their theory; None for the topological theory.
+        run: A run that is replayed with its beliefs.
+        called: What commands on the page call its files.
+        port: The port; 0 for any free one.
+        max_maps: The most maps of an answer; None for all.
+        time_limit: Seconds for each answer; None for no limit.
 
-    Raises MapError where the maps are not of the trace.
+    Raises:
+        MapError: If the maps are not of the trace.
     """
 
     daemon_threads = True
@@ -71,22 +83,35 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def port(self) -> int:
+        """The port that the server listens on."""
         return int(self.server_address[1])
 
     @property
     def url(self) -> str:
+        """The address of the page, with its token."""
         return f"http://127.0.0.1:{self.port}/{self._token}/"
 
     def is_known(self, path: str) -> str | None:
-        """What is asked for, if the token is right."""
+        """The question in a path with the right token; None if the token is wrong."""
         token, _, rest = path.partition("?")[0].lstrip("/").partition("/")
         return rest if hmac.compare_digest(token.encode(), self._token.encode()) else None
 
     def page(self) -> bytes:
+        """The page as HTML."""
         return self._page
 
     def answer(self, question: str, data: Mapping[str, Any], watch: Watch) -> dict[str, Any]:
-        """The answer to a question of the page. Raises AbductionError, and LimitError when the watch says so."""
+        """The answer to a question of the page.
+
+        Args:
+            question: "explain" or "solve".
+            data: `pair` (of steps), and the pairs that are assumed `same` or `different`.
+            watch: Interrupts the answer.
+
+        Raises:
+            AbductionError: If the question is malformed, or has no answer.
+            LimitError: If a limit of the watch was reached.
+        """
         if question not in ("explain", "solve"):
             raise MapError(f"expected explain or solve, got {brief(question)}")
         theory = self._assuming(data)
@@ -109,26 +134,27 @@ class PageServer(ThreadingHTTPServer):
 
     @contextmanager
     def _turn(self, watch: Watch) -> Iterator[None]:
-        """One question at a time has the processor; who gave up while waiting waits no longer."""
+        """Wait for the processor, which works on one question at a time."""
         while not self._one_at_a_time.acquire(timeout=POLL):
             watch.check()
         try:
-            watch.start()  # the time that was waited does not count
+            watch.start()  # the time of waiting does not count
             yield
         finally:
             self._one_at_a_time.release()
 
     @property
     def net(self) -> float | None:
-        """Seconds after which the process of an answer is ended."""
+        """Seconds after which the process of an answer is ended; None for never."""
         return None if self._limit is None else NET * self._limit + MORE
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Whoever closes the connection before the answer is there is no error to be printed."""
+        """Print no error if the connection was closed before the answer came."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
     def _assuming(self, data: Mapping[str, Any]) -> Theory:
+        """The theory with the assumptions of a question."""
         theory = self._theory or Theory.topological()
         for name in ("same", "different"):
             pairs = data.get(name, [])
@@ -140,6 +166,7 @@ class PageServer(ThreadingHTTPServer):
         return theory
 
     def _pair(self, pair: Any) -> tuple[int, int]:
+        """A pair of steps in order, checked."""
         last = len(self._trace) - 1
         if (
             not isinstance(pair, list)
@@ -151,6 +178,8 @@ class PageServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
+    """Answers a request. The protocol is HTTP/1.0, so each connection is closed afterwards."""
+
     server: PageServer
     server_version, sys_version = "ssh-abduction", ""
     timeout = 60
@@ -186,7 +215,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, json.dumps(told).encode(), "application/json")
 
     def _asked(self) -> str | None:
-        """What is asked for, if who asks may."""
+        """The question of a request; None if the request is refused."""
         hosts = [f"{name}:{self.server.port}" for name in ("127.0.0.1", "localhost")]
         origin = self.headers.get("Origin")
         if self.headers.get("Host") not in hosts or (
@@ -196,12 +225,11 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server.is_known(self.path)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """What is no request for this server is refused as others are, without a word on what would be one."""
+        """Refuse a malformed request without saying what is wrong."""
         self._refuse()
 
     def _refuse(self) -> None:
-        """An empty answer, and the connection is closed, as what follows in it was not read."""
-        self.close_connection = True
+        """Send an empty answer."""
         self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
 
     def _send(self, status: HTTPStatus, body: bytes, kind: str) -> None:
@@ -219,12 +247,12 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing is logged, as addresses hold the token."""
+        """Log nothing, as addresses hold the token."""
 
 
 @contextmanager
 def _while_there(connection: socket.socket, watch: Watch) -> Iterator[None]:
-    """Meanwhile, interrupt the watch as soon as who asked closes the connection."""
+    """Interrupt the watch as soon as the other side closes the connection."""
     done = threading.Event()
 
     def look() -> None:
@@ -235,7 +263,7 @@ def _while_there(connection: socket.socket, watch: Watch) -> Iterator[None]:
                 ):
                     watch.interrupted = True
                     return
-            except (OSError, ValueError):  # it was reset, or closed here
+            except (OSError, ValueError):  # the connection was reset, or closed on this side
                 watch.interrupted = True
                 return
 

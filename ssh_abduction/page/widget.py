@@ -10,7 +10,8 @@ SHOW = """
 export default { render({ model, el }) {
   const frame = document.createElement("iframe");
   frame.sandbox = "allow-scripts";
-  frame.style.cssText = "display:block;box-sizing:border-box;width:100%;height:680px;border:1px solid #8888";
+  frame.style.cssText =
+    "display:block;box-sizing:border-box;width:100%;height:680px;border:1px solid #8888";
   frame.title = "Maps";
   frame.srcdoc = model.get("html");
   el.append(frame);
@@ -19,13 +20,18 @@ export default { render({ model, el }) {
 
 
 def widget_of(html: str) -> Any:
-    """A widget that shows a page, in a frame of its own. Raises MapError where anywidget is not installed."""
+    """A widget that shows a page in a frame.
+
+    Raises:
+        MapError: If anywidget is not installed.
+    """
     try:
         import anywidget
         import traitlets
     except ImportError:
         raise MapError(
-            "widget: expected anywidget, got none; install it with pip install 'ssh-abduction[notebook]'"
+            "widget: expected anywidget, got none; "
+            "install it with pip install 'ssh-abduction[notebook]'"
         ) from None
     members = {"_esm": SHOW, "html": traitlets.Unicode(html).tag(sync=True)}
     return type("PageWidget", (anywidget.AnyWidget,), members)()

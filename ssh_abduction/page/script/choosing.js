@@ -1,0 +1,146 @@
+// Choosing what is drawn, with the legend.
+
+function draw(keep = true) {
+  const last = data.maps.length - 1;
+  state.map = Math.min(state.map, last);
+  state.other = Math.min(state.other, last);
+  $("drawings").replaceChildren();
+  const told =
+    state.mode === "overview"
+      ? [overviewFigure()]
+      : state.mode === "one"
+        ? [mapFigure(state.map, null)]
+        : [mapFigure(state.map, state.other), mapFigure(state.other, state.map)];
+  figures = told.map(newFigure);
+  if (!keep || !settled()) settle();
+  paint();
+  for (const name of ["overview", "one", "two"])
+    $(name).setAttribute("aria-pressed", state.mode === name);
+  $("moves").hidden = state.mode === "overview" || !last;
+  $("second").hidden = state.mode !== "two";
+  $("two").disabled = !last;
+  $("number").max = $("other").max = last + 1;
+  $("number").value = state.map + 1;
+  $("other").value = state.other + 1;
+  $("back").disabled = state.map === 0;
+  $("next").disabled = state.map === last;
+  $("labels").disabled = nextMap((one, now) => one.labeling !== now.labeling) === null;
+  $("paths").disabled = nextMap((one, now) => one.labeling === now.labeling) === null;
+  about();
+  legend();
+  tellBelief();
+}
+
+function legend() {
+  $("legend").replaceChildren();
+  const rows = [];
+  if (state.mode === "overview" && data.maps.length > 1)
+    rows.push(
+      ["street", "", "all maps"],
+      ["street", "most", "more than two thirds"],
+      ["street", "half", "about half"],
+      ["street", "few", "less than a third"],
+      ["dstate", "hollow half", "rivals dispute what else is along its path"],
+    );
+  if (state.mode === "two")
+    rows.push(
+      ["street", "", "as in the other map"],
+      ["street", "differs", "not so in the other map"],
+      ["street", "course", "there too, but along another path"],
+    );
+  if (state.mode === "one" && mapOf(state.map).streets.some((street) => !street.travelled))
+    rows.push(["street", "order", "nobody travelled there: the order of the path says so"]);
+  if (data.places[0].some(([place]) => place !== null))
+    rows.push(["node", "", "a place"], ["dstate", "", "a dstate, headed as it faces"]);
+  if (!replay().other) rows.push(["here", "", "where the robot is at this step"]);
+  if (replay().beliefs)
+    rows.push(["believed", "", "where it is believed to be: the larger, the more probable"]);
+  if (figures.some((figure) => figure.layout?.ellipses?.length))
+    rows.push(["ellipse", "", "two standard deviations of a position"]);
+  if (data.faults.length)
+    rows.push([
+      "fault",
+      "",
+      state.mode === "one" ? "what the map disbelieves" : "what all disbelieve",
+    ]);
+  if (data.faults.length && state.mode !== "one")
+    rows.push([
+      "fault",
+      "disputed",
+      state.mode === "two" ? "what the other map does not disbelieve" : "what some maps disbelieve",
+    ]);
+  for (const [shape, kind, text] of rows) {
+    const row = element("p", { class: "key" }, null, $("legend")),
+      svg = element("svg:svg", { viewBox: "0 0 38 16", "aria-hidden": "true" }, null, row);
+    if (shape === "street")
+      element(
+        "svg:path",
+        {
+          d: "M2,8 H36",
+          class: classes("street", kind),
+          "stroke-width": kind === "order" ? 1.5 : 4,
+        },
+        null,
+        svg,
+      );
+    else if (shape === "dstate")
+      element(
+        "svg:path",
+        { d: arrowAt(19, 8, 1, 0, 7), class: classes("dstate", kind) },
+        null,
+        svg,
+      );
+    else if (shape === "ellipse")
+      element("svg:ellipse", { cx: 19, cy: 8, rx: 14, ry: 6, class: shape }, null, svg);
+    else if (shape === "fault") {
+      const mark = element("svg:g", { class: classes("fault", kind) }, null, svg);
+      element("svg:path", { d: "M19,0 l8,8 l-8,8 l-8,-8 Z" }, null, mark);
+      element("svg:text", { x: 19, y: 8, "font-size": 11 }, "!", mark);
+    } else element("svg:circle", { cx: 19, cy: 8, r: 6, class: shape }, null, svg);
+    element("span", {}, text, row);
+  }
+}
+
+function about() {
+  $("about").replaceChildren();
+  if (state.mode === "overview") {
+    element("p", {}, `${counted(data.maps.length, "map")} of ${data.file}`, $("about"));
+    return;
+  }
+  for (const i of state.mode === "two" ? [state.map, state.other] : [state.map]) {
+    const ssh = mapOf(i);
+    const paths = data.orders[data.maps[i].orders].length;
+    const counts = [counted(ssh.dstates.length, "dstate")];
+    if (ssh.places.size) counts.push(counted(ssh.places.size, "place"), counted(paths, "path"));
+    element("p", {}, `Map ${i + 1}: ${counts.join(", ")}`, $("about"));
+    for (const [, text] of ssh.faults) element("p", {}, `Disbelieved: ${text}`, $("about"));
+  }
+}
+
+// The next map that is wanted after the one drawn. The first map comes after the last.
+function nextMap(wanted) {
+  const count = data.maps.length,
+    now = data.maps[state.map];
+  for (let k = 1; k < count; k++) {
+    const i = (state.map + k) % count;
+    if (wanted(data.maps[i], now)) return i;
+  }
+  return null;
+}
+
+function go(i) {
+  if (i === null || !(i >= 0 && i < data.maps.length)) {
+    draw();
+    return;
+  }
+  state.map = i;
+  if (state.mode === "overview") state.mode = "one";
+  draw();
+}
+
+function setMode(mode) {
+  if (mode === "two" && data.maps.length < 2) return;
+  state.mode = mode;
+  if (mode === "two" && state.other === state.map) state.other = state.map ? 0 : 1;
+  draw(false);
+}
