@@ -18,6 +18,7 @@ VERBS = {
     for name, verb in parser().verbs.items()
 }
 WITH_THEORY = tuple(name for name, options in VERBS.items() if "--theory" in options)
+WITH_MAPS = tuple(name for name, options in VERBS.items() if "--maps" in options)
 WITH_MAP = tuple(name for name, options in VERBS.items() if "--map" in options)
 # The verbs that print what a module says, where that is not one verb of the module's name. All of them have each option that is named without a verb.
 # A sentence that other verbs print too names the verb: "write it with solve --json".
@@ -26,6 +27,7 @@ SAID_BY = {
     "perception/readers": ("import", "map"),
     "simulator": ("simulate",),
     "ssh_abduction/solver/asp/rules.py": WITH_THEORY,
+    "ssh_abduction/data/checks.py": WITH_MAPS,
     "ssh_abduction/cli/batch.py": ("solve",),
     "ssh_abduction/data/checks.py": ("solve", "explain", "ladder", "map"),
     "ssh_abduction/explain/question.py": ("explain",),

@@ -522,7 +522,9 @@ def test_wrong_arguments_are_refused_by_errors_of_the_package(call: str, functio
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("call", [call for call, _ in SWEPT])
 def test_right_arguments_are_accepted(call: str) -> None:
-    """The sweep would tell nothing of a call that fails whatever it is given. Two calls read files that no test ships."""
+    """A call that always fails would pass the sweep above. Two calls read files that no test has."""
+    if call == "to_pandas":
+        pytest.importorskip("pandas")
     function = dict(SWEPT)[call]
     if call not in ("Plan.load", "World.from_occupancy", "BootstrapLearner.score"):
         do(call, function, {p.name: good(call, p) for p in parameters(function)})
