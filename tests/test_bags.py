@@ -1,4 +1,8 @@
-"""Bags as robots leave them: in parts, packed, cut, with clocks that part, with several lasers, and odometry of several sources."""
+"""Bags as robots leave them.
+
+They come in parts, packed, cut, with wrong clocks, with several lasers, or with odometry of several
+sources.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +29,11 @@ from ssh_abduction.cli import main
 
 SCANS = drive(40, SMALL)
 PACK: dict[str, Callable[[bytes], bytes]] = {
-    "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress, "zst": lambda data: bytes(zstd_module().compress(data)),
-}  # fmt: skip
+    "gz": gzip.compress,
+    "bz2": bz2.compress,
+    "xz": lzma.compress,
+    "zst": lambda data: bytes(zstd_module().compress(data)),
+}
 FILES = {"ros1": "drive.bag", "mcap": "drive.mcap", "ros2": "drive.db3"}
 
 
@@ -94,7 +101,7 @@ def test_of_a_bag_that_was_cut_the_whole_part_is_read_and_it_is_said(
 
 @pytest.mark.parametrize("format", ["ros1", "mcap"])
 def test_a_chunk_that_was_packed_and_cut_is_read_up_to_the_cut(tmp_path: Path, format: str) -> None:
-    """Recorders pack many messages at once: the last such chunk is the one that is cut."""
+    """Recorders pack many messages in a chunk; the last chunk is the one that is cut."""
     from rosbags import rosbag1, rosbag2
     from rosbags.interfaces import Connection
 
@@ -134,7 +141,7 @@ def test_a_chunk_that_was_packed_and_cut_is_read_up_to_the_cut(tmp_path: Path, f
 
 
 def parts(folder: Path, ending: str, count: int = 3) -> None:
-    """The parts of one drive; static transforms are in the first one alone. Part 10 comes last by its number, not by its name."""
+    """The parts of a drive. Part 10 is last by number; only the first has static transforms."""
     folder.mkdir()
     size = len(SCANS) // count
     for k in range(count):
@@ -177,8 +184,8 @@ def test_one_part_that_is_named_alone_is_said_to_be_one(tmp_path: Path) -> None:
     log = read_log(tmp_path / "drive" / "drive_0.db3")
     assert len(log) == len(SCANS) // 3
     assert (
-        "drive_0.db3 is one part of a drive, and is read alone. Beside it lie drive_1.db3, drive_10.db3: name the folder"
-        in notes(log)
+        "drive_0.db3 is one part of a drive, and is read alone. Beside it lie drive_1.db3, "
+        "drive_10.db3: name the folder" in notes(log)
     )
     (tmp_path / "drive" / "drive_1.db3").rename(tmp_path / "drive_1.db3")
     assert "these parts are not there: 0" in notes(read_log(tmp_path / "drive_1.db3"))
@@ -201,7 +208,10 @@ def test_a_folder_of_several_drives_is_refused(tmp_path: Path) -> None:
         write_bag(tmp_path / f"{name}.mcap", SCANS)
     with pytest.raises(
         LogError,
-        match=r"expected the parts of one drive, .* got monday\.mcap, tuesday\.mcap; name one of the files, or ros2 bag reindex",
+        match=(
+            r"expected the parts of one drive, .* got monday\.mcap, tuesday\.mcap; name one of "
+            r"the files, or ros2 bag reindex"
+        ),
     ):
         read_log(tmp_path)
 
@@ -228,7 +238,10 @@ def test_no_room_for_a_copy_is_one_clear_error(
     monkeypatch.setattr(shutil, "copyfileobj", full)
     with pytest.raises(
         LogError,
-        match=r"a\.mcap\.gz: expected room for a temporary copy in .*, got a full disk; free some, or name another folder \(TMPDIR",
+        match=(
+            r"a\.mcap\.gz: expected room for a temporary copy in .*, got a full disk; free some, "
+            r"or name another folder \(TMPDIR"
+        ),
     ):
         read_log(tmp_path / "a.mcap.gz")
 
@@ -268,7 +281,7 @@ def clocks(
     odometer: Callable[[float], float],
     recorded: Callable[[float], float],
 ) -> Any:
-    """What is read of a drive at one metre a second, where the clocks of the laser, the odometer and the recorder go as these say."""
+    """Read a drive at one metre a second with these clocks of laser, odometer and recorder."""
 
     def messages(m: Messages) -> list[tuple[str, float, Any]]:
         both = [
@@ -290,7 +303,7 @@ def true(t: float) -> float:
 
 
 def off(log: Any) -> float:
-    """How far the odometry of most scans is off, at most: metres, and so seconds."""
+    """Largest error of the odometry for most scans, in metres and so in seconds."""
     return max(abs(scan.odometry[0] - (scan.line - 1) * 0.5) for scan in log.scans)
 
 
@@ -324,8 +337,8 @@ def test_clocks_that_part_are_found_and_the_times_of_recording_used(
     ("recorded", "said"),
     [
         (true, ""),
-        (lambda t: t + 0.3 * math.sin(t), ""),  # late by itself, now more and now less
-        (lambda t: t + 3600 + 0.05 * t, ""),  # another clock than that of both headers
+        (lambda t: t + 0.3 * math.sin(t), ""),  # Late by itself, by varying amounts.
+        (lambda t: t + 3600 + 0.05 * t, ""),  # Another clock than that of both headers.
         (lambda t: 0.0, "were all recorded at one time"),
         (lambda t: 10 * math.ceil(t / 10), "were recorded in 12 bursts, each of up to 9.5 s"),
     ],
@@ -348,7 +361,7 @@ def test_if_both_clocks_are_broken_it_is_said(tmp_path: Path) -> None:
 
 
 def two_lasers(m: Messages, *topics: str) -> list[tuple[str, float, Any]]:
-    """A laser that looks ahead and one that looks back, whose scans come by turns."""
+    """Two lasers, one ahead and one behind, whose scans alternate."""
     found: list[tuple[str, float, Any]] = [
         ("/tf_static", 0.5, m.transform("base_link", "front", (0.2, 0.0, 0.0))),
         ("/tf_static", 0.5, m.transform("base_link", "rear", (-0.2, 0.0, math.pi))),
@@ -389,8 +402,8 @@ def test_of_two_transforms_to_a_laser_the_later_one_is_used_and_it_is_said(
     log = read_log(bag(tmp_path / "bag", messages))
     assert abs(log.scans[0].laser.mount[2]) == pytest.approx(math.pi)
     assert (
-        "The 3 transforms from base_link to laser, by which the laser is mounted, contradict each other by up to 0.00 m and 180 degrees"
-        in notes(log)
+        "The 3 transforms from base_link to laser, by which the laser is mounted, contradict "
+        "each other by up to 0.00 m and 180 degrees" in notes(log)
     )
 
 
@@ -415,9 +428,17 @@ def test_first_echoes_of_a_laser_with_several_are_read(tmp_path: Path) -> None:
         echo = m.types["sensor_msgs/msg/LaserEcho"]
         beams = [[1.0, 3.0], [2.0], [], [4.0, 5.0], [9.0]]
         scan = m.types["sensor_msgs/msg/MultiEchoLaserScan"](
-            header=scan.header, angle_min=-1.0, angle_max=1.0, angle_increment=0.5, time_increment=0.0, scan_time=0.1, range_min=0.1, range_max=8.0,
-            ranges=[echo(echoes=np.array(beam, dtype=np.float32)) for beam in beams], intensities=[],
-        )  # fmt: skip
+            header=scan.header,
+            angle_min=-1.0,
+            angle_max=1.0,
+            angle_increment=0.5,
+            time_increment=0.0,
+            scan_time=0.1,
+            range_min=0.1,
+            range_max=8.0,
+            ranges=[echo(echoes=np.array(beam, dtype=np.float32)) for beam in beams],
+            intensities=[],
+        )
         return [
             *[("/odom", t, m.odometry(t, (t, 0.0, 0.0))) for t in (1.0, 2.0)],
             ("/echoes", 1.5, scan),
@@ -431,7 +452,7 @@ def test_first_echoes_of_a_laser_with_several_are_read(tmp_path: Path) -> None:
 
 
 def alternate(m: Messages, kind: str) -> list[tuple[str, float, Any]]:
-    """A robot that drives along x; another program puts it elsewhere."""
+    """A robot that drives along x, while another program publishes other poses."""
     found: list[tuple[str, float, Any]] = []
     for i in range(100):
         t = 1.0 + 0.1 * i
@@ -466,15 +487,24 @@ def alternate(m: Messages, kind: str) -> list[tuple[str, float, Any]]:
     [
         (
             "topic",
-            "Several sources publish /odom, whose poses alternate, up to 5.8 m apart: 100 and 67 of 167 messages",
+            (
+                "Several sources publish /odom, whose poses alternate, up to 5.8 m apart: 100 and "
+                "67 of 167 messages"
+            ),
         ),
         (
             "frames",
-            "Several sources publish /odom: 100 from odom to camera, 200 from odom to laser. Those from odom to laser are read",
+            (
+                "Several sources publish /odom: 100 from odom to camera, 200 from odom to laser. "
+                "Those from odom to laser are read"
+            ),
         ),
         (
             "transforms",
-            "Several sources publish the transforms from odom to laser, whose poses alternate, up to 5.8 m apart",
+            (
+                "Several sources publish the transforms from odom to laser, whose poses "
+                "alternate, up to 5.8 m apart"
+            ),
         ),
         ("parents", ""),
     ],

@@ -1,4 +1,4 @@
-"""Drives as robots log them: scans all along, an odometer that drifts, and the truth about places."""
+"""Drives as robots log them: scans, an odometer that drifts, and the truth about places."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ def steps_of(poses: np.ndarray) -> list[tuple[float, float, float]]:
 
 
 def test_an_odometer_errs_as_it_says() -> None:
-    """Over many drives of 9 m straight ahead, and of two radians on the spot: the spread of what is read is the noise times the root of the motion, and the mean shows what repeats."""
+    """Noise grows with the square root of a motion, and the mean shows the systematic errors.
+
+    Measured over many drives of 9 m straight ahead, and of two radians on the spot.
+    """
     odometer, rng = (
         Odometer(along=0.04, across=0.03, heading=0.0, turning=0.05, scale=0.1, bend=0.01),
         np.random.default_rng(0),
@@ -64,7 +67,7 @@ def test_an_odometer_errs_as_it_says() -> None:
     np.testing.assert_allclose(ends.std(0), (0.0, 0.0, 0.05 * math.sqrt(2)), rtol=0.07)
     assert odometer.reading(line, rng)[-1, 2] == pytest.approx(
         0.09, abs=1e-9
-    )  # the bend, in each metre
+    )  # The bend, in each metre.
 
 
 def test_an_exact_odometer_reads_the_way_itself() -> None:
@@ -82,7 +85,7 @@ def test_a_wrong_odometer_names_its_field(field: str) -> None:
 
 
 def test_scans_are_taken_all_along() -> None:
-    """Also within a long motion: the next scan is at most a fifth farther than was asked for, in metres and degrees."""
+    """Also within a long motion, the next scan is at most a fifth too late."""
     recorder = Recorder(every=0.3)
     for pose in (
         (1.0, 1.0, 0.0),
@@ -122,12 +125,15 @@ def test_a_drive_of_a_world_says_where_the_robot_was() -> None:
     again = record(RECTANGLE, tours=2, seed=1, odometer=Odometer(along=0.2))
     np.testing.assert_array_equal(
         drive.poses, again.poses
-    )  # noise of the odometer changes the log alone
+    )  # Noise of the odometer changes only the log.
     assert not np.array_equal(drive.odometry, again.odometry)
 
 
 def test_the_covariance_of_an_odometer_is_that_of_its_errors() -> None:
-    """Along two sides of a square, over many drives: the errors at the end, in the standard deviations that the odometer itself says, are three independent numbers."""
+    """The errors of many drives, in the odometer's own standard deviations, are independent.
+
+    Each drive is along two sides of a square; the errors are those at its end.
+    """
     rng, odometer = np.random.default_rng(0), Odometer()
     side = np.column_stack([np.linspace(0, 4, 41), np.zeros((41, 2))])
     turn = np.column_stack([np.full(11, 4.0), np.zeros(11), np.linspace(0, math.pi / 2, 11)])
@@ -151,12 +157,12 @@ def test_the_covariance_of_an_odometer_is_that_of_its_errors() -> None:
 
 
 def test_doors_are_openings_in_the_walls_of_both_rooms(ring: Building) -> None:
-    """The rooms are 0.2 m apart. A laser in the middle of a room sees through its door, and what is beside the door is a wall."""
+    """A laser in a room sees through its door, and wall beside it. Rooms are 0.2 m apart."""
     opening = ring.openings[0]
     assert (*opening.middle, opening.width, opening.depth) == pytest.approx((10.0, -5.0, 1.0, 0.2))
     assert abs(math.sin(opening.along)) == pytest.approx(1.0)
     ranges = Laser(reach=30.0).exact(ring.world(), np.array([[5.0, -5.0, 0.0]]))[0]
-    assert ranges[89] > 14  # through the door, and the closet's
+    assert ranges[89] > 14  # Through the door, and the closet's.
     assert ranges[[80, 99]] == pytest.approx(4.9, abs=0.1)
     assert holds(ring.plan.rooms[0].polygon, (5.0, -5.0))
     assert not holds(ring.plan.rooms[0].polygon, (10.0, -5.0))
@@ -169,7 +175,7 @@ def test_a_robot_drives_through_doors_from_room_to_room(ring: Building) -> None:
     assert len(drive.truth["scans"]) == len(drive)
     for pose, room in zip(
         drive.poses, drive.truth["scans"], strict=True
-    ):  # in the room that the truth says, or in the wall between two
+    ):  # In the room of the truth, or in the wall between two rooms.
         outline = np.array(ring.plan.rooms[int(room.removeprefix("room "))].polygon)
         assert (outline.min(0) - 0.6 < pose[:2]).all()
         assert (pose[:2] < outline.max(0) + 0.6).all()
@@ -179,7 +185,7 @@ def test_a_robot_drives_through_doors_from_room_to_room(ring: Building) -> None:
         assert sorted(door["rooms"]) == sorted([before, after])
         assert math.dist(drive.poses[crossing["scan"]][:2], door["at"]) < 0.8
     half = len(visits) // 2
-    assert visits[: half + 1] == visits[half:]  # the same round twice, which ends where it began
+    assert visits[: half + 1] == visits[half:]  # The same round twice, which ends where it began.
     assert len(set(visits)) >= 3
     rooms = Rooms(ring, 0.3)
     rounds = [Round.drawn(rooms, 45.0, np.random.default_rng(seed)).doors for seed in range(5)]
@@ -195,7 +201,10 @@ def test_rounds_that_cannot_be_driven(ring: Building, tmp_path: Path) -> None:
         record_plan(replace(ring.plan, doors=()))
     with pytest.raises(
         SimulatorError,
-        match=r"walls: expected them on at most 200,000 square metres, .*, got 2,784 x 1,984 m; check the scale",
+        match=(
+            r"walls: expected them on at most 200,000 square metres, .*, got 2,784 x 1,984 m; "
+            r"check the scale"
+        ),
     ):
         record_plan(plan_of(tmp_path, xml(unit="m")))
     with pytest.raises(SimulatorError, match="metres: expected a length above 0"):
@@ -210,7 +219,7 @@ def test_rounds_that_cannot_be_driven(ring: Building, tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not SCHOOLS, reason="the school plans are not here")
 def test_a_school_can_be_driven() -> None:
-    """The robot goes through 30 doors of a school, hits nothing, and comes home."""
+    """The robot drives through 30 doors of a school, hits nothing, and returns home."""
     drive = record_plan(
         Plan.load(next(path for path in SCHOOLS if "Sabadell" in path.name)), seed=0, metres=100.0
     )
@@ -224,7 +233,10 @@ def test_a_school_can_be_driven() -> None:
 
 @pytest.mark.parametrize(("name", "tours"), [("curved", 1), ("cluttered", 1), ("doors", 2)])
 def test_shipped_worlds_are_driven_off_their_walls_and_furniture(name: str, tours: int) -> None:
-    """Each place is visited as often as the route says, also on a second tour, on which the furniture stands differently, and the robot touches nothing."""
+    """Each place is visited as often as the route says, also when the furniture has moved.
+
+    The robot touches nothing.
+    """
     world = World.named(name)
     drive = record(world, tours, seed=4, every=1.0)
     asked = [
@@ -289,7 +301,10 @@ def test_walls_may_be_round_uneven_or_those_of_an_occupancy_map(tmp_path: Path) 
         ),
         (
             {"route": ["a", "travel"]},
-            r"route\[1\]: expected a place \(b, a\), as there are others in the route, got 'travel'",
+            (
+                r"route\[1\]: expected a place \(b, a\), as there are others in the route, got "
+                r"'travel'"
+            ),
         ),
         (
             {"route": ["c"]},
@@ -325,7 +340,10 @@ def test_a_route_of_places_that_cannot_be_driven(tmp_path: Path) -> None:
     )
     with pytest.raises(
         SimulatorError,
-        match=r"route: expected a way from \(1\.00, 1\.00\) to b, got none; open the walls, or move b, which is 1\.00 m off",
+        match=(
+            r"route: expected a way from \(1\.00, 1\.00\) to b, got none; open the walls, or move "
+            r"b, which is 1\.00 m off"
+        ),
     ):
         record(World.load(tmp_path / "world.json"))
     with pytest.raises(
@@ -340,16 +358,61 @@ def test_a_route_of_places_that_cannot_be_driven(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("world", "body", "laser", "message"),
     [
-        (HALL.with_choices(reach=0.6), None, None, r"action 5 of tour 1, travel: expected the robot to come to D2 at \(13\.00, -10\.00\), got it at \(13\.4.*reach is 0\.6 m, and the world's own is 1 m"),
-        (replace(HALL, reach=1.3), None, None, r"expected the robot to come to P3 .*reach is 1\.3 m, and half the width of the street there is 1\.00 m"),
-        (HALL.with_choices(route="travel,right"), None, None, r"tour 1: expected it to end where it began, at \(0\.00, -15\.00\), got its end at .* 15\.0 m and 90 degrees off"),
-        (replace(World.named("three-ways"), angles="right"), None, None, 'walls meet at other than right angles, and the world says "right"'),
-        (replace(World.named("triangle"), start=(-2.0, 1.2, -2.1)), None, None, r"the start is 4\.3 m off the nearest dstate"),
+        (
+            HALL.with_choices(reach=0.6),
+            None,
+            None,
+            (
+                r"action 5 of tour 1, travel: expected the robot to come to D2 at \(13\.00, "
+                r"-10\.00\), got it at \(13\.4.*reach is 0\.6 m, and the world's own is 1 m"
+            ),
+        ),
+        (
+            replace(HALL, reach=1.3),
+            None,
+            None,
+            (
+                r"expected the robot to come to P3 .*reach is 1\.3 m, and half the width of the "
+                r"street there is 1\.00 m"
+            ),
+        ),
+        (
+            HALL.with_choices(route="travel,right"),
+            None,
+            None,
+            (
+                r"tour 1: expected it to end where it began, at \(0\.00, -15\.00\), got its end "
+                r"at .* "
+                r"15\.0 m and 90 degrees off"
+            ),
+        ),
+        (
+            replace(World.named("three-ways"), angles="right"),
+            None,
+            None,
+            'walls meet at other than right angles, and the world says "right"',
+        ),
+        (
+            replace(World.named("triangle"), start=(-2.0, 1.2, -2.1)),
+            None,
+            None,
+            r"the start is 4\.3 m off the nearest dstate",
+        ),
         (World.named("triangle"), None, Laser(noise=0.1), r"ranges err by 10 cm"),
-        (HALL, Body(slip=0.4), None, r"expected a free way ahead, got a wall; .*a motion errs by 40 %"),
-        (replace(RECTANGLE, start=(3.4, 1.4, 0.7), route=("travel",)), None, None, r"the start heads 40 degrees off the walls"),
+        (
+            HALL,
+            Body(slip=0.4),
+            None,
+            r"expected a free way ahead, got a wall; .*a motion errs by 40 %",
+        ),
+        (
+            replace(RECTANGLE, start=(3.4, 1.4, 0.7), route=("travel",)),
+            None,
+            None,
+            r"the start heads 40 degrees off the walls",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_goes_wrong_is_told_with_its_cause(
     world: World, body: Body | None, laser: Laser | None, message: str
 ) -> None:
@@ -360,7 +423,7 @@ def test_what_goes_wrong_is_told_with_its_cause(
 def test_a_single_tour_that_does_not_return_is_a_warning() -> None:
     with pytest.warns(
         SimulatorWarning,
-        match=r"tour 1: expected it to end where it began, .*; it cannot be driven again from there",
+        match=r"expected it to end where it began, .*; it cannot be driven again from there",
     ):
         assert len(simulate(RECTANGLE.with_choices(route="right"))) == 1
 
@@ -369,7 +432,7 @@ def test_a_single_tour_that_does_not_return_is_a_warning() -> None:
 
 
 def test_a_way_leads_around_what_was_not_known() -> None:
-    """A box stands on the midline of a corridor, and no map shows it. The robot drives around it, and goes on along its way."""
+    """The robot drives around an unknown box on the midline of a corridor, and continues."""
     walls = np.array([[0, 0, 12, 0], [12, 0, 12, 3], [12, 3, 0, 3], [0, 3, 0, 0.0]])
     box = np.array([[5, 1, 6, 1], [6, 1, 6, 2], [6, 2, 5, 2], [5, 2, 5, 1.0]])
     space = FreeSpace.of(walls, 0.2)
@@ -405,7 +468,10 @@ def test_a_way_that_is_closed_is_an_error() -> None:
     )
     with pytest.raises(
         SimulatorError,
-        match=r"shut: drive at \(\d\.\d+, 1\.\d+\): expected a way around what stands there, got none",
+        match=(
+            r"shut: drive at \(\d\.\d+, 1\.\d+\): expected a way around what stands there, got "
+            r"none"
+        ),
     ):
         for _ in follow(driver, space, way):
             pass
@@ -453,7 +519,7 @@ def test_simulate_writes_logs_that_can_be_read(
 
 
 def test_a_bag_says_what_its_odometry_is_worth(tmp_path: Path) -> None:
-    """The covariance of the pose grows from zero, as the odometer has it."""
+    """The covariance of the pose grows from zero, as the odometer states."""
     rosbags = pytest.importorskip("rosbags.highlevel")
     bag = tmp_path / "run.bag"
     assert main(["simulate", "triangle", "--route", "A,B", "--format", "bag", "-o", str(bag)]) == 0

@@ -1,4 +1,4 @@
-"""What ranges mean that are no wall, and what is said if scan matching and odometry disagree."""
+"""Ranges that are no walls, and disagreement of scan matching and odometry."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SEES = 5.0
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[Scan, ...]:
-    """A drive around a corner of a hall, a scan each metre, with ranges as they truly are."""
+    """A drive around a corner of a hall, with a scan each metre and true ranges."""
     return tuple(scans_of(record(World.named("taylor-hall"), every=1.0)))[:80]
 
 
@@ -43,9 +43,9 @@ def written(
 
     Args:
         scans: The scans with true ranges.
-        say: What the driver makes of the ranges, and of which of them are beyond SEES.
-        reach: How far the driver says that the laser reaches.
-        nearest: The least range that the driver says.
+        say: Turns ranges, and a mask of those beyond SEES, into what the driver writes.
+        reach: Reach that the driver states.
+        nearest: Least range that the driver states.
     """
     return [
         replace(
@@ -66,7 +66,7 @@ def constant(value: float, noise: float = 0.0) -> Callable[[Array, Array], Array
 
 
 def with_rays_beyond(ranges: Array, beyond: Array) -> Array:
-    """A driver that writes 5.0, and now and then something farther."""
+    """A driver that writes 5.0, and sometimes something farther."""
     said = np.where(beyond, 5.0, ranges)
     stray = np.flatnonzero(beyond)[::40]
     said[stray] = ranges[stray]
@@ -92,7 +92,10 @@ def test_a_range_that_repeats_is_no_return(
     scans, notes = understood(written(drive, say, reach), Told())
     assert len(notes) == 1
     assert re.search(
-        r"Ranges of \d\.?\d* m repeat in \d+ % of the beams, and hardly any are longer.*--set no_return",
+        (
+            r"Ranges of \d\.?\d* m repeat in \d+ % of the beams, and hardly any are longer.*--set "
+            r"no_return"
+        ),
         notes[0],
     )
     for scan, true in zip(scans, drive, strict=True):
@@ -102,7 +105,7 @@ def test_a_range_that_repeats_is_no_return(
 @pytest.mark.parametrize(
     ("say", "reach"),
     [
-        (lambda ranges, _: np.minimum(ranges, 8.0), 8.0),  # the reach itself is no news
+        (lambda ranges, _: np.minimum(ranges, 8.0), 8.0),  # The reach itself is not worth a note.
         (lambda ranges, beyond: np.where(beyond, np.inf, ranges), 12.0),
         (lambda ranges, _: ranges, 8.0),
     ],
@@ -183,10 +186,21 @@ def test_ranges_from_no_return_on_are_none(drive: tuple[Scan, ...]) -> None:
 @pytest.mark.parametrize(
     "told",
     [
-        {"fov": 0}, {"fov": 361}, {"fov": math.nan}, {"fov": "180"}, {"mount": (1, 2)}, {"mount": (1, 2, math.inf)}, {"mount": (1000, 0, 0)},
-        {"mount": "0,0,0"}, {"no_return": 0}, {"no_return": -1}, {"no_return": math.inf}, {"zero_is": "wall"}, {"zero_is": 0},
+        {"fov": 0},
+        {"fov": 361},
+        {"fov": math.nan},
+        {"fov": "180"},
+        {"mount": (1, 2)},
+        {"mount": (1, 2, math.inf)},
+        {"mount": (1000, 0, 0)},
+        {"mount": "0,0,0"},
+        {"no_return": 0},
+        {"no_return": -1},
+        {"no_return": math.inf},
+        {"zero_is": "wall"},
+        {"zero_is": 0},
     ],
-)  # fmt: skip
+)
 def test_nonsense_about_the_laser_is_refused(told: dict[str, object]) -> None:
     with pytest.raises(LogError, match=f"{next(iter(told))}: expected .*, got .*; name"):
         Told(**told)  # type: ignore[arg-type]
@@ -233,7 +247,7 @@ def test_a_wrong_mount_is_said_with_the_likely_one(drive: tuple[Scan, ...], angl
 
 
 def test_one_warning_is_enough_where_the_odometer_explains_it(drive: tuple[Scan, ...]) -> None:
-    """Odometry in a foreign unit, or none, explains that both ways differ."""
+    """Odometry in a wrong unit, or none, already explains the disagreement."""
     lost = tuple(replace(scan, odometry=(0.0, 0.0, 0.0)) for scan in drive)
     _, _, notes = tracked(RobotLog(lost, source="drive"))
     assert any("odometry is missing there" in note for note in notes)
@@ -244,7 +258,7 @@ def test_one_warning_is_enough_where_the_odometer_explains_it(drive: tuple[Scan,
 def test_both_verbs_show_all_notes_and_take_the_same_options(
     drive: tuple[Scan, ...], verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "dri\x1b[31mve.bag"  # a name that would colour a terminal
+    path = tmp_path / "dri\x1b[31mve.bag"  # A name that would colour a terminal.
     write_bag(path, written(tuple(Told(fov=135).placed(scan) for scan in drive), constant(5.0)))
     out = [
         "-o",
@@ -289,7 +303,7 @@ def test_both_verbs_show_all_notes_and_take_the_same_options(
 def test_a_field_of_view_that_a_log_does_not_say_is_noted(
     drive: tuple[Scan, ...], tmp_path: Path
 ) -> None:
-    """CARMEN's FLASER lines have no field of view; custom says that of 180 beams, and of 181, and not that of 150."""
+    """FLASER lines have no field of view; conventions cover 180 and 181 beams, not 150."""
     for beams, is_noted in ((180, False), (150, True)):
         path = tmp_path / "drive.log"
         few = [
@@ -297,7 +311,8 @@ def test_a_field_of_view_that_a_log_does_not_say_is_noted(
             for scan in drive
         ]
         lines = [
-            f"FLASER {beams} {' '.join(f'{min(r, 81.0):.2f}' for r in s.ranges)} 0 0 0 {' '.join(map(str, s.odometry))} {t} x {t}"
+            f"FLASER {beams} {' '.join(f'{min(r, 81.0):.2f}' for r in s.ranges)} 0 0 0 "
+            f"{' '.join(map(str, s.odometry))} {t} x {t}"
             for t, s in enumerate(few)
         ]
         path.write_text("\n".join(lines) + "\n")

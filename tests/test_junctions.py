@@ -1,4 +1,4 @@
-"""Worlds whose streets meet at any angles: what the robot sees of a place, the control laws, and the maps of what it drove."""
+"""Streets that meet at any angles: what the robot sees, the control laws, and the maps."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ REACH = 0.8
 
 
 def streets(*directions: float, length: float = 6.0) -> nx.Graph:
-    """A hub, and a dead end in each of these directions, in degrees; each a little farther than the one before."""
+    """A hub with a dead end in each of these directions in degrees, each farther than the last."""
     graph = planar.junction(*directions)
     for k in range(len(directions)):
         graph.nodes[k]["at"] *= length + 0.7 * k
@@ -49,7 +49,7 @@ def streets(*directions: float, length: float = 6.0) -> nx.Graph:
 
 
 def bend(degrees: float) -> nx.Graph:
-    """Two streets that meet, where who goes on turns left by so many degrees."""
+    """Two streets that meet; going on means a turn to the left by this many degrees."""
     return streets(180, degrees)
 
 
@@ -59,7 +59,7 @@ def world_of(folder: Path, graph: nx.Graph, first: tuple[object, object], **chan
 
 
 def exact_panorama(world: World, pose: tuple[float, float, float]) -> np.ndarray:
-    """Ranges all around without noise, one a degree, counter-clockwise from ahead."""
+    """Ranges all around without noise, one a degree, counterclockwise from ahead."""
     x, y, heading = pose
     poses = [(x, y, heading + math.radians(k) - BEARINGS[90]) for k in range(360)]
     return Laser(reach=8.0).exact(world, np.array(poses))[:, 90]
@@ -73,7 +73,7 @@ def exact_panorama(world: World, pose: tuple[float, float, float]) -> np.ndarray
 def test_a_panorama_shows_the_streets_and_where_they_meet(
     shape: int, dx: float, dy: float, heading: float
 ) -> None:
-    """From anywhere near the fixed point: streets to a degree, the fixed point to two centimetres."""
+    """Near the fixed point: streets to a degree, the fixed point to two centimetres."""
     shapes: tuple[tuple[float, ...], ...] = (
         *((0, 60), (0, 120), (0, 90, 180), (0, 120, 240), (0, 60, 180)),
         *((0, 90, 180, 270), (0, 72, 144, 216, 288), (0, 60, 120, 180, 240, 300), (0, 135)),
@@ -119,7 +119,7 @@ def test_a_street_that_goes_straight_on_is_no_place() -> None:
 def test_the_compass_tells_how_the_robot_is_turned(
     heading: float, turn: float, error: float, seed: int
 ) -> None:
-    """Odometry is off by up to 3 % of the turn; the images know better than to half a degree."""
+    """Odometry is off by up to 3 % of the turn; images tell it to half a degree."""
     around = exact_panorama(FIVE, (0.1, 0.2, heading))
     image = Laser().scan(FIVE, np.array([[0.1, 0.2, heading + turn]]), np.random.default_rng(seed))[
         0
@@ -130,7 +130,7 @@ def test_the_compass_tells_how_the_robot_is_turned(
 
 
 def test_a_panorama_is_what_is_around() -> None:
-    """Of images that a robot takes while it turns, with noise, and with turns that are off by 3 %."""
+    """Images of a turning robot, with noise, and with turns that are off by 3 %."""
     rng, pose = np.random.default_rng(0), (0.1, 0.2, 0.5)
     panorama = Panorama(Laser().scan(FIVE, np.array([pose]), rng)[0])
     for k in range(1, 25):
@@ -157,7 +157,7 @@ def test_a_panorama_is_what_is_around() -> None:
 def test_the_robot_comes_to_every_dstate(
     tmp_path: Path, graph: nx.Graph, start: tuple[object, object]
 ) -> None:
-    """A route along all streets, both ways. Every step is near a true dstate, and the star has its streets to two degrees."""
+    """Along all streets in both directions, each step is near a true dstate, with the true star."""
     world = world_of(tmp_path, graph, start, angles="any")
     trace = simulate(world, seed=3)
     true = {dstate.name: dstate.pose for dstate in world.dstates}
@@ -178,7 +178,7 @@ def test_the_robot_comes_to_every_dstate(
 
 
 def test_displacements_are_as_good_as_their_covariances_say() -> None:
-    """Against fixed points, over 40 steps: a chi-square near its degrees of freedom."""
+    """Relative to fixed points, 40 steps have a chi-square near its degrees of freedom."""
     trace = simulate(FIVE, tours=2, seed=5)
     true = {dstate.name: dstate.pose for dstate in FIVE.dstates}
     squares = []
@@ -196,7 +196,7 @@ def test_displacements_are_as_good_as_their_covariances_say() -> None:
 
 
 def test_control_never_reads_the_true_pose() -> None:
-    """The same scans, the same commands: a robot that claims to be elsewhere, in a world that is there, does the same."""
+    """A robot that claims to be elsewhere, in a world shifted with it, acts the same."""
     commands: list[list[tuple[float, float]]] = []
     for shift in (0.0, 100.0):
         rng = np.random.default_rng(5)
@@ -237,7 +237,10 @@ def test_what_cannot_be_driven(tmp_path: Path, route: list[str], message: str) -
 def test_a_start_that_is_no_place(tmp_path: Path) -> None:
     with pytest.raises(
         SimulatorError,
-        match=r"start at .*: expected a place, where streets meet or end, got a street that goes straight on",
+        match=(
+            r"start at .*: expected a place, where streets meet or end, got a street that goes "
+            r"straight on"
+        ),
     ):
         simulate(world_of(tmp_path, streets(0, 60, length=8), ("hub", 0), start=[4, 0, 0]))
     with pytest.raises(
@@ -251,7 +254,7 @@ def test_walls_tell_which_control_laws_hold(tmp_path: Path) -> None:
     assert all(World.named(name).angles == "any" for name in SHIPPED)
     assert (
         world_of(tmp_path, streets(20, 110, 200), ("hub", 0)).angles == "right"
-    )  # turned as a whole
+    )  # Turned as a whole.
     column = [[1, 0], [1.1, 0.1], [1, 0.2], [0.9, 0.1]]
     assert (
         world_of(
@@ -281,7 +284,7 @@ def test_images_at_even_distances() -> None:
 def test_the_true_map_is_found_from_what_was_simulated(
     name: str, tours: int, seed: int, tmp_path: Path
 ) -> None:
-    """simulate, cluster and solve, as a user would: one minimal map, and it is the true one."""
+    """simulate, cluster and solve, as a user would: one minimal map, which is the true one."""
     run, views = str(tmp_path / "run.jsonl"), str(tmp_path / "views.jsonl")
     assert main(["simulate", name, "--tours", str(tours), "--seed", str(seed), "-o", run]) == 0
     assert main(["cluster", run, "-o", views]) == 0

@@ -1,4 +1,4 @@
-"""The bootstrap loop: from a simulated robot to a recogniser, in Python and in the shell."""
+"""The bootstrap loop, from a simulated robot to a recogniser, in Python and in the shell."""
 
 from __future__ import annotations
 
@@ -66,13 +66,13 @@ def run() -> Trace:
 
 @pytest.fixture(scope="module")
 def learnt(run: Trace) -> BootstrapLearner:
-    """What is learnt from the views of the run alone."""
+    """The map learnt from the views of the run alone."""
     return BootstrapLearner(VIEWS_ALONE).fit(run)
 
 
 @pytest.fixture(scope="module")
 def measured() -> Run:
-    """What `reproduce` measures with seed 500 in the notched rectangle, with few circuits, so that it is quick."""
+    """The measurements of `reproduce` with seed 500 and, to be fast, few circuits."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
         return measure("notched-rectangle", 500)
@@ -159,7 +159,10 @@ def test_an_incomplete_list_of_maps_is_said() -> None:
     with pytest.warns(AmbiguousMapWarning) as caught:
         labels_of(maps, complete=False, proven=False)
     assert [str(w.message).split(":")[0] for w in caught] == [
-        f"the map of {len(maps[0].dstates)} dstates is the best that was found, and not proven minimal"
+        (
+            f"the map of {len(maps[0].dstates)} dstates is the best that was found, and not "
+            "proven minimal"
+        )
     ]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -274,7 +277,11 @@ def test_an_image_that_is_noise_is_not_learnt_from(run: Trace) -> None:
 
 
 def test_the_beams_that_tell_corners_apart_see_the_notch(run: Trace) -> None:
-    """The notch, or its edge within 15 cm: where the robot faces the notch, it stops at the same distance from it, and sees that the wall beside it is nearer."""
+    """Whether a beam hits the notch, or its edge within 15 cm.
+
+    Facing the notch, the robot stops at the same distance from it, and sees that the wall beside it
+    is nearer.
+    """
     truth, images = true_dstates(run), ReciprocalTransformer().fit_transform(images_of(run))
     poses = np.array([step.truth["pose"] for step in run.steps])
     for i in range(4):
@@ -327,7 +334,7 @@ def test_the_shell_tells_what_tells_dstates_apart(
 
 @pytest.fixture(scope="module")
 def large_room() -> Trace:
-    """Eight circuits in a room a tenth longer and wider, where M prefers 2 views, and trimmed M 4."""
+    """Eight circuits in a room a tenth larger, where M prefers 2 views and trimmed M 4."""
     world = World.named("notched-rectangle")
     walls = world.segments.copy()
     walls[walls > 0] *= 1.1
@@ -346,7 +353,10 @@ def large_room() -> Trace:
 def test_another_map_of_the_runner_up_is_said(large_room: Trace) -> None:
     with pytest.warns(
         RunnerUpWarning,
-        match="2 views may be too few: 4 also separate .* another map, of 8 dstates instead of 6; cluster",
+        match=(
+            "2 views may be too few: 4 also separate .* another map, of 8 dstates instead of 6; "
+            "cluster"
+        ),
     ):
         learner = BootstrapLearner().fit(large_room)
     assert (learner.clusterer_.k_, learner.clusterer_.runner_up_, len(learner.map_.dstates)) == (
@@ -364,7 +374,10 @@ def test_another_map_of_the_runner_up_is_said(large_room: Trace) -> None:
 def test_the_shell_says_it_too(
     large_room: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = "ssh-abduction: warning: 2 views may be too few: 4 also separate the images well, and give another map, of 8 dstates instead of 6"
+    said = (
+        "ssh-abduction: warning: 2 views may be too few: 4 also separate the images well, and "
+        "give another map, of 8 dstates instead of 6"
+    )
     run, views = str(tmp_path / "run.jsonl"), str(tmp_path / "views.jsonl")
     large_room.save(run)
     assert main(["cluster", run, "-o", views, "--set", "k_max=6"]) == 0
@@ -412,7 +425,8 @@ def test_a_runner_up_is_whole_or_wrong() -> None:
     )
     assert found is not None
     assert found.sentence.startswith(
-        "2 views may be too many: 1 also separate the images well, and give another map, of 1 dstates instead of 2"
+        "2 views may be too many: 1 also separate the images well, and give another map, of 1 "
+        "dstates instead of 2"
     )
 
 
@@ -483,7 +497,8 @@ def test_what_was_replaced_is_said_in_one_line(tmp_path: Path) -> None:
         [sys.executable, "-m", "ssh_abduction", *words], capture_output=True, text=True, check=True
     )
     assert done.stderr == (
-        "ssh-abduction: warning: 3 of 12 ranges were replaced: 1 infinite and 1 missing (NaN) are taken as nothing seen, "
+        "ssh-abduction: warning: 3 of 12 ranges were replaced: 1 infinite and 1 missing (NaN) are "
+        "taken as nothing seen, "
         "1 of zero or less as 0.05 m\n"
     )
 
@@ -561,7 +576,7 @@ def test_outcomes_differ_over_notch_and_spread(monkeypatch: pytest.MonkeyPatch) 
     assert (good.k, good.right) == (4, True)
     assert good.rate > 0.99
     assert blurred.rate < good.rate
-    assert bare.rate < 0.7  # without a notch nothing tells opposite corners apart
+    assert bare.rate < 0.7  # Without a notch, nothing tells opposite corners apart.
     assert (bare.k, bare.right) == (4, True)
 
 
@@ -618,7 +633,8 @@ def test_from_simulation_to_recognition_in_the_shell(
     assert main(["evaluate", path("maps.json"), path("views.jsonl")]) == 0
     told = capsys.readouterr().out
     assert told.startswith(
-        "map 1 is the true one, of 1 map\nthe truth, told at 80 of 80 steps: 8 dstates, 4 places, 4 paths; 14 % of"
+        "map 1 is the true one, of 1 map\nthe truth, told at 80 of 80 steps: 8 dstates, 4 "
+        "places, 4 paths; 14 % of"
     )
     assert (
         main(
@@ -671,7 +687,7 @@ def test_from_simulation_to_recognition_in_the_shell(
 def test_traces_go_through_pipes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is said of them is said on standard error."""
+    """Warnings about images go to standard error."""
     assert main(["simulate", "notched-rectangle", "--tours", "10", "--seed", "3", "-o", "-"]) == 0
     driven = capsys.readouterr()
     assert driven.err == "80 images of notched rectangle\n"
@@ -698,7 +714,10 @@ def test_errors_of_the_wings_are_one_line(
     for words, message in [
         (
             ["simulate", "atlantis", "-o", str(tmp_path / "x")],
-            "world: expected one of cluttered, curved, doors, five-ways, notched-rectangle, six-ways, taylor-hall",
+            (
+                "world: expected one of cluttered, curved, doors, five-ways, notched-rectangle, "
+                "six-ways, taylor-hall"
+            ),
         ),
         (
             ["simulate", "notched-rectangle", "--tours", "0", "-o", str(tmp_path / "x")],
@@ -737,7 +756,7 @@ def test_reproduce_writes_the_page_and_all_that_made_it(
     monkeypatch: pytest.MonkeyPatch,
     measured: Run,
 ) -> None:
-    """With few circuits, so that it is quick; the claims themselves are measured by `reproduce`, over 20 seeds."""
+    """A fast version with few circuits; `reproduce` measures the claims over 20 seeds."""
     monkeypatch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
     known = {("notched-rectangle", 500): measured}
     monkeypatch.setattr(
@@ -877,7 +896,7 @@ def test_bad_images_are_named_where_no_fault_is_allowed() -> None:
         learner = BootstrapLearner(time_limit=1)
         with contextlib.suppress(
             LearnerError
-        ):  # with openings and displacements there may be no map at all
+        ):  # With openings and displacements, there may be no map at all.
             learner.fit(spoilt)
     assert any("(image 9" in str(w.message) for w in caught)
 

@@ -1,4 +1,4 @@
-"""From a robot's log to the map of a building: on logs that the simulator writes, and on real ones where they are."""
+"""From a robot's log to the map of a building, for simulated logs and for real ones if present."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from ssh_abduction.robot_logs.log_maps import SPEED, map_log, seconds_left
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver.result import Solution, Status
 
-LINES = 620  # three for each scan
+LINES = 620  # Three for each scan.
 REAL = Path(__file__).parents[2] / "shared" / "data" / "logs"
 
 
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Most of a tour through the hallway, as a CARMEN log: into both side hallways, and out of them again."""
+    """Most of a tour through the hallway, as a CARMEN log: into and out of both side hallways."""
     path = tmp_path_factory.mktemp("logs") / "hall.log"
     assert (
         main(
@@ -67,7 +67,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def runs(hall: Path) -> Path:
-    """What `map` writes of it, and of a log that cannot be read."""
+    """The output of `map` for it, and for a log that cannot be read."""
     bad = hall.with_name("bad.log")
     bad.write_text("nothing\n")
     assert (
@@ -114,7 +114,7 @@ def test_a_drive_becomes_a_trace_of_the_places_it_passed(runs: Path) -> None:
     assert max(visits.count(visit) for visit in set(visits)) == 2
     for i, action in enumerate(trace.actions):
         assert (action.kind == "turn") == (visits[i] == visits[i + 1])
-    # What the robot took for its way agrees with where it was: within a few standard deviations of the displacement.
+    # The trajectory agrees with the truth, within a few standard deviations of the displacement.
     for i, (before, after) in enumerate(zip(trace.steps[:-1], trace.steps[1:], strict=True)):
         error = np.array(
             between(between(before.truth["pose"], after.truth["pose"]), after.displacement)
@@ -183,7 +183,7 @@ def test_waves_go_around_walls() -> None:
     seed[10, 5] = True
     found = distances(room, seed, 20.0)
     assert found[10, 35] == pytest.approx(30 * CELL, rel=0.1)
-    assert found[30, 5] > 2 * 29 * CELL  # through the gap at the right end
+    assert found[30, 5] > 2 * 29 * CELL  # Through the gap at the right end.
     assert math.isinf(distances(room, seed, 1.0)[10, 35])
 
 
@@ -291,7 +291,7 @@ def test_what_cannot_be_is_said_before_a_log_is_read(
 
 
 def test_a_log_whose_stars_no_map_fits_is_mapped_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ahead the way is open, and still at the robot's right once it has turned around."""
+    """The corridor is open ahead, and still at the robot's right after it turned around."""
     trace = replace(
         Trace.from_steps(
             "aba", ["travel", "around"], stars=[(1, 0, 0, 0), (0, 0, 1, 0), (0, 1, 0, 0)]
@@ -332,7 +332,7 @@ def test_two_runs_are_compared(
     told = json.loads(capsys.readouterr().out)
     assert told == {
         "runs": {"scale.radius": [pytest.approx(5.6, abs=1), 9.0]}
-    }  # and no more, as their traces differ
+    }  # And no more, as their traces differ.
     assert main(["compare", str(folder), str(folder), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["runs"] == {}
@@ -391,19 +391,19 @@ def test_the_building_of_the_paper_comes_out_of_its_raw_log() -> None:
         ([], []),
         ([0.0], [0.0]),
         ([0.0, 5.0, 9.0], [0.0, 5.0, 9.0]),
-        ([0.0, 5.0, 5.2, 9.0], [0.0, 5.0, 9.0]),  # in and out by one door
-        ([5.0, 5.8, 5.0], [5.0]),  # a narrow part behind the first door of a log
-        ([0.0, 5.0, 5.8, 5.1, 9.0], [0.0, 5.0, 9.0]),  # and behind another one
+        ([0.0, 5.0, 5.2, 9.0], [0.0, 5.0, 9.0]),  # In and out by one door.
+        ([5.0, 5.8, 5.0], [5.0]),  # A narrow part behind the first door of a log.
+        ([0.0, 5.0, 5.8, 5.1, 9.0], [0.0, 5.0, 9.0]),  # And behind another one.
         (
             [0.0, 5.0, 6.2, 5.1, 9.0],
             [0.0, 5.0, 6.2, 5.1, 9.0],
-        ),  # another door, a little farther behind it
+        ),  # Another door, a little farther behind it.
     ],
 )
 def test_passes_through_one_door_in_a_row_are_one_visit(
     middles: list[float], expected: list[float]
 ) -> None:
-    """The doors are in a line, each wider than the one before it, so that the first of those that are one door says where its middle is."""
+    """Doors in a line, each wider than the last: the first of one door tells its middle."""
     track = Track(np.array([(x, 0.0, 0.0) for x in range(20)], dtype=float), np.zeros((20, 3, 3)))
     doors = [
         Door(2 * k + 1, np.array([x, 0.0]), 1.0 + k / 100, 2.0 * k) for k, x in enumerate(middles)
@@ -464,4 +464,4 @@ def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> 
         import_log(no_doors, doors=True)
     begin = RobotLog(done.log.scans[: done.imported.visits[1].end + 20], source="begin")
     assert import_log(begin).scale.doors
-    assert not import_log(begin, gateway=0.8).scale.doors  # a scale is one of junctions
+    assert not import_log(begin, gateway=0.8).scale.doors  # This scale is one of junctions.

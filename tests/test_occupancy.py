@@ -1,4 +1,4 @@
-"""Occupancy maps are read as map_server and nav2_map_server read them: each map is held against their rules, pixel by pixel."""
+"""Occupancy maps are compared pixel by pixel with the rules of map_server and nav2_map_server."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ GREY = np.array([[0, 0, 0, 0], [0, 254, 205, 0], [0, 254, 254, 90], [0, 0, 0, 25
 
 
 def cell(pixel: Pixel, alpha: float, negate: bool, occupied: float, free: float, mode: str) -> int:
-    """The value of one cell by the rules of nav2_map_server. Channels are from 0 to 255; alpha is 255 where a pixel is opaque or has none."""
+    """The value of a cell by the rules of nav2_map_server.
+
+    Channels are from 0 to 255; alpha is 255 if the pixel is opaque or has none.
+    """
     mean = sum(pixel) / len(pixel)
     if mode == "raw":
         return round(mean) if round(mean) <= 100 else -1
@@ -42,7 +45,7 @@ def cell(pixel: Pixel, alpha: float, negate: bool, occupied: float, free: float,
 def borders(
     walls: np.ndarray[Any, Any], resolution: float, origin: tuple[float, float, float]
 ) -> set[frozenset[tuple[int, int]]]:
-    """Walls as sides of cells: each the two corners that it joins, counted in cells from the lower left one."""
+    """Walls as sides of cells: each as its two corners, counted in cells from the lower left."""
     x, y, yaw = origin
     found = set()
     for wall in walls:
@@ -59,7 +62,7 @@ def borders(
 
 
 def sides(occupied: list[list[bool]]) -> set[frozenset[tuple[int, int]]]:
-    """The sides of cells between an occupied cell and another one, or the outside. The last row is at the bottom."""
+    """The sides of cells between occupied and other cells, from the bottom row up."""
     found: set[frozenset[tuple[int, int]]] = set()
     for i, row in enumerate(reversed(occupied)):
         for j, here in enumerate(row):
@@ -89,7 +92,10 @@ def saved(folder: Path, text: str | bytes, image: np.ndarray[Any, Any] | None = 
         (HEAD + ORIGIN + TAIL).replace("\n", "\r\n"),
         "# made by hand\n%s" % (HEAD + ORIGIN + TAIL),
         "---\n" + HEAD + ORIGIN + TAIL + "...\n",
-        "{image: map.pgm, resolution: 0.5, origin: [-1, 2, 0], negate: 0, occupied_thresh: 0.65, free_thresh: 0.196}",
+        (
+            "{image: map.pgm, resolution: 0.5, origin: [-1, 2, 0], negate: 0, occupied_thresh: "
+            "0.65, free_thresh: 0.196}"
+        ),
         '"image": "map.pgm"\n\'resolution\': "0.5"\n' + ORIGIN + TAIL,
         "image:    map.pgm   # a comment\nresolution: 5e-1\n"
         + ORIGIN

@@ -1,4 +1,4 @@
-"""Panoramas: what the camera sees, features in which the light hardly shows, and the bootstrap loop on them."""
+"""Panoramas: the camera, features that hardly depend on light, and the bootstrap loop on them."""
 
 from __future__ import annotations
 
@@ -71,12 +71,12 @@ def test_a_turn_of_the_robot_turns_the_panorama() -> None:
         camera.shot(ROOM, (3.0, 0.8, math.radians(degrees)), rng, 20.0) for degrees in (10.0, 50.0)
     )
     differences = np.abs(np.roll(first, 20, axis=1).astype(int) - turned)
-    assert (differences > 1).mean() < 0.01  # rays that meet the edge of a stripe
+    assert (differences > 1).mean() < 0.01  # Rays at the edge of a stripe.
     assert np.abs(first.astype(int) - turned).mean() > 5
 
 
 def test_what_is_in_the_middle_of_a_panorama_is_ahead() -> None:
-    """A robot that faces the near wall of a room sees it higher in the middle than at either end, which is behind."""
+    """Facing the near wall of a room, the robot sees it higher in the middle than behind itself."""
     image = Camera(noise=0).shot(ROOM, (3.8, 1.0, 0.0), np.random.default_rng(0)).astype(int)
     floor = np.abs(image[-1] - image[-1, 0]).max(axis=1) > 3
     assert floor[90]
@@ -98,7 +98,7 @@ def test_repeated_textures_make_opposite_corners_look_alike_and_unique_ones_do_n
         Camera(paint=Paint(2, repeated=True), noise=0).shot(rectangle, pose, rng, 12.0).astype(int)
         for pose in poses
     )
-    assert np.abs(a - b).mean() > 5  # the sun is at one side
+    assert np.abs(a - b).mean() > 5  # The sun is at one side.
 
 
 def test_clutter_keeps_its_texture_where_it_is_moved() -> None:
@@ -129,11 +129,11 @@ def test_a_camera_makes_up_for_brightness_by_its_exposure() -> None:
     }
     ratios = [day / night for day, night in by.values()]
     assert ratios[0] > 2 > ratios[1] > 1.3 > ratios[2]
-    assert ratios[2] == pytest.approx(1, abs=0.06)  # bright patches are cut off at 255
+    assert ratios[2] == pytest.approx(1, abs=0.06)  # Bright patches are cut off at 255.
 
 
 def test_features_do_not_change_with_the_light() -> None:
-    """By brightness and colour they do not change at all; over the hours, with sun, noise and all, they change less than between places."""
+    """Brightness and colour do not change features; the hour does less than the place."""
     rng = np.random.default_rng(0)
     images = rng.uniform(5, 250, (4, 12 * 60 * 3))
     made = PanoramaTransformer(SMALL.shape, floor=0).fit(images)
@@ -219,7 +219,7 @@ def test_the_robot_drives_the_same_with_a_camera_and_without(run: Trace) -> None
     ]
     assert images_of(run).shape == (40, 12 * 60 * 3)
     first, last = (images_of(run)[i].reshape(-1, 3).mean(axis=0) for i in (0, 16))
-    assert last.sum() > 1.05 * first.sum()  # from seven o'clock to noon
+    assert last.sum() > 1.05 * first.sum()  # From seven o'clock to noon.
 
 
 @pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
@@ -237,7 +237,7 @@ def test_the_loop_has_the_true_map_over_a_day_where_views_of_raw_pixels_cannot(r
     raw = clusterer.fit(images_of(run) / 255)
     assert (
         uncertainty_coefficient(raw.labels_, true_dstates(run)) < 0.9
-    )  # dstates have several views, so no map of these is the true one
+    )  # Dstates have several views, so no map of these is the true one.
 
 
 @pytest.mark.filterwarnings("ignore::perception.errors.ImageWarning")
@@ -260,7 +260,10 @@ def test_panoramas_in_the_shell(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    drive = "simulate notched-rectangle --tours 2 --images panoramas --set textures=repeated --set paint_seed=5 --set hours=8,18 --set stars=false"
+    drive = (
+        "simulate notched-rectangle --tours 2 --images panoramas --set textures=repeated --set "
+        "paint_seed=5 --set hours=8,18 --set stars=false"
+    )
     assert main([*drive.split(), "-o", "run.jsonl"]) == 0
     trace = Trace.load("run.jsonl")
     assert (trace.images, trace.extra["panorama"], trace.steps[3].image) == (

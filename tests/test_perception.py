@@ -1,4 +1,8 @@
-"""Images to views to a recogniser: against independent computations, scikit-learn's own checks, poor images and hostile files."""
+"""From images to views and a recogniser.
+
+Compared with independent computations and scikit-learn's checks; with poor images and hostile
+files.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +55,7 @@ Images = np.ndarray[Any, Any]
 def blobs(
     clusters: int, each: int, beams: int = 8, spread: float = 0.1, seed: int = 0
 ) -> tuple[Images, Images]:
-    """Images around well separated centres, and the number of the centre of each."""
+    """Images around well-separated centres, and the index of the centre of each."""
     rng = np.random.default_rng(seed)
     centres = 3 * np.eye(max(beams, clusters))[:clusters, :beams] + np.arange(clusters)[:, None]
     truth = np.arange(clusters * each) % clusters
@@ -59,7 +63,7 @@ def blobs(
 
 
 def plain_quality(images: Images, labels: Images) -> float:
-    """M from all pairs at once."""
+    """M computed from all pairs at once."""
     distances, same = squareform(pdist(images)), labels[:, None] == labels
     return float(distances[~same].min() / distances[same].max())
 
@@ -163,7 +167,7 @@ def test_cells_and_blocks_change_nothing(
     tree, labels = spanning_tree(images), np.random.default_rng(1).integers(4, size=300)
     shortest = minimum_spanning_tree(
         squareform(pdist(images / scale))
-    ).sum()  # scipy takes tiny lengths for no edge
+    ).sum()  # scipy reads tiny lengths as missing edges.
     assert tree.lengths.sum() == pytest.approx(scale * shortest, rel=1e-12, abs=0)
     assert cluster_quality(images, labels) == pytest.approx(
         plain_quality(images, labels), rel=1e-12, abs=0
@@ -174,7 +178,7 @@ def test_cells_and_blocks_change_nothing(
 
 
 def test_near_images_far_from_others_are_compared_exactly() -> None:
-    # Squared distances of 1e-14 beside norms of 1e6 drown in the rounding of |a|² + |b|² - 2ab.
+    # Squared distances of 1e-14 next to norms of 1e6 are lost in the rounding of |a|² + |b|² - 2ab.
     rng = np.random.default_rng(0)
     images = np.concatenate(
         [1e3 + 1e-7 * rng.normal(size=(40, 12)), -1e3 + 1e-7 * rng.normal(size=(40, 12))]
@@ -325,7 +329,7 @@ def test_k_is_where_the_quality_peaks() -> None:
 
 
 def test_the_runner_up_is_what_trimmed_m_likes_about_as_well() -> None:
-    """Two pairs of clusters, each pair near each other: the farther they are, the less doubt there is that there are four."""
+    """Two pairs of near clusters: the farther the pairs, the less reason for four."""
     rng = np.random.default_rng(0)
     found = {}
     for gap in (0.3, 0.5, 1.1, 4.0):
@@ -334,14 +338,16 @@ def test_the_runner_up_is_what_trimmed_m_likes_about_as_well() -> None:
     assert [(f.k_, f.runner_up_) for f in found.values()] == [(2, None), (2, 4), (2, 4), (4, None)]
     assert (
         found[0.5].trimmed_[2] > 3 * found[0.5].trimmed_[4] > 3 * 2.3
-    )  # four are well apart, too, though two are much farther
+    )  # Four are well separated, too, though two are much farther apart.
     assert found[1.1].runner_up_labels_ is found[1.1].labels_by_k_[4]
     assert (
         found[1.1].labels_by_k_.keys() == found[1.1].trimmed_.keys() == found[1.1].quality_.keys()
     )
     spoilt = images.copy()
     spoilt[0, 0] += (
-        4  # one beam of one image, as far off as the next cluster: M makes a view of that image
+        # One beam of one image is off by the distance to the next cluster, so M gives the image a
+        # view.
+        4
     )
     by = {
         by: ViewClusterer(k_max=6, by=by, random_state=0).fit(spoilt).k_ for by in ("M", "trimmed")
@@ -509,7 +515,7 @@ def test_doubtful_images_and_views_are_said() -> None:
         warnings.simplefilter("error")
         warn_of_doubts(
             [0, 1, 2, 2, 0, 3], [0.99, 0.5, 0.99, 0.99, 0.99, 0.5], 3.0
-        )  # nearly all of it was seen once
+        )  # Nearly all of them were seen once.
     with pytest.warns(ImageWarning, match=r"views overlap \(M is 0\.40, below 1\)"):
         warn_of_doubts(truth, sure, 0.4)
 
@@ -592,11 +598,11 @@ def test_a_learning_curve_rises_to_certainty() -> None:
     assert curve.mean[-1] == curve.lowest[-1] == 1
     assert curve.mean[0] < 0.3
     assert all(a <= b <= c for a, b, c in zip(curve.lowest, curve.mean, curve.highest, strict=True))
-    assert 0.2 < curve.mean[1] <= 0.5  # two of four places have been seen
+    assert 0.2 < curve.mean[1] <= 0.5  # Two of four places were seen.
 
 
 def test_a_learning_curve_never_tests_on_what_it_learned() -> None:
-    # Every image is unlike all others, so that only an image itself could tell its label.
+    # Every image differs from all others, so only an image itself could tell its label.
     rng = np.random.default_rng(0)
     curve = learning_curve(
         rng.uniform(1, 5, (400, 30)), rng.integers(20, size=400), sizes=[400], random_state=0
@@ -647,7 +653,7 @@ def test_learning_curves_that_cannot_be_drawn(arguments: dict[str, Any], message
 def test_the_feature_that_differs_tells_two_apart() -> None:
     rng = np.random.default_rng(0)
     labels = np.repeat([3, 8, 5], 20)
-    images = rng.normal(0, [0.1, 0.1, 2.0, 0.1], (60, 4))  # the third is loud, and tells nothing
+    images = rng.normal(0, [0.1, 0.1, 2.0, 0.1], (60, 4))  # The third is loud and tells nothing.
     images[labels == 8, 1] += 1
     found = telling_features(images, labels, 3, 8)
     for method, shares in found.methods.items():

@@ -24,7 +24,8 @@ PLANS = Path(__file__).parent.parent.parent / "shared" / "data" / "plans"
 SCHOOLS = sorted(PLANS.glob("*.xml"))
 NOISE = Odometry(along=0.05, across=0.02, heading=0.002)
 
-# Four rooms in a ring, 10 m apart, and a closet beside the second; y grows downwards. A pixel is a tenth of a metre, and each door is drawn at both sides of a wall of 0.2 m.
+# Four rooms in a ring, 10 m apart, and a closet beside the second; y points down. A pixel is 0.1 m,
+# and each door is drawn on both sides of a wall of 0.2 m.
 MIDDLES = {"a": (50, 50), "b": (150, 50), "c": (150, 150), "d": (50, 150), "closet": (230, 50)}
 DOORS = [
     ("a", "b", (99, 50), (101, 50)),
@@ -36,7 +37,10 @@ DOORS += [("d", "a", (50, 101), (50, 99)), ("b", "closet", (199, 50), (201, 50))
 
 def line(name: str, point: tuple[int, int]) -> str:
     x, y = point
-    return f'<linesegment id="{name}"><point x="{x}" y="{y}"/><point x="{x}" y="{y}"/><class>PORTAL</class></linesegment>'
+    return (
+        f'<linesegment id="{name}"><point x="{x}" y="{y}"/><point x="{x}" '
+        f'y="{y}"/><class>PORTAL</class></linesegment>'
+    )
 
 
 def xml(
@@ -44,7 +48,7 @@ def xml(
     unit: str = "cm",
     middles: dict[str, tuple[int, int]] = MIDDLES,
 ) -> str:
-    """A plan in the form of the school plans."""
+    """A plan in the format of the school plans."""
     spaces = []
     for room, (x, y) in middles.items():
         here = [(i, door) for i, door in enumerate(doors) if room in door[:2]]
@@ -58,7 +62,8 @@ def xml(
             for dx, dy in ((-49, -49), (49, -49), (49, 49), (-49, 49))
         )
         spaces.append(
-            f'<space id="{room}"><labels><label>CLASSROOM</label></labels><centroid><point x="{x}" y="{y}"/></centroid>'
+            f'<space id="{room}"><labels><label>CLASSROOM</label></labels><centroid><point x="{x}" '
+            f'y="{y}"/></centroid>'
             f"<bounding_polygon>{corners}</bounding_polygon><space_representation>{walls}</space_representation><portals>{portals}</portals></space>"
         )
     return (
@@ -78,7 +83,7 @@ def ring(tmp_path: Path) -> Plan:
 
 
 def true_map(plan: Plan, trace: Trace) -> SSHMap:
-    """The map that the truth of a tour is."""
+    """The map that the truth of a tour describes."""
     numbers: dict[str, dict[str, int]] = {"dstate": {}, "place": {}, "path": {}}
     dstates = []
     for step in trace.steps:
@@ -134,7 +139,7 @@ def test_a_plan_is_read_in_metres_with_north_up(ring: Plan) -> None:
         1,
         1,
         2,
-    ]  # from a through b into the closet is one path
+    ]  # From a through b into the closet is one path.
 
 
 def test_two_doors_between_two_rooms_are_two(tmp_path: Path) -> None:
@@ -142,7 +147,7 @@ def test_two_doors_between_two_rooms_are_two(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, xml(again))
     positions = sorted(door.position for door in plan.doors if door.rooms == (0, 1))
     np.testing.assert_allclose(positions, [(10, -8), (10, -5), (10, -2)])
-    near = plan.told_apart(40)  # seen from a, two of them are 31 degrees off the third
+    near = plan.told_apart(40)  # Seen from a, two of them are 31 degrees from the third.
     assert len([door for door in near.doors if door.rooms == (0, 1)]) == 1
     assert len(plan.told_apart(20).doors) == len(plan.doors)
 
@@ -169,7 +174,7 @@ def test_each_step_is_at_a_room_and_a_door(ring: Plan) -> None:
 
 
 def sees(step: Step, bearing: float) -> bool:
-    """Whether a step sees a gateway in this direction, and those that are told to be opposite are nearly so."""
+    """Whether a step sees this gateway, and gateways marked as opposite nearly are."""
     seen = step.gateways.gateways if step.gateways else ()
     for gateway in seen:
         if gateway.opposite is not None:
@@ -184,7 +189,7 @@ def sees(step: Step, bearing: float) -> bool:
 
 
 def test_turns_are_counted_to_their_side(tmp_path: Path) -> None:
-    """A hub with doors at 0, 60, 120, 195 and 300 degrees: what a turn is called is where it ends, relative to where it began."""
+    """In a hub with doors at 0, 60, 120, 195 and 300 degrees, the name of a turn tells its end."""
     bearings = (0, 60, 120, 195, 300)
     out = {
         f"r{b}": (
@@ -208,7 +213,8 @@ def test_turns_are_counted_to_their_side(tmp_path: Path) -> None:
                 round(90 - math.degrees(step.truth["pose"][2])) % 360 for step in (before, after)
             ]
             turns.setdefault(action.name, set()).add((degrees[0], (degrees[1] - degrees[0]) % 360))
-    # Who comes through the door at 120 faces the one at 300, and who comes through that at 195 faces the one at 0, which is nearly opposite.
+    # Entering by the door at 120, the robot faces the one at 300; by that at 195, the one at 0,
+    # which is nearly opposite.
     for name, found in turns.items():
         side, number = name.split(" to gateway ")
         for here, by in found:
@@ -225,7 +231,7 @@ def test_turns_are_counted_to_their_side(tmp_path: Path) -> None:
         195,
         240,
         300,
-    }  # at 240 it faces no door, as it comes through the one at 60
+    }  # At 240 it faces no door, since it enters by the one at 60.
 
 
 def test_without_noise_displacements_lead_from_true_pose_to_true_pose(ring: Plan) -> None:
@@ -268,7 +274,7 @@ def test_the_truth_of_a_tour_is_a_map(ring: Plan, tmp_path: Path) -> None:
 
 
 def test_directions_of_doors_tell_dstates_apart(tmp_path: Path) -> None:
-    """A hub with four doors, two of them nearly in one direction: the odometer takes one for the other, and the star does not."""
+    """Of four doors, two have nearly one direction: odometry confuses them, the star does not."""
     bearings = (0, 7, 120, 240)
     out = {
         f"r{b}": (
@@ -343,7 +349,7 @@ def test_all_school_plans_can_be_driven() -> None:
         if trace.actions[-1].kind == "turn":
             trace = trace.prefix(
                 len(trace) - 1
-            )  # nothing travels from where the last turn ends, so that is along no path of a map
+            )  # No travel starts where the last turn ends, so that state is on no path of a map.
         theory = Theory.topological().replace(star="none", displacement="none", boundary="none")
         assert (check(trace, true_map(plan.told_apart(), trace), theory) == ()) == (
             plan.name != "westasheville"

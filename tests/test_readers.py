@@ -1,4 +1,4 @@
-"""Logs of robots: what each reader makes of them, round trips through the writers, and logs that are damaged."""
+"""Readers of robots' logs: each format, round trips through the writers, and damaged logs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ BAGS = {"drive.bag": "ros1", "drive.mcap": "mcap", "drive": "ros2"}
 
 
 def drive(count: int = 12, laser: Laser = LASER, noise: float = 0.03) -> list[Scan]:
-    """Scans of a robot that drives a bend, whose odometer is off by some noise."""
+    """Scans of a robot that drives a bend with noisy odometry."""
     rng = np.random.default_rng(7)
     true: Pose = (1.0, -2.0, 0.3)
     odometry: Pose = (0.5, 0.0, 0.0)
@@ -55,7 +55,7 @@ def is_near(a: Pose | None, b: Pose | None, off: float = 1e-4) -> bool:
 
 
 def agree(read: Scan, written: Scan) -> bool:
-    """Whether a scan is as it was written, but for rounding."""
+    """Whether a scan is as written, up to rounding."""
     laser, other = read.laser, written.laser
     return (
         np.allclose(read.ranges, written.ranges, atol=1e-4, equal_nan=True)
@@ -84,7 +84,10 @@ def flaser(first: Pose, second: Pose, time: str = "1.5", ranges: str = "1 2 8 8 
 
 
 def robotlaser(first: Pose, second: Pose, time: float = 1.5) -> str:
-    return f"ROBOTLASER1 0 -1.5707963 3.1415927 0.7853982 8.0 0.1 0 5 1 2 7.99 8 9 0 {pose(first)} {pose(second)} 0 0 0 0 0 {time} host {time}"
+    return (
+        f"ROBOTLASER1 0 -1.5707963 3.1415927 0.7853982 8.0 0.1 0 5 1 2 7.99 8 9 0 {pose(first)} "
+        f"{pose(second)} 0 0 0 0 0 {time} host {time}"
+    )
 
 
 def odom(value: Pose, time: str = "1.5") -> str:
@@ -92,13 +95,17 @@ def odom(value: Pose, time: str = "1.5") -> str:
 
 
 def by_gmapping(scans: int = 8, with_neff: bool = True) -> tuple[list[str], list[Pose], list[Pose]]:
-    """The lines of a log as GMapping writes it, with three ODOM lines between two scans; and the odometer's pose at each scan, and the corrected one."""
+    """Lines of a GMapping log with three ODOM lines between scans.
+
+    Returns:
+        The lines, the odometry at each scan, and the corrected poses.
+    """
     rng = np.random.default_rng(3)
     lines, odometry, truth, at = [], [START], [], START
     for i in range(scans):
         corrected: Pose = (
             moved(at, (0.2, -0.15, 0.1)) if i else at
-        )  # the correction jumps as far as the robot drives
+        )  # The correction jumps as far as the robot drives.
         truth.append(corrected)
         lines += [flaser(corrected, corrected, f"{i}.5"), odom(corrected, "0")] + [
             "NEFF 30"
@@ -119,7 +126,7 @@ def by_gmapping(scans: int = 8, with_neff: bool = True) -> tuple[list[str], list
 @pytest.mark.parametrize("noise", [0.03, 0.0])
 @pytest.mark.parametrize("name", ["drive.log", "drive.log.gz", *BAGS])
 def test_a_log_is_read_as_it_was_written(tmp_path: Path, name: str, noise: float) -> None:
-    """Also where odometry has no noise the true poses are kept: formats have a place of their own for them."""
+    """True poses have a place of their own, and are kept even without odometry noise."""
     scans = drive(noise=noise)
     (write_bag if name in BAGS else write_carmen)(tmp_path / name, scans)
     log = read_log(tmp_path / name)
@@ -190,7 +197,7 @@ def test_a_scan_that_is_lost_leaves_no_correction_in_odometry(
     at = next(i for i, line in enumerate(lines) if line.startswith("FLASER 5") and i > 15)
     lines[at : at + 1] = [damage] * (damage is not None)
     if damage is None and not with_neff:
-        return  # of a line that is gone without a trace nothing can tell
+        return  # A line that is missing without a trace cannot be noticed.
     log = read_text(tmp_path / "a.log", *lines)
     assert [d.line for d in log.damaged] == ([] if damage in (None, "FLXSER 5 1 2") else [at + 1])
     kept = odometry[:3] + odometry[4:] if with_neff else odometry[:4] + odometry[5:]
@@ -225,7 +232,7 @@ def test_a_lost_odometer_line_of_gmappings_logs_costs_no_more_than_its_motion(
 
 
 def test_poses_of_a_raw_log_are_odometry(tmp_path: Path) -> None:
-    """Though each scan was logged before the ODOM line of its time, which then repeats its pose."""
+    """Each scan was logged before the ODOM line of its time, which then repeats its pose."""
     poses: list[Pose] = [(0.1 * i, 0.0, 0.02 * i) for i in range(6)]
     lines = [
         line
@@ -393,9 +400,8 @@ def test_a_damaged_vertex_costs_its_scan_alone(tmp_path: Path) -> None:
 
 def test_a_missing_edge_is_told(tmp_path: Path) -> None:
     lines = graph(VERTICES, MOTIONS)
-    lines[-2] = (
-        f"EDGE2 3 2 {pose(between(MOTIONS[2], START))} 1 0 1 1 0 0"  # as good as the one from 2 to 3
-    )
+    # This edge is as good as the one from 2 to 3.
+    lines[-2] = f"EDGE2 3 2 {pose(between(MOTIONS[2], START))} 1 0 1 1 0 0"
     assert is_near(read_text(tmp_path / "a.graph", *lines).scans[-1].odometry, chained(MOTIONS)[-1])
     log = read_text(tmp_path / "a.graph", *lines[:-1])
     assert "before these vertices, so that it seems to have stood still: 4" in " ".join(log.notes)
@@ -407,7 +413,7 @@ def test_a_missing_edge_is_told(tmp_path: Path) -> None:
 
 
 def bag(path: Path, messages: Callable[[Any], list[tuple[str, float, Any]]]) -> Path:
-    """A bag of ROS 2 that holds messages: topic, seconds at which each was recorded, and the message."""
+    """A bag of ROS 2 with messages: topic, seconds of recording, and message."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -415,7 +421,7 @@ def bag(path: Path, messages: Callable[[Any], list[tuple[str, float, Any]]]) -> 
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         topics: dict[str, Any] = {}
         for topic, time, message in messages(Messages(store.types)):
-            if isinstance(message, bytes):  # a damaged one
+            if isinstance(message, bytes):  # A damaged one.
                 writer.write(topics[topic], round(time * 1e9), message)
                 continue
             kind = message.__msgtype__
@@ -425,7 +431,7 @@ def bag(path: Path, messages: Callable[[Any], list[tuple[str, float, Any]]]) -> 
 
 
 class Messages:
-    """Makes messages. Times are seconds; where one is 0 the header has none."""
+    """Makes messages. Times are seconds; 0 means that the header has none."""
 
     def __init__(self, types: Any) -> None:
         self.types = types
@@ -443,9 +449,17 @@ class Messages:
     def scan(self, time: float, frame: str = "laser") -> Any:
         ranges = np.array([0.05, 1, 2, np.inf, 9], dtype=np.float32)
         return self.types["sensor_msgs/msg/LaserScan"](
-            header=self.header(frame, time), angle_min=-1.0, angle_max=1.0, angle_increment=0.5, time_increment=0.0, scan_time=0.1,
-            range_min=0.1, range_max=8.0, ranges=ranges, intensities=np.zeros(0, dtype=np.float32),
-        )  # fmt: skip
+            header=self.header(frame, time),
+            angle_min=-1.0,
+            angle_max=1.0,
+            angle_increment=0.5,
+            time_increment=0.0,
+            scan_time=0.1,
+            range_min=0.1,
+            range_max=8.0,
+            ranges=ranges,
+            intensities=np.zeros(0, dtype=np.float32),
+        )
 
     def odometry(self, time: float, at: Pose, base: str = "base_link") -> Any:
         geometry, zero = (
@@ -460,8 +474,11 @@ class Messages:
             header=self.header("odom", time),
             child_frame_id=base,
             pose=self.types[geometry + "PoseWithCovariance"](pose=where, covariance=np.zeros(36)),
-            twist=self.types[geometry + "TwistWithCovariance"](twist=self.types[geometry + "Twist"](linear=zero, angular=zero), covariance=np.zeros(36)),
-        )  # fmt: skip
+            twist=self.types[geometry + "TwistWithCovariance"](
+                twist=self.types[geometry + "Twist"](linear=zero, angular=zero),
+                covariance=np.zeros(36),
+            ),
+        )
 
     def transform(
         self, parent: str, child: str, at: Pose, time: float = 0.0, upside_down: bool = False
@@ -478,7 +495,7 @@ class Messages:
 
 
 def test_odometry_of_a_bag_is_that_at_the_times_of_the_scans(tmp_path: Path) -> None:
-    """Headings that wrap between two messages, too. A scan long after the last of them has no odometry."""
+    """Headings wrap between two messages. A scan long after the last message has no odometry."""
     path = bag(
         tmp_path / "bag",
         lambda m: (
@@ -502,7 +519,10 @@ def test_odometry_of_a_bag_is_that_at_the_times_of_the_scans(tmp_path: Path) -> 
 
 
 def test_odometry_of_transforms_and_a_laser_upside_down(tmp_path: Path) -> None:
-    """There are no messages Odometry: odom to base_footprint to base_link to mast to laser, some of it under ROS 1's names with a slash."""
+    """Without Odometry messages, the transforms lead from odom to the laser.
+
+    The chain is odom, base_footprint, base_link, mast, laser; some names have the slash of ROS 1.
+    """
     path = bag(
         tmp_path / "bag",
         lambda m: [
@@ -657,7 +677,7 @@ DAMAGED = {
 
 @pytest.mark.parametrize("what", DAMAGED)
 def test_a_damaged_line_is_skipped_and_told(tmp_path: Path, what: str) -> None:
-    """ROBOTLASER1 is the kind of scan that is read where that is the damaged one."""
+    """If a ROBOTLASER1 line is the damaged one, ROBOTLASER1 is still the kind that is read."""
     good = robotlaser if DAMAGED[what].startswith(b"ROBOT") else flaser
     lines = [good((0.1 * i, 0, 0), (0.1 * i, 0, 0)).encode() for i in range(5)]
     lines.insert(2, DAMAGED[what])
@@ -744,7 +764,7 @@ def test_paths_and_formats_that_cannot_be(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["drive.log", "drive.log.gz", "gmapping.log", "graph.log", *BAGS])
 def test_nothing_that_bytes_can_hold_is_a_crash(tmp_path: Path, name: str) -> None:
-    """Bytes are changed, left out, or written twice."""
+    """Bytes are changed, left out, or repeated."""
     file = tmp_path / name
     if name in BAGS:
         write_bag(file, drive(4, SMALL))
@@ -813,7 +833,10 @@ def test_a_log_that_is_given_as_a_trace_is_named(tmp_path: Path) -> None:
     for name in ("a.log", "a.log.gz", "a.bag", "b.log"):
         with pytest.raises(
             TraceError,
-            match=r"as robots' logs are; make a trace of it with ssh-abduction import LOG -o trace\.jsonl",
+            match=(
+                r"as robots' logs are; make a trace of it with ssh-abduction import LOG -o "
+                r"trace\.jsonl"
+            ),
         ):
             Trace.load(tmp_path / name)
 
@@ -822,7 +845,8 @@ def test_a_log_that_is_given_as_a_trace_is_named(tmp_path: Path) -> None:
 
 
 REAL = {
-    # scans, beams, reach, metres by odometry and by corrected poses, and how far increments differ: the median and that of 95 % of the scans, in metres and degrees
+    # Scans, beams, reach, metres by odometry and by corrected poses, and differences of increments:
+    # median and 95th percentile, in metres and degrees.
     "aces-corrected.log.gz": (440, 180, 50, 322, 323, (0.06, 1), (0.15, 6)),
     "seattle-corrected.log.gz": (241, 361, 81.83, 190, 190, (0.03, 0.2), (0.06, 1)),
     "csail-corrected.log.gz": (406, 361, 50, 370, 380, (0.1, 5), (0.25, 16)),
@@ -854,12 +878,12 @@ def test_logs_of_real_robots(name: str) -> None:
     off = np.column_stack([np.hypot(off[:, 0], off[:, 1]), np.degrees(off[:, 2])])
     assert (np.median(off, axis=0) < median).all()
     assert (np.quantile(off, 0.95, axis=0) < most).all()
-    assert (off.max(axis=0) > 0).all()  # odometry is no copy of the corrected poses
+    assert (off.max(axis=0) > 0).all()  # Odometry is no copy of the corrected poses.
     end = between(
         between(log.scans[0].odometry, log.scans[-1].odometry),
         between(log.scans[0].corrected or START, log.scans[-1].corrected or START),
     )
-    assert math.hypot(*end[:2]) > 0.5  # and drifts
+    assert math.hypot(*end[:2]) > 0.5  # And it drifts.
 
 
 def test_docstrings_run() -> None:

@@ -141,7 +141,8 @@ def test_a_world_from_an_occupancy_map(tmp_path: Path) -> None:
     ):
         (tmp_path / "map.pgm").write_bytes(head + body)
         (tmp_path / "map.yaml").write_text(
-            "image: map.pgm\nresolution: 0.1\norigin: [-0.2, -0.2, 0.0]\nnegate: 0\noccupied_thresh: 0.65\n"
+            "image: map.pgm\nresolution: 0.1\norigin: [-0.2, -0.2, 0.0]\nnegate: "
+            "0\noccupied_thresh: 0.65\n"
         )
         world = World.named(str(tmp_path / "map.yaml"))
         assert world.bounds == pytest.approx((-0.2, -0.2, 4.2, 2.2))
@@ -189,7 +190,10 @@ def test_bad_worlds_name_the_field(changes: dict[str, Any], message: str, tmp_pa
 def test_worlds_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(
         SimulatorError,
-        match="expected one of cluttered, curved, doors, five-ways, notched-rectangle, six-ways, taylor-hall, three-ways, triangle, or a file",
+        match=(
+            "expected one of cluttered, curved, doors, five-ways, notched-rectangle, six-ways, "
+            "taylor-hall, three-ways, triangle, or a file"
+        ),
     ):
         World.named("atlantis")
     with pytest.raises(SimulatorError, match="check the path"):
@@ -210,9 +214,10 @@ def test_worlds_that_are_not_there(tmp_path: Path) -> None:
 def test_sight_measures_the_corner_that_it_sees(
     ahead: float, left: float, degrees: float, corner: int
 ) -> None:
-    """In a room without a notch, facing into each corner: distances to both walls, and the tilt, to a few millimetres and tenths of a degree.
+    """Facing each corner of a room: distances and tilt, to a few millimetres and 0.1 degrees.
 
-    Of the wall on the left a robot turned to the right sees less than what is ahead of it; where that is less than 0.4 m, it may count as no wall.
+    A robot turned to the right sees less of the wall on its left than of the wall ahead. If that is
+    less than 0.4 m, the wall may be missing.
     """
     quarter = -corner * math.pi / 2
     room = np.array([[0, 0, 4, 0], [4, 0, 4, 2], [4, 2, 0, 2], [0, 2, 0, 0]], float)
@@ -246,7 +251,7 @@ def test_an_image_of_nothing_shows_nothing() -> None:
 def test_hill_climbing_ends_at_the_fixed_point(
     dx: float, dy: float, degrees: float, seed: int
 ) -> None:
-    """From anywhere near x0, along the way and in heading, the robot comes to within the tolerance of the law."""
+    """From anywhere near x0, the robot reaches the tolerance of the control law."""
     rng = np.random.default_rng(seed)
     robot = Robot(Body(), (3.4 + dx, 1.4 + dy, math.radians(degrees)), rng)
     climb(Driver(RECTANGLE, robot, Laser(), rng))
@@ -257,7 +262,7 @@ def test_hill_climbing_ends_at_the_fixed_point(
 
 
 def test_control_never_reads_the_true_pose() -> None:
-    """The same scans, the same commands: a driver whose robot claims to be elsewhere does what the images say."""
+    """The same scans give the same commands, even if the robot claims another pose."""
     commands: list[list[tuple[float, float]]] = []
     for lie in (False, True):
         rng = np.random.default_rng(5)
@@ -293,7 +298,7 @@ def test_every_dstate_is_reached_in_order(circuits: Trace, tours: Trace) -> None
 
 
 def test_errors_do_not_add_up(circuits: Trace) -> None:
-    """The spread of the pose at the dstates in the last ten circuits is that in the first ten."""
+    """The spread of poses at the dstates is the same in the first and the last ten circuits."""
     for poses in poses_by_dstate(circuits).values():
         off = np.abs(poses[:, :2] - poses[:, :2].mean(0)).max(1)
         assert off.max() < 0.025
@@ -310,7 +315,7 @@ def test_errors_do_not_add_up(circuits: Trace) -> None:
 
 
 def test_without_hill_climbing_errors_do_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test above can fail: dead reckoning for two sides loses the corner."""
+    """The test above can fail: after two sides by dead reckoning, the corner is lost."""
     rng = np.random.default_rng(0)
     ends = []
     for _ in range(30):
@@ -334,7 +339,7 @@ def test_odometry_drifts_and_is_not_the_truth(circuits: Trace) -> None:
 POSES = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3, 3))
 SQUARE = 2 * (
     [(0.15, 0.01)] * 20 + [(0.0, -math.pi / 2)]
-)  # two sides of a square, in strides and turns
+)  # Two sides of a square, in strides and turns.
 
 
 def whitened(error: Any, covariance: Any) -> np.ndarray:
@@ -346,7 +351,7 @@ def whitened(error: Any, covariance: Any) -> np.ndarray:
 def errors_of(
     trace: Trace, poses: list[tuple[float, float, float]], odometry: Odometry, kind: str
 ) -> np.ndarray:
-    """The errors of the displacements of the actions of a kind, against those between poses, in standard deviations: (n, 3)."""
+    """Errors of displacements of some actions, (n, 3), in standard deviations."""
     found = []
     for before, after, step, action in zip(
         poses, poses[1:], trace.steps[1:], trace.actions, strict=False
@@ -363,7 +368,7 @@ def errors_of(
 
 
 def fixed_points(trace: Trace) -> list[tuple[float, float, float]]:
-    """For each step the middle of all poses at its place, and of all headings at its dstate."""
+    """The mean position at the place and the mean heading at the dstate of each step."""
     places: dict[str, list[list[float]]] = {}
     for step in trace.steps:
         places.setdefault(step.truth["place"], []).append(step.truth["pose"][:2])
@@ -400,7 +405,7 @@ def test_noise_has_the_covariance_that_the_odometry_says() -> None:
 
 
 def test_errors_that_repeat_make_a_line_an_arc() -> None:
-    """In pieces or at once: after ten metres straight ahead, 10 % too long, the heading that is reported is off by 10 bends."""
+    """After ten metres straight ahead, reported 10 % too long, the heading is off by 10 bends."""
     exact, rng = Odometry(0, 0, 0, 0, 0, 0, 0, 0), np.random.default_rng(0)
     pose = (0.0, 0.0, 0.0)
     for _ in range(100):
@@ -449,7 +454,7 @@ def test_worn_wheels_report_too_long_ways_and_unequal_ones_a_drift() -> None:
 
 
 def test_displacements_are_the_motions_between_the_dstates(circuits: Trace, tours: Trace) -> None:
-    """As the wheels have it, they lead from true pose to true pose; as a map has it, from fixed point to fixed point."""
+    """Displacements of wheels lead between true poses; those of a map lead between fixed points."""
     for trace in (circuits, tours):
         assert trace.steps[0].displacement is None
         assert trace.odometry is not None
@@ -464,7 +469,7 @@ def test_displacements_are_the_motions_between_the_dstates(circuits: Trace, tour
 
 
 def test_the_shares_of_a_step_are_those_of_its_motions() -> None:
-    """Without hill-climbing, over many drives: chi-square by the model of all reports has its degrees of freedom."""
+    """Without hill-climbing, the chi-square by the noise model has its degrees of freedom."""
     rng = np.random.default_rng(0)
     body = Body(wander=0, odometry=0.05)
     reports, errors = [], []
