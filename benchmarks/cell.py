@@ -34,7 +34,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.asp import limits
 from ssh_abduction.solver.asp.limits import peak_memory
-from ssh_abduction.solver.result import Status
+from ssh_abduction.solver import Status
 from ssh_abduction.theory import Speedups
 
 AROUND = 300  # seconds for all that the clock does not count

@@ -37,7 +37,7 @@ from ssh_abduction.learning.learner import (
     LearnerError,
     RunnerUpWarning,
 )
-from ssh_abduction.solver.search import solve
+from ssh_abduction.solver import solve
 
 WORLD = World.named("notched-rectangle")
 SECONDS = 2.0

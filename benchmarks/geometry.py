@@ -22,7 +22,7 @@ import ssh_abduction.checker.geometry
 import ssh_abduction.solver.fit
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.data import Odometry
-from ssh_abduction.solver.result import Status
+from ssh_abduction.solver import Status
 from ssh_abduction.theory.evidence import displacement
 
 # Where geometry begins: what is called from elsewhere.

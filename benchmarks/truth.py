@@ -33,7 +33,7 @@ from ssh_abduction import Solution, Theory, Trace, solve
 from ssh_abduction.data import Odometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import NUMBERS
-from ssh_abduction.solver import Status
+from ssh_abduction.solver import Status, find_backbone
 
 ROOT = Path(__file__).parent.parent
 # What the noise is unless a flag says otherwise: 5 % along the way, 0.5 % across it, and 0.002 rad of heading in a metre.
@@ -189,7 +189,7 @@ def share_all(solution: Solution) -> bool:
     """Whether all minimal maps, of which only some are listed, have the same dstates and the same places: then they differ in paths alone."""
     if solution.status is not Status.OPTIMAL:
         return False
-    shared = solution.backbone
+    shared = find_backbone(solution)
     return (
         shared is not None
         and shared.proven

@@ -25,7 +25,7 @@ from typing import Any
 from ssh_abduction.cli import main as shell
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
-from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver import Solution
 
 Row = dict[str, Any]
 

@@ -6,7 +6,10 @@ import json
 import pickle
 import random
 from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import replace
 from itertools import combinations, combinations_with_replacement
+from pathlib import Path
 from unittest.mock import patch
 
 import pytest
@@ -19,16 +22,17 @@ from worlds import HEADINGS, QUARTERS, TWO_BLOCKS, Streets, drive, rectangle
 from benchmarks.instances import maze
 from ssh_abduction import OnlineMapper, Theory, Trace, solve
 from ssh_abduction.cli import main
-from ssh_abduction.data import Odometry
+from ssh_abduction.data import MapError, Odometry, SolverError
 from ssh_abduction.data.words import counted
 from ssh_abduction.rivals import difference
-from ssh_abduction.solver import Search, Status, prefixes
+from ssh_abduction.solver import choosing
+from ssh_abduction.solver import Search, Solution, Status, find_backbone, prefixes
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.frameless import FramelessEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
-from ssh_abduction.solver.result import summary_of
+from ssh_abduction.solver.writing import summary_of
 from ssh_abduction.solver.sharing import Backbone, Shared
 
 ACES3 = "examples/aces3-route.jsonl"
@@ -94,15 +98,15 @@ def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
     counts, keys = minimal_maps(trace, theory, lambda key: all(toy.allows(key) for toy in toys))
     first_prefix = data.draw(st.sampled_from([1, prefixes.FIRST_PREFIX]), label="first prefix")
     # Engines that settle dstates first are for longer traces, and those for places without frames only where clingo takes its time.
-    few_steps = data.draw(st.sampled_from([0, solver.FEW_STEPS]), label="few steps")
-    frame_after = data.draw(st.sampled_from([0.0, solver.FRAME_AFTER]), label="frame after")
+    few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
+    frame_after = data.draw(st.sampled_from([0.0, choosing.FRAME_AFTER]), label="frame after")
     patches = {
         "FEW_STEPS": few_steps,
         "FRAME_AFTER": frame_after,
         "ONE_MORE": 0.0,
         "ONE_MORE_SHARE": 0.0,
     }
-    with patch.object(prefixes, "FIRST_PREFIX", first_prefix), patch.multiple(solver, **patches):
+    with patch.object(prefixes, "FIRST_PREFIX", first_prefix), patch.multiple(choosing, **patches):
         every = solve(trace, theory, max_maps=None, time_limit=LIMIT)
         first = solve(trace, theory, max_maps=1, time_limit=LIMIT)
         assert counts is None or first.backbone is not None
@@ -138,12 +142,12 @@ def test_reasoning_from_one_map_says_what_the_whole_list_says(
     trace = Trace.load(ACES3)
     every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
     assert every.summary == f"{count} minimal maps: {shared}"
+    backbone = find_backbone(first)
+    assert backbone == every.backbone
     assert (
-        first.summary == f"at least 1 minimal map (listing was stopped by the maps limit): {shared}"
+        summary_of(first, 1, backbone)
+        == f"at least 1 minimal map (listing was stopped by the maps limit): {shared}"
     )
-    assert first.backbone == every.backbone
-    assert first.rivals is not None
-    assert first.rivals.sharing.maps < 20
 
 
 def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
@@ -164,27 +168,29 @@ def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
 def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine: type) -> None:
     """32 maps that differ in dstates, too: found by a prefix of the readable encodings, or by labels that are settled before places and paths."""
     trace, theory = walk(TWO_BLOCKS, "a1", 60, 1), Theory(boundary="none", prefer=("dstates",))
-    with patch.object(solver, "FRAME_AFTER", frame_after):
+    with patch.object(choosing, "FRAME_AFTER", frame_after):
         every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
-    assert first.rivals is not None
-    assert type(first.rivals.engine) is engine
+        search = Search(trace, theory, max_maps=1, reasons=True)
+        reasoned = search.solution(tuple(search))
+    assert type(search._prefixes.engine) is engine
     assert every.count == 32
-    assert first.backbone == every.backbone
-    assert first.backbone is not None
-    assert len(first.backbone.dstates.always) == len(trace)
-    assert first.backbone.dstates.differing
-    assert first.rivals.sharing.maps < 16
+    assert find_backbone(first) == reasoned.backbone == every.backbone
+    assert every.backbone is not None
+    assert len(every.backbone.dstates.always) == len(trace)
+    assert every.backbone.dstates.differing
+    assert search._rivals.sharing.maps < 16
     assert (first.prefix < len(trace)) == (engine is StepEngine)
 
 
 def test_a_maze_with_stars_is_reasoned_about_by_its_labels() -> None:
     """Seven maps in three labellings."""
     trace = maze(5, 5, steps=100, seed=1, stars=True).trace
-    every, first = solve(trace, max_maps=None), solve(trace, max_maps=1)
+    every, search = solve(trace, max_maps=None), Search(trace, max_maps=1, reasons=True)
+    first = search.solution(tuple(search))
     assert every.count == 7
-    assert first.rivals is not None
-    assert type(first.rivals.engine) is FramedEngine
-    assert first.backbone == every.backbone
+    assert type(search._prefixes.engine) is FramedEngine
+    assert find_backbone(first) == first.backbone == every.backbone
+    assert find_backbone(solve(trace, max_maps=1)) == every.backbone
     assert "7 minimal maps: the dstates of steps 80, 83–84, 97 and 99–100 differ" in every.summary
 
 
@@ -217,14 +223,38 @@ def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end()
     assert summary_of(solution, count, solution.backbone) == f"{listed}: {found}"
 
 
-def test_what_is_known_goes_to_other_processes_and_what_asks_clingo_does_not() -> None:
+def test_a_solution_is_a_value(tmp_path: Path) -> None:
+    """It survives pickle, copies and files, and finds a backbone only where it is asked to."""
     solution = solve(Trace.load(ACES3), max_maps=1)
-    same = pickle.loads(pickle.dumps(solution))
-    assert same == solution
-    assert same.backbone is not None
-    assert not same.backbone.proven
-    assert solution.backbone is not None
-    assert solution.backbone.proven
+    solution.save(tmp_path / "maps.json")
+    loaded = Solution.load(tmp_path / "maps.json", solution.trace)
+    copies = [pickle.loads(pickle.dumps(solution)), deepcopy(solution), replace(solution), loaded]
+    for same in copies:
+        assert same == solution
+        assert hash(same) == hash(solution)
+        assert same.to_dict() == solution.to_dict()
+        assert same.backbone == solution.backbone
+        assert same.backbone is not None
+        assert not same.backbone.proven
+        backbone = find_backbone(same)
+        assert backbone is not None
+        assert backbone.proven
+        assert find_backbone(replace(same, shared=backbone)) is backbone
+
+
+def test_a_backbone_that_cannot_be_found_in_time_is_not_proven() -> None:
+    solution = solve(Trace.load(ACES3), max_maps=1)
+    assert find_backbone(solution, time_limit=1e-9) == solution.backbone
+
+
+def test_a_backbone_needs_the_trace(tmp_path: Path) -> None:
+    solve(Trace.load(ACES3), max_maps=1).save(tmp_path / "maps.json")
+    loaded = Solution.load(tmp_path / "maps.json")
+    with pytest.raises(SolverError, match="trace: expected the trace that was solved, got none"):
+        find_backbone(loaded)
+    with pytest.raises(MapError):
+        find_backbone(loaded, rectangle(14))
+    assert find_backbone(loaded, Trace.load(ACES3)) is not None
 
 
 def test_while_the_robot_drives_the_backbone_is_that_of_the_maps_listed() -> None:

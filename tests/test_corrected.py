@@ -12,6 +12,7 @@ from strategies import STARS
 from ssh_abduction import Theory, Trace
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.trace import Action
+from ssh_abduction.solver import choosing
 from ssh_abduction.solver import Search, mending, search
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.speedups import SPEEDUPS
@@ -38,7 +39,7 @@ def broken_traces(draw: st.DrawFn, most_steps: int = 6) -> Trace:
 
 
 def maps_of(trace: Trace, theory: Theory, speedups: Speedups) -> set[object]:
-    with patch.object(search, "FEW_STEPS", 0):
+    with patch.object(choosing, "FEW_STEPS", 0):
         found = Search(trace, theory, max_maps=None, speedups=speedups)
         maps = list(found)
     assert found.complete
@@ -72,7 +73,7 @@ def test_maps_of_mended_traces_are_those_of_the_plain_encodings(data: st.DataObj
     plain = Search(trace, theory, max_maps=None, speedups=PLAIN)
     expected = {(*key(ssh_map), ssh_map.faults) for ssh_map in plain}
     assert plain.complete
-    with patch.object(search, "FEW_STEPS", 0), patch.object(mending, "MOST_CAUSAL", 500):
+    with patch.object(choosing, "FEW_STEPS", 0), patch.object(mending, "MOST_CAUSAL", 500):
         mended = Search(trace, theory, max_maps=None)
         maps = list(mended)
     assert {(*key(ssh_map), ssh_map.faults) for ssh_map in maps} == expected

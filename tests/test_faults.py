@@ -24,6 +24,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Step
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
+from ssh_abduction.solver import choosing
 from ssh_abduction.solver import Status, search
 from ssh_abduction.solver.engines import faulty
 from ssh_abduction.solver.engines.base import Task
@@ -162,7 +163,7 @@ def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) 
             NAMES=1,
             MORE_NAMES=1,
         ),
-        patch.object(search, "FEW_STEPS", 0),
+        patch.object(choosing, "FEW_STEPS", 0),
     ):
         solution = solve(trace, theory, max_maps=None)
     cost, expected = cheapest(trace, round(10 * theory.misread), round(10 * theory.slipped))

@@ -20,6 +20,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.online.keeper import MapKeeper
+from ssh_abduction.solver import choosing
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp import facts
@@ -28,7 +29,8 @@ from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import framed
 from ssh_abduction.solver.engines import paths as paths_module
 from ssh_abduction.solver.engines import visits as same
-from ssh_abduction.solver.engines.base import Cost, Found
+from ssh_abduction.solver.engines.base import Found
+from ssh_abduction.solver.values import Cost
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
 from ssh_abduction.solver.engines.sides import FramedSides
@@ -143,7 +145,7 @@ def test_lists_the_maps_of_the_plain_encoding(
     charted = data.draw(st.sampled_from([FramedEngine._charted, plainly_charted]), label="charted")
     prefixes = patch.object(engine, "FIRST_PREFIXES", first)
     with (
-        patch.object(solver, "FEW_STEPS", 0),
+        patch.object(choosing, "FEW_STEPS", 0),
         prefixes,
         patch.multiple(same, **cores),
         patch.multiple(framed, **sought),
@@ -180,7 +182,7 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(
     """From a guess of any quality. Names that do not fit a frame, or have no paths, are no maps; and clingo may need more names than it had."""
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     with (
-        patch.object(solver, "FEW_STEPS", 0),
+        patch.object(choosing, "FEW_STEPS", 0),
         patch.multiple(framed, SOON=-1.0, Beside=Before, MANY_DSTATES=sweeps % 2),
         patch.object(same, "FIRST_PAIRS", 5 * (sweeps % 3)),
         patch.object(paths_module, "SECONDS", 0.0),
@@ -251,7 +253,7 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
     charted = data.draw(st.sampled_from([FramedEngine._charted, plainly_charted]), label="charted")
     first, *rest = trace.steps
     with (
-        patch.object(solver, "FEW_STEPS", 0),
+        patch.object(choosing, "FEW_STEPS", 0),
         patch.multiple(
             same,
             GROWN=grown,
@@ -281,7 +283,7 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
     paths = set()
     with (
         patch.multiple(same, GROWN=100, MANY=1, AT_A_TIME=5),
-        patch.object(solver, "FEW_STEPS", 10),
+        patch.object(choosing, "FEW_STEPS", 10),
     ):
         mapper = OnlineMapper(first.view or "", star=first.star, time_limit=None, max_maps=None)
         for i, (action, step) in enumerate(zip(trace.actions, rest, strict=True)):

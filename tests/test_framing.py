@@ -14,6 +14,7 @@ from strategies import theories, traces
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.solver import choosing
 from ssh_abduction.solver import Search, Status, candidates, prefixes
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
@@ -65,7 +66,7 @@ def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
     first = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
     expected = solve(trace, theory, max_maps=None, speedups=Speedups.without(SPEEDUPS))
     with (
-        patch.multiple(solver, FRAME_AFTER=-1.0, FEW_STEPS=0),
+        patch.multiple(choosing, FRAME_AFTER=-1.0, FEW_STEPS=0),
         patch.object(prefixes, "FIRST_PREFIX", first),
     ):
         found = solve(trace, theory, max_maps=None, speedups=Speedups.without("names"))
@@ -117,7 +118,7 @@ def test_listing_is_not_paused() -> None:
     listed = Prefixes.minimal_maps
 
     def slowly(self: Prefixes) -> Iterator[SSHMap]:
-        self._task.watch._spent += 2 * solver.FRAME_AFTER
+        self._task.watch._spent += 2 * choosing.FRAME_AFTER
         yield from listed(self)
 
     with patch.object(Prefixes, "minimal_maps", slowly):
@@ -153,7 +154,7 @@ def test_while_a_robot_drives_the_time_is_clingos() -> None:
     mapper = OnlineMapper(trace.steps[0].view or "", time_limit=0.01)
     with (
         patch.object(framing, "maps_with_frames", side_effect=AssertionError),
-        patch.object(solver, "FRAME_AFTER", -1.0),
+        patch.object(choosing, "FRAME_AFTER", -1.0),
     ):
         for action, step in zip(trace.actions, trace.steps[1:], strict=True):
             answer = mapper.observe(action, step.view or "")

@@ -21,7 +21,7 @@ from simulator.world import World
 from ssh_abduction.checker.checker import check
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import between, moved
-from ssh_abduction.solver.search import solve
+from ssh_abduction.solver import solve
 
 START: Pose = (0.0, 0.0, 0.0)
 COUNT = 110

@@ -17,6 +17,7 @@ from test_speedups import PLAIN, machines
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
+from ssh_abduction.solver import choosing
 from ssh_abduction.solver import Status
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp import facts
@@ -94,7 +95,7 @@ def test_a_search_beside_another_changes_no_answer(
     most = data.draw(st.sampled_from([0, 1, 3]), label="most")
     turned = Mock(side_effect=lambda _, __, size: Mock(node_of=range(size)))
     with (
-        patch.object(solver, "FEW_STEPS", 0),
+        patch.object(choosing, "FEW_STEPS", 0),
         patch.object(engine, "FIRST_PREFIXES", len(trace)),
         patch.multiple(
             named, PATIENCE=0, CORES=cores, TRIES=data.draw(st.integers(1, 3), label="tries")

@@ -25,6 +25,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import TheoryError
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.online.replay import ReplayedMap
+from ssh_abduction.solver import choosing
 from ssh_abduction.solver import Search, Status, judging, prefixes, search
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
@@ -66,7 +67,7 @@ def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.Dat
     allows = TOYS[0].allows if toy.rules not in theory.rules else toy.allows
     trace = data.draw(traces(max_steps=6), label="trace")
     mapper: OnlineMapper | None = None
-    with patch.object(prefixes, "FIRST_PREFIX", 1), patch.object(search, "FEW_STEPS", 0):
+    with patch.object(prefixes, "FIRST_PREFIX", 1), patch.object(choosing, "FEW_STEPS", 0):
         for steps in range(1, len(trace) + 1):
             prefix = trace.prefix(steps)
             counts, expected = minimal_maps(prefix, replace(theory, rules=()), allows)
@@ -249,7 +250,7 @@ def test_what_evidence_refuses_of_a_map_is_forbidden(name: str, data: st.DataObj
     with (
         patch.object(judging, "evidence_of", lambda _: (NoLongReturns(),)),
         patch.object(prefixes, "FIRST_PREFIX", 1),
-        patch.object(search, "FEW_STEPS", 0),
+        patch.object(choosing, "FEW_STEPS", 0),
     ):
         solution = solve(trace, theory, max_maps=None)
     assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
@@ -282,7 +283,7 @@ def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.
         patch.object(
             prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 8]), label="first prefix")
         ),
-        patch.multiple(search, FEW_STEPS=0, FRAME_AFTER=-1.0),
+        patch.multiple(choosing, FEW_STEPS=0, FRAME_AFTER=-1.0),
     ):
         asked = Search(trace, theory, max_maps=None, speedups=Speedups.without("framing"))
         found = tuple(asked)

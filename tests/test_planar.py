@@ -21,6 +21,7 @@ from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker import check
 from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.data.maps import DState
+from ssh_abduction.solver import choosing
 from ssh_abduction.solver import Status, prefixes, search
 from ssh_abduction.theory.evidence import Equality, Planar
 from ssh_abduction.theory.planarity import can_be_drawn, is_planar
@@ -255,7 +256,7 @@ def test_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
     first_prefix = data.draw(st.sampled_from([1, 8]), label="first prefix")
     with (
         patch.object(prefixes, "FIRST_PREFIX", first_prefix),
-        patch.object(search, "FEW_STEPS", data.draw(st.sampled_from([0, 24]))),
+        patch.object(choosing, "FEW_STEPS", data.draw(st.sampled_from([0, 24]))),
     ):
         solution = solve(trace, theory, max_maps=None)
     assert solution.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)

@@ -22,6 +22,7 @@ from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.cli import main
 from ssh_abduction.data import MapError
 from ssh_abduction.solver import Search
+from ssh_abduction.solver.recorded import Support
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.log import Log
 
@@ -52,8 +53,8 @@ def test_a_certificate_is_worked_out_when_asked_for(length: int) -> None:
     trace = wandering(2, rooms=5, length=length, views=3)
     search = Search(trace, Theory.causal(), max_maps=1)
     solution = search.solution(tuple(search))
-    assert solution.basis is not None
-    assert "certificate" not in vars(solution.basis)
+    assert solution.support.basis is not None
+    assert "certificate" not in vars(solution.support.basis)
     log = Log(trace, search.theory)
     certificate = solution.certificate
     assert certificate is not None
@@ -73,17 +74,17 @@ def test_a_solution_travels_with_its_certificate(asked: bool) -> None:
         assert solution.certificate is not None
     copy = pickle.loads(pickle.dumps(solution))
     assert copy == solution
-    assert hash(copy.basis) == hash(solution.basis)
+    assert hash(copy.support.basis) == hash(solution.support.basis)
     assert copy.certificate == solution.certificate
-    assert replace(solution, prefix=0).certificate == solution.certificate
-    assert replace(solution, basis=None).certificate is None
-    assert replace(solution, basis=None).certificate is None
+    assert replace(solution, effort=replace(solution.effort, prefix=0)).certificate == solution.certificate
+    assert replace(solution, support=Support()).certificate is None
+    assert replace(solution, support=Support()).certificate is None
 
 
 def test_a_theory_without_what_it_rests_on_has_no_certificate() -> None:
     trace = wandering(2, rooms=5, length=5, views=3)
     solution = solve(trace, Theory.causal().replace(without=("deterministic",)))
-    assert (solution.basis, solution.certificate) == (None, None)
+    assert (solution.support.basis, solution.certificate) == (None, None)
 
 
 def test_a_mapper_gives_a_certificate() -> None:

@@ -13,6 +13,7 @@ from strategies import FOREIGN, TOYS, theories, traces
 from ssh_abduction import solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver import choosing
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver import search as solver
 from ssh_abduction.theory.theory import Count, Theory
@@ -49,10 +50,10 @@ def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
     # The traces are shorter than the solver's first prefix: a shorter one makes it replay and extend.
     first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
     first_paths = data.draw(st.sampled_from([1, 2, prefixes.FIRST_PATHS]), label="first paths")
-    few_steps = data.draw(st.sampled_from([0, solver.FEW_STEPS]), label="few steps")
+    few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
     with (
         patch.multiple(prefixes, FIRST_PREFIX=first_prefix, FIRST_PATHS=first_paths),
-        patch.object(solver, "FEW_STEPS", few_steps),
+        patch.object(choosing, "FEW_STEPS", few_steps),
     ):
         agree(trace, theory)
 

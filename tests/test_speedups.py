@@ -22,6 +22,7 @@ from strategies import traces
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import SolverError
+from ssh_abduction.solver import choosing
 from ssh_abduction.solver import Search, Status
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp import facts
@@ -89,7 +90,7 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(
         SPARES=spares,
         MORE_LINKS=2,
     )
-    with settings, fewer, patch.object(solver, "FEW_STEPS", 0):
+    with settings, fewer, patch.object(choosing, "FEW_STEPS", 0):
         found = solve(trace, Theory.causal(), max_maps=None, speedups=Speedups.without(off))
     assert found.status is expected.status is Status.OPTIMAL
     assert found.cost == expected.cost
@@ -152,7 +153,7 @@ CASES = {
 def hurried() -> Iterator[None]:
     """What is done only where a search takes its time is done at once."""
     with (
-        patch.multiple(solver, FEW_STEPS=0, FRAME_AFTER=-1.0),
+        patch.multiple(choosing, FEW_STEPS=0, FRAME_AFTER=-1.0),
         patch.multiple(named, PATIENCE=0, CORES=0),
         patch.multiple(framed, SOON=-1.0, GUESS_FIRST=-1.0),
         patch.object(annealing, "ANNEALED", ((0.5, 50),)),
@@ -192,7 +193,7 @@ def test_as_many_maps_as_asked_for(most: int) -> None:
         ["travel", "right", "travel", "left", "right", "right", "travel"] + ["travel", "left"] * 3,
     )
     every = solve(trace, Theory.causal(), max_maps=None, speedups=PLAIN)
-    with patch.object(solver, "FEW_STEPS", 0):
+    with patch.object(choosing, "FEW_STEPS", 0):
         found = solve(trace, Theory.causal(), max_maps=most or None)
     assert found.count == min(most, every.count)
     assert set(found.maps) <= set(every.maps)
@@ -205,7 +206,7 @@ def test_merging_greedily_gives_a_map(trace: Trace) -> None:
     theory = Theory.causal()
     with (
         patch.object(named.NamedLabels, "grow", side_effect=KeyboardInterrupt),
-        patch.object(solver, "FEW_STEPS", 0),
+        patch.object(choosing, "FEW_STEPS", 0),
     ):
         found = solve(trace, theory)
     assert found.status is Status.FEASIBLE
@@ -252,7 +253,7 @@ def test_continuations_of_circuits(period: int) -> None:
 def test_a_search_without_greedy_merging_has_a_bound_when_time_is_over() -> None:
     """The clique is a bound before clingo has said anything."""
     trace = Trace.from_steps("abcabd", ["travel"] * 5)
-    with patch.object(solver, "FEW_STEPS", 0):
+    with patch.object(choosing, "FEW_STEPS", 0):
         search = Search(trace, Theory.causal(), speedups=Speedups.without("greedy"))
     with patch.object(named.NamedLabels, "improving", side_effect=KeyboardInterrupt):
         assert list(search) == []

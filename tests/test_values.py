@@ -273,6 +273,18 @@ def test_a_solution_survives_files(kind: str, tmp_path: Path) -> None:
     assert pickle.loads(pickle.dumps(loaded)) == solution
 
 
+def test_values_are_loaded_without_a_solver() -> None:
+    program = (
+        "import sys; from ssh_abduction import Solution, SSHMap, Theory, Trace; "
+        "from ssh_abduction.solver import Backbone, Certificate, Cost, Progress, Status; "
+        "print([name for name in ('clingo', 'networkx', 'numpy') if name in sys.modules])"
+    )
+    shown = subprocess.run(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, check=True
+    ).stdout
+    assert shown.strip() == "[]"
+
+
 def test_what_the_shell_prints_is_what_is_saved(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

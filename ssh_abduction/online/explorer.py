@@ -52,7 +52,7 @@ from ssh_abduction.online.return_doubts import ReturnDoubts
 from ssh_abduction.rivals.experiment import Experiment
 from ssh_abduction.rivals.explore import next_experiment
 from ssh_abduction.rivals.tour import next_tour
-from ssh_abduction.solver import Solution, Status, check_limit, solve
+from ssh_abduction.solver import Solution, Status, check_limit, find_backbone, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # Where nothing is left to do but the map is not proven minimal, it is solved for this many times
@@ -351,7 +351,11 @@ class Explorer:
         """Solve all steps in more time than a step has."""
         limit = None if self._time_limit is None else LONGER * self._time_limit
         mapper = self.mapper
-        return solve(mapper.trace, mapper.theory, time_limit=limit, max_maps=self._max_maps)
+        found = solve(mapper.trace, mapper.theory, time_limit=limit, max_maps=self._max_maps)
+        # Maps that are not listed may still differ from those that are.
+        if _are_alike(found.maps) and not found.complete:
+            found = replace(found, shared=find_backbone(found, time_limit=limit))
+        return found
 
     def _doubting_plan(self, best: SSHMap) -> tuple[str, ...]:
         """The actions that tell the map from one without one of its returns."""
@@ -395,11 +399,7 @@ def _is_unique(solution: Solution) -> bool:
     """Whether all minimal maps have the same dstates, and the same places."""
     if solution.status is not Status.OPTIMAL or not solution.maps:
         return False
-    maps = solution.maps
-    if (
-        len({ssh_map.labels for ssh_map in maps}) > 1
-        or len({tuple(s.place for s in ssh_map.dstates) for ssh_map in maps}) > 1
-    ):
+    if not _are_alike(solution.maps):
         return False
     if solution.complete:
         return True
@@ -410,3 +410,9 @@ def _is_unique(solution: Solution) -> bool:
         and not shared.dstates.sometimes
         and not (shared.places and shared.places.sometimes)
     )
+
+
+def _are_alike(maps: Sequence[SSHMap]) -> bool:
+    """Whether all maps have the same dstates and places."""
+    labels = {ssh_map.labels for ssh_map in maps}
+    return len(labels) <= 1 and len({tuple(s.place for s in m.dstates) for m in maps}) <= 1

@@ -11,7 +11,7 @@ from ssh_abduction.online.guesser import Guesser
 from ssh_abduction.online.incremental import IncrementalSolver
 from ssh_abduction.online.options import StepOptions
 from ssh_abduction.online.replay import MinimalMaps
-from ssh_abduction.solver import Cost, Judging, Seconds, Solution, Status
+from ssh_abduction.solver import Cost, Effort, Judging, Seconds, Solution, Status
 from ssh_abduction.theory.evidence import evidence_of, pairs_of, said_by
 from ssh_abduction.theory.theory import Theory
 
@@ -151,17 +151,19 @@ class MapKeeper:
             complete=minimal.complete,
             theory=self.theory,
             steps=steps,
-            prefix=asked.prefix,
-            basis=asked.basis,
-            seconds=Seconds(
-                time.perf_counter() - began,
-                asked.seconds.ground if was_asked else 0.0,
-                asked.seconds.solve if was_asked else 0.0,
+            effort=Effort(
+                prefix=asked.prefix,
+                seconds=Seconds(
+                    time.perf_counter() - began,
+                    asked.seconds.ground if was_asked else 0.0,
+                    asked.seconds.solve if was_asked else 0.0,
+                ),
+                evidence=said_by(
+                    evidence_of(self.theory),
+                    self.trace,
+                    {name: said["refused"] for name, said in asked.evidence.items()},
+                ),
             ),
             stopped=None if minimal.complete else asked.stopped,
-            evidence=said_by(
-                evidence_of(self.theory),
-                self.trace,
-                {name: said["refused"] for name, said in asked.evidence.items()},
-            ),
+            support=asked.support,
         )

@@ -43,7 +43,7 @@ from ssh_abduction.online.background_solve import FaultSolver
 from ssh_abduction.online.options import StepOptions
 from ssh_abduction.online.rival_maps import RivalMaps
 from ssh_abduction.online.standing import Confidence, Standing
-from ssh_abduction.solver import Judging, Seconds, Solution, Status, cost_as_counted
+from ssh_abduction.solver import Effort, Judging, Seconds, Solution, Status, cost_as_counted
 from ssh_abduction.theory.theory import Theory
 
 
@@ -139,8 +139,7 @@ class Recovery:
             complete=maps.is_complete or status is Status.UNSATISFIABLE,
             theory=self._theory,
             steps=steps,
-            prefix=solved.steps,
-            seconds=Seconds(time.perf_counter() - began, 0.0, 0.0),
+            effort=Effort(solved.steps, Seconds(time.perf_counter() - began, 0.0, 0.0)),
             stopped=None if maps.is_complete or maps.is_impossible else solved.stopped,
             partial=None if listed else self._confidence.known,
         )

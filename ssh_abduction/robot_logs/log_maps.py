@@ -12,7 +12,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from statistics import median
 from typing import Any
@@ -25,7 +25,7 @@ from ssh_abduction.data.logs import log_of
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import report
-from ssh_abduction.solver import Solution, Status
+from ssh_abduction.solver import Solution, Status, find_backbone
 from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
@@ -114,6 +114,9 @@ class LogMap:
     def files(self) -> dict[str, bytes]:
         """The folder of a run, by name: trace.jsonl, maps.json, page.html, report.html and run.json, which comes last."""
         trace, solution = self.imported.trace, self.solution
+        if not self.interrupted:
+            shared = find_backbone(solution, trace, time_limit=self.limit)
+            solution = replace(solution, shared=shared)
         found = {
             "trace.jsonl": "".join(f"{line}\n" for line in trace.to_lines()),
             "maps.json": f"{json_line(solution.to_dict())}\n",

@@ -20,30 +20,30 @@ if TYPE_CHECKING:
     )
     from ssh_abduction.solver.asp.process import end_all, in_process
     from ssh_abduction.solver.asp.rules import check_rules
-    from ssh_abduction.solver.engines.base import AT_ONCE, Cost, Task, cost_as_counted
-    from ssh_abduction.solver.engines.doubts import Sort
+    from ssh_abduction.solver.engines.base import AT_ONCE, Task
     from ssh_abduction.solver.engines.framed import FramedEngine
+    from ssh_abduction.solver.entry import find_backbone, solve
     from ssh_abduction.solver.front import Front, Point, fault_front
     from ssh_abduction.solver.guesses.tree import Sketch
     from ssh_abduction.solver.judging import InternalError, Judging
     from ssh_abduction.solver.ranking import Ranking
     from ssh_abduction.solver.recorded import theory_in
-    from ssh_abduction.solver.result import (
+    from ssh_abduction.solver.result import Solution
+    from ssh_abduction.solver.search import Search
+    from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, Sharing, Sort, stretches
+    from ssh_abduction.solver.steps.certificate import RESTS_ON, Certificate
+    from ssh_abduction.solver.steps.log import Outcome, observation
+    from ssh_abduction.solver.values import (
         Bound,
+        Cost,
+        Effort,
         Level,
         Progress,
         Seconds,
-        Solution,
         Status,
-        ending,
-        opening,
-        summary_of,
-        written_map,
+        cost_as_counted,
     )
-    from ssh_abduction.solver.search import Search, solve
-    from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, Sharing, stretches
-    from ssh_abduction.solver.steps.certificate import RESTS_ON, Certificate
-    from ssh_abduction.solver.steps.log import Outcome, observation
+    from ssh_abduction.solver.writing import ending, opening, summary_of, written_map
 
 _HOMES = {  # module: the names that this package exports from it
     "asp": (
@@ -66,12 +66,13 @@ _HOMES = {  # module: the names that this package exports from it
     "asp.rules": ("check_rules",),
     "engines.base": (
         "AT_ONCE",
-        "Cost",
         "Task",
-        "cost_as_counted",
     ),
-    "engines.doubts": ("Sort",),
     "engines.framed": ("FramedEngine",),
+    "entry": (
+        "find_backbone",
+        "solve",
+    ),
     "front": (
         "Front",
         "Point",
@@ -84,27 +85,14 @@ _HOMES = {  # module: the names that this package exports from it
     ),
     "ranking": ("Ranking",),
     "recorded": ("theory_in",),
-    "result": (
-        "ending",
-        "opening",
-        "written_map",
-        "Bound",
-        "Level",
-        "Progress",
-        "Seconds",
-        "Solution",
-        "Status",
-        "summary_of",
-    ),
-    "search": (
-        "Search",
-        "solve",
-    ),
+    "result": ("Solution",),
+    "search": ("Search",),
     "sharing": (
         "SORTS",
         "Backbone",
         "Shared",
         "Sharing",
+        "Sort",
         "stretches",
     ),
     "steps.certificate": (
@@ -114,6 +102,22 @@ _HOMES = {  # module: the names that this package exports from it
     "steps.log": (
         "Outcome",
         "observation",
+    ),
+    "values": (
+        "Bound",
+        "Cost",
+        "Effort",
+        "Level",
+        "Progress",
+        "Seconds",
+        "Status",
+        "cost_as_counted",
+    ),
+    "writing": (
+        "ending",
+        "opening",
+        "summary_of",
+        "written_map",
     ),
 }
 __all__ = [
@@ -125,6 +129,7 @@ __all__ = [
     "Bound",
     "Certificate",
     "Cost",
+    "Effort",
     "FramedEngine",
     "Front",
     "InternalError",
@@ -153,6 +158,7 @@ __all__ = [
     "ending",
     "facts",
     "fault_front",
+    "find_backbone",
     "has_processors",
     "in_process",
     "observation",

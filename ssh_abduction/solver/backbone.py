@@ -39,16 +39,22 @@ SHOWN_ONCE = frozenset({"one_place", "one_course"})
 
 
 class Rivals:
-    """The minimal maps of a trace, as far as they are known, and what it takes to find out about the others.
+    """The minimal maps of a trace that are known, and what is known of the others.
 
-    sharing  what the known ones share
-    listed   whether these are all
-    engine   what they were asked of
-    reasons  whether it may be asked what those share that are not listed
+    Attributes:
+        sharing: What the known maps share.
+        listed: Whether there are no others.
+        engine: The engine that found them.
+        reasons: Whether that engine can say what the maps that are not listed share.
     """
 
     def __init__(self, task: Task, judging: Judging) -> None:
-        """No minimal map is known yet. The task is that of the search which lists them."""
+        """No minimal map is known yet.
+
+        Args:
+            task: The task of the search that lists the maps.
+            judging: Says which maps the evidence refuses.
+        """
         self.sharing = Sharing()
         self.listed = False
         self.engine: Engine | None = None
@@ -56,34 +62,20 @@ class Rivals:
         self._task, self._judging = task, judging
         self._cost: tuple[int, ...] = ()
         self._proven = False
-        self._reasoned = False
-
-    def __getstate__(self) -> dict[str, object]:
-        """What is known goes to other processes; what it takes to find out more does not."""
-        return {
-            "sharing": self.sharing,
-            "listed": self.listed,
-            "engine": None,
-            "_proven": self._proven,
-            "_reasoned": True,
-        }
 
     def add(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-        """Take in a minimal map, and what it costs: the preferred counts, first to last."""
+        """Take in a minimal map and its preferred counts."""
         self._cost = cost
         self.sharing.absorb(ssh_map)
 
-    def reason(self, *, anew: bool = False) -> None:
-        """Find out, once, what all minimal maps share, unless all are listed. It ends when a limit of the search is over, or with Ctrl-C.
+    def reason(self) -> None:
+        """Find out what all minimal maps share, unless all are listed.
 
-        anew  whether the limits begin anew, as the search is over
+        It ends early when a limit of the search is over, or with Ctrl-C.
         """
-        if self.listed or self._reasoned or not self.reasons or not self.sharing.maps:
+        if self.listed or self._proven or not self.reasons or not self.sharing.maps:
             return
-        self._reasoned = True
         _log.info("what all minimal maps share is sought, from %d of them", self.sharing.maps)
-        if anew:
-            self._task.watch.begin_anew()
         with suppress(LimitError, StageTimeError, KeyboardInterrupt):
             self._proven = prove_backbone(
                 self._task, self._judging, self._cost, self.sharing, self.engine
@@ -93,7 +85,7 @@ class Rivals:
 
     @property
     def backbone(self) -> Backbone | None:
-        """What the minimal maps share that are known; None where none is."""
+        """What the known minimal maps share; None where none is known."""
         return (
             self.sharing.backbone(proven=self.listed or self._proven) if self.sharing.maps else None
         )
@@ -106,13 +98,22 @@ def prove_backbone(
     sharing: Sharing,
     engine: Engine | None = None,
 ) -> bool:
-    """Let minimal maps be taken in until those share only what all minimal maps of the trace share. Raises LimitError.
+    """Find minimal maps until those found share only what all minimal maps of the trace share.
 
-    cost     what minimal maps cost: the preferred counts, first to last
-    sharing  what one minimal map or more share
-    engine   what found that they are minimal, if that is still at hand
+    Args:
+        task: The task of the search.
+        judging: Says which maps the evidence refuses.
+        cost: The preferred counts of minimal maps, the most important one first.
+        sharing: What the known minimal maps share, of which there is at least one. The maps that
+            are found are added.
+        engine: The engine that proved them minimal, if it is still at hand.
 
-    Returns whether that is proven. It cannot be for a theory in which a dstate may be at several places, or along several courses.
+    Returns:
+        Whether it is proven. This is impossible for a theory in which a dstate may be at several
+        places, or along several courses.
+
+    Raises:
+        LimitError: A limit of the search is over.
     """
     if SHOWN_ONCE & task.theory.given_up:
         return False

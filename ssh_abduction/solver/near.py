@@ -21,7 +21,7 @@ from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.prefixes import Prefixes
-from ssh_abduction.solver.result import Status
+from ssh_abduction.solver.values import Status
 from ssh_abduction.theory.theory import Count, Theory
 
 

@@ -1,4 +1,4 @@
-"""What a file says of a solution, read field by field: what is not as it was written is an error that names the field."""
+"""Read a solution's JSON field by field. An error names the field that is wrong."""
 
 from __future__ import annotations
 
@@ -8,35 +8,31 @@ from typing import Any
 
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.fields import FieldReader
-from ssh_abduction.solver.asp.control import Grounding
-from ssh_abduction.solver.engines.base import Cost
 from ssh_abduction.solver.sharing import Backbone
-from ssh_abduction.solver.steps.certificate import Certificate
+from ssh_abduction.solver.steps.certificate import Basis, Certificate
+from ssh_abduction.solver.values import Bound, Cost, Effort, Grounding, Level, Seconds
 from ssh_abduction.theory.theory import COUNTS, Theory
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What a file says of a solution that only its search, or its trace, could tell anew.
+    """What a file says of a solution, and only its search or its trace could compute again.
 
-    certificate          why no map has fewer dstates
-    written_certificate  the same as the file has it, with the words that show it
-    backbone             what the minimal maps share; None where the file has not all of it
-    listed               whether all minimal maps are listed
-    warnings             what makes the trace suspicious, a sentence each
-    explanation          why there is no map
+    Attributes:
+        certificate: Why no map has fewer dstates.
+        written_certificate: The certificate as the file has it, with the words that show it.
+        warnings: What makes the trace suspicious, a sentence each.
+        explanation: Why there is no map.
     """
 
     certificate: Certificate | None
     written_certificate: Mapping[str, Any] | None
-    backbone: Backbone | None
-    listed: bool
     warnings: tuple[str, ...]
     explanation: Mapping[str, Any] | None
 
     @classmethod
     def of(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Recorded:
-        """What a record, of a solution for so many steps, says. Raises MapError."""
+        """Read a record of a solution for a trace of `steps` steps. Raises MapError."""
         written = (
             None
             if record.get("certificate") is None
@@ -49,15 +45,42 @@ class Recorded:
         return cls(
             certificate=None if written is None else _certificate(read, written, steps),
             written_certificate=written,
-            backbone=None
-            if record.get("backbone") is None
-            else Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone"),
-            listed=record.get("minimal_listed", record.get("complete")) is True,
             warnings=tuple(warnings),
             explanation=None
             if record.get("explanation") is None
             else read.mapping(record["explanation"], "explanation"),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Support:
+    """What backs a solution up: its certificate, and warnings about its trace.
+
+    Attributes:
+        basis: What the certificate is computed from. None where the theory lacks an axiom that
+            the certificate rests on.
+        odometry_warning: What is wrong with the odometry: the best map contradicts its noise, or
+            displacements do not distinguish travel from standing still.
+        recorded: What the file says, in a solution that was read from one.
+    """
+
+    basis: Basis | None = None
+    odometry_warning: str | None = None
+    recorded: Recorded | None = None
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """Why no map has fewer dstates. Computed when it is first asked for."""
+        if self.recorded is not None:
+            return self.recorded.certificate
+        return self.basis.certificate if self.basis else None
+
+
+def backbone_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> Backbone | None:
+    """What the minimal maps share; None where the file does not say so. Raises MapError."""
+    if record.get("backbone") is None:
+        return None
+    return Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone")
 
 
 def _certificate(read: FieldReader, written: Mapping[str, Any], steps: int) -> Certificate:
@@ -93,7 +116,7 @@ def _whole(read: FieldReader, value: Any, name: str) -> int:
 
 
 def theory_in(value: Any, where: str) -> Theory:
-    """The theory that a solution is of. Raises MapError."""
+    """The theory of a solution. Raises MapError."""
     try:
         return Theory.from_dict(value)
     except TheoryError as error:
@@ -109,69 +132,59 @@ def cost_in(read: FieldReader, value: Any, name: str) -> Cost:
     return Cost(**counts, faults=_positive(read, record.get("faults", 0.0), f"{name}.faults"))
 
 
-def bound_in(read: FieldReader, value: Any) -> dict[str, int]:
-    """The counts that are bounded, with their bounds. Raises MapError."""
+def bound_in(read: FieldReader, value: Any) -> Bound:
+    """The proven lower bounds. Raises MapError."""
     record = read.mapping(value, "bound")
     counts = {str(k): _whole(read, v, f"bound.{k}") for k, v in record.items() if k in COUNTS}
     if unknown := set(record) - {*counts, "cost"}:
         raise read.wrong("bound", f"numbers of {', '.join(COUNTS)}, or a cost", sorted(unknown))
-    return counts | (
-        {"tenths": round(10 * _positive(read, record["cost"], "bound.cost"))}
-        if "cost" in record
-        else {}
+    if "cost" in record:
+        counts["tenths"] = round(10 * _positive(read, record["cost"], "bound.cost"))
+    return Bound(**counts)
+
+
+def effort_in(read: FieldReader, record: Mapping[str, Any]) -> Effort:
+    """What the search did. Raises MapError."""
+    prefix = read.integer(record.get("prefix", 0), "prefix")
+    times = read.mapping(record.get("seconds", {}), "seconds")
+    seconds = Seconds(
+        *(_positive(read, times.get(k, 0.0), f"seconds.{k}") for k in ("total", "ground", "solve"))
     )
-
-
-def seconds_in(read: FieldReader, value: Any) -> tuple[float, float, float]:
-    """The seconds in all, for grounding and for solving. Raises MapError."""
-    record = read.mapping(value, "seconds")
-    total, ground, solve = (
-        _positive(read, record.get(k, 0.0), f"seconds.{k}") for k in ("total", "ground", "solve")
+    sizes = read.mapping(record.get("grounding", {}), "grounding")
+    grounding = Grounding(
+        *(_whole(read, sizes.get(k, 0), f"grounding.{k}") for k in ("rules", "atoms"))
     )
-    return total, ground, solve
-
-
-def grounding_in(read: FieldReader, value: Any) -> Grounding:
-    """How large the ground program was. Raises MapError."""
-    record = read.mapping(value, "grounding")
-    return Grounding(
-        *(_whole(read, record.get(k, 0), f"grounding.{k}") for k in ("rules", "atoms"))
-    )
-
-
-def evidence_in(read: FieldReader, value: Any) -> dict[str, dict[str, int]]:
-    """For each kind of evidence what it excluded. Raises MapError."""
-    return {
+    evidence = {
         kind: {
             k: _whole(read, v, f"evidence.{kind}.{k}")
             for k, v in read.mapping(said, f"evidence.{kind}").items()
         }
-        for kind, said in read.mapping(value, "evidence").items()
+        for kind, said in read.mapping(record.get("evidence", {}), "evidence").items()
     }
+    return Effort(prefix, seconds, grounding, evidence)
 
 
-def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> list[tuple[Cost, int]]:
-    """What maps of each level cost, and how many there are: one level of all maps, where the file names none. Raises MapError."""
+def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> tuple[Level, ...]:
+    """The levels of the maps: one level of all maps, where the file names none. Raises MapError."""
+    complete = record.get("minimal_listed", record.get("complete")) is True
     if "levels" not in record:
-        return (
-            [(cost_in(read, record["cost"], "cost"), maps)]
-            if maps and record.get("cost") is not None
-            else []
-        )
+        if not maps or record.get("cost") is None:
+            return ()
+        return (Level(cost_in(read, record["cost"], "cost"), maps, complete),)
     levels = [
         read.mapping(level, f"levels[{i}]") for i, level in enumerate(read.list(record, "levels"))
     ]
-    found = [
-        (
+    found = tuple(
+        Level(
             cost_in(read, level.get("cost"), f"levels[{i}].cost"),
             _whole(read, level.get("count"), f"levels[{i}].count"),
+            complete,
         )
         for i, level in enumerate(levels)
-    ]
-    if sum(count for _, count in found) != maps:
-        raise read.wrong(
-            "levels", f"{maps} maps in all, as so many are listed", [count for _, count in found]
-        )
+    )
+    counts = [level.count for level in found]
+    if sum(counts) != maps:
+        raise read.wrong("levels", f"{maps} maps in all, as so many are listed", counts)
     return found
 
 

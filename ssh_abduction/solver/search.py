@@ -1,10 +1,4 @@
-"""Every minimal map of a trace.
-
->>> from ssh_abduction import Theory, Trace, solve
->>> trace = Trace.from_steps(views=["end", "end", "end"], actions=["travel", "around"])
->>> solution = solve(trace, Theory.topological())
->>> solution.status.value, solution.cost.dstates, solution.complete
-('optimal', 3, True)
+"""The search for every minimal map of a trace.
 
 Solving for a prefix, replaying to the end
 ------------------------------------------
@@ -55,83 +49,46 @@ from ssh_abduction.data.logs import PROGRESS, log_of
 from ssh_abduction.data.maps import SSHMap, checked_map, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
-from ssh_abduction.solver import prefixes
-from ssh_abduction.solver.asp import facts
-from ssh_abduction.solver.asp.control import Grounding
+from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop, Watch, check_limit
 from ssh_abduction.solver.asp.rules import check_rules
 from ssh_abduction.solver.backbone import Rivals
 from ssh_abduction.solver.candidates import FRAMING_SHARE, Candidates
-from ssh_abduction.solver.engines.base import AT_ONCE, Cost, Engine, Found, Task, cost_as_counted
+from ssh_abduction.solver.choosing import may_name, new_engine, takes_all
+from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.ranking import Ranking, in_order, noise_warning, units_warning
-from ssh_abduction.solver.result import Bound, Level, Progress, Seconds, Solution, Status
+from ssh_abduction.solver.recorded import Support
+from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.solver.steps.certificate import Basis
+from ssh_abduction.solver.values import (
+    Bound,
+    Cost,
+    Effort,
+    Grounding,
+    Level,
+    Progress,
+    Seconds,
+    Status,
+    cost_as_counted,
+)
 from ssh_abduction.theory.evidence import evidence_of, said_by
 from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-FEW_STEPS = (
-    24  # Traces up to this length skip names and greedy maps: solving them directly is faster.
-)
 ONE_MORE = 1.0  # For so many seconds one more map is sought where as many as asked for are known: it says whether the list is complete.
 ONE_MORE_SHARE = 0.1  # Or for such a share of the time that these took, if that is more, so that it is never a large part of the search.
-SETTLE_AFTER = 0.15  # After so many seconds step by step it is looked whether the dstates are known without a search: to look loads numpy.
-FRAME_AFTER = 1.0  # After so many seconds step by step a map with frames is sought, where the theory does not ask for one: most traces are solved by then.
-READABLE = 60  # Traces up to so many steps are given to the readable encodings, which know places and faults; longer ones would take more memory than there is.
 SHORTEST = 0.05  # A trace that was mended has so many seconds at least.
 # To make some map where a search was stopped without one, or to check it, may take so many seconds beyond the limit, and such a share of it.
 OVERTIME, OVERTIME_SHARE = 0.5, 0.05
 INTERRUPTED = 0.6  # Or so many seconds after Ctrl-C, or where memory is over.
 REASONING = 5.0  # For so many seconds it is sought what all minimal maps share, where the search took less and has no time limit.
 _log = log_of(__name__)
-
-
-@renamed_parameters("limit", "maps", "memory")
-def solve(
-    trace: Trace,
-    theory: Theory | None = None,
-    *,
-    time_limit: float | None = None,
-    max_maps: int | None = 100,
-    within: int = 0,
-    memory_limit: int | None = None,
-    speedups: Speedups = ALL,
-    on_progress: Callable[[Progress], None] | None = None,
-) -> Solution:
-    """Find the minimal maps of a trace.
-
-    theory       which axioms and which preference; Theory.topological() by default
-    time_limit   seconds of wall-clock time; when they are over, the best answer so far is returned
-    max_maps     list at most so many maps; None lists all (take `Search` to stream them). Where there are so many, one more is sought for a second,
-                 or a tenth of the time so far: only if that ends the answer is complete
-    within       list maps with up to so many dstates more than the least, too: for each number of dstates the maps that are minimal among those with just so
-                 many, in the order of these numbers. Where the theory prefers few paths or places first, these are counted instead
-    memory_limit MiB of memory that the process may use at its peak before the search stops
-    speedups     which speed-ups are on; none changes the answer
-    on_progress  is told now and then how far the search is
-
-    Ctrl-C ends the search like a limit does. Raises TraceError or TheoryError where the trace lacks what the theory needs.
-    Source: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
-    """
-    theory = checked_theory(theory)
-    theory.check_steps(checked_trace(trace))
-    search = Search(
-        trace,
-        theory,
-        time_limit=time_limit,
-        max_maps=max_maps,
-        within=within,
-        memory_limit=memory_limit,
-        speedups=speedups,
-        on_progress=on_progress,
-    )
-    return search.solution(tuple(search))
 
 
 class Search:
@@ -223,7 +180,7 @@ class Search:
         self._judging = Judging(trace, self.theory)
         self._rivals = Rivals(self._task, self._judging)
         self._candidates = Candidates(self._task, self._known, self._judging, self._report)
-        engine = self._engine_after(after) if after else self._new_engine()
+        engine = self._engine_after(after) if after else new_engine(self._task)
         self._prefixes = Prefixes(
             self._task, self._known, self._judging, engine, most, self._report
         )
@@ -235,36 +192,12 @@ class Search:
         best = f", best {counted(len(self.best.dstates), 'dstates')}" if self.best else ""
         return f"<Search of {counted(len(self.trace), 'steps')}: {self.status.value}{best}, {counted(self.count, 'maps')} given>"
 
-    def _new_engine(self) -> Engine:
-        """The engine that suits the theory and the length of the trace."""
-        if self._may_name():  # loads numpy, which takes longer than to solve a short trace
-            from ssh_abduction.solver.engines.causal import CausalEngine
-            from ssh_abduction.solver.engines.faulty import FaultyEngine
-            from ssh_abduction.solver.engines.framed import FramedEngine
-
-            if row("named dstates with faults").holds_for(self.theory):
-                return FaultyEngine(self._task)
-            if not self.theory.has_faults:
-                return (
-                    CausalEngine(self._task)
-                    if self.theory.level == "causal"
-                    else FramedEngine(self._task)
-                )
-        most = facts.most_paths(self.trace, self.theory, len(self.trace))
-        return StepEngine(
-            self._task, min(prefixes.FIRST_PATHS, most) if self._task.speedups.path_names else most
-        )
-
-    def _may_name(self) -> bool:
-        """Whether the theory lets dstates be settled before all else, and the trace is long enough for that to pay."""
-        return self._task.speedups.names and len(self.trace) > FEW_STEPS
-
     def _engine_after(self, after: Search) -> Engine:
         """The engine of a search of the first steps, which goes on; or a new one, where that one cannot, or was left half told."""
         self._watch.use_reserve()
         before = after._prefixes.engine
-        outgrown = not before.goes_on or (isinstance(before, StepEngine) and self._may_name())
-        engine = self._new_engine() if outgrown else before.over(self._task)
+        outgrown = not before.goes_on or (isinstance(before, StepEngine) and may_name(self._task))
+        engine = new_engine(self._task) if outgrown else before.over(self._task)
         half_told = (
             after.stopped == "interrupted" or not engine.intact
         )  # perhaps while a step was grounded
@@ -399,35 +332,33 @@ class Search:
 
     def _make_first_map(self) -> None:
         """Make a causal map at once, that clingo has to better."""
-        if self.status is not Status.OPTIMAL and len(self.trace) > FEW_STEPS:
+        if self.status is not Status.OPTIMAL and len(self.trace) > choosing.FEW_STEPS:
             self._candidates.merge()
 
     def _find_minimum(self) -> None:
         """Find the minimal cost; where that takes long, seek maps with frames first, and go on with an engine that settles dstates first."""
         engine, steps = self._prefixes.engine, len(self.trace)
-        if row("mending").holds_for(self.theory) and self._may_name() and self._mend():
+        if row("mending").holds_for(self.theory) and may_name(self._task) and self._mend():
             return
-        if self._mends and len(self.trace) > READABLE:
+        if self._mends and len(self.trace) > choosing.READABLE:
             raise LimitError("no proof")
         if self.status is Status.OPTIMAL:  # a map that another search proved
             if not engine.size:
                 engine.grow(steps if engine.lists_least else min(steps, prefixes.FIRST_PREFIX))
             return
-        takes_all = (
-            isinstance(engine, StepEngine) and not self._goes_on and FEW_STEPS < steps <= AT_ONCE
-        )
+        takes_all = isinstance(engine, StepEngine) and not self._goes_on and takes_all(self._task)
         may_frame = takes_all and self._task.speedups.framing
         may_settle = takes_all and self._task.speedups.ways and self._asked_speedups.names
         if (
             may_settle
-            and not self._find_minimum_soon(min(SETTLE_AFTER, FRAME_AFTER))
+            and not self._find_minimum_soon(min(choosing.SETTLE_AFTER, choosing.FRAME_AFTER))
             and self._candidates.sketch_least()
         ):
             self._settle_dstates_first()
         elif (
             (may_frame or may_settle)
             and self.status is Status.UNKNOWN
-            and not self._find_minimum_soon(FRAME_AFTER)
+            and not self._find_minimum_soon(choosing.FRAME_AFTER)
         ):
             _log.info("no minimum after %.1f s step by step", self._watch.elapsed())
             if may_frame:
@@ -672,30 +603,35 @@ class Search:
         basis = self._basis or self._basis_of(
             len(self.trace) if ran_out else self._prefixes.engine.size
         )
+        levels = tuple(self._levels)
+        if self._rivals.listed:
+            levels = tuple(replace(level, complete=True) for level in levels)
+        odometry_warning = None
+        if self._first and self._first.fit:
+            odometry_warning = units_warning(self.trace) or noise_warning(
+                self._first.fit, self.trace
+            )
         return Solution(
             status=self.status,
             maps=maps,
-            cost=self._levels[0].cost if self._levels else self._known.best_cost,
+            cost=levels[0].cost if levels else self._known.best_cost,
             bound=self.bound,
             complete=self.complete,
             theory=self.theory,
             steps=len(self.trace),
-            prefix=self.prefix,
-            basis=basis,
-            seconds=Seconds(self._watch.elapsed(), asker.ground_seconds, asker.solve_seconds),
+            effort=Effort(
+                self.prefix,
+                Seconds(self._watch.elapsed(), asker.ground_seconds, asker.solve_seconds),
+                grounding,
+                said_by(evidence_of(self.theory), self.trace, self._known.refused),
+            ),
             stopped=self.stopped,
             partial=None if self.best else self._known.partial,
             within=self.within,
-            levels=tuple(self._levels),
-            rivals=self._rivals,
+            levels=levels,
+            shared=self._rivals.backbone,
             trace=self.trace,
-            grounding=grounding,
-            evidence=said_by(evidence_of(self.theory), self.trace, self._known.refused),
-            odometry_warning=(
-                units_warning(self.trace) or noise_warning(self._first.fit, self.trace)
-            )
-            if self._first and self._first.fit
-            else None,
+            support=Support(basis, odometry_warning),
         )
 
     def _in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:

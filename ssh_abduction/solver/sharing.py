@@ -23,9 +23,9 @@ from ssh_abduction.data.checks import a_text, a_whole_number
 from ssh_abduction.data.errors import MapError, brief, is_whole
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.words import counted
-from ssh_abduction.solver.engines.doubts import Sort
 
 Pair: TypeAlias = tuple[int, int]
+Sort: TypeAlias = Literal["dstates", "places", "paths", "courses"]
 
 SORTS: tuple[Sort, ...] = ("dstates", "places", "paths", "courses")
 # So many pairs of steps are printed, at most: more say little that the numbers of `always` do not.

@@ -15,6 +15,7 @@ import clingo
 
 from ssh_abduction.data.logs import log_of
 from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch, peak_memory
+from ssh_abduction.solver.values import Grounding
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import Speedups
 
@@ -27,14 +28,6 @@ _log = log_of(__name__)
 _ONE = clingo.Number(1)
 _grounding = threading.Lock()
 _under_way: set[clingo.SolveHandle] = set()  # the searches that clingo does now, each in a thread
-
-
-@dataclass(frozen=True, slots=True)
-class Grounding:
-    """How large a ground program is."""
-
-    rules: int
-    atoms: int
 
 
 @atexit.register

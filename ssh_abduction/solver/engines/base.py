@@ -6,69 +6,21 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.control import Asker, has_processors
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.speedups import Speedups
-from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.theory.theory import Theory
 
 # An engine with a chart tries a prefix of so many steps before one of AT_ONCE steps: most traces are settled by then.
 FIRST_PREFIXES = 32
 # So many steps, at most, are compared in pairs: the matrix of the pairs has the square of that many bytes.
 AT_ONCE = 8000
-
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """How many dstates, places, paths and excused pairs of paths a map has, and how many dstates its faults cost."""
-
-    dstates: int
-    places: int
-    paths: int
-    excuses: int = 0
-    faults: float = 0.0
-
-    @staticmethod
-    def of(ssh_map: SSHMap) -> Cost:
-        checked_map(ssh_map)
-        faults = sum(round(10 * fault.cost) for fault in ssh_map.faults) / 10
-        return Cost(
-            len(ssh_map.dstates),
-            len(ssh_map.places),
-            len(ssh_map.paths),
-            len(ssh_map.excused),
-            faults,
-        )
-
-    @property
-    def tenths(self) -> int:
-        """Tenths of dstates that the dstates and the faults cost together."""
-        return 10 * self.dstates + round(10 * self.faults)
-
-    def preferred_by(self, theory: Theory) -> tuple[int, ...]:
-        """The counts that a theory prefers, first to last."""
-        return tuple(getattr(self, name) for name in checked_theory(theory).priorities)
-
-    def to_dict(self) -> dict[str, float]:
-        counts: dict[str, float] = {
-            "dstates": self.dstates,
-            "places": self.places,
-            "paths": self.paths,
-        }
-        counts |= {"excuses": self.excuses} if self.excuses else {}
-        return {**counts, "faults": self.faults} if self.faults else counts
-
-
-def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> Cost:
-    """The counts of a map: those that the theory prefers as clingo counted them, since it may count more than the map can show where axioms are left out."""
-    counted = {
-        name: count for name, count in zip(theory.priorities, cost, strict=True) if name != "tenths"
-    }
-    return replace(Cost.of(ssh_map), **counted)
 
 
 @dataclass(frozen=True, slots=True)

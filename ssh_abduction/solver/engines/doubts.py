@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from contextlib import closing
-from typing import Literal, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 import clingo
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.sharing import Sort
 
 Answer = TypeVar("Answer")
-Sort: TypeAlias = Literal["dstates", "places", "paths", "courses"]
 # That two steps, or two dstates of some labels, are one after all (True), or are not (False): as to their dstate, place, path, or course.
 Doubt: TypeAlias = tuple[Sort, int, int, bool]
 

@@ -1,0 +1,54 @@
+"""Choose the engine for a theory and a trace."""
+
+from __future__ import annotations
+
+from ssh_abduction.solver import prefixes
+from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.engines.base import AT_ONCE, Engine, Task
+from ssh_abduction.solver.engines.stepwise import StepEngine
+from ssh_abduction.theory.speedups import row
+
+# Traces with at most this many steps are solved directly, which is faster than naming dstates or
+# merging steps first.
+FEW_STEPS = 24
+# Traces of at most this many steps are given to the readable encodings, which know places and
+# faults. Longer ones would take too much memory.
+READABLE = 60
+# After this many seconds with the step engine, check whether the dstates are known without a
+# search. The check loads numpy.
+SETTLE_AFTER = 0.15
+# After this many seconds with the step engine, look for a map in which places have frames. Most
+# traces are solved by then.
+FRAME_AFTER = 1.0
+
+
+def may_name(task: Task) -> bool:
+    """Whether dstates can be settled before places and paths, and the trace is long enough."""
+    return task.speedups.names and len(task.trace) > FEW_STEPS
+
+
+def takes_all(task: Task) -> bool:
+    """Whether an engine for named dstates could take the whole trace."""
+    return FEW_STEPS < len(task.trace) <= AT_ONCE
+
+
+def new_engine(task: Task) -> Engine:
+    """The engine for the theory and the length of the trace. It was given no steps yet."""
+    if may_name(task):
+        # Imported here, as loading numpy takes longer than solving a short trace.
+        from ssh_abduction.solver.engines.causal import CausalEngine
+        from ssh_abduction.solver.engines.faulty import FaultyEngine
+        from ssh_abduction.solver.engines.framed import FramedEngine
+
+        if row("named dstates with faults").holds_for(task.theory):
+            return FaultyEngine(task)
+        if not task.theory.has_faults:
+            return CausalEngine(task) if task.theory.level == "causal" else FramedEngine(task)
+    return step_engine(task)
+
+
+def step_engine(task: Task) -> StepEngine:
+    """The engine that takes any theory. It begins with few names for paths, if that is allowed."""
+    most = facts.most_paths(task.trace, task.theory, len(task.trace))
+    names = min(prefixes.FIRST_PATHS, most) if task.speedups.path_names else most
+    return StepEngine(task, names)

@@ -1,0 +1,171 @@
+"""The functions that users call: `solve`, and `find_backbone`.
+
+>>> from ssh_abduction import Theory, Trace, solve
+>>> trace = Trace.from_steps(views=["end", "end", "end"], actions=["travel", "around"])
+>>> solution = solve(trace, Theory.topological())
+>>> solution.status.value, solution.cost.dstates, solution.complete
+('optimal', 3, True)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+
+from ssh_abduction.data.checks import an_instance
+from ssh_abduction.data.clock import heeding
+from ssh_abduction.data.deprecated import renamed_parameters
+from ssh_abduction.data.errors import SolverError
+from ssh_abduction.data.maps import check_of_trace
+from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
+from ssh_abduction.solver.backbone import prove_backbone
+from ssh_abduction.solver.choosing import READABLE, may_name, new_engine, takes_all
+from ssh_abduction.solver.engines.base import Engine, Task
+from ssh_abduction.solver.engines.stepwise import StepEngine
+from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.search import Search
+from ssh_abduction.solver.sharing import Backbone, Sharing
+from ssh_abduction.solver.values import Progress
+from ssh_abduction.theory.speedups import ALL, Speedups, row
+from ssh_abduction.theory.theory import Theory, checked_theory
+
+
+@renamed_parameters("limit", "maps", "memory")
+def solve(
+    trace: Trace,
+    theory: Theory | None = None,
+    *,
+    time_limit: float | None = None,
+    max_maps: int | None = 100,
+    within: int = 0,
+    memory_limit: int | None = None,
+    speedups: Speedups = ALL,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Solution:
+    """Find the minimal maps of a trace.
+
+    Ctrl-C ends the search like a limit does.
+
+    Args:
+        trace: The trace.
+        theory: The axioms and the preference; Theory.topological() by default.
+        time_limit: Seconds of wall-clock time. When they are over, the best answer so far is
+            returned.
+        max_maps: List at most this many maps; None lists all. Use `Search` to stream them. After
+            the last one, the search goes on for a second, or a tenth of the time so far, to see
+            whether there is another one. The answer is complete only if that shows there is none.
+        within: Also list maps with up to this many dstates more than the minimum: for each number
+            of dstates, the maps that are minimal among those with that number. Where the theory
+            prefers few paths or places first, these are counted instead.
+        memory_limit: MiB of memory that the process may use at its peak before the search stops.
+        speedups: The speed-ups that are on. None of them changes the answer.
+        on_progress: Called now and then with how far the search is.
+
+    Raises:
+        TraceError: The trace lacks what the theory needs.
+        TheoryError: The theory asks for what the trace does not have.
+
+    Reference:
+        Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
+    """
+    theory = checked_theory(theory)
+    theory.check_steps(checked_trace(trace))
+    search = Search(
+        trace,
+        theory,
+        time_limit=time_limit,
+        max_maps=max_maps,
+        within=within,
+        memory_limit=memory_limit,
+        speedups=speedups,
+        on_progress=on_progress,
+    )
+    return search.solution(tuple(search))
+
+
+def find_backbone(
+    solution: Solution,
+    trace: Trace | None = None,
+    *,
+    time_limit: float | None = None,
+    memory_limit: int | None = None,
+) -> Backbone | None:
+    """Find out what all minimal maps share, also those that the solution does not list.
+
+    clingo looks for minimal maps that differ from those in the solution until it has proven that
+    there is nothing more to find. That may take as long as the search did. Where the solution
+    knows the answer already, or holds no minimal map to begin with, nothing is searched.
+
+    >>> from ssh_abduction import Theory, Trace, solve
+    >>> solution = solve(Trace.load("examples/aces3-route.jsonl"), max_maps=1)
+    >>> solution.backbone.proven, find_backbone(solution).proven
+    (False, True)
+
+    Args:
+        solution: The solution.
+        trace: Its trace; only needed for a solution that was read from a file without it.
+        time_limit: Seconds of wall-clock time.
+        memory_limit: MiB of memory that the process may use at its peak.
+
+    Returns:
+        The backbone; None where no minimal map is known. It is not `proven` if a limit was over
+        or Ctrl-C was pressed before the proof, or the theory allows none.
+
+    Raises:
+        SolverError: The solution has no trace, and none is given.
+        MapError: The maps are not of the given trace.
+    """
+    an_instance("solution", solution, Solution, SolverError, mend="take what solve returned")
+    check_limit("time_limit", "seconds", time_limit)
+    check_limit("memory_limit", "MiB", memory_limit)
+    trace = solution.trace if trace is None else checked_trace(trace)
+    minimal, known = solution.minimal_maps, solution.backbone
+    if known is None or known.proven or not minimal:
+        return known
+    if trace is None:
+        raise SolverError("trace: expected the trace that was solved, got none; give it")
+    views = "functional_view" in solution.theory.hard
+    check_of_trace(minimal, trace, "solution", views=views)
+    sharing = Sharing()
+    for ssh_map in minimal:
+        sharing.absorb(ssh_map)
+    watch = Watch(time_limit, memory_limit)
+    watch.use_reserve()
+    watch.start()
+    cost, proven = solution.costs[0].preferred_by(solution.theory), False
+    with suppress(LimitError, KeyboardInterrupt), heeding(watch.check):
+        task = Task.of(trace, solution.theory, watch)
+        if _is_known_by_mending_alone(task):
+            return known
+        engine = _labelling_engine(task, solution)
+        judging = Judging(trace, solution.theory)
+        try:
+            proven = prove_backbone(task, judging, cost, sharing, engine)
+        finally:
+            if engine is not None:
+                engine.settle()
+    # The search may have seen more maps than the solution holds.
+    has_learnt = proven or sharing.maps > len(minimal)
+    return sharing.backbone(proven=proven) if has_learnt else known
+
+
+def _is_known_by_mending_alone(task: Task) -> bool:
+    """Whether the maps come from mended traces, of which no engine knows anything."""
+    mends = row("mending").holds_for(task.theory) and may_name(task)
+    return mends and len(task.trace) > READABLE
+
+
+def _labelling_engine(task: Task, solution: Solution) -> Engine | None:
+    """An engine that settles dstates before places and paths; None if the search needed none."""
+    engine = new_engine(task)
+    if isinstance(engine, StepEngine):
+        # The search needed only a prefix, or the theory has no such engine.
+        if not (takes_all(task) and task.speedups.ways and solution.prefix == solution.steps):
+            return None
+        from ssh_abduction.solver.engines.frameless import FramelessEngine  # loads numpy
+
+        engine = FramelessEngine(task, solution.maps[0].labels)
+    engine.grow(solution.prefix)
+    return engine

@@ -1,0 +1,112 @@
+"""Solutions as plain data and in words: the summary, and the JSON that `solve --json` prints."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from ssh_abduction.data.map_file import SOLUTION_FORMAT, VERSION
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver.sharing import Backbone
+from ssh_abduction.solver.values import Cost, Status
+from ssh_abduction.theory.theory import Theory
+
+if TYPE_CHECKING:
+    from ssh_abduction.solver.result import Solution
+
+
+def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str:
+    """Say in one sentence how many minimal maps there are, and where they differ.
+
+    Args:
+        solution: The solution.
+        count: The number of maps that were given. The solution need not hold them.
+        backbone: What the minimal maps share, as far as it is known.
+    """
+    if solution.status is Status.UNSATISFIABLE:
+        return "no map satisfies the axioms"
+    if backbone is None:
+        return "a map that is not proven minimal" if solution.cost else "no map was found"
+    minimal = solution.levels[0].count if solution.levels else count
+    listed = solution.minimal_listed
+    told = f"{'' if listed else 'at least '}{minimal} minimal map{'' if minimal == 1 else 's'}"
+    if not listed:
+        told += (
+            f" (listing was stopped by the {solution.stopped})"
+            if solution.stopped != "interrupted"
+            else " (listing was interrupted)"
+        )
+    # A single map differs from no other one.
+    if not (listed and minimal == 1):
+        told += f": {backbone.sentence}" + (
+            "" if backbone.proven else ", as far as was found out: others may differ in more"
+        )
+    more = sum(level.count for level in solution.levels[1:])
+    return told + (f"; and {more} with up to {solution.within} more" if more else "")
+
+
+def opening(theory: Theory, steps: int, within: int) -> dict[str, Any]:
+    """The fields of a solution's JSON that come before its maps."""
+    head = {
+        "format": SOLUTION_FORMAT,
+        "version": VERSION,
+        "theory": theory.to_dict(),
+        "steps": steps,
+    }
+    return {**head, **({"within": within} if within else {})}
+
+
+def written_map(ssh_map: SSHMap, cost: Cost | None = None) -> dict[str, Any]:
+    """A map in a solution's JSON.
+
+    Args:
+        ssh_map: The map.
+        cost: What the map costs, where not all maps cost the same.
+    """
+    return ssh_map.to_dict() | ({"cost": cost.to_dict()} if cost else {})
+
+
+def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[str, Any]:
+    """The fields of a solution's JSON that come after its maps.
+
+    Args:
+        solution: The solution.
+        count: The number of maps that were written. The solution need not hold them.
+        backbone: What the minimal maps share, as far as it is known.
+    """
+    end: dict[str, Any] = {
+        "status": solution.status.value,
+        "complete": solution.complete,
+        "count": count,
+        "cost": solution.cost.to_dict() if solution.cost else None,
+        "bound": solution.bound.to_dict(),
+        "prefix": solution.prefix,
+        "grounding": asdict(solution.grounding),
+        "seconds": {
+            k: round(getattr(solution.seconds, k), 6) for k in ("total", "ground", "solve")
+        },
+    }
+    end["summary"] = summary_of(solution, count, backbone)
+    # Fields that say nothing are left out.
+    if backbone and not (solution.minimal_listed and count == 1):
+        end["backbone"] = backbone.to_dict()
+    if solution.within:
+        end["levels"] = [level.to_dict() for level in solution.levels]
+        if solution.minimal_listed and not solution.complete:
+            end["minimal_listed"] = True
+    recorded = solution.support.recorded
+    if recorded is not None and recorded.written_certificate is not None:
+        end["certificate"] = dict(recorded.written_certificate)
+    elif solution.certificate:
+        end["certificate"] = solution.certificate.to_dict(solution.trace)
+    if solution.stopped:
+        end["stopped"] = solution.stopped
+    if solution.partial:
+        end["partial"] = solution.partial.to_dict()
+    if solution.evidence:
+        end["evidence"] = {name: dict(said) for name, said in solution.evidence.items()}
+    if solution.warnings:
+        end["warnings"] = list(solution.warnings)
+    if recorded is not None and recorded.explanation is not None:
+        end["explanation"] = dict(recorded.explanation)
+    return end
