@@ -25,15 +25,14 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, Odometry, SolverError
 from ssh_abduction.data.words import counted
 from ssh_abduction.rivals import difference
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Search, Solution, Status, find_backbone, prefixes
+from ssh_abduction.solver import Search, Solution, Status, choosing, find_backbone, prefixes
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.frameless import FramelessEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
-from ssh_abduction.solver.writing import summary_of
 from ssh_abduction.solver.sharing import Backbone, Shared
+from ssh_abduction.solver.writing import summary_of
 
 ACES3 = "examples/aces3-route.jsonl"
 LIMIT = 100  # seconds: a search that does not end is a failure, not a hang
@@ -100,24 +99,24 @@ def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
     # Engines that settle dstates first are for longer traces, and those for places without frames only where clingo takes its time.
     few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
     frame_after = data.draw(st.sampled_from([0.0, choosing.FRAME_AFTER]), label="frame after")
-    patches = {
-        "FEW_STEPS": few_steps,
-        "FRAME_AFTER": frame_after,
-        "ONE_MORE": 0.0,
-        "ONE_MORE_SHARE": 0.0,
-    }
-    with patch.object(prefixes, "FIRST_PREFIX", first_prefix), patch.multiple(choosing, **patches):
+    with (
+        patch.object(prefixes, "FIRST_PREFIX", first_prefix),
+        patch.multiple(choosing, FEW_STEPS=few_steps, FRAME_AFTER=frame_after),
+        patch.multiple(solver, ONE_MORE=0.0, ONE_MORE_SHARE=0.0),
+    ):
         every = solve(trace, theory, max_maps=None, time_limit=LIMIT)
         first = solve(trace, theory, max_maps=1, time_limit=LIMIT)
-        assert counts is None or first.backbone is not None
+        search = Search(trace, theory, max_maps=1, time_limit=LIMIT, reasons=True)
+        reasoned = search.solution(tuple(search)).backbone
+        found = find_backbone(first, time_limit=LIMIT)
     if counts is None:
-        assert every.backbone is first.backbone is None
+        assert every.backbone is first.backbone is reasoned is found is None
         assert every.summary == "no map satisfies the axioms"
         return
-    for solution in (every, first):
-        assert solution.backbone is not None
-        assert solution.backbone.proven
-        agrees(solution.backbone, keys, len(trace))
+    for backbone in (every.backbone, reasoned, found):
+        assert backbone is not None
+        assert backbone.proven
+        agrees(backbone, keys, len(trace))
     assert every.summary.startswith(f"{len(keys)} minimal map")
 
 

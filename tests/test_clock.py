@@ -15,9 +15,7 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.clock import each_heeding, heeding, look_at_clock
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Status, candidates
-from ssh_abduction.solver import search as solver
+from ssh_abduction.solver import Status, candidates, choosing
 from ssh_abduction.solver.fit import fit
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging

@@ -24,8 +24,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import Step
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Status, search
+from ssh_abduction.solver import Status, choosing
 from ssh_abduction.solver.engines import faulty
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.blocks import Blocks

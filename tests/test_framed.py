@@ -20,9 +20,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.online.keeper import MapKeeper
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Search, Status
-from ssh_abduction.solver import search as solver
+from ssh_abduction.solver import Search, Status, choosing
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
@@ -30,7 +28,6 @@ from ssh_abduction.solver.engines import framed
 from ssh_abduction.solver.engines import paths as paths_module
 from ssh_abduction.solver.engines import visits as same
 from ssh_abduction.solver.engines.base import Found
-from ssh_abduction.solver.values import Cost
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
 from ssh_abduction.solver.engines.sides import FramedSides
@@ -41,6 +38,7 @@ from ssh_abduction.solver.guesses.merging import kept, merged_near
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.steps.chart import QUARTERS, Chart, FramedChart, numbered
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory.speedups import SPEEDUPS
 

@@ -14,9 +14,7 @@ from strategies import theories, traces
 
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Search, Status, candidates, prefixes
-from ssh_abduction.solver import search as solver
+from ssh_abduction.solver import Search, Status, candidates, choosing, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
 from ssh_abduction.solver.engines import framing
 from ssh_abduction.solver.engines.framing import maps_with_frames

@@ -13,9 +13,7 @@ from benchmarks.instances import maze
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Status
-from ssh_abduction.solver import search as solver
+from ssh_abduction.solver import Status, choosing
 from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.solver.guesses.gated import gated_map
 from ssh_abduction.theory.pairs import Pairs

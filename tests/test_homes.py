@@ -8,9 +8,7 @@ from unittest.mock import patch
 import pytest
 
 from ssh_abduction import Theory, Trace, solve
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Status
-from ssh_abduction.solver import search as solver
+from ssh_abduction.solver import Status, choosing
 from ssh_abduction.solver.asp.facts import Segments
 from ssh_abduction.solver.engines import frameless
 from ssh_abduction.solver.engines.frameless import PlacesAndPaths

@@ -32,8 +32,8 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.evaluation import evaluate_visits
 from ssh_abduction.robot_logs import log_maps
 from ssh_abduction.robot_logs.log_maps import SPEED, map_log, seconds_left
-from ssh_abduction.solver.asp import workers
 from ssh_abduction.solver import Solution, Status
+from ssh_abduction.solver.asp import workers
 
 LINES = 620  # Three for each scan.
 REAL = Path(__file__).parents[2] / "shared" / "data" / "logs"

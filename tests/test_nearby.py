@@ -17,8 +17,7 @@ from test_speedups import PLAIN, machines
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Status
+from ssh_abduction.solver import Status, choosing
 from ssh_abduction.solver import search as solver
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, Watch

@@ -25,8 +25,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import TheoryError
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.online.replay import ReplayedMap
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Search, Status, judging, prefixes, search
+from ssh_abduction.solver import Search, Status, choosing, judging, prefixes
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.frameless import FramelessEngine

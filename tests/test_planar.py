@@ -21,8 +21,7 @@ from ssh_abduction import OnlineMapper, Solution, SSHMap, Theory, Trace, solve
 from ssh_abduction.checker import check
 from ssh_abduction.checker.planarity import Edges
 from ssh_abduction.data.maps import DState
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Status, prefixes, search
+from ssh_abduction.solver import Status, choosing, prefixes
 from ssh_abduction.theory.evidence import Equality, Planar
 from ssh_abduction.theory.planarity import can_be_drawn, is_planar
 

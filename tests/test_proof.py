@@ -76,7 +76,10 @@ def test_a_solution_travels_with_its_certificate(asked: bool) -> None:
     assert copy == solution
     assert hash(copy.support.basis) == hash(solution.support.basis)
     assert copy.certificate == solution.certificate
-    assert replace(solution, effort=replace(solution.effort, prefix=0)).certificate == solution.certificate
+    assert (
+        replace(solution, effort=replace(solution.effort, prefix=0)).certificate
+        == solution.certificate
+    )
     assert replace(solution, support=Support()).certificate is None
     assert replace(solution, support=Support()).certificate is None
 

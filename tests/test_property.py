@@ -13,8 +13,7 @@ from strategies import FOREIGN, TOYS, theories, traces
 from ssh_abduction import solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import prefixes
+from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver import search as solver
 from ssh_abduction.theory.theory import Count, Theory
 

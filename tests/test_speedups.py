@@ -22,9 +22,7 @@ from strategies import traces
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import SolverError
-from ssh_abduction.solver import choosing
-from ssh_abduction.solver import Search, Status
-from ssh_abduction.solver import search as solver
+from ssh_abduction.solver import Search, Status, choosing
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.engines import base as engine

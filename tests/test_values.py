@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path

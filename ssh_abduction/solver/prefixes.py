@@ -18,8 +18,8 @@ from ssh_abduction.solver.engines.refusing import first_accepted
 from ssh_abduction.solver.engines.stepwise import StepEngine, paths_needed
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
-from ssh_abduction.solver.values import Status
 from ssh_abduction.solver.steps.log import Outcome, Replay
+from ssh_abduction.solver.values import Status
 from ssh_abduction.theory.evidence import Equality
 
 _log = log_of(__name__)

@@ -346,9 +346,11 @@ class Search:
             if not engine.size:
                 engine.grow(steps if engine.lists_least else min(steps, prefixes.FIRST_PREFIX))
             return
-        takes_all = isinstance(engine, StepEngine) and not self._goes_on and takes_all(self._task)
-        may_frame = takes_all and self._task.speedups.framing
-        may_settle = takes_all and self._task.speedups.ways and self._asked_speedups.names
+        may_take_all = (
+            isinstance(engine, StepEngine) and not self._goes_on and takes_all(self._task)
+        )
+        may_frame = may_take_all and self._task.speedups.framing
+        may_settle = may_take_all and self._task.speedups.ways and self._asked_speedups.names
         if (
             may_settle
             and not self._find_minimum_soon(min(choosing.SETTLE_AFTER, choosing.FRAME_AFTER))
