@@ -59,6 +59,7 @@ THEMES: dict[str, tuple[str, ...]] = {
             "Level",
             "Progress",
             "Backbone",
+            "find_backbone",
             "fault_front",
         )
     ),
