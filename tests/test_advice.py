@@ -47,6 +47,7 @@ SAID_BY = {
     "ssh_abduction/online/move_graph.py": ("route",),
     "ssh_abduction/online/routes.py": ("route",),
     "ssh_abduction/solver/search.py": ("solve",),
+    "ssh_abduction/solver/start.py": ("solve",),
     "ssh_abduction/theory": WITH_THEORY,
 }
 OWN = ("train", "learning-curve", "tell-apart", "recognise")  # which cli/train.py has

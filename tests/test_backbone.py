@@ -25,8 +25,16 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import MapError, Odometry, SolverError
 from ssh_abduction.data.words import counted
 from ssh_abduction.rivals import difference
-from ssh_abduction.solver import Search, Solution, Status, choosing, find_backbone, prefixes
-from ssh_abduction.solver import search as solver
+from ssh_abduction.solver import (
+    Search,
+    Solution,
+    Start,
+    Status,
+    choosing,
+    find_backbone,
+    map_list,
+    prefixes,
+)
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.frameless import FramelessEngine
@@ -102,11 +110,11 @@ def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
     with (
         patch.object(prefixes, "FIRST_PREFIX", first_prefix),
         patch.multiple(choosing, FEW_STEPS=few_steps, FRAME_AFTER=frame_after),
-        patch.multiple(solver, ONE_MORE=0.0, ONE_MORE_SHARE=0.0),
+        patch.multiple(map_list, ONE_MORE=0.0, ONE_MORE_SHARE=0.0),
     ):
         every = solve(trace, theory, max_maps=None, time_limit=LIMIT)
         first = solve(trace, theory, max_maps=1, time_limit=LIMIT)
-        search = Search(trace, theory, max_maps=1, time_limit=LIMIT, reasons=True)
+        search = Search(trace, theory, max_maps=1, time_limit=LIMIT, _start=Start(reasons=True))
         reasoned = search.solution(tuple(search)).backbone
         found = find_backbone(first, time_limit=LIMIT)
     if counts is None:
@@ -169,25 +177,28 @@ def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine:
     trace, theory = walk(TWO_BLOCKS, "a1", 60, 1), Theory(boundary="none", prefer=("dstates",))
     with patch.object(choosing, "FRAME_AFTER", frame_after):
         every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
-        search = Search(trace, theory, max_maps=1, reasons=True)
+        search = Search(trace, theory, max_maps=1, _start=Start(reasons=True))
         reasoned = search.solution(tuple(search))
-    assert type(search._prefixes.engine) is engine
+    assert type(search._parts.prefixes.engine) is engine
     assert every.count == 32
     assert find_backbone(first) == reasoned.backbone == every.backbone
     assert every.backbone is not None
     assert len(every.backbone.dstates.always) == len(trace)
     assert every.backbone.dstates.differing
-    assert search._rivals.sharing.maps < 16
+    assert search._parts.rivals.sharing.maps < 16
     assert (first.prefix < len(trace)) == (engine is StepEngine)
 
 
 def test_a_maze_with_stars_is_reasoned_about_by_its_labels() -> None:
     """Seven maps in three labellings."""
     trace = maze(5, 5, steps=100, seed=1, stars=True).trace
-    every, search = solve(trace, max_maps=None), Search(trace, max_maps=1, reasons=True)
+    every, search = (
+        solve(trace, max_maps=None),
+        Search(trace, max_maps=1, _start=Start(reasons=True)),
+    )
     first = search.solution(tuple(search))
     assert every.count == 7
-    assert type(search._prefixes.engine) is FramedEngine
+    assert type(search._parts.prefixes.engine) is FramedEngine
     assert find_backbone(first) == first.backbone == every.backbone
     assert find_backbone(solve(trace, max_maps=1)) == every.backbone
     assert "7 minimal maps: the dstates of steps 80, 83–84, 97 and 99–100 differ" in every.summary
@@ -195,7 +206,7 @@ def test_a_maze_with_stars_is_reasoned_about_by_its_labels() -> None:
 
 def test_what_is_listed_is_not_taken_for_proven_where_time_is_over() -> None:
     trace = Trace.load(ACES3)
-    search = Search(trace, Theory(star="none"), max_maps=2, reasons=True)
+    search = Search(trace, Theory(star="none"), max_maps=2, _start=Start(reasons=True))
     found = []
     for ssh_map in search:
         found.append(ssh_map)
@@ -210,7 +221,9 @@ def test_what_is_listed_is_not_taken_for_proven_where_time_is_over() -> None:
 
 def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end() -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=())
-    search = Search(rectangle(14), theory, max_maps=None, time_limit=1000, reasons=True)
+    search = Search(
+        rectangle(14), theory, max_maps=None, time_limit=1000, _start=Start(reasons=True)
+    )
     with patch.object(Watch, "reserve_begins", 2.0):
         count = sum(1 for _ in search)
     solution = search.solution()

@@ -98,7 +98,7 @@ def test_every_kind_of_answer_is_shown(
 
 def test_an_unknown_answer_shows_the_best_map_of_the_first_steps() -> None:
     search = Search(ACES)
-    search._known.partial = solve(ACES[:10])[0]
+    search._parts.known.partial = solve(ACES[:10])[0]
     text = shown(search.solution())[1]
     assert text.startswith("unknown: no map of 23 steps yet")
     assert "the best map of the first 10 steps:" in text

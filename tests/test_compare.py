@@ -37,6 +37,7 @@ from ssh_abduction.rivals.table import Table
 from ssh_abduction.solver import find_backbone
 from ssh_abduction.solver import search as searching
 from ssh_abduction.solver.engines import framed, naming
+from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.sharing import Backbone, Sharing
 
 ACES3 = "examples/aces3-route.jsonl"
@@ -417,7 +418,7 @@ def test_a_list_is_in_order_whatever_order_maps_are_found_in(
     usual = solve(Trace.load(ACES3), FREE_PLACES, max_maps=None)
     found = searching.Search._found
 
-    def shuffled(search: searching.Search) -> Iterator[SSHMap]:
+    def shuffled(search: searching.Search) -> Iterator[Priced]:
         maps = list(found(search))
         random.Random(7).shuffle(maps)
         return iter(maps)

@@ -20,7 +20,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.online.keeper import MapKeeper
-from ssh_abduction.solver import Search, Status, choosing
+from ssh_abduction.solver import Search, Start, Status, choosing
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
@@ -158,7 +158,7 @@ def test_lists_the_maps_of_the_plain_encoding(
         search = Search(trace, theory, max_maps=None, speedups=Speedups.without(off))
         maps = tuple(search)
     found = search.solution(maps)
-    assert isinstance(search._prefixes.engine, FramedEngine)
+    assert isinstance(search._parts.prefixes.engine, FramedEngine)
     assert found.status is expected.status
     assert set(maps) == set(expected.maps)
     assert len(set(maps)) == len(maps)
@@ -298,7 +298,7 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
                 assert set(answer.maps) == set(expected.maps)
             assert isinstance(mapper._keeper, MapKeeper)
             search = mapper._keeper.solver.search
-            engine = search and search._prefixes.engine
+            engine = search and search._parts.prefixes.engine
             if isinstance(engine, FramedEngine):
                 paths.add((engine._visits.batch, len(engine._sides._said)))
     assert max(paths)[0] > 5
@@ -325,7 +325,7 @@ def test_apart_nodes_are_different_dstates_of_the_world() -> None:
     for seed in range(6):
         walk = maze(3, 3, steps=120, seed=seed, stars=True)
         search = Search(walk.trace, Theory.topological())
-        engine = search._prefixes.engine
+        engine = search._parts.prefixes.engine
         assert isinstance(engine, FramedEngine)
         chart = engine._charted(len(walk.trace), None)
         assert chart
@@ -461,7 +461,7 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
     contradicted = 0
     for seed in range(6):
         trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
-        engine = Search(trace, theory)._prefixes.engine
+        engine = Search(trace, theory)._parts.prefixes.engine
         assert isinstance(engine, FramedEngine)
         with patch.object(FramedEngine, "_charted", plainly_charted):
             engine.grow(len(trace))
@@ -533,7 +533,7 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
         patch.object(engine, "FIRST_PREFIXES", 300),
     ):
         search = Search(walk.trace, Theory.topological())
-        search._prefixes.start = 201
+        search._parts.prefixes.start = 201
         solution = search.solution(tuple(search))
     assert solution.status is Status.FEASIBLE
     assert solution.cost
@@ -562,7 +562,7 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
     fewest: set[int] = set()
     stopped = 0
     for stop in range(0, 50, 4):
-        engine = Search(trace, Theory.topological())._prefixes.engine
+        engine = Search(trace, Theory.topological())._parts.prefixes.engine
         assert isinstance(engine, FramedEngine)
         engine.grow(len(trace))
         checks = iter(range(1, 10**6))
@@ -590,7 +590,7 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
     """Else the time that is kept for any map would be spent on the engine of a shorter prefix, and its map be taken for the whole trace's."""
     walk = maze(3, 3, steps=120, seed=1, stars=True)
     search = Search(walk.trace, Theory.topological(), time_limit=100)
-    engine = search._prefixes.engine
+    engine = search._parts.prefixes.engine
     engine.grow(40)
     with (
         patch.object(engine._visits, "_charted", side_effect=KeyboardInterrupt),
@@ -598,7 +598,7 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
     ):
         engine.grow(121)
     assert engine.size == 40
-    search._prefixes.start = 121
+    search._parts.prefixes.start = 121
     maps = tuple(search)
     assert search.status is Status.OPTIMAL
     for ssh_map in maps:
@@ -614,8 +614,8 @@ def test_ctrl_c_in_the_last_part_of_the_time_leaves_no_engine_to_go_on_with() ->
     ):
         assert [check(search.trace, ssh_map, search.theory) for ssh_map in search] == [()]
     assert search.stopped == "interrupted"
-    later = Search(trace, Theory.topological(), max_maps=None, after=search)
-    assert later._prefixes.engine is not search._prefixes.engine
+    later = Search(trace, Theory.topological(), max_maps=None, _start=Start(after=search._parts))
+    assert later._parts.prefixes.engine is not search._parts.prefixes.engine
     assert set(later) == set(solve(trace, max_maps=None).maps)
 
 
@@ -623,16 +623,16 @@ def test_an_error_leaves_no_engine_to_go_on_with() -> None:
     trace = maze(3, 3, steps=80, seed=1, stars=True).trace
     first = Search(trace.prefix(60), Theory.topological())
     list(first)
-    second = Search(trace.prefix(70), Theory.topological(), after=first)
-    assert second._prefixes.engine is first._prefixes.engine
+    second = Search(trace.prefix(70), Theory.topological(), _start=Start(after=first._parts))
+    assert second._parts.prefixes.engine is first._parts.prefixes.engine
     with (
         patch.object(VisitLabels, "_best_answer", side_effect=MemoryError),
         pytest.raises(MemoryError),
     ):
         list(second)
     assert (
-        Search(trace, Theory.topological(), after=first)._prefixes.engine
-        is not first._prefixes.engine
+        Search(trace, Theory.topological(), _start=Start(after=first._parts))._parts.prefixes.engine
+        is not first._parts.prefixes.engine
     )
 
 
@@ -641,8 +641,10 @@ def test_maps_of_a_known_cost_are_listed_for_the_whole_trace() -> None:
     trace = maze(3, 3, steps=70, seed=44, stars=True).trace
     first = Search(trace, Theory.topological(), max_maps=1)
     known = next(iter(first))
-    first._known.stopped = "interrupted"
-    again = Search(trace, Theory.topological(), max_maps=None, after=first, minimal=known)
+    first._parts.known.stopped = "interrupted"
+    again = Search(
+        trace, Theory.topological(), max_maps=None, _start=Start(after=first._parts, minimal=known)
+    )
     assert not again.prefix
     assert set(again) == set(solve(trace, max_maps=None).maps)
     assert again.prefix == len(trace)

@@ -244,7 +244,7 @@ def test_a_snapshot_waits_for_the_sketch_that_is_under_way(
 
     monkeypatch.setattr(Candidates, "_attempts", slowly)
     search = Search(Trace.load(noisy))
-    other = threading.Thread(target=search._candidates.sketch)
+    other = threading.Thread(target=search._parts.candidates.sketch)
     other.start()
     assert begun.wait(SOON)
     snapshot = search.snapshot("time limit")
@@ -431,7 +431,7 @@ def test_noise_is_told_where_the_search_is_stopped_after_a_minimal_map_is_known(
     search = Search(flawed, Theory.causal())
     list(search)
     assert search.status is Status.OPTIMAL
-    search._prefixes.engine._named.size, search._known.stopped = (
+    search._parts.prefixes.engine._named.size, search._parts.known.stopped = (
         0,
         "time limit",
     )  # as where the limit ends the listing while clingo is given more

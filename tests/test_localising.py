@@ -98,7 +98,7 @@ def test_a_long_trace_is_solved_from_few_of_its_visits(seed: int) -> None:
     search = Search(trace, max_maps=None)
     with patch.object(same, "FIRST_PAIRS", 500):
         maps = tuple(search)
-    engine = search._prefixes.engine
+    engine = search._parts.prefixes.engine
     assert isinstance(engine, FramedEngine)
     assert len(engine._visits._visits) < 0.8 * len(engine._visits.chart.stars)
     expected = solve(trace, max_maps=None, speedups=Speedups.without("lazy"))

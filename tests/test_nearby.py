@@ -17,8 +17,7 @@ from test_speedups import PLAIN, machines
 
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver import Status, choosing
-from ssh_abduction.solver import search as solver
+from ssh_abduction.solver import Search, Status, choosing, fallback
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
@@ -216,7 +215,7 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
         yield []
         return "open"
 
-    limited = solver.Search(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"))
+    limited = Search(walk.trace, CAUSAL, speedups=Speedups.without("prefixes"))
     truth = {state: number for number, state in enumerate(dict.fromkeys(walk.truth))}
     with (
         patch.object(
@@ -282,7 +281,7 @@ def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
         raise LimitError("time limit")
 
     with (
-        patch.object(solver.Search, "_salvage", side_effect=AssertionError),
+        patch.object(fallback, "salvage", side_effect=AssertionError),
         patch.object(Prefixes, "minimise", stop),
     ):
         solution = solve(trace, time_limit=1000)

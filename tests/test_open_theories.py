@@ -286,7 +286,7 @@ def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.
     ):
         asked = Search(trace, theory, max_maps=None, speedups=Speedups.without("framing"))
         found = tuple(asked)
-    assert isinstance(asked._prefixes.engine, kind) or name == "frameless"
+    assert isinstance(asked._parts.prefixes.engine, kind) or name == "frameless"
     assert asked.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)
     assert {key(ssh_map) for ssh_map in found} == expected
 

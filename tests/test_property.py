@@ -13,8 +13,7 @@ from strategies import FOREIGN, TOYS, theories, traces
 from ssh_abduction import solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver import choosing, prefixes
-from ssh_abduction.solver import search as solver
+from ssh_abduction.solver import Status, choosing, prefixes
 from ssh_abduction.theory.theory import Count, Theory
 
 LIMIT = 100  # seconds: a search that does not end is a failure, not a hang
@@ -32,10 +31,10 @@ def agree(trace: Trace, theory: Theory) -> None:
     for ssh_map in solution.maps:
         assert check(trace, ssh_map, theory) == ()
     if counts is None:
-        assert solution.status is solver.Status.UNSATISFIABLE
+        assert solution.status is Status.UNSATISFIABLE
         assert solution.cost is None
         return
-    assert solution.status is solver.Status.OPTIMAL
+    assert solution.status is Status.OPTIMAL
     assert solution.cost is not None
     for name in theory.priorities:
         assert getattr(solution.cost, name) == getattr(counts, name)

@@ -32,14 +32,15 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.learning.learner import BootstrapLearner
-from ssh_abduction.solver import Progress, Search, Status, prefixes
-from ssh_abduction.solver import search as solver_module
+from ssh_abduction.solver import Progress, Search, Status, fallback, map_list, prefixes
 from ssh_abduction.solver.asp.facts import links_of
+from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine_module
 from ssh_abduction.solver.engines import stepwise
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.steps.log import Log, Outcome
 from ssh_abduction.theory import Speedups
 
@@ -311,7 +312,7 @@ def test_time_limit_while_listing_keeps_the_proof() -> None:
     maps = []
     for ssh_map in search:
         maps.append(ssh_map)
-        search._watch._spent += 500  # so that the time is over after two maps
+        search._parts.watch._spent += 500  # so that the time is over after two maps
     solution = search.solution(tuple(maps))
     assert (solution.status, solution.complete, solution.stopped) == (
         Status.OPTIMAL,
@@ -503,19 +504,19 @@ def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
     trace = drive(*TOURS["comb"])
     theory = Theory.topological().resolve(trace)
 
-    class Impatient(solver_module.Watch):
+    class Impatient(Watch):
         left = 100
 
         def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
             self.left -= 1
             if not self.left:
-                raise solver_module.LimitError("time limit")
+                raise LimitError("time limit")
 
     watch = Impatient(None, None, lambda: None)
-    engine = solver_module.StepEngine(Task.of(trace, theory, watch), paths=10)
+    engine = StepEngine(Task.of(trace, theory, watch), paths=10)
     engine.grow(4)
     watch.left = 2
-    with pytest.raises(solver_module.LimitError):
+    with pytest.raises(LimitError):
         engine.grow(len(trace))
     assert 4 < engine.size < len(trace)
     engine.grow(len(trace))
@@ -528,15 +529,15 @@ def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
 def test_a_stop_while_maps_are_held_back_gives_them(monkeypatch: pytest.MonkeyPatch) -> None:
     theory = Theory(boundary="none", path_order="partial", prefer=("paths", "places", "dstates"))
     search = Search(drive(*TOURS["comb"]), theory, max_maps=None)
-    honest = search._prefixes.engine.maps_of_cost
+    honest = search._parts.prefixes.engine.maps_of_cost
 
     def interrupted(cost: tuple[int, ...], enough: int) -> Iterator[object]:
         for number, found in enumerate(honest(cost, enough)):
             if number == 200:
-                raise solver_module.LimitError("interrupted")
+                raise LimitError("interrupted")
             yield found
 
-    monkeypatch.setattr(search._prefixes.engine, "maps_of_cost", interrupted)
+    monkeypatch.setattr(search._parts.prefixes.engine, "maps_of_cost", interrupted)
     maps = tuple(search)
     solution = search.solution(maps)
     assert (solution.count, len(set(maps)), solution.complete, solution.stopped) == (
@@ -557,14 +558,14 @@ def test_a_stop_while_the_prefix_grows_gives_the_maps_that_replayed(
         trace = wandering(seed, rooms=4, length=14, views=2)
         every = set(solve(trace, Theory.causal(), max_maps=None).maps)
         search = Search(trace, Theory.causal(), max_maps=None)
-        grow = search._prefixes.engine.grow
+        grow = search._parts.prefixes.engine.grow
 
         def stopped(size: int, search: Search = search, grow: Callable[[int], None] = grow) -> None:
             if search.status is Status.OPTIMAL:
-                raise solver_module.LimitError("time limit")
+                raise LimitError("time limit")
             grow(size)
 
-        monkeypatch.setattr(search._prefixes.engine, "grow", stopped)
+        monkeypatch.setattr(search._parts.prefixes.engine, "grow", stopped)
         maps = set(search)
         assert maps <= every
         assert search.stopped == "time limit"
@@ -673,7 +674,7 @@ def test_a_map_of_a_prefix_goes_on_when_time_is_over() -> None:
         with (
             patch.object(engine_module, "AT_ONCE", 500),
             patch.object(FramedEngine, "grow", interrupted),
-            patch.object(solver_module, "INTERRUPTED", 100.0),
+            patch.object(fallback, "INTERRUPTED", 100.0),
         ):
             found[most] = solve(trace)
         assert found[most].stopped == "interrupted"
@@ -695,7 +696,7 @@ def test_whether_there_is_one_more_map_is_not_sought_for_long() -> None:
 
     with (
         patch.object(CausalEngine, "maps_of_cost", slow),
-        patch.object(solver_module, "ONE_MORE", 0.01),
+        patch.object(map_list, "ONE_MORE", 0.01),
     ):
         search = Search(trace, Theory.causal(), max_maps=every.count, time_limit=100.0)
         asked_for = search.solution(tuple(search))

@@ -15,7 +15,7 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import Search, Status, choosing
+from ssh_abduction.solver import Search, Start, Status, choosing
 from ssh_abduction.solver.asp.facts import most_paths
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import frameless as ways
@@ -147,7 +147,7 @@ def test_a_maze_without_stars(off: str) -> None:
         search = Search(trace, max_maps=None, speedups=Speedups.without(off))
         found = search.solution(tuple(search))
     expected = solve(trace, max_maps=None, speedups=Speedups.without("ways"))
-    assert isinstance(search._prefixes.engine, FramelessEngine)
+    assert isinstance(search._parts.prefixes.engine, FramelessEngine)
     assert set(found.maps) == set(expected.maps)
     assert found.complete
     assert found.certificate
@@ -163,7 +163,7 @@ def test_the_route_of_a_robot() -> None:
     with patch.multiple(choosing, FRAME_AFTER=-1.0, FEW_STEPS=0):
         search = Search(trace, Theory(star="none"), max_maps=None)
         found = search.solution(tuple(search))
-    assert isinstance(search._prefixes.engine, FramelessEngine)
+    assert isinstance(search._parts.prefixes.engine, FramelessEngine)
     assert found.cost
     assert found.cost.to_dict() == {"dstates": 19, "places": 9, "paths": 4}
     assert len(set(found.maps)) == found.count == 38
@@ -236,8 +236,8 @@ def test_a_robot_that_goes_on_where_that_ended() -> None:
     with patch.object(choosing, "FRAME_AFTER", -1.0):
         search = Search(first, max_maps=None)
         before = search.solution(tuple(search))
-        assert isinstance(search._prefixes.engine, FramelessEngine)
-        after = Search(trace, max_maps=None, after=search)
+        assert isinstance(search._parts.prefixes.engine, FramelessEngine)
+        after = Search(trace, max_maps=None, _start=Start(after=search._parts))
         found = after.solution(tuple(after))
     assert before.complete
     assert set(found.maps) == set(

@@ -43,7 +43,7 @@ from ssh_abduction.data.errors import AbductionError, SolverError, brief, named,
 from ssh_abduction.data.program import SIGNALLED, interrupted_code
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.solver import POLL, Backbone, Search, Solution, workers
+from ssh_abduction.solver import POLL, Backbone, Search, Solution, Start, workers
 from ssh_abduction.solver import Stop as SearchStop
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
@@ -182,7 +182,7 @@ class Question:
             time_limit=self.limit,
             max_maps=self.maps or None,
             within=self.within,
-            reasons=self.json,
+            _start=Start(reasons=self.json),
             memory_limit=self.memory,
             speedups=self.speedups,
             on_progress=on_progress,

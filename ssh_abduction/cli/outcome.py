@@ -58,7 +58,7 @@ def explained(search: Search) -> Explanation | None:
 
 def opening(search: Search) -> dict[str, Any]:
     """What the JSON of a solution says before its maps."""
-    return written_opening(search.theory, len(search.trace), search.within)
+    return written_opening(search.theory, len(search.trace), search.limits.within)
 
 
 def told(given: Given) -> dict[str, Any]:
@@ -69,7 +69,7 @@ def told(given: Given) -> dict[str, Any]:
 
 def given_by(search: Search, ssh_map: SSHMap) -> Given:
     """The map that a search gave last, and what it costs, where not all maps cost the same."""
-    return ssh_map, search.cost if search.within else None
+    return ssh_map, search.cost if search.limits.within else None
 
 
 def all_given(solution: Solution) -> list[Given]:
@@ -113,11 +113,12 @@ _second_opinions: WeakKeyDictionary[Search, list[str]] = (
 def _second_opinion(search: Search, solution: Solution) -> list[str]:
     """What is said of the runner-up's views, where the trace has them, the search came to an end, and there is time left."""
     if search not in _second_opinions:
-        left = None if search.limit is None else search.limit - solution.seconds.total
+        limit = search.limits.time_limit
+        left = None if limit is None else limit - solution.seconds.total
         if solution.stopped not in (None, "maps limit") or (left is not None and left < LEAST_LEFT):
             return []
         known = [*solution.maps, *([search.best] if search.best else [])]
-        found = second_map(search.trace, known, search.theory, left, search.memory)
+        found = second_map(search.trace, known, search.theory, left, search.limits.memory_limit)
         _second_opinions[search] = [found.sentence] if found else []
     return _second_opinions[search]
 

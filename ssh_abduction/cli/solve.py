@@ -32,7 +32,16 @@ from ssh_abduction.data.logs import PROGRESS
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.solver import Backbone, Progress, Search, Solution, Status, Stop, summary_of
+from ssh_abduction.solver import (
+    Backbone,
+    Progress,
+    Search,
+    Solution,
+    Start,
+    Status,
+    Stop,
+    summary_of,
+)
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
 # So many maps are compared on the terminal, at most, and so many are put in order in JSON: of more the first ones found are compared, and all are printed as found.
@@ -124,7 +133,7 @@ def run(options: argparse.Namespace) -> int:
                 time_limit=options.time_limit,
                 max_maps=options.maps or None,
                 within=options.within,
-                reasons=True,
+                _start=Start(reasons=True),
                 memory_limit=options.memory_limit,
                 speedups=Speedups.without(options.without_speedups),
                 on_progress=on_progress,

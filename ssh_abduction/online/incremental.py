@@ -55,13 +55,13 @@ class IncrementalSolver:
             The minimal maps, or the best map found in time. `solution.status` says which.
         """
         self.searches += 1
-        search = Search(
+        search = Search.continuing(
+            self.search,
             trace,
             theory,
             time_limit=self.options.time_limit,
             max_maps=self.options.max_maps,
             speedups=self.options.speedups,
-            after=self.search,
             minimal=known,
         )
         # Unranked, as ranking takes longer than a step may.

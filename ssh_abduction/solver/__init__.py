@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from ssh_abduction.solver.result import Solution
     from ssh_abduction.solver.search import Search
     from ssh_abduction.solver.sharing import SORTS, Backbone, Shared, Sharing, Sort, stretches
+    from ssh_abduction.solver.start import Limits, Start
     from ssh_abduction.solver.steps.certificate import RESTS_ON, Certificate
     from ssh_abduction.solver.steps.log import Outcome, observation
     from ssh_abduction.solver.values import (
@@ -87,6 +88,10 @@ _HOMES = {  # module: the names that this package exports from it
     "recorded": ("theory_in",),
     "result": ("Solution",),
     "search": ("Search",),
+    "start": (
+        "Limits",
+        "Start",
+    ),
     "sharing": (
         "SORTS",
         "Backbone",
@@ -136,6 +141,7 @@ __all__ = [
     "Judging",
     "Level",
     "LimitError",
+    "Limits",
     "Outcome",
     "Point",
     "Progress",
@@ -147,6 +153,7 @@ __all__ = [
     "Sketch",
     "Solution",
     "Sort",
+    "Start",
     "Status",
     "Stop",
     "Task",

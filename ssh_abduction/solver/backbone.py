@@ -5,7 +5,7 @@ one in none of them may be one in another. So clingo is asked for a minimal map 
 doubts are left; if there is none, what is shared is proven. This is brave and cautious reasoning in one, and each answer is a map that can be looked at.
 
 *Prefixes.* It is asked for maps of a prefix that cost at most as much as minimal maps of the trace. The cut of a minimal map is among these
-(`solver/search.py`). So a map that is found and replays to the end is minimal; where one does not, the prefix grows. Where none is left in which a doubt about
+(`solver/prefixes.py`). So a map that is found and replays to the end is minimal; where one does not, the prefix grows. Where none is left in which a doubt about
 steps of the prefix holds, the classes of steps that are one in all known maps are one in all minimal maps. As actions are deterministic, these classes
 replay like a map: where they replay to the end, each further step is in the class of a step of the prefix in every minimal map, and so nothing about it is in
 doubt. Where they do not, the prefix grows.

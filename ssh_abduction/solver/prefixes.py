@@ -1,6 +1,39 @@
-"""Solve for a prefix, replay its maps to the end of the trace, and extend the prefix where they fail.
+"""Solve for a prefix, replay its maps to the end of the trace, and extend the prefix if they fail.
 
-That this is exact is proven in `solver/search.py`. Where an axiom does not survive the cut to a prefix, the prefix is the whole trace.
+Grounding the axioms for a whole trace costs more than the square of its length. But once a map is
+closed, the rest of the trace only re-traverses it. So a search solves for a prefix, replays the
+maps found over the whole trace (`steps/log.py`), and extends the prefix, in the same clingo
+control, while a replay stops early. This is exact.
+
+*Claim.* Let every minimal map of a prefix, of cost c, replay to the end of the trace. Then the
+replayed maps are exactly the minimal maps of the trace, and c is their cost.
+
+*Proof.* (1) A map of the trace, cut down to the prefix, is a map of the prefix. Every axiom forbids
+a pattern of links, observations and names, and a cut removes patterns. What the axioms ask for (a
+course, an order, a side, a heading), the map of the trace has. A course that only a later travel
+supports is dropped together with that travel. Cutting adds no dstate, place, path or excuse, so no
+count grows. The minimum of the prefix therefore bounds that of the trace from below.
+(2) A map that replays to the end has the same links and observations over the whole trace as over
+the prefix. The axioms speak of nothing else, so the replayed map satisfies them, at cost c. By (1),
+c is the minimum.
+(3) A minimal map F of the trace has cost c by (2). Cut down to the prefix it costs at most c in
+every count, and at least c in the order of preference by (1). So the cut is one of the minimal maps
+of the prefix, R. As actions are deterministic and replaying R meets only links of R, F has the
+labels of the replayed R, the same links, and so the same support for every course: F is the
+replayed R. Different R replay to different maps, as they differ on the prefix already. ∎
+
+*Names for paths.* Grounding grows with the square of the number of names for paths, and most traces
+have far more segments than their maps have paths. So a control starts with a few names. What it
+finds minimal stands if no map with more paths can be as good. Where fewest paths come first, this
+holds once there is any map. Where fewest dstates come first, it holds once there are half as many
+names as dstates in the minimal map: every path holds the two ends of a travel, and a dstate is
+along one path (with all_on_paths a path may hold one dstate alone). Otherwise the control is made
+again with more names. At most one for each segment of the prefix is enough for any map.
+
+A map of the prefix that stops early is no answer. The longer prefix says how it continues. The
+claim needs determinism, and that a dstate has one place, course and heading, and that axioms
+survive the cut. `theory/speedups.py` says for which theories that is known. For any other, the
+prefix is the whole trace.
 """
 
 from __future__ import annotations

@@ -1,0 +1,129 @@
+"""Make the Solution of a search from what was given and what is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.ranking import in_order, noise_warning, units_warning
+from ssh_abduction.solver.recorded import Support
+from ssh_abduction.solver.result import Solution
+from ssh_abduction.solver.steps.certificate import Basis
+from ssh_abduction.solver.values import (
+    Cost,
+    Effort,
+    Grounding,
+    Level,
+    Seconds,
+    cost_as_counted,
+)
+from ssh_abduction.theory.evidence import evidence_of, said_by
+from ssh_abduction.theory.speedups import row
+
+
+class Answer:
+    """Remembers the maps that a search gave, as far as the Solution needs them."""
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+        self._levels: list[Level] = []
+        self._first: SSHMap | None = None
+        self._last: tuple[SSHMap, tuple[int, ...]] | None = None
+        self._basis: Basis | None = None  # of the whole trace, if the search was stopped
+
+    @property
+    def cost(self) -> Cost | None:
+        """The cost of the map that was given last."""
+        return None if self._last is None else cost_as_counted(*self._last, self._parts.task.theory)
+
+    def take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
+        """Remember a map that is given, and count it in its level."""
+        theory = self._parts.task.theory
+        self._first, self._last = self._first or ssh_map, (ssh_map, cost)
+        if not self._levels or self._levels[-1].cost.preferred_by(theory) != cost:
+            self._levels.append(Level(cost_as_counted(ssh_map, cost, theory), 0))
+        self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
+
+    def count_apart(self) -> None:
+        """Raise the bound of a search that was stopped to the steps that are pairwise apart."""
+        known = self._parts.known
+        self._basis = self._basis_of(len(self._parts.task.trace))
+        if self._basis:
+            apart = len(self._basis.certificate.clique)
+            known.bound = replace(known.bound, dstates=max(apart, known.bound.dstates or 0))
+
+    def solution(self, maps: tuple[SSHMap, ...], grounding: Grounding | None = None) -> Solution:
+        """The solution with these maps.
+
+        Args:
+            maps: The maps that the caller kept.
+            grounding: The size of the ground program; None to ask clingo.
+        """
+        parts, known, task = self._parts, self._parts.known, self._parts.task
+        levels = tuple(replace(level, complete=parts.rivals.listed) for level in self._levels)
+        asker = parts.engine.asker
+        seconds = Seconds(parts.watch.elapsed(), asker.ground_seconds, asker.solve_seconds)
+        return Solution(
+            status=known.status,
+            maps=maps,
+            cost=levels[0].cost if levels else known.best_cost,
+            bound=known.bound,
+            complete=known.complete,
+            theory=task.theory,
+            steps=len(task.trace),
+            effort=Effort(
+                parts.engine.size,
+                seconds,
+                asker.grounding if grounding is None else grounding,
+                said_by(evidence_of(task.theory), task.trace, known.refused),
+            ),
+            stopped=known.stopped,
+            partial=None if known.best else known.partial,
+            within=parts.limits.within,
+            levels=levels,
+            shared=parts.rivals.backbone,
+            trace=task.trace,
+            support=self._support(),
+        )
+
+    def _support(self) -> Support:
+        """What the certificate and the warnings are made from."""
+        parts, trace = self._parts, self._parts.task.trace
+        # A search that ran out may have ended while the prefix was grounded. All steps are then
+        # searched for what shows the bound.
+        ran_out = parts.known.stopped not in (None, "maps limit")
+        size = len(trace) if ran_out else parts.prefixes.engine.size
+        warning = None
+        if self._first and self._first.fit:
+            warning = units_warning(trace) or noise_warning(self._first.fit, trace)
+        return Support(self._basis or self._basis_of(size), warning)
+
+    def in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:
+        """Sort maps, if they are all that were given and no minimal map is missing.
+
+        The order is the same in each run. Each level then costs what its first map does.
+        """
+        parts, theory = self._parts, self._parts.task.theory
+        is_all = parts.known.complete or parts.rivals.listed
+        if not is_all or not maps or len(maps) < sum(level.count for level in self._levels):
+            return maps
+        ordered = in_order(maps, [level.count for level in self._levels])
+        begin = 0
+        for i, level in enumerate(self._levels):
+            cost = level.cost.preferred_by(theory)
+            self._levels[i] = replace(level, cost=cost_as_counted(ordered[begin], cost, theory))
+            begin += level.count
+        return ordered
+
+    def _basis_of(self, size: int) -> Basis | None:
+        """What shows that no map of the first `size` steps has fewer dstates."""
+        task = self._parts.task
+        if not row("clique").holds_for(task.theory):
+            return None
+        number: dict[object, int] = {}
+        views = tuple(
+            number.setdefault(step.view, len(number)) for step in task.trace.steps[: max(size, 1)]
+        )
+        actions = tuple(task.log.actions[: len(views) - 1])
+        return Basis(views, actions, self._parts.known.bound.dstates or 0)

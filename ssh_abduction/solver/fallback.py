@@ -1,0 +1,85 @@
+"""What a search that was stopped still does: make some map of the whole trace, and a bound."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+
+from ssh_abduction.data.clock import heeding
+from ssh_abduction.data.logs import log_of
+from ssh_abduction.solver.answer import Answer
+from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.map_list import Priced, note
+from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.values import Status
+
+# To make some map of a search that was stopped without one, or to check it, may take this many
+# seconds beyond the time limit, and this share of the limit.
+OVERTIME, OVERTIME_SHARE = 0.5, 0.05
+# Or this many seconds after Ctrl-C, or when the memory limit is over.
+INTERRUPTED = 0.6
+_log = log_of(__name__)
+
+
+def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
+    """If the search was stopped, make some map of the whole trace, and a bound without a search.
+
+    Args:
+        parts: The parts of the search.
+        answer: What it gave.
+        may_search: Whether clingo may look for a map in the last part of the time limit.
+    """
+    known = parts.known
+    if not known.stopped or known.status is Status.OPTIMAL:
+        return
+    may_salvage = (
+        may_search
+        and known.best is None
+        and known.stopped == "time limit"
+        and parts.watch.has_reserve
+    )
+    with suppress(KeyboardInterrupt):
+        parts.candidates.sketch(_overtime(parts))
+    if may_salvage:
+        salvage(parts)
+    answer.count_apart()
+    if known.best is not None and known.status is Status.UNKNOWN:
+        known.status = Status.FEASIBLE
+
+
+def salvage(parts: Parts) -> None:
+    """Look for any map of the whole trace in the last part of the time limit."""
+    _log.info("in the last part of the time limit any map is sought")
+    known, watch = parts.known, parts.watch
+    watch.use_reserve()
+    watch.start()
+    known.lower = None  # no map as cheap as this bound was found
+    try:
+        with heeding(watch.check):
+            parts.prefixes.engine.grow(len(parts.task.trace))
+            found = parts.prefixes.minimise()
+            known.status = Status.OPTIMAL if found else Status.UNSATISFIABLE
+    except LimitError as limit:
+        known.stopped = limit.reason
+    except KeyboardInterrupt:
+        known.stopped = "interrupted"
+    parts.end_clingo()
+
+
+def best_map(parts: Parts) -> Iterator[Priced]:
+    """The best map known, if no minimal map was listed, after it has passed the checker."""
+    known = parts.known
+    if known.status in (Status.FEASIBLE, Status.OPTIMAL) and not known.count and known.best:
+        with suppress(LimitError), heeding(Watch().part(_overtime(parts)).check):
+            parts.judging.pass_map(known.best, parts.engine.size, parts.watch.elapsed())
+        known.count = 1
+        note(parts, known.best, known.cost)
+        yield known.best, known.cost
+
+
+def _overtime(parts: Parts) -> float:
+    """Seconds left to make a map without a search, or to check one."""
+    limit = parts.limits.time_limit
+    if parts.known.stopped != "time limit" or limit is None:
+        return INTERRUPTED
+    return max(parts.watch.left(), 0.0) + OVERTIME_SHARE * limit + OVERTIME

@@ -1,0 +1,89 @@
+"""List the maps of a search once the minimal cost is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TypeAlias
+
+from ssh_abduction.data.logs import log_of
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.words import counted
+from ssh_abduction.solver.near import NearMinimal, counted_first
+from ssh_abduction.solver.parts import Parts
+from ssh_abduction.solver.values import Status
+
+# After the last map that was asked for, one more is sought for this many seconds. It shows whether
+# the list is complete.
+ONE_MORE = 1.0
+# Or for this share of the time that the maps took, if that is more.
+ONE_MORE_SHARE = 0.1
+_log = log_of(__name__)
+
+Priced: TypeAlias = tuple[SSHMap, tuple[int, ...]]
+"""A map and its preferred counts, the most important one first."""
+
+
+def listed(
+    parts: Parts, mended_maps: tuple[SSHMap, ...] | None, *, keeps_time: bool
+) -> Iterator[Priced]:
+    """List the maps that were asked for, each after it has passed the checker.
+
+    The clock stands still while the caller has a map.
+
+    Args:
+        parts: The parts of the search.
+        mended_maps: The minimal maps, if mending the trace found them.
+        keeps_time: Whether to keep a share of the time limit for reasoning.
+    """
+    known, watch, most = parts.known, parts.watch, parts.limits.most
+    if known.status is Status.OPTIMAL:
+        _log.info("minimal maps cost %s; they are listed", _told_cost(parts))
+        ends = watch.reserve_begins if keeps_time else math.inf
+        ends = ends if ends > watch.elapsed() else math.inf
+        watch.end_stage_after(ends)
+        for ssh_map, cost in _by_cost(parts, mended_maps):
+            if most and known.count == most:
+                known.stopped = "maps limit"
+                return
+            parts.judging.pass_map(ssh_map, parts.engine.size, watch.elapsed())
+            # The first map is the best one, also in the counts that the theory does not prefer.
+            known.best = known.best if known.count else ssh_map
+            known.count += 1
+            note(parts, ssh_map, cost)
+            parts.report()
+            watch.stop()
+            yield ssh_map, cost
+            watch.start()
+            if known.count == most:
+                spent = watch.elapsed()
+                watch.end_stage_after(min(ends, spent + max(ONE_MORE, ONE_MORE_SHARE * spent)))
+    known.complete = True
+
+
+def note(parts: Parts, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
+    """Take a map into what the minimal maps share, if it is one of them."""
+    if parts.known.status is Status.OPTIMAL and cost == parts.known.cost:
+        parts.rivals.add(ssh_map, cost)
+
+
+def _by_cost(parts: Parts, mended_maps: tuple[SSHMap, ...] | None) -> Iterator[Priced]:
+    """The minimal maps, and then those that cost up to `within` more."""
+    known, limits = parts.known, parts.limits
+    minimal = mended_maps or parts.prefixes.minimal_maps()
+    yield from ((ssh_map, known.cost) for ssh_map in minimal)
+    parts.rivals.listed = True  # so no time is kept for reasoning
+    if not limits.most or known.count < limits.most:
+        parts.watch.end_stage_after(math.inf)
+    if limits.within and counted_first(parts.task.theory):
+        engine = parts.prefixes.engine
+        engine.settle()
+        parts.near = NearMinimal(parts.task, parts.judging, limits.most, parts.report, engine.asker)
+        yield from parts.near.maps(known.cost, limits.within)
+
+
+def _told_cost(parts: Parts) -> str:
+    cost = parts.known.best_cost
+    if cost is None:
+        return "nothing that is counted"
+    return ", ".join(counted(v, k) for k, v in cost.to_dict().items())

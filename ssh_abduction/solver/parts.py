@@ -1,0 +1,128 @@
+"""The parts of one search: what it knows, the engine it asks, and how it reports its progress."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+
+from ssh_abduction.data.logs import PROGRESS
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver import prefixes
+from ssh_abduction.solver.asp.limits import Watch
+from ssh_abduction.solver.backbone import Rivals
+from ssh_abduction.solver.candidates import Candidates
+from ssh_abduction.solver.choosing import may_name, new_engine
+from ssh_abduction.solver.engines.base import Engine, Task
+from ssh_abduction.solver.engines.stepwise import StepEngine
+from ssh_abduction.solver.judging import Judging
+from ssh_abduction.solver.known import Known
+from ssh_abduction.solver.near import NearMinimal
+from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.solver.start import Limits, Start
+from ssh_abduction.solver.values import Bound, Cost, Progress, Status
+from ssh_abduction.theory.speedups import Speedups
+from ssh_abduction.theory.theory import Theory
+
+
+class Parts:
+    """What the stages of one search share.
+
+    Attributes:
+        limits: What the search is allowed.
+        speedups: The speed-ups that the caller has on. `task.speedups` are those that hold here.
+        watch: The clock of the search.
+        task: The trace and theory, as engines see them.
+        known: What is known of the trace so far.
+        judging: Checks maps before they are given.
+        rivals: The minimal maps, as far as they are known.
+        candidates: Makes maps without a proof.
+        prefixes: Finds and lists minimal maps.
+        near: Lists maps that cost more than the minimum; None before it is their turn.
+    """
+
+    def __init__(
+        self,
+        trace: Trace,
+        theory: Theory,
+        limits: Limits,
+        speedups: Speedups,
+        on_progress: Callable[[Progress], None] | None,
+        start: Start,
+    ) -> None:
+        self.limits, self.speedups = limits, speedups
+        self.watch = Watch(limits.time_limit, limits.memory_limit, self.report)
+        self._on_progress = on_progress
+        self._news: tuple[Cost | None, Bound] = (None, Bound())  # what the last report said
+        self.watch.start()  # comparing all pairs of steps may take long
+        self.task = Task.of(trace, theory, self.watch, speedups)
+        self.known = Known(theory)
+        self.judging = Judging(trace, theory)
+        self.rivals = Rivals(self.task, self.judging)
+        self.candidates = Candidates(self.task, self.known, self.judging, self.report)
+        self.near: NearMinimal | None = None
+        engine = self._engine_after(start.after) if start.after else new_engine(self.task)
+        self.prefixes = Prefixes(
+            self.task, self.known, self.judging, engine, limits.most, self.report
+        )
+        if start.after:
+            self._take_over(start.after, start)
+        self.watch.stop()
+
+    def _engine_after(self, after: Parts) -> Engine:
+        """The engine of a search for the first steps, if it can go on; else a new one."""
+        self.watch.use_reserve()
+        before = after.prefixes.engine
+        is_outgrown = not before.goes_on or (isinstance(before, StepEngine) and may_name(self.task))
+        engine = new_engine(self.task) if is_outgrown else before.over(self.task)
+        # A search that was interrupted may have stopped while a step was grounded.
+        half_told = after.known.stopped == "interrupted" or not engine.intact
+        return engine.with_paths(engine.paths) if half_told else engine
+
+    def _take_over(self, after: Parts, start: Start) -> None:
+        """Take over what a search for the first steps proved."""
+        known, before = self.known, after.known
+        if self.task.speedups.prefixes:
+            known.bound, known.lower = before.bound, before.lower
+            solved = before.status is Status.OPTIMAL
+            self.prefixes.start = (
+                len(self.task.trace)
+                if solved
+                else max(prefixes.FIRST_PREFIX, self.prefixes.engine.size_to_go_on)
+            )
+        if start.minimal is not None:
+            known.status, known.best, known.cost = Status.OPTIMAL, start.minimal, before.cost
+            known.raise_bound(known.cost[0] if known.cost else None)
+
+    @property
+    def engine(self) -> Engine:
+        """The engine that was asked last."""
+        return self.near.engine if self.near else self.prefixes.engine
+
+    def end_clingo(self) -> None:
+        """End what clingo still does, and take over the bound that it leaves."""
+        self.watch.end_stage_after(math.inf)
+        self.watch.stop()
+        engine = self.prefixes.engine
+        engine.settle()
+        self.known.raise_bound(engine.bound)
+        self.rivals.engine = None if self.rivals.listed or not engine.intact else engine
+
+    def report(self) -> None:
+        """Log how far the search is, and tell the caller."""
+        if self._on_progress is None and not PROGRESS.isEnabledFor(logging.INFO):
+            return
+        known = self.known
+        progress = Progress(
+            self.engine.size,
+            len(self.task.trace),
+            known.best_cost,
+            known.bound,
+            known.count,
+            self.watch.elapsed(),
+        )
+        news = (progress.cost, progress.bound)
+        PROGRESS.log(logging.DEBUG if news == self._news else logging.INFO, "%s", progress.sentence)
+        self._news = news
+        if self._on_progress is not None:
+            self._on_progress(progress)

@@ -1,0 +1,75 @@
+"""The limits of a search, and where it begins: frozen values that its parts share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ssh_abduction.data.checks import a_count_of_maps, a_flag
+from ssh_abduction.data.errors import SolverError, brief, is_whole
+from ssh_abduction.data.maps import SSHMap, checked_map
+from ssh_abduction.solver.asp.limits import check_limit
+
+if TYPE_CHECKING:
+    from ssh_abduction.solver.parts import Parts
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a search is allowed.
+
+    Attributes:
+        time_limit: Seconds of wall-clock time; None for no limit.
+        memory_limit: MiB that the process may use at its peak; None for no limit.
+        max_maps: The number of maps to list at most; None for all.
+        within: How many dstates more than the minimum a listed map may have.
+
+    Raises:
+        SolverError: A value is out of range.
+    """
+
+    time_limit: float | None = None
+    memory_limit: int | None = None
+    max_maps: int | None = None
+    within: int = 0
+
+    def __post_init__(self) -> None:
+        a_count_of_maps(self.max_maps, SolverError)
+        if not is_whole(self.within) or self.within < 0:
+            raise SolverError(
+                f"within (--within): expected a whole number, 0 or more, got {brief(self.within)};"
+                " say how much more than the least a map may cost"
+            )
+        check_limit("time_limit (--time-limit)", "seconds", self.time_limit)
+        check_limit("memory_limit (--memory-limit)", "MiB", self.memory_limit)
+
+    @property
+    def most(self) -> int:
+        """The number of maps to list at most; 0 for all."""
+        return self.max_maps or 0
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where a search begins, and whether it reasons at its end. For other packages of this project.
+
+    Attributes:
+        reasons: Whether to find out at the end what all minimal maps share, if not all are
+            listed. A share of the time limit is kept for that.
+        after: The parts of a search for the first steps of the trace, which has ended. What it
+            grounded and proved is taken over.
+        minimal: A map of the trace with the cost that `after` proved to be minimal. Only the other
+            maps remain to be found.
+    """
+
+    reasons: bool = False
+    after: Parts | None = None
+    minimal: SSHMap | None = None
+
+    def __post_init__(self) -> None:
+        a_flag("reasons", self.reasons, SolverError)
+        if self.minimal is not None:
+            checked_map(self.minimal, "minimal")
+
+
+ANEW = Start()
