@@ -15,7 +15,7 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.clock import each_heeding, heeding, look_at_clock
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import Status, candidates, choosing
+from ssh_abduction.solver import Status, candidates, fallback
 from ssh_abduction.solver.fit import fit
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
@@ -119,7 +119,7 @@ def test_whoever_uses_an_item_is_not_under_the_limit_of_whoever_makes_it() -> No
 def test_there_is_a_map_when_the_time_is_over(steps: int, wrong: int, stars: bool) -> None:
     """Though the checker refuses the sketches that take places for some seen before, as displacements are wrong."""
     trace = driven(maze(4, 4, steps=steps, seed=steps, stars=stars).trace, wrong)
-    with patch.multiple(choosing, OVERTIME=100.0):
+    with patch.multiple(fallback, OVERTIME=100.0):
         solution = solve(trace, time_limit=1e-6)
     assert (solution.status, solution.stopped) == (Status.FEASIBLE, "time limit")
     assert check(trace, solution.maps[0], solution.theory) == ()
@@ -129,7 +129,7 @@ def test_a_sketch_that_the_checker_refuses_is_not_the_last_one() -> None:
     trace = driven(maze(3, 3, steps=60, seed=1).trace, 4)
     theory = Theory.topological().resolve(trace)
     assert check(trace, sketched(trace, theory), theory)
-    with patch.multiple(choosing, OVERTIME=100.0), patch.object(candidates, "SKETCH_SHARE", 1.0):
+    with patch.multiple(fallback, OVERTIME=100.0), patch.object(candidates, "SKETCH_SHARE", 1.0):
         assert solve(trace, time_limit=1e-6).maps
 
 
@@ -144,7 +144,7 @@ def test_no_sketch_takes_all_the_time() -> None:
         raise over_time
 
     with (
-        patch.multiple(choosing, OVERTIME=100.0),
+        patch.multiple(fallback, OVERTIME=100.0),
         patch.object(candidates.Candidates, "_go_on_to_end", deaf),
     ):
         assert solve(trace, time_limit=1e-6).status is Status.UNKNOWN

@@ -13,7 +13,7 @@ from benchmarks.instances import maze
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver import Status, choosing
+from ssh_abduction.solver import Status, fallback
 from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.solver.guesses.gated import gated_map
 from ssh_abduction.theory.pairs import Pairs
@@ -54,7 +54,7 @@ def test_a_greedy_map_satisfies_all_axioms(world: str, homing: bool) -> None:
 @pytest.mark.parametrize("world", ["junction of 5", "any angles"])
 def test_a_greedy_map_is_returned_when_time_is_up(world: str) -> None:
     trace = drive(world, 0, 40)
-    with patch.multiple(choosing, OVERTIME=100.0):
+    with patch.multiple(fallback, OVERTIME=100.0):
         solution = solve(trace, time_limit=1e-6)
     assert solution.status is Status.FEASIBLE
     assert check(trace, solution.maps[0], solution.theory) == ()
@@ -101,7 +101,7 @@ def ruled(text: str, theory: Theory) -> Theory:
 def test_a_map_that_satisfies_own_rules_is_returned_when_time_is_up(name: str) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
     theory = ruled(KEPT[name], Theory.topological())
-    with patch.multiple(choosing, OVERTIME=100.0):
+    with patch.multiple(fallback, OVERTIME=100.0):
         solution = solve(trace, theory, time_limit=1e-6)
     assert solution.status is Status.FEASIBLE
     assert check(trace, solution.maps[0], Theory.topological()) == ()
@@ -110,7 +110,7 @@ def test_a_map_that_satisfies_own_rules_is_returned_when_time_is_up(name: str) -
 @pytest.mark.parametrize("name", BROKEN)
 def test_no_map_that_breaks_own_rules_is_returned(name: str) -> None:
     trace = maze(3, 3, steps=60, seed=0).trace
-    with patch.multiple(choosing, OVERTIME=100.0):
+    with patch.multiple(fallback, OVERTIME=100.0):
         assert solve(trace, ruled(BROKEN[name], Theory.topological()), time_limit=1e-6).maps == ()
 
 
