@@ -27,6 +27,8 @@ from simulator.sight import Sight, sight
 from simulator.world import World
 
 Array = NDArray[np.float64]
+# Slots between the headings before and after an action, clockwise.
+QUARTERS = {"travel": 0, "right": 1, "around": 2, "left": 3}
 TURNS = {"left": math.pi / 2, "right": -math.pi / 2, "around": math.pi}
 # Metres between two images while the robot travels.
 STRIDE = 0.15
@@ -196,3 +198,49 @@ def _come_again(driver: Driver) -> None:
             return
         stride = min(0.08, max(0.5 * to_go, 0.01))
         driver.go(stride, _steer(seen, reach, stride))
+
+
+class Corridors:
+    """Does the actions of a route with the control laws for right angles.
+
+    It collects the openings of the place where the robot is. They are numbered by slots, clockwise
+    from the direction of arrival.
+
+    Args:
+        driver: The robot.
+        looks_behind: Whether to look behind at the start, where the robot has not arrived yet.
+    """
+
+    def __init__(self, driver: Driver, looks_behind: bool = False) -> None:
+        self.driver, self.looks_behind = driver, looks_behind
+        self._openings: dict[int, bool] = {}
+        self._facing = 0
+
+    def begin(self) -> None:
+        """Climb to the dstate near the start."""
+        climb(self.driver)
+        if self.looks_behind:
+            self.driver.go(0.0, math.pi)
+            self._facing = 2
+            self.star(self.driver.look(STILL))
+            self.driver.go(0.0, math.pi)
+            self._facing = 0
+            climb(self.driver)
+
+    def act(self, action: str) -> None:
+        """Do an action of a route."""
+        act(self.driver, action)
+        self._facing = (self._facing + QUARTERS[action]) % 4
+        if action == "travel":
+            # The robot came through the opening behind it.
+            self._openings, self._facing = {2: True}, 0
+
+    def star(self, image: Array) -> tuple[float, ...]:
+        """The openings ahead, right, behind and left, as far as known.
+
+        A direction is open if its wall is far. The image does not show what is behind the robot.
+        """
+        for slot, beams in ((0, image[82:98]), (1, image[:10]), (3, image[-10:])):
+            is_far = bool(np.median(beams) > 1.8 * self.driver.world.reach)
+            self._openings[(self._facing + slot) % 4] = is_far
+        return tuple(float(self._openings.get((self._facing + k) % 4, False)) for k in range(4))

@@ -106,8 +106,8 @@ class Pilot:
                 )
             self._face(self.here.heading + turn)
 
-    def star(self) -> tuple[float, ...]:
-        """Bearings of the gateways, in degrees clockwise from straight ahead."""
+    def star(self, image: Array | None = None) -> tuple[float, ...]:
+        """Bearings of the gateways in the panorama, in degrees clockwise from straight ahead."""
         bearings = (
             round(math.degrees(self.here.heading - street.bearing) % 360, 1) % 360
             for street in self.here.place.streets

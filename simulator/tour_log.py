@@ -18,43 +18,6 @@ from ssh_abduction.data.odometry import Covariance, Displacement
 from ssh_abduction.data.odometry import Odometry as Noise
 
 Array = NDArray[np.float64]
-# Quarter turns to the right that an action makes.
-QUARTERS = {"travel": 0, "right": 1, "around": 2, "left": 3}
-
-
-@dataclass
-class Star:
-    """The openings of the place where the robot is, as seen since it arrived.
-
-    Attributes:
-        reach: Half the width of a corridor in metres.
-        slots: Whether there is an opening, by slot. Slot 0 is the direction of arrival.
-        facing: The slot that the robot faces.
-    """
-
-    reach: float
-    slots: dict[int, bool] = field(default_factory=dict)
-    facing: int = 0
-
-    def act(self, action: str) -> None:
-        """Update the slots after an action."""
-        if action == "travel":
-            # The robot came through the opening behind it.
-            self.slots, self.facing = {2: True}, 0
-        else:
-            self.facing = (self.facing + QUARTERS[action]) % 4
-
-    def look(self, image: Array) -> None:
-        """Mark the directions ahead, right and left as openings if their walls are far.
-
-        The image does not show what is behind the robot.
-        """
-        for slot, beams in ((0, image[82:98]), (1, image[:10]), (3, image[-10:])):
-            self.slots[(self.facing + slot) % 4] = bool(np.median(beams) > 1.8 * self.reach)
-
-    def seen(self) -> tuple[float, ...]:
-        """The openings ahead, right, behind and left, as far as known."""
-        return tuple(float(self.slots.get((self.facing + k) % 4, False)) for k in range(4))
 
 
 def noise_of(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Noise:

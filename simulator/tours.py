@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.control import STILL, Driver, Tolerance, act, climb
+from simulator.control import STILL, Corridors, Driver, Tolerance
 from simulator.cruise import follow
 from simulator.drive import EVERY, Drive, Recorder
 from simulator.errors import SimulatorError
@@ -20,7 +20,7 @@ from simulator.laser import Laser
 from simulator.odometer import Odometer
 from simulator.panorama import Camera
 from simulator.robot import Body, Robot
-from simulator.tour_log import Eye, Log, Star, covariance_of, noise_of
+from simulator.tour_log import Eye, Log, covariance_of, noise_of
 from simulator.watch import Watch
 from simulator.world import World
 from ssh_abduction.data.checks import a_flag, a_number, a_whole_number, an_instance
@@ -241,68 +241,25 @@ def _at_dstates(
     driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye
 ) -> Iterator[Step]:
     """Drive all tours, and make a step at each dstate."""
-    if world.angles == "any":
-        yield from _at_junctions(driver, log, world, tours, stars, eye)
-        return
-    star, watch = Star(world.reach), Watch(world, driver, tours)
-    with watch.start():
-        climb(driver)
-        if stars:  # The image shows half a circle, so look behind, too.
-            driver.go(0.0, math.pi)
-            star.facing = 2
-            star.look(driver.look(STILL))
-            driver.go(0.0, math.pi)
-            star.facing = 0
-            climb(driver)
-    for tour in range(tours):
-        if tour:
-            driver.world = world.arranged(driver.rng)
-        for number, action in enumerate(world.route, tour * len(world.route)):
-            image = driver.look(STILL)
-            star.look(image)
-            yield Step(
-                image=eye.image(driver, image, number),
-                action=Action.of(action),
-                star=star.seen() if stars else None,
-                displacement=log.displacement(),
-                truth=_truth(world, driver.robot.pose),
-            )
-            with watch.action(number, action):
-                act(driver, action)
-            star.act(action)
-
-
-def _at_junctions(
-    driver: Driver, log: Log, world: World, tours: int, stars: bool, eye: Eye
-) -> Iterator[Step]:
-    """The same as `_at_dstates`, for streets that meet at any angles.
-
-    The robot turns by different amounts to look around, so each displacement has its own
-    covariance.
-    """
-    pilot, watch = Pilot(driver), Watch(world, driver, tours)
-    with watch.start():
-        pilot.begin()
+    is_square = world.angles == "right"
+    pilot = Corridors(driver, looks_behind=stars) if is_square else Pilot(driver)
     done = ""
-    for tour in range(tours):
-        if tour:
-            driver.world = world.arranged(driver.rng)
-        for number, action in enumerate(world.route, tour * len(world.route)):
-            # Makes the report whose covariance is used below.
-            displacement = log.displacement()
-            yield Step(
-                image=eye.image(driver, driver.look(STILL), number),
-                action=ACTIONS[action],
-                star=pilot.star() if stars else None,
-                displacement=displacement,
-                covariance=None
-                if displacement is None
-                else covariance_of(log.reports[-1], driver.tolerance, done),
-                truth=_truth(world, driver.robot.pose),
-            )
-            with watch.action(number, action):
-                pilot.act(action)
-            done = action
+    for number, action in _legs(driver, world, tours, pilot):
+        image, displacement = driver.look(STILL), log.displacement()
+        # Where streets meet at any angles, the robot turns by different amounts to look around, so
+        # each displacement has its own covariance.
+        has_covariance = displacement is not None and not is_square
+        yield Step(
+            image=eye.image(driver, image, number),
+            action=Action.of(action) if is_square else ACTIONS[action],
+            star=pilot.star(image) if stars else None,
+            displacement=displacement,
+            covariance=covariance_of(log.reports[-1], driver.tolerance, done)
+            if has_covariance
+            else None,
+            truth=_truth(world, driver.robot.pose),
+        )
+        done = action
 
 
 def _evenly(
@@ -342,18 +299,21 @@ def _evenly(
     return logged
 
 
-def _legs(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
+def _legs(
+    driver: Driver, world: World, tours: int, pilot: Corridors | Pilot | None = None
+) -> Iterator[tuple[int, str]]:
     """Drive all tours; yield the number and name of each action before it."""
-    pilot, watch = Pilot(driver) if world.angles == "any" else None, Watch(world, driver, tours)
+    pilot = pilot or (Pilot(driver) if world.angles == "any" else Corridors(driver))
+    watch = Watch(world, driver, tours)
     with watch.start():
-        pilot.begin() if pilot else climb(driver)
+        pilot.begin()
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
         for number, action in enumerate(world.route, tour * len(world.route)):
             yield number, action
             with watch.action(number, action):
-                pilot.act(action) if pilot else act(driver, action)
+                pilot.act(action)
 
 
 def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:

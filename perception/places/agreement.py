@@ -179,7 +179,10 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
         )
     if not causes:
         causes = [
-            'a range that means "nothing came back" is read as a wall (--set no_return, --set zero_is)',
+            (
+                'a range that means "nothing came back" is read as a wall (--set no_return, --set '
+                "zero_is)"
+            ),
             "the laser sits or looks elsewhere on the robot (--set mount)",
             "its field of view is another (--fov)",
         ]
