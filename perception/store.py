@@ -22,6 +22,7 @@ from sklearn.pipeline import Pipeline
 
 from perception.appearance import PanoramaTransformer
 from perception.errors import PerceptionError
+from perception.images import LARGEST
 from perception.likelihood import ImageLikelihood
 from perception.reciprocal import ReciprocalTransformer
 from perception.recognition import PlaceRecogniser
@@ -37,8 +38,6 @@ OURS = (
     ),
     "perception.recognition.PlaceRecognizer",  # The name in files of version 0.1.0.
 )
-# Limit in bytes of an unpacked file, since a small archive may unpack to more than the memory.
-LARGEST = 4 * 2**30
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from simulator.errors import SimulatorError
 from simulator.plans import Door, Plan, Room
-from simulator.world import World
+from simulator.world import World, distances_to
 
 Array = NDArray[np.float64]
 # Width of a door, and distance from the corners of its rooms, in metres.
@@ -107,12 +107,13 @@ def _outline(room: Room) -> Array:
 
 def _opening(plan: Plan, door: Door) -> Opening:
     """The opening of a door in the nearest walls of its rooms."""
-    walls = [_nearest(_outline(plan.rooms[room]), door.position) for room in door.rooms]
+    outlines = [_outline(plan.rooms[room]) for room in door.rooms]
+    walls = [walls[int(distances_to(walls, door.position).argmin())] for walls in outlines]
     longest = max(walls, key=lambda wall: float(np.hypot(*(wall[2:] - wall[:2]))))
     way = longest[2:] - longest[:2]
     flat = Opening(door.position, math.atan2(way[1], way[0]), DOOR, 0.0)
     # Shift the door along the wall into the span that both rooms share, and narrow it if necessary.
-    spans = [_span(flat, _outline(plan.rooms[room])) for room in door.rooms]
+    spans = [_span(flat, walls) for walls in outlines]
     low, high = max(low for low, _ in spans) + OFF, min(high for _, high in spans) - OFF
     width = min(DOOR, high - low) if high > low else DOOR
     shift = float(np.clip(0.0, low + width / 2, high - width / 2)) if high > low else 0.0
@@ -147,15 +148,6 @@ def _across(flat: Opening, wall: Array, along: float) -> float:
     """Position of a wall across a door, at a position along it."""
     ends = flat.frame(wall.reshape(2, 2))
     return float(np.interp(along, *ends[np.argsort(ends[:, 0])].T))
-
-
-def _nearest(walls: Array, point: tuple[float, float]) -> Array:
-    """The wall nearest to a point, (4,)."""
-    along = walls[:, 2:] - walls[:, :2]
-    share = np.clip(((np.array(point) - walls[:, :2]) * along).sum(1) / (along**2).sum(1), 0, 1)
-    off = np.hypot(*(walls[:, :2] + share[:, None] * along - np.array(point)).T)
-    nearest: Array = walls[int(off.argmin())]
-    return nearest
 
 
 def _cut(walls: Array, opening: Opening) -> Array:

@@ -45,7 +45,7 @@ from ssh_abduction.data.checks import (
 from ssh_abduction.data.errors import brief, named, printable
 from ssh_abduction.data.files import parse_json, read_at_most
 
-__all__ = ["Clutter", "TrueDState", "World", "checked_segments", "pose_of"]
+__all__ = ["Clutter", "TrueDState", "World", "checked_segments", "distances_to", "pose_of"]
 
 # Largest size of a world file in bytes.
 LARGEST = 64 * 2**20
@@ -73,6 +73,14 @@ def pose_of(name: str, value: object) -> tuple[float, float, float]:
         name, value, SimulatorError, 3, "x, y and heading, in metres and radians"
     )
     return x, y, heading
+
+
+def distances_to(walls: Array, point: Point) -> Array:
+    """Metres from a point to each wall, (n,)."""
+    starts, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
+    squares = np.maximum((along**2).sum(1), 1e-12)
+    share = np.clip(((np.array(point) - starts) * along).sum(1) / squares, 0, 1)
+    return np.asarray(np.hypot(*(starts + share[:, None] * along - np.array(point)).T))
 
 
 @dataclass(frozen=True)
@@ -172,11 +180,7 @@ class World:
         """Metres from a point to the nearest wall."""
         a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")
         a_number("y", y, SimulatorError, -FARTHEST, FARTHEST, what="metres")
-        a, b = self.segments[:, :2], self.segments[:, 2:]
-        along = b - a
-        length = np.maximum((along**2).sum(1), 1e-12)
-        t = np.clip(((np.array([x, y]) - a) * along).sum(1) / length, 0, 1)
-        return float(np.hypot(*(a + t[:, None] * along - np.array([x, y])).T).min())
+        return float(distances_to(self.segments, (x, y)).min())
 
     def nearest(self, pose: Sequence[float]) -> TrueDState | None:
         """The true dstate nearest to a pose, where a radian counts as a metre.
