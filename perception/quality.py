@@ -152,7 +152,7 @@ def trimmed_quality(
     if clusters.max() == 0:
         return math.nan
     if distances is None:
-        chosen = sampled(len(images))
+        chosen = sample_indices(len(images))
         clusters, distances = clusters[chosen], cdist(images[chosen], images[chosen])
     members = [np.flatnonzero(clusters == c) for c in np.unique(clusters)]
     if len(members) < 2:
@@ -171,7 +171,7 @@ def trimmed_quality(
     return 0.0 if between == 0 else between / within if within > 0 else math.inf
 
 
-def sampled(count: int) -> Integers:
+def sample_indices(count: int) -> Integers:
     """Ascending indices of the images for quantiles: all `count`, or a fixed random sample."""
     if count <= SAMPLE:
         return np.arange(count)

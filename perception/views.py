@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 
 from perception.confidence import NOISE, confidence
 from perception.errors import ImageWarning, PerceptionError, equal_length
-from perception.quality import cluster_quality, sampled, spanning_tree, trimmed_quality
+from perception.quality import cluster_quality, sample_indices, spanning_tree, trimmed_quality
 from ssh_abduction.data.checks import a_whole_number
 from ssh_abduction.data.errors import brief, is_finite
 
@@ -135,9 +135,11 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         images = validate_data(self, equal_length(X), dtype=np.float64, ensure_min_samples=2)
         if (images == images[0]).all():
             return self._one_view(images)
-        return self._fit_all(images) if self.isolated is None else self._fit_together(images)
+        return (
+            self._fit_all(images) if self.isolated is None else self._fit_without_isolated(images)
+        )
 
-    def _fit_together(self, images: NDArray[np.float64]) -> Self:
+    def _fit_without_isolated(self, images: NDArray[np.float64]) -> Self:
         """Fit to the images that are not isolated. The others become noise."""
         far = _to_neighbour(images, images, 1)
         self.reach_ = float(self.isolated or math.inf) * float(np.median(far))
@@ -148,7 +150,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             inside[:] = True
         self._fit_all(images[inside])
         self.labels_by_k_: dict[int, NDArray[np.intp]] = {
-            k: _among(inside, labels) for k, labels in self.labels_by_k_.items()
+            k: _with_noise(inside, labels) for k, labels in self.labels_by_k_.items()
         }
         self.labels_ = self.labels_by_k_[self.k_]
         self.confidence_, self.inside_ = confidence(images, self.labels_), images[inside]
@@ -157,17 +159,17 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     def _fit_all(self, images: NDArray[np.float64]) -> Self:
         """Fit to images that are not all equal."""
         seed = int(check_random_state(self.random_state).randint(2**31 - 1))
-        if self.clusterer is not None and _size(self.clusterer) is None:
+        if self.clusterer is not None and _count_parameter(self.clusterer) is None:
             best = self._cluster(images, None, seed)
-            self._tell(best, images)
+            self._record_single(best, images)
         elif self.k is not None:
             if self.k > 1:
-                self._affordable(self.k, images)
+                self._check_distinct(self.k, images)
             best = self._cluster(images, self.k, seed)
-            self._tell(best, images)
+            self._record_single(best, images)
         else:
             best = self._search(images, seed)
-        return self._keep(best, images)
+        return self._record_fit(best, images)
 
     def predict(self, X: ArrayLike) -> NDArray[np.intp]:
         """Predict the views of images.
@@ -206,7 +208,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         """The views of the runner-up, (n,); None without a runner-up."""
         return None if self.runner_up_ is None else self.labels_by_k_[self.runner_up_]
 
-    def _tell(self, best: Any, images: NDArray[np.float64]) -> None:
+    def _record_single(self, best: Any, images: NDArray[np.float64]) -> None:
         """Record the only clustering that was tried."""
         labels = _labels(best, images)
         inside = labels != NOISE
@@ -224,11 +226,11 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
     def _search(self, images: NDArray[np.float64], seed: int) -> Any:
         """Try each k, record the results, and return the fitted clusterer with the best k."""
-        tree, chosen = spanning_tree(images), sampled(len(images))
+        tree, chosen = spanning_tree(images), sample_indices(len(images))
         distances = cdist(images[chosen], images[chosen])
         most = min(20, len(images) - 1) if self.k_max is None else self.k_max
         most = min(max(most, self.k_min), tree.distinct)
-        self._affordable(self.k_min, images, tree.distinct)
+        self._check_distinct(self.k_min, images, tree.distinct)
         self.quality_, self.trimmed_, self.labels_by_k_ = {}, {}, {}
         fitted: dict[int, Any] = {}
         for k in range(self.k_min, most + 1):
@@ -244,10 +246,10 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             if self.by == "trimmed"
             else max(self.quality_, key=self.quality_.__getitem__)
         )
-        self.runner_up_ = self._doubted()
+        self.runner_up_ = self._find_runner_up()
         return fitted[self.k_]
 
-    def _doubted(self) -> int | None:
+    def _find_runner_up(self) -> int | None:
         """The number of views that rivals the chosen one; None without a rival."""
         others = {k: worth for k, worth in self.trimmed_.items() if k != self.k_}
         if others and self.trimmed_[self.k_] < NEAR * max(others.values()):
@@ -262,7 +264,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         chosen = clone(self.clusterer)
         settings = chosen.get_params()
         if k is not None:
-            chosen.set_params(**{str(_size(chosen)): k})
+            chosen.set_params(**{str(_count_parameter(chosen)): k})
         if (
             "random_state" in settings
             and settings["random_state"] is None
@@ -291,7 +293,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 )
             return KMeans(k, n_init=self.n_init, random_state=seed).fit(images)
 
-    def _keep(self, best: Any, images: NDArray[np.float64]) -> Self:
+    def _record_fit(self, best: Any, images: NDArray[np.float64]) -> Self:
         """Record the fitted clusterer and its labels."""
         self.clusterer_ = best
         self.labels_ = _labels(best, images)
@@ -369,13 +371,19 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
                 "clusterer: expected a scikit-learn clusterer, such as DBSCAN(), got "
                 f"{self.clusterer!r}"
             )
-        if self.k is not None and self.clusterer is not None and _size(self.clusterer) is None:
+        if (
+            self.k is not None
+            and self.clusterer is not None
+            and _count_parameter(self.clusterer) is None
+        ):
             raise PerceptionError(
                 f"k: {type(self.clusterer).__name__} finds the number of clusters itself; "
                 "leave k out"
             )
 
-    def _affordable(self, k: int, images: NDArray[np.float64], distinct: int | None = None) -> None:
+    def _check_distinct(
+        self, k: int, images: NDArray[np.float64], distinct: int | None = None
+    ) -> None:
         """Raise PerceptionError if there are fewer different images than views."""
         found = len(np.unique(images, axis=0)) if distinct is None else distinct
         if found < k:
@@ -399,7 +407,7 @@ def as_view_clusterer(clusterer: Any) -> ViewClusterer:
         return clusterer
     checked = ViewClusterer(clusterer=clusterer)
     checked._check()
-    size = _size(clusterer)
+    size = _count_parameter(clusterer)
     return checked if size is None else checked.set_params(k=clusterer.get_params()[size])
 
 
@@ -420,7 +428,7 @@ def _to_neighbour(
     return np.asarray(distances[:, -1])
 
 
-def _among(inside: NDArray[np.bool_], labels: NDArray[np.intp]) -> NDArray[np.intp]:
+def _with_noise(inside: NDArray[np.bool_], labels: NDArray[np.intp]) -> NDArray[np.intp]:
     """Labels for all images: `labels` for those inside, noise for the others."""
     every = np.full(len(inside), NOISE, np.intp)
     every[inside] = labels
@@ -432,7 +440,7 @@ def _smallest_good(worth: dict[int, float]) -> int:
     return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
 
 
-def _size(clusterer: Any) -> str | None:
+def _count_parameter(clusterer: Any) -> str | None:
     """The parameter that sets the number of clusters; None if the clusterer finds it."""
     settings = clusterer.get_params()
     if settings.get("n_clusters") is not None:

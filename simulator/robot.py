@@ -109,7 +109,7 @@ class Robot:
         self.pose = _moved(self.pose, forward_done, turn_done)
         forward_told = forward_done * (1 + body.scale) * (1 + body.odometry * e[3])
         turn_told = turn_done * (1 + body.odometry * e[4]) + body.bend * forward_done
-        self._spread(forward_told, turn_told)
+        self._add_covariance(forward_told, turn_told)
         self.odometry = _moved(self.odometry, forward_told, turn_told)
         self.driven += abs(forward_told)
 
@@ -121,7 +121,7 @@ class Robot:
         self._reported, self._covariance = self.odometry, np.zeros((3, 3))
         return said
 
-    def _spread(self, forward: float, turn: float) -> None:
+    def _add_covariance(self, forward: float, turn: float) -> None:
         """Add the covariance of a motion, to first order."""
         middle = self.odometry[2] + turn / 2
         cos, sin = math.cos(middle), math.sin(middle)

@@ -14,7 +14,7 @@ import pytest
 from perception.errors import LogError
 from perception.places.agreement import disagreement
 from perception.places.importing import tracked
-from perception.readers.echoes import MEANINGS, Array, Told, as_told, understood
+from perception.readers.echoes import MEANINGS, Array, Told, interpret_log, interpret_scan
 from perception.readers.logs import read_log
 from perception.readers.scans import RobotLog, Scan
 from perception.readers.writers import write_bag, write_carmen
@@ -89,7 +89,7 @@ def with_rays_beyond(ranges: Array, beyond: Array) -> Array:
 def test_a_range_that_repeats_is_no_return(
     drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float
 ) -> None:
-    scans, notes = understood(written(drive, say, reach), Told())
+    scans, notes = interpret_log(written(drive, say, reach), Told())
     assert len(notes) == 1
     assert re.search(
         (
@@ -113,7 +113,7 @@ def test_a_range_that_repeats_is_no_return(
 def test_walls_are_walls(
     drive: tuple[Scan, ...], say: Callable[[Array, Array], Array], reach: float
 ) -> None:
-    scans, notes = understood(written(drive, say, reach), Told())
+    scans, notes = interpret_log(written(drive, say, reach), Told())
     assert notes == ()
     for scan, true in zip(scans, drive, strict=True):
         seen = np.isfinite(scan.ranges)
@@ -125,11 +125,11 @@ def test_a_robot_that_stands_before_a_wall_sees_no_range_that_repeats(
     drive: tuple[Scan, ...],
 ) -> None:
     flat = replace(drive[0], ranges=np.full(180, 2.0))
-    assert not any("repeat" in note for note in understood([flat] * 200, Told())[1])
+    assert not any("repeat" in note for note in interpret_log([flat] * 200, Told())[1])
 
 
 def test_a_reach_of_nothing_is_that_of_the_largest_range(drive: tuple[Scan, ...]) -> None:
-    scans, notes = understood(
+    scans, notes = interpret_log(
         written(drive, lambda ranges, beyond: np.where(beyond, np.inf, ranges), math.inf), Told()
     )
     most = max(scan.ranges[scan.ranges <= SEES].max() for scan in drive)
@@ -142,7 +142,7 @@ def test_a_reach_of_nothing_is_that_of_the_largest_range(drive: tuple[Scan, ...]
 
 @pytest.mark.parametrize("value", [0.0, math.nan, -1.0, 0.05])
 def test_zeros_beside_long_beams_are_free(drive: tuple[Scan, ...], value: float) -> None:
-    scans, notes = understood(written(drive, constant(value), nearest=0.1), Told())
+    scans, notes = interpret_log(written(drive, constant(value), nearest=0.1), Told())
     assert re.search(r"\d+ % of the beams are .*nothing came back.*--set zero_is=unknown", notes[0])
     for scan, true in zip(scans, drive, strict=True):
         assert np.array_equal(np.isinf(scan.ranges), true.ranges > SEES)
@@ -151,7 +151,7 @@ def test_zeros_beside_long_beams_are_free(drive: tuple[Scan, ...], value: float)
 @pytest.mark.parametrize("value", [0.0, math.nan])
 def test_zeros_at_random_are_unknown(drive: tuple[Scan, ...], value: float) -> None:
     rng = np.random.default_rng(0)
-    scans, notes = understood(
+    scans, notes = interpret_log(
         written(drive, lambda ranges, _: np.where(rng.random(len(ranges)) < 0.1, value, ranges)),
         Told(),
     )
@@ -165,18 +165,18 @@ def test_what_the_user_says_of_zeros_is_obeyed_in_silence(
     drive: tuple[Scan, ...], meaning: str
 ) -> None:
     told = Told(zero_is=meaning, no_return=11.0)
-    scans, notes = understood(written(drive, constant(0.0)), told)
+    scans, notes = interpret_log(written(drive, constant(0.0)), told)
     assert notes == ()
     is_meant = np.isinf if meaning == "free" else np.isnan
     for scan, alone, true in zip(
-        scans, (as_told(s, told) for s in written(drive, constant(0.0))), drive, strict=True
+        scans, (interpret_scan(s, told) for s in written(drive, constant(0.0))), drive, strict=True
     ):
         assert is_meant(scan.ranges[true.ranges > SEES]).all()
         assert np.array_equal(scan.ranges, alone.ranges, equal_nan=True)
 
 
 def test_ranges_from_no_return_on_are_none(drive: tuple[Scan, ...]) -> None:
-    scans, _ = understood(drive, Told(no_return=3.0))
+    scans, _ = interpret_log(drive, Told(no_return=3.0))
     assert all(
         np.array_equal(np.isinf(scan.ranges), true.ranges >= 3.0)
         for scan, true in zip(scans, drive, strict=True)
@@ -209,7 +209,7 @@ def test_nonsense_about_the_laser_is_refused(told: dict[str, object]) -> None:
 def test_a_mount_for_several_lasers_is_refused(drive: tuple[Scan, ...]) -> None:
     second = [replace(scan, laser=replace(scan.laser, mount=(0.0, 0.0, math.pi))) for scan in drive]
     with pytest.raises(LogError, match="mount: expected the scans of one laser, got those of 2"):
-        understood([*drive, *second], Told(mount=(0, 0, 0)))
+        interpret_log([*drive, *second], Told(mount=(0, 0, 0)))
 
 
 def doubt(scans: tuple[Scan, ...]) -> str:

@@ -277,7 +277,7 @@ def test_trimmed_quality_where_it_degenerates(monkeypatch: pytest.MonkeyPatch) -
         trimmed_quality(*blobs(3, 20)), rel=0.3
     )  # of a sample
     assert (
-        trimmed_quality(many, ~np.isin(np.arange(300), quality.sampled(300))) == 0
+        trimmed_quality(many, ~np.isin(np.arange(300), quality.sample_indices(300))) == 0
     )  # a cluster that the sample does not hold
 
 

@@ -150,13 +150,13 @@ def tracked(log: RobotLog) -> tuple[RobotLog, Track, tuple[str, ...]]:
     Returns:
         The log with the odometry of one source in metres, its track, and notes about the track.
     """
-    log, alternating = jumps.of_one_source(log)
+    log, alternating = jumps.keep_one_source(log)
     log, counted = in_metres(log)
     track = follow(log)
-    notes = alternating + counted + jumps.said_of(log, track, turned_wrongly(log, track))
+    notes = alternating + counted + jumps.describe_cuts(log, track, turned_wrongly(log, track))
     # An odometry that is wrong throughout already explains all differences between the
     # trajectories.
-    notes += jumps.said_of_whole(log) or [doubt for doubt in [disagreement(log, track)] if doubt]
+    notes += jumps.describe_whole(log) or [doubt for doubt in [disagreement(log, track)] if doubt]
     for note in notes:
         _log.warning("%s: %s", named(log.source), note)
     return log, track, tuple(notes)

@@ -43,7 +43,7 @@ NO_RANGE = 25.0
 ANEW = 1.0
 
 
-def of_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
+def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
     """Keep the odometry of one source if the poses of several sources alternate.
 
     Returns:
@@ -96,7 +96,7 @@ def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan
     return tuple(replace(scan, odometry=pose) for scan, pose in zip(scans, odometry, strict=True))
 
 
-def said_of(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> list[str]:
+def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> list[str]:
     """Describe where a track is cut or broken.
 
     Args:
@@ -156,7 +156,7 @@ def said_of(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> lis
     return notes
 
 
-def said_of_whole(log: RobotLog) -> list[str]:
+def describe_whole(log: RobotLog) -> list[str]:
     """Describe odometry that is wrong throughout, or a log that is out of order."""
     notes = []
     far_apart, to_and_fro = (
@@ -220,7 +220,7 @@ class Unknown:
     doubtful: frozenset[int] = frozenset()
     still: tuple[tuple[int, int], ...] = ()
 
-    def but_for(self, standing: frozenset[int]) -> Unknown:
+    def without(self, standing: frozenset[int]) -> Unknown:
         """The same without the scans in which the robot really stood still."""
         return replace(self, unknown=self.unknown - (standing - self.carried), still=())
 
@@ -236,10 +236,10 @@ def unknown_steps(log: RobotLog) -> Unknown:
     jumped, doubtful = _impossible(log, seconds, paused)
     carried, still = _moved_while_still(log, paused)
     moved = frozenset(k for first, last in still for k in range(first, last + 1))
-    return Unknown(_after(jumped) | moved | carried, carried, _after(doubtful & ~jumped), still)
+    return Unknown(_targets(jumped) | moved | carried, carried, _targets(doubtful & ~jumped), still)
 
 
-def _after(steps: NDArray[np.bool_]) -> frozenset[int]:
+def _targets(steps: NDArray[np.bool_]) -> frozenset[int]:
     """The scans that steps lead to."""
     return frozenset((np.flatnonzero(steps) + 1).tolist())
 

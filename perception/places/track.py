@@ -158,7 +158,7 @@ def follow(log: RobotLog, trust: Trust | None = None) -> Track:
         <= CARRIED
     )
     if standing:
-        follower = replace(follower, steps=steps.but_for(standing))
+        follower = replace(follower, steps=steps.without(standing))
         track = follower.followed(steps.carried)
     if more := frozenset(_carried(log, track)):
         track = follower.followed(steps.carried | more)

@@ -70,7 +70,7 @@ def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
                     frame_name(stamped.header.frame_id),
                 )
                 try:
-                    edge = _heard(frames, child, parent, stamped.transform, is_static)
+                    edge = _record(frames, child, parent, stamped.transform, is_static)
                 except Damaged as damage:
                     damaged.append(Damage(number, f"{connection.topic}: {child}: {damage}"))
                     continue
@@ -85,7 +85,7 @@ def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
     return frames
 
 
-def _heard(frames: Frames, child: str, parent: str, transform: Any, is_static: bool) -> Frame:
+def _record(frames: Frames, child: str, parent: str, transform: Any, is_static: bool) -> Frame:
     """Record a message of the transform to a frame. Raises Damaged."""
     move, turn = transform.translation, transform.rotation
     flat = flat_pose(move, turn)

@@ -108,7 +108,7 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Readin
     notes += contradictions
     if above:
         notes.append(f"Corrected poses are those of the transforms above {odom}.")
-    where = _Where(
+    where = _ScanPoses(
         Poses.of(odometer, by_stamp),
         [Poses.of(track, by_stamp) for track in above],
         mounts,
@@ -251,7 +251,7 @@ def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
 
 
 @dataclass(frozen=True)
-class _Where:
+class _ScanPoses:
     """Poses of the robot and its lasers.
 
     Attributes:
@@ -269,7 +269,7 @@ class _Where:
 
     def at(self, time: float) -> tuple[Pose, Pose | None]:
         """The pose by the odometer, and the corrected one. Raises Damaged."""
-        if not self.odometry.tells(time):
+        if not self.odometry.covers(time):
             begin, end = self.odometry.times[[0, -1]]
             raise Damaged(
                 f"expected odometry at the time of the scan, {time:.3f} s, got it from "
@@ -284,7 +284,7 @@ class _Where:
 
 
 def _scans(
-    bag: Bag, topics: set[str], where: _Where, damaged: list[Damage]
+    bag: Bag, topics: set[str], where: _ScanPoses, damaged: list[Damage]
 ) -> Iterator[Scan | Damage]:
     """Read the scans, after the damage found so far."""
     yield from damaged

@@ -1,7 +1,7 @@
 """Reads logs in lines: CARMEN's, and those of g2o or TORO with scans.
 
-These lines of CARMEN are read (http://carmen.sourceforge.net, logger); `...` ends with `[time host
-time]`, and an R is remission:
+These lines of CARMEN are read (http://carmen.sourceforge.net, logger). `...` means `[time host
+time]`, and R means remission:
 
     FLASER n range*n x y theta odom_x odom_y odom_theta ...
     ROBOTLASER1 type start fov step reach accuracy R n range*n m R*m
@@ -165,24 +165,24 @@ def _scans(
                 continue
             tag = tokens[0]
             if tag != kind.encode():
-                odometer.hear(tag, tokens)
+                odometer.read_line(tag, tokens)
             elif (line := scan_line(tokens)) is not None:
                 waiting.append(
                     Scan(
                         *_measured(line, mount, reach, fov),
-                        *odometer.place(line),
+                        *odometer.pose_of(line),
                         line.time,
                         number,
                     )
                 )
         except Damaged as damage:
-            odometer.mishear(tag)
+            odometer.skip_line(tag)
             waiting.append(Damage(number, str(damage)))
         if odometer.meaning != "lines" or tag == b"ODOM" or len(waiting) >= MOST_WAITING:
-            yield from map(odometer.placed, waiting)
+            yield from map(odometer.with_pose, waiting)
             waiting.clear()
     odometer.before = odometer.last
-    yield from map(odometer.placed, waiting)
+    yield from map(odometer.with_pose, waiting)
 
 
 @dataclass(slots=True)
@@ -216,7 +216,7 @@ class _Odometer:
     truth: tuple[Pose, Pose] | None = None
     news: Pose | None = None
 
-    def hear(self, tag: bytes, tokens: list[bytes]) -> None:
+    def read_line(self, tag: bytes, tokens: list[bytes]) -> None:
         """Take in a line that is not a scan. Raises Damaged."""
         if tag == b"ODOM":
             pose = pose_at(tokens, 1)
@@ -239,9 +239,9 @@ class _Odometer:
             self.news = vertex_of(tokens)[1]
             self.vertex = 0 if self.vertex is None else self.vertex + 1
         elif tag not in OTHERS:
-            self.mishear(tag)
+            self.skip_line(tag)
 
-    def mishear(self, tag: bytes) -> None:
+    def skip_line(self, tag: bytes) -> None:
         """Take in that a line cannot be read.
 
         The line may have been a scan, after which ODOM lines restart. Then the next ODOM line tells
@@ -249,11 +249,11 @@ class _Odometer:
         """
         self.restarts |= self.meaning == "restarts" and tag != b"ODOM"
 
-    def place(self, line: ScanLine) -> tuple[Pose, Pose | None]:
+    def pose_of(self, line: ScanLine) -> tuple[Pose, Pose | None]:
         """The pose by the odometer, and the corrected one if it is known. Raises Damaged."""
         first, second = line.first, line.second
         if first is None or second is None:
-            return self.chain, None  # This is replaced in `placed`.
+            return self.chain, None  # This is replaced in `with_pose`.
         if self.meaning == "edges":
             index = self.found.graph.index_at(second, self.vertex)
             if index is None:
@@ -267,9 +267,11 @@ class _Odometer:
             return self.chain, second
         if self.news is not None:
             self.truth, self.news = (self.news, second), None
-        return second, self._truly(second) or (first if self.meaning == "first corrected" else None)
+        return second, self._corrected(second) or (
+            first if self.meaning == "first corrected" else None
+        )
 
-    def placed(self, item: Scan | Damage) -> Scan | Damage:
+    def with_pose(self, item: Scan | Damage) -> Scan | Damage:
         """Give a scan without a pose one between those of the last two ODOM lines."""
         if self.meaning != "lines" or isinstance(item, Damage) or self.last is None:
             return item
@@ -286,9 +288,9 @@ class _Odometer:
             share = (item.time - began) / (ended - began)
         dx, dy, turned = between(start, end)
         odometry = moved(start, (share * dx, share * dy, share * turned))
-        return replace(item, odometry=odometry, corrected=self._truly(odometry))
+        return replace(item, odometry=odometry, corrected=self._corrected(odometry))
 
-    def _truly(self, odometry: Pose) -> Pose | None:
+    def _corrected(self, odometry: Pose) -> Pose | None:
         """The true pose, from the last corrected pose and the odometry since."""
         return (
             moved(self.truth[0], between(self.truth[1], odometry))

@@ -140,7 +140,7 @@ class Meaning:
     free: frozenset[str]
 
 
-def understood(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], tuple[str, ...]]:
+def interpret_log(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], tuple[str, ...]]:
     """Find out what the ranges of a whole log mean.
 
     Args:
@@ -169,7 +169,7 @@ def understood(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], tup
     for members in groups.values():
         kept = moving(placed[i] for i in members)
         some = np.unique(np.linspace(0, len(kept) - 1, min(len(kept), MOST_SURVEYED)).astype(int))
-        meaning, said = _surveyed([kept[i] for i in some], told)
+        meaning, said = _survey([kept[i] for i in some], told)
         meanings |= dict.fromkeys(members, meaning)
         notes += said
     return tuple(_measured(scan, meanings[i]) for i, scan in enumerate(placed)), tuple(
@@ -177,7 +177,7 @@ def understood(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], tup
     )
 
 
-def as_told(scan: Scan, told: Told) -> Scan:
+def interpret_scan(scan: Scan, told: Told) -> Scan:
     """Interpret the ranges of a single scan without its log.
 
     Args:
@@ -226,7 +226,7 @@ def _kinds(scan: Scan) -> dict[str, Bools]:
     return dict(zip(KINDS, found, strict=True))
 
 
-def _surveyed(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
+def _survey(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
     """The meaning of the ranges of one laser, and notes on it."""
     laser, notes = scans[0].laser, list[str]()
     reach = told.reach(laser.reach)

@@ -10,7 +10,7 @@ from typing import IO
 
 from perception.errors import LogError
 from perception.readers import bag_files, bag_topics, bags, carmen
-from perception.readers.echoes import Told, as_told, understood
+from perception.readers.echoes import Told, interpret_log, interpret_scan
 from perception.readers.lines import LONGEST_LINE, lines, opened
 from perception.readers.scans import Damage, Reading, RobotLog, Scan
 from ssh_abduction.data.errors import brief, named
@@ -81,7 +81,7 @@ def read_log(
             f"{named(path)}: expected scans, got none that can be read; {len(damaged)} are "
             f"damaged, first: {damaged[0].what if damaged else 'none'}"
         )
-    meant, found_out = understood(scans, told)
+    meant, found_out = interpret_log(scans, told)
     # What the user said need not be assumed.
     assumed = (note for option, note in reading.assumed.items() if getattr(told, option) is None)
     log = RobotLog(
@@ -119,7 +119,7 @@ def stream_log(
     told = Told(fov, mount, no_return, zero_is)
     with _reading(path, format, scan_topic, odom_topic) as reading:
         for item in reading.items:
-            yield as_told(item, told) if isinstance(item, Scan) else item
+            yield interpret_scan(item, told) if isinstance(item, Scan) else item
 
 
 @contextmanager

@@ -78,7 +78,7 @@ class Poses:
         x, y, heading = (float(np.interp(time, self.times, self.poses[:, i])) for i in range(3))
         return x, y, math.remainder(heading, math.tau)
 
-    def tells(self, time: float) -> bool:
+    def covers(self, time: float) -> bool:
         """Whether the poses cover a time, or nearly do."""
         return bool(self.times[0] - BESIDE <= time <= self.times[-1] + BESIDE)
 
