@@ -1,4 +1,6 @@
-"""What each kind of evidence is worth for a trace: the minimal maps by views alone, and then with one kind more on each rung.
+"""What each kind of evidence is worth for a trace, one kind more on each rung of a ladder.
+
+The first rung has the minimal maps by views alone.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.evaluation.ladder import ladder
@@ -7,7 +9,8 @@
 >>> [(rung.name, rung.solution.cost.places, rung.solution.count) for rung in ladder(trace)]
 [('views', 3, 1), ('+ pairs', 4, 1), ('+ geometry', 4, 1), ('+ planarity', 4, 1)]
 
-A square whose corners look alike is explained by a triangle, unless displacements say otherwise. Each rung is a theory of its own, and its maps are solved for from scratch.
+A square whose corners look alike is explained by a triangle, unless displacements say otherwise.
+Each rung is a theory of its own, and its maps are solved for from scratch.
 """
 
 from __future__ import annotations
@@ -27,11 +30,12 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 
 @dataclass(frozen=True, slots=True)
 class Rung:
-    """One kind of evidence more.
+    """One more kind of evidence.
 
-    name        what the rung adds
-    solution    the minimal maps by all evidence up to it
-    evaluation  how right they are; None where the trace has no truth, or there is no map
+    Attributes:
+        name: What the rung adds.
+        solution: The minimal maps by all evidence up to this rung.
+        evaluation: How right they are; None if the trace has no truth, or there is no map.
     """
 
     name: str
@@ -40,7 +44,7 @@ class Rung:
 
     @property
     def rank(self) -> int | None:
-        """Which of the minimal maps is the true one, counted from 1; None if none is, or if that is not known."""
+        """The number of the true map, from 1; None if none is true, or the truth is unknown."""
         return self.evaluation.rank if self.evaluation else None
 
     def to_dict(self) -> dict[str, Any]:
@@ -60,10 +64,12 @@ class Rung:
 
 
 class UnderWay:
-    """Searches that come one after the other. A handler of signals, or another thread, ends the one that is under way, and all that come after it.
+    """Searches that come one after the other, and can be ended together.
+
+    A signal handler or another thread ends the search that is under way, and all that come after.
 
     Attributes:
-        search: The search that is under way or was the last one; None before the first.
+        search: The current or last search; None before the first.
         interrupted: Whether somebody asked for an end.
     """
 
@@ -72,23 +78,26 @@ class UnderWay:
         self.interrupted = False
 
     def interrupt(self) -> None:
-        """End the search that is under way soon, with its best answer so far."""
+        """End the current search soon, with its best answer so far."""
         self.interrupted = True
         if self.search is not None:
             self.search.interrupt()
 
     def snapshot(self) -> Solution:
-        """What the search that is under way in another thread, which cannot be stopped, knows by now. It is of no use any more then."""
+        """What the current search knows, if it is in another thread that cannot be stopped.
+
+        The search cannot be used afterwards.
+        """
         assert self.search
         return self.search.snapshot("interrupted")
 
     def solve(
         self, trace: Trace, theory: Theory, *, time_limit: float | None, max_maps: int | None
     ) -> Solution:
-        """Do as `ssh_abduction.solve` does. Ctrl-C that ends this search ends the others, too."""
+        """Solve as `ssh_abduction.solve` does. Ctrl-C ends this search and the later ones."""
         theory.check_steps(trace)
         self.search = Search(trace, theory, time_limit=time_limit, max_maps=max_maps)
-        if self.interrupted:  # perhaps before there was a search to be told
+        if self.interrupted:  # perhaps before there was a search
             self.search.interrupt()
         solution = self.search.solution(tuple(self.search))
         self.interrupted |= solution.stopped == "interrupted"
@@ -96,11 +105,15 @@ class UnderWay:
 
 
 def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[str, Theory]]:
-    """The theories of the ladder, each with one kind of evidence more, as far as the trace has it."""
-    jumped, theory = (
-        theory.jumped,
-        theory.replace(star="none", displacement="none", planar=False, jumped=0),
-    )
+    """The theories of the ladder, each with one more kind of evidence that the trace has.
+
+    Args:
+        trace: The trace.
+        theory: The other choices.
+        stars: Whether stars have a rung.
+    """
+    jumped = theory.jumped
+    theory = theory.replace(star="none", displacement="none", planar=False, jumped=0)
     yield "views", theory
     topological = theory.level == "topological"
     if trace.has_stars and stars:
@@ -111,7 +124,7 @@ def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[st
         yield "+ pairs", theory
         theory = theory.replace(joint=2)
         yield "+ geometry", theory
-    if topological and not theory.has_faults:  # a theory has the one or the other
+    if topological and not theory.has_faults:  # a theory cannot have both
         yield "+ planarity", theory.replace(planar=True)
 
 
@@ -126,14 +139,17 @@ def ladder(
     known: Solution | None = None,
     under_way: UnderWay | None = None,
 ) -> Iterator[Rung]:
-    """The rungs of a trace, as they are solved. A rung that is interrupted is the last one.
+    """Solve the rungs of a trace, one after the other. An interrupted rung is the last one.
 
-    theory  the other choices; Theory.topological() by default. What it says of stars, displacements and planarity is laid over
-    limit   seconds for each rung
-    maps    so many minimal maps, at most, are listed and evaluated on each rung
-    stars   whether stars have a rung, where the trace has some
-    known   a solution of this trace that is there already: the rung that has its theory takes it, and is not solved again
-    under_way  what can interrupt the ladder from elsewhere; Ctrl-C does so without
+    Args:
+        trace: The trace.
+        theory: The other choices; Theory.topological() by default. The ladder replaces what it says
+            of stars, displacements and planarity.
+        time_limit: Seconds for each rung; None for no limit.
+        max_maps: List and evaluate at most this many minimal maps on each rung; None for all.
+        stars: Whether stars have a rung, if the trace has some.
+        known: A solution of this trace. The rung with its theory takes it, and is not solved again.
+        under_way: Interrupts the ladder from elsewhere. Ctrl-C does so without it.
     """
     checked_trace(trace)
     theory = checked_theory(theory)
@@ -164,6 +180,7 @@ def _solved(
     known: Solution | None,
     under_way: UnderWay,
 ) -> Iterator[Rung]:
+    """Solve the rungs, with checked arguments."""
     has_truth = tells_names(trace)
     for name, chosen in rungs(trace, theory, stars):
         solution = (

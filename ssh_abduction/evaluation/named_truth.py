@@ -1,20 +1,22 @@
-"""How right maps are, where the steps of the trace say what is true.
+"""How right maps are, where the steps of a trace name their true dstates, places and paths.
 
 >>> from dataclasses import replace
 >>> from ssh_abduction import Theory, Trace, evaluate, solve
 >>> seen = Trace.from_steps("abab", ["on", "on", "on"])
 >>> rooms = ["hall", "nook", "yard", "nook"]
->>> trace = replace(seen, steps=tuple(replace(step, truth=room) for step, room in zip(seen.steps, rooms)))
+>>> steps = [replace(step, truth=room) for step, room in zip(seen.steps, rooms)]
+>>> trace = replace(seen, steps=tuple(steps))
 >>> found = evaluate(solve(trace, Theory.causal()).maps, trace)
 >>> found.rank, found.true_dstates, found.maps[0].dstates, found.maps[0].accuracy
 (None, 3, 2, 0.75)
 
-The minimal map takes the yard for the hall, which looks the same: three of four steps have the right label.
+The minimal map takes the yard for the hall, which looks the same: three of four steps have the
+right label.
 
-Everything is counted over the steps whose truth is told: a step without truth is left out, and so is, when places are counted, a step
-of which only the dstate is told. What cannot be said is None: a share of nothing, a sort of thing (dstates, places, paths) that the
-truth does not tell, and one that the map does not have, as maps of causal theories have no places. docs/formats.md says in which forms
-a trace tells its truth. Nothing that infers maps may import this module.
+Only steps with truth are counted; for places, only steps whose true place is known. A value is None
+if it cannot be said: a share of nothing, or a sort of thing (dstates, places, paths) that the truth
+or the map does not have. Maps of causal theories have no places, for example. docs/formats.md says
+in which forms a trace has its truth. Nothing that infers maps may import this module.
 """
 
 from __future__ import annotations
@@ -41,21 +43,29 @@ from ssh_abduction.data.words import counted
 class MapEvaluation:
     """How right one map is. Shares are from 0 to 1; what cannot be said is None.
 
-    dstates_right    whether the labels are the true dstates up to renaming: two steps have one label exactly if they are at one true dstate
-    places_right     the same of places
-    paths_right      the same of paths, and of courses (a path and one of its directions) where the truth tells directions. The order of
-                     the places on a path is no part of the truth
-    accuracy         localisation accuracy: the share of steps with the right label, under the one-to-one assignment of dstates to
-                     true dstates that makes it largest
-    place_precision  of the pairs of steps that the map has at one place, the share that truly is
-    place_recall     of the pairs of steps that truly are at one place, the share that the map has there
-    edge_precision   edges join the places at both ends of a travel, in either direction. Of the map's edges, the share that is true,
-                     under the best one-to-one assignment of places to true places
-    edge_recall      of the true edges, the share that the map has. Both speak of travels that were driven, from one step to the next:
-                     the edges of TOPO-Bench (Wang et al., arXiv 2510.04100) with a budget of one hop
-    link_precision   the same of links: a dstate, an action, and the dstate that it leads to, under the assignment of dstates
-    link_recall      of the true links, the share that the map has
-    dstates, places, paths  how many the map has at the steps that are counted
+    An edge joins the places at both ends of a travel, in either direction. Edges are counted for
+    travels that were driven, from one step to the next: the edges of TOPO-Bench (Wang et al., arXiv
+    2510.04100) with a budget of one hop. A link is a dstate, an action, and the dstate that it
+    leads to.
+
+    Attributes:
+        dstates_right: Whether the labels are the true dstates up to renaming: two steps have one
+            label exactly if they are at one true dstate.
+        places_right: The same for places.
+        paths_right: The same for paths, and for courses (a path and a direction) if the truth has
+            directions. The order of places on a path is no part of the truth.
+        accuracy: Localisation accuracy: the share of steps with the right label, under the best
+            one-to-one assignment of dstates to true dstates.
+        place_precision: Of the pairs of steps at one place in the map, the share that truly is.
+        place_recall: Of the pairs of steps that truly are at one place, the share in the map.
+        edge_precision: Of the map's edges, the share that is true, under the best one-to-one
+            assignment of places to true places.
+        edge_recall: Of the true edges, the share that the map has.
+        link_precision: Of the map's links, the share that is true, under the assignment of dstates.
+        link_recall: Of the true links, the share that the map has.
+        dstates: How many dstates the map has at the counted steps.
+        places: How many places.
+        paths: How many paths.
     """
 
     dstates_right: bool | None
@@ -74,12 +84,13 @@ class MapEvaluation:
 
     @property
     def isomorphic(self) -> bool | None:
-        """Whether the map is the true one up to renaming: its dstates are right, and so are its places and paths where these can be said."""
-        return (
-            False
-            if False in (self.dstates_right, self.places_right, self.paths_right)
-            else self.dstates_right
-        )
+        """Whether the map is the true one up to renaming.
+
+        Its dstates are right, and so are its places and paths as far as these can be said.
+        """
+        if False in (self.dstates_right, self.places_right, self.paths_right):
+            return False
+        return self.dstates_right
 
     def to_dict(self) -> dict[str, Any]:
         """The values under their names, as `evaluate --json` prints them."""
@@ -90,10 +101,13 @@ class MapEvaluation:
 class Evaluation:
     """How right maps of one trace are.
 
-    maps          each map, in the order given
-    steps         how many steps have truth
-    true_dstates, true_places, true_paths  how many different ones the truth names; None where it names none
-    ambiguity     how ambiguous the trace is: of the pairs of different true dstates, the share that shares a view
+    Attributes:
+        maps: Each map, in the order given.
+        steps: How many steps have truth.
+        true_dstates: How many different dstates the truth names; None if it names none.
+        true_places: How many different places.
+        true_paths: How many different paths.
+        ambiguity: Of the pairs of different true dstates, the share that shares a view.
     """
 
     maps: tuple[MapEvaluation, ...]
@@ -107,11 +121,12 @@ class Evaluation:
         which = (
             "no map is the true one" if self.rank is None else f"map {self.rank} is the true one"
         )
-        return f"<Evaluation: {which}, of {counted(len(self.maps), 'maps')}; the truth is told at {counted(self.steps, 'steps')}>"
+        maps, steps = counted(len(self.maps), "maps"), counted(self.steps, "steps")
+        return f"<Evaluation: {which}, of {maps}; the truth is told at {steps}>"
 
     @property
     def rank(self) -> int | None:
-        """Which map is the first that is isomorphic to the truth, counted from 1; None if none is."""
+        """The number of the first map that is isomorphic to the truth, from 1; None if none is."""
         return next((i for i, found in enumerate(self.maps, 1) if found.isomorphic), None)
 
     def to_dict(self) -> dict[str, Any]:
@@ -124,9 +139,15 @@ class Evaluation:
 
 
 def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
-    """How right these maps of a trace are.
+    """How right maps of a trace are.
 
-    Raises TraceError where no step has truth, or where it contradicts itself; MapError for a map of other steps.
+    Args:
+        maps: Maps of the trace.
+        trace: A trace whose steps name what is true.
+
+    Raises:
+        TraceError: No step has truth, or the truth contradicts itself.
+        MapError: A map is of other steps.
     """
     maps = checked_maps(maps)
     truth = _Truth(checked_trace(trace))
@@ -144,7 +165,10 @@ def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
 
 
 def tells_names(trace: Trace) -> bool:
-    """Whether the truth of some step names a dstate, a place or a path. Raises TraceError for what cannot be a name."""
+    """Whether the truth of some step names a dstate, a place or a path.
+
+    Raises TraceError for what cannot be a name.
+    """
     return any(
         name
         for t, step in enumerate(trace.steps)
@@ -153,7 +177,10 @@ def tells_names(trace: Trace) -> bool:
 
 
 class _Truth:
-    """What the steps of a trace say is true. Names of dstates, places, paths and courses, one a step; None where a step does not tell it."""
+    """The true names of dstates, places, paths and courses, one a step; None if not told.
+
+    Raises TraceError if no step has a name, or one dstate has two places, paths or courses.
+    """
 
     def __init__(self, trace: Trace) -> None:
         self.trace = trace
@@ -163,29 +190,34 @@ class _Truth:
         )
         if not any((*self.dstates, *self.places, *self.paths)):
             raise TraceError(
-                f"{named(trace.source or 'trace')}: truth: expected the true dstate or place of some step, got none; "
-                f'write "truth": {{"dstate": …, "place": …}} on the steps, or {{"pose": [x, y, heading]}}'
+                f"{named(trace.source or 'trace')}: truth: expected the true dstate or place of "
+                'some step, got none; write "truth": {"dstate": …, "place": …} on the steps, '
+                'or {"pose": [x, y, heading]}'
             )
-        first: dict[Hashable, dict[str, tuple[int, Hashable]]] = {}
+        # The first step at each dstate that tells its place, path or course.
+        first: dict[tuple[Hashable, str], tuple[int, Hashable]] = {}
         for t, step in enumerate(told):
+            dstate = step.get("dstate")
             for sort in ("place", "path", "course"):
-                if (name := step.get(sort)) is not None and (
-                    dstate := step.get("dstate")
-                ) is not None:
-                    before, known = first.setdefault(dstate, {}).setdefault(sort, (t, name))
-                    if known != name:
-                        field = "direction" if sort == "course" else sort
-                        raise TraceError(
-                            f"{trace.at(t)}: truth.{field}: expected {brief(trace.steps[before].truth[field])}, as {trace.at(before)} says "
-                            f"of the same dstate, got {brief(trace.steps[t].truth[field])}; name another dstate, or mend the {field}"
-                        )
+                name = step.get(sort)
+                if dstate is None or name is None:
+                    continue
+                before, known = first.setdefault((dstate, sort), (t, name))
+                if known != name:
+                    field = "direction" if sort == "course" else sort
+                    expected, got = (brief(trace.steps[i].truth[field]) for i in (before, t))
+                    raise TraceError(
+                        f"{trace.at(t)}: truth.{field}: expected {expected}, as {trace.at(before)} "
+                        f"says of the same dstate, got {got}; "
+                        f"name another dstate, or mend the {field}"
+                    )
 
     def dstate_hops(self) -> list[int]:
-        """The steps whose dstate is told, and that of the next step, too."""
+        """The steps at which the dstates of this and the next step are told."""
         return _hops(self.dstates)
 
     def place_hops(self) -> list[int]:
-        """The steps after which the robot travelled, and whose place is told, and that of the next step, too."""
+        """The steps before a travel at which the places of this and the next step are told."""
         return [t for t in _hops(self.places) if self.trace.actions[t].kind == "travel"]
 
 
@@ -193,14 +225,19 @@ _SORTS = ("dstate", "place", "path", "course")
 
 
 def _told(value: Any, where: str) -> dict[str, Hashable]:
-    """What the truth of a step tells, by sort. Names are JSON texts, so that lists and objects can be names, too. Raises TraceError."""
+    """The true names of a step, by sort.
+
+    Names become JSON texts, so that lists and objects can be names, too. Raises TraceError for what
+    JSON cannot hold.
+    """
 
     def name(value: Any) -> str | None:
         try:
             return None if value is None else json.dumps(value, sort_keys=True, allow_nan=False)
         except (TypeError, ValueError, RecursionError):
             raise TraceError(
-                f"{where}: truth: expected what JSON can hold, got {brief(value)}; name dstates by texts or numbers"
+                f"{where}: truth: expected what JSON can hold, got {brief(value)}; "
+                "name dstates by texts or numbers"
             ) from None
 
     if not isinstance(value, Mapping):
@@ -221,23 +258,27 @@ def _hops(names: Sequence[Hashable]) -> list[int]:
 
 
 def checked_map(ssh_map: object, where: str, trace: Trace) -> SSHMap:
-    """A map that has a label for each step of the trace. Raises MapError."""
+    """A map that has a label for each step of the trace. Raises MapError for anything else."""
     if not isinstance(ssh_map, SSHMap):
         raise MapError(
-            f"{where}: expected an SSHMap, got {brief(ssh_map)}; take the maps of a solution, or SSHMap.load"
+            f"{where}: expected an SSHMap, got {brief(ssh_map)}; "
+            "take the maps of a solution, or SSHMap.load"
         )
     if len(ssh_map.labels) != len(trace):
         raise MapError(
-            f"{where}: labels: expected {len(trace)}, one for each step of the trace, got {len(ssh_map.labels)}; solve this trace"
+            f"{where}: labels: expected {len(trace)}, one for each step of the trace, "
+            f"got {len(ssh_map.labels)}; solve this trace"
         )
     if strange := set(ssh_map.labels) - set(range(len(ssh_map.dstates))):
         raise MapError(
-            f"{where}: labels: expected 0 to {len(ssh_map.dstates) - 1}, the dstates of the map, got {brief(min(strange))}; mend it"
+            f"{where}: labels: expected 0 to {len(ssh_map.dstates) - 1}, the dstates of the map, "
+            f"got {brief(min(strange))}; mend it"
         )
     return ssh_map
 
 
 def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
+    """How right a map is."""
     at = [ssh_map.dstates[label] for label in ssh_map.labels]
     dstates = _Sort([s.id for s in at], truth.dstates)
     places = _Sort([s.place for s in at], truth.places)
@@ -269,34 +310,37 @@ def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
 
 
 class _Sort:
-    """One sort of thing, such as places, as a map and as the truth have it.
+    """One sort of thing, such as places, in a map and in the truth.
 
-    said  what the map says each step is at; None: at none
-    true  what each step truly is at; None: not told
+    Args:
+        said: What the map says each step is at; None for nothing.
+        true: What each step truly is at; None if it is not told.
     """
 
     def __init__(self, said: Sequence[Hashable], true: Sequence[Hashable]) -> None:
         self.said, self.true = said, true
-        # How many steps the map has at the one and are truly at the other. In the order of the trace, so that names make no difference.
+        # How many steps are at x in the map and truly at y. They are in the order of the trace, so
+        # that names make no difference.
         self.steps = Counter((x, y) for x, y in zip(said, true, strict=True) if y is not None)
         self.of_map = list(dict.fromkeys(x for x, _ in self.steps if x is not None))
         self.of_truth = list(dict.fromkeys(y for _, y in self.steps))
 
     @property
     def right(self) -> bool | None:
-        """Whether both tell the same steps apart; None where one of them tells nothing. A step that the map has at none makes a pair too many."""
+        """Whether map and truth tell the same steps apart; None if one of them tells nothing."""
         if not self.of_map:
             return None
+        # A step that is at nothing in the map makes a pair too many.
         return len(self.steps) == len(self.of_map) == len(self.of_truth)
 
     @property
     def count(self) -> int | None:
-        """How many the map has at the steps that are counted."""
+        """How many things the map has at the counted steps."""
         return len(self.of_map) or None
 
     @cached_property
     def assignment(self) -> dict[Hashable, Hashable]:
-        """What the map has, each with another one of the truth, so that as many steps as can be are at what they are assigned to."""
+        """The one-to-one assignment of the map's things to true ones that suits most steps."""
         rows, columns = (
             {name: i for i, name in enumerate(names)} for names in (self.of_map, self.of_truth)
         )
@@ -311,12 +355,10 @@ class _Sort:
 
     @property
     def accuracy(self) -> float | None:
-        """The share of steps that are at what is assigned to what the map says."""
-        return (
-            _share(sum(self.steps[pair] for pair in self.assignment.items()), self.steps.total())
-            if self.of_map
-            else None
-        )
+        """The share of steps that are right under the assignment."""
+        if not self.of_map:
+            return None
+        return _share(sum(self.steps[pair] for pair in self.assignment.items()), self.steps.total())
 
     def pairs(self) -> tuple[float | None, float | None]:
         """Precision and recall of pairs of steps at one thing."""
@@ -328,22 +370,21 @@ class _Sort:
             true[y] += steps
         del said[None]
         both = sum(comb(steps, 2) for (x, _), steps in self.steps.items() if x is not None)
-        return _share(both, sum(comb(n, 2) for n in said.values())), _share(
-            both, sum(comb(n, 2) for n in true.values())
-        )
+        of_map, of_truth = (sum(comb(n, 2) for n in found.values()) for found in (said, true))
+        return _share(both, of_map), _share(both, of_truth)
 
     def edges(
         self, hops: Iterable[int], edge: Callable[[int, Hashable, Hashable], Hashable]
     ) -> tuple[float | None, float | None]:
-        """Precision and recall of edges, each between a step and the next one, under the assignment.
+        """Precision and recall of edges, under the assignment.
 
-        edge  what joins two things, after this step: edges that are equal count once
+        Args:
+            hops: The steps before an edge.
+            edge: Makes an edge of a step and the things at its ends. Equal edges count once.
         """
         if not self.of_map:
             return None, None
-        said: dict[
-            Hashable, Hashable
-        ] = {}  # each edge of the map, and the edge that it is assigned to
+        said: dict[Hashable, Hashable] = {}  # an edge of the map: the edge that it is assigned to
         true = set()
         for t in hops:
             here, there = self.said[t], self.said[t + 1]
@@ -369,9 +410,8 @@ def _ambiguity(views: Sequence[View | None], dstates: Sequence[Hashable]) -> flo
     for view, dstate in zip(views, dstates, strict=True):
         if view is not None and dstate is not None:
             seen.setdefault(dstate, set()).add(view)
-    alike = Counter(
-        frozenset(own) for own in seen.values()
-    )  # most dstates have one view, so there are few sets of views
+    # Most dstates have one view, so there are few different sets of views.
+    alike = Counter(frozenset(own) for own in seen.values())
     shared = sum(comb(n, 2) for n in alike.values()) + sum(
         n * m for (a, n), (b, m) in combinations(alike.items(), 2) if a & b
     )

@@ -1,22 +1,25 @@
-"""How right maps are, where the truth is no name but a pose: are the visits that a map has at one place truly at one place?
+"""How right maps are, where the truth is poses: are visits at one place of the map truly at one?
 
 >>> from dataclasses import replace
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.evaluation import evaluate_visits
 >>> seen = Trace.from_steps("abab", [{"name": "go", "kind": "travel"}] * 3)
 >>> poses = [0, 0, 0], [9, 0, 0], [0.5, 0, 0], [0, 9, 0]
->>> trace = replace(seen, steps=tuple(replace(step, truth={"pose": pose}) for step, pose in zip(seen.steps, poses)))
+>>> steps = [replace(step, truth={"pose": pose}) for step, pose in zip(seen.steps, poses)]
+>>> trace = replace(seen, steps=tuple(steps))
 >>> found = evaluate_visits(solve(trace, Theory.causal()).maps, trace)
 >>> found.dstates.judged, found.dstates.returns, found.maps[0].dstates
 (6, 1, MapPairs(things=2, joined=2, right=1, returns=1))
 
-The minimal map rightly has steps 0 and 2 at one dstate, half a metre apart, and wrongly steps 1 and 3. The truth has no names here, as nobody can say where a place ends:
-poses are those at which a robot passed, and two of them are taken for one place if they are near each other.
+The minimal map rightly has steps 0 and 2 at one dstate, half a metre apart, and wrongly steps 1 and
+3. The truth has no names here, as nobody can say where a place ends. It has the poses at which the
+robot passed, and two poses are taken for one place if they are near each other.
 
-*What is counted.* A visit is what lies between two travels: the steps that turns join. So steps that follow each other by a turn are one visit, and no pair of visits. Visits
-make pairs for places, and steps of different visits make pairs for dstates. A pair is a true *return* if both are near each other, and if the robot was farther away
-at some visit between: where it merely went on to the next door, it did not return, and yet both may be near each other. Of such a pair nobody can say whether it is one place:
-it is left out, and counted as that.
+*What is counted.* A visit is the steps between two travels, which turns join. Pairs of visits are
+counted for places, and pairs of steps of different visits for dstates. A pair is a true *return* if
+both are near each other and the robot was farther away at some visit in between. If it merely went
+on to the next door, it did not return, and yet both may be near each other. Nobody can say whether
+such a pair is one place, so it is left out and counted as `stayed`.
 """
 
 from __future__ import annotations
@@ -40,29 +43,35 @@ from ssh_abduction.evaluation.named_truth import checked_map
 from ssh_abduction.evaluation.relations import Relations
 from ssh_abduction.evaluation.trajectory import checked_pose, checked_time
 
-# Two poses are one place if they are so near each other, in metres, unless another distance is asked for; and one dstate if their headings differ by at most so many
-# degrees, too: half of a right angle, which tells the directions of a corridor apart, and lets a robot swerve.
-NEAR, TURNED = 2.0, 45.0
-# A distance by composed relations is in doubt by so many metres, and by such a share of the way along which they were composed: so far those of Freiburg and its
-# corrected poses differ, at 998 of 1,000 pairs of scans.
+# By default two poses within this many metres are one place.
+NEAR = 2.0
+# They are one dstate if their headings also differ by at most this many degrees: half of a right
+# angle tells the directions of a corridor apart, and lets a robot swerve.
+TURNED = 45.0
+# A distance by composed relations is in doubt by this many metres, and by this share of the way
+# along which they were composed. Relations and corrected poses of Freiburg differ by at most that
+# at 998 of 1,000 pairs of scans.
 DOUBT, DOUBT_OF_WAY = 0.2, 0.01
 
 Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]
 Verdicts: TypeAlias = NDArray[np.uint8]
-# What is true of a pair: nobody knows; it is not one; it is one; or it is near, but the robot was not away in between.
+# What is true of a pair: it is unknown; it is apart; it is a return; or it is near, but the robot was
+# not away in between.
 UNKNOWN, APART, RETURN, STAYED = range(4)
 JUDGED = APART, RETURN
 
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Pairs that are judged, whatever a map says of them.
+    """How many pairs are judged, and how many are left out.
 
-    judged    pairs of which it is known whether they are one place (or one dstate)
-    returns   those that are
-    stayed    pairs near each other that are left out, as the robot was at no visit farther away in between
-    unknown   pairs that are left out, as the truth does not tell how far apart they are
+    Attributes:
+        judged: Pairs that are known to be one place (or dstate), or not.
+        returns: The judged pairs that are one.
+        stayed: Pairs left out because they are near each other, but the robot was not farther away
+            in between.
+        unknown: Pairs left out because the truth does not tell how far apart they are.
     """
 
     judged: int
@@ -73,12 +82,13 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True)
 class MapPairs:
-    """What a map says of the pairs that are judged.
+    """What a map says of the judged pairs.
 
-    things   how many places (or dstates) the map has at the steps of the trace
-    joined   how many of the judged pairs it has at one place (or dstate)
-    right    how many of these truly are
-    returns  how many of the judged pairs truly are, whether joined or not
+    Attributes:
+        things: How many places (or dstates) the map has at the steps of the trace.
+        joined: How many of the judged pairs it has at one place (or dstate).
+        right: How many of the joined pairs truly are at one.
+        returns: How many of the judged pairs truly are at one, joined or not.
     """
 
     things: int
@@ -88,12 +98,12 @@ class MapPairs:
 
     @property
     def precision(self) -> float | None:
-        """Of the pairs that the map joins, the share that truly is one; None where it joins none."""
+        """Of the pairs that the map joins, the share that truly is one; None if it joins none."""
         return self.right / self.joined if self.joined else None
 
     @property
     def recall(self) -> float | None:
-        """Of the pairs that truly are one, the share that the map joins; None where there are none."""
+        """Of the pairs that truly are one, the share that the map joins; None if there are none."""
         return self.right / self.returns if self.returns else None
 
     def to_dict(self) -> dict[str, Any]:
@@ -109,7 +119,12 @@ class MapPairs:
 
 @dataclass(frozen=True, slots=True)
 class MapVisits:
-    """How right one map is, by pairs. `places` is None where the map has none, as maps of causal theories have."""
+    """How right one map is, by pairs.
+
+    Attributes:
+        places: Pairs of visits; None for a map without places, as of a causal theory.
+        dstates: Pairs of steps of different visits.
+    """
 
     places: MapPairs | None
     dstates: MapPairs
@@ -119,13 +134,16 @@ class MapVisits:
 class VisitsEvaluation:
     """How right maps of one trace are, judged by poses.
 
-    judge    what tells the truth: "poses" of the trace, or "relations"
-    near     metres within which two poses are one place
-    turned   degrees by which the headings of one dstate differ at most
-    visits   how many the trace has
-    places, dstates  the pairs of visits, and of steps of different visits
-    maps     each map, in the order given
-    by_both  of the pairs of visits that relations judge, how many the poses of the trace judge, too, and how many of these they judge alike; None where poses judge
+    Attributes:
+        judge: What has the truth: "poses" of the trace, or "relations".
+        near: Metres within which two poses are one place.
+        turned: Degrees by which the headings of one dstate differ at most.
+        visits: How many visits the trace has.
+        places: Pairs of visits.
+        dstates: Pairs of steps of different visits.
+        maps: Each map, in the order given.
+        by_both: Of the pairs of visits that relations judge: how many the poses of the trace judge,
+            too, and how many of these they judge alike. None if poses judge.
     """
 
     judge: str
@@ -138,11 +156,12 @@ class VisitsEvaluation:
     by_both: tuple[int, int] | None = None
 
     def __repr__(self) -> str:
-        told = f"{counted(self.visits, 'visits')}, {counted(self.places.returns, 'returns')} by {self.judge}"
-        return f"<VisitsEvaluation: {counted(len(self.maps), 'maps')} of {told}>"
+        visits, returns = counted(self.visits, "visits"), counted(self.places.returns, "returns")
+        maps = counted(len(self.maps), "maps")
+        return f"<VisitsEvaluation: {maps} of {visits}, {returns} by {self.judge}>"
 
     def to_dict(self) -> dict[str, Any]:
-        """The values under their names, as `evaluate --json` prints them, with the precision and recall of each map."""
+        """The values under their names, as `evaluate --json` prints them, with shares."""
         own: dict[str, Any] = {
             "near": self.near,
             "turned": self.turned,
@@ -167,18 +186,26 @@ def evaluate_visits(
     turned: float = TURNED,
     relations: Relations | None = None,
 ) -> VisitsEvaluation:
-    """How right these maps of a trace are: precision and recall of the pairs of visits, and of steps, that they have at one place, and at one dstate.
+    """How right maps of a trace are, by the pairs that they have at one place, and at one dstate.
 
-    near, turned  what counts as one place, in metres, and as one dstate, in degrees
-    relations     judge by them, at the `time` of the steps, and not by the poses of the trace
+    Args:
+        maps: Maps of the trace.
+        trace: A trace whose steps have true poses; with relations, times.
+        near: Metres within which two poses are one place.
+        turned: Degrees by which the headings of one dstate differ at most.
+        relations: Judge by them, at the `time` of the steps, in place of the poses of the trace.
 
-    Raises TraceError where no step has a pose, or with relations a time, or one is malformed; MapError for a map of other steps.
+    Raises:
+        TraceError: No step has a pose (with relations: a time), or one is malformed.
+        MapError: A map is of other steps.
     """
     checked_trace(trace)
     for name, value in (("near", near), ("turned", turned)):
         if not is_finite(value) or value <= 0:
+            thing = "place" if name == "near" else "dstate"
             raise TraceError(
-                f"{name}: expected a number above 0, got {brief(value)}; say what counts as one {'place' if name == 'near' else 'dstate'}"
+                f"{name}: expected a number above 0, got {brief(value)}; "
+                f"say what counts as one {thing}"
             )
     maps = checked_maps(maps)
     if relations is not None:
@@ -190,6 +217,7 @@ def evaluate_visits(
             mend="make them with Relations.load, or leave them out",
         )
     truth: _Poses | _Related = _Poses(trace) if relations is None else _Related(trace, relations)
+    # A travel begins a new visit.
     visit = np.cumsum([0, *(action.kind != "turn" for action in trace.actions)])
     places, dstates = _verdicts(truth, visit, near, turned)
     by_both = None
@@ -213,7 +241,10 @@ def evaluate_visits(
 
 
 def told_poses(trace: Trace) -> list[Pose | None]:
-    """The true pose of each step, (x, y, heading) in metres and radians; None where it is not told. Raises TraceError for one that is malformed."""
+    """The true pose of each step, (x, y, heading) in metres and radians; None if not told.
+
+    Raises TraceError for one that is malformed.
+    """
     told = [
         step.truth.get("pose") if isinstance(step.truth, Mapping) else None for step in trace.steps
     ]
@@ -221,7 +252,7 @@ def told_poses(trace: Trace) -> list[Pose | None]:
 
 
 def _pose(value: Any, where: str) -> Pose | None:
-    """A pose as JSON has it; None where there is none. Raises TraceError."""
+    """A pose from JSON; None if there is none. Raises TraceError for anything else."""
     if value is None:
         return None
     if (
@@ -237,7 +268,7 @@ def _pose(value: Any, where: str) -> Pose | None:
 
 
 class _Poses:
-    """The poses of a trace as judges."""
+    """Judges by the poses of a trace."""
 
     name = "poses"
 
@@ -246,19 +277,25 @@ class _Poses:
         self.told = np.array([pose is not None for pose in poses])
         if not self.told.any():
             raise TraceError(
-                f'{named(trace.source or "trace")}: truth.pose: expected the true pose of some step, got none; write "truth": {{"pose": [x, y, heading]}} '
-                f"on the steps, as import does where a log has corrected poses"
+                f"{named(trace.source or 'trace')}: truth.pose: expected the true pose of some step, "
+                'got none; write "truth": {"pose": [x, y, heading]} on the steps, '
+                "as import does where a log has corrected poses"
             )
         self._poses = np.array([(math.nan,) * 3 if pose is None else pose for pose in poses])
 
     def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """How far each step is from this one, in metres; how far its heading is turned from this one's, in degrees; and the doubt of the distance. NaN: not known."""
+        """Each step as seen from one.
+
+        Returns:
+            Distances in metres, (n,), differences of headings in degrees, (n,), and the doubt of
+            the distances in metres, (n,). NaN where a pose is unknown.
+        """
         dx, dy, turned = (self._poses - self._poses[step]).T
         return np.hypot(dx, dy), _degrees(turned), np.zeros(len(dx))
 
 
 class _Related:
-    """Relative poses of the times of a trace as judges."""
+    """Judges by relations, at the times of a trace."""
 
     name = "relations"
 
@@ -274,12 +311,13 @@ class _Related:
         if not self.told.any():
             began, ended = relations.times[0], relations.times[-1]
             raise TraceError(
-                f"{named(trace.source or 'trace')}: time: expected steps at times that are related, from {began:g} to {ended:g} s, got none; "
-                f"import the trace from the log that the relations are of"
+                f"{named(trace.source or 'trace')}: time: expected steps at times that are related, "
+                f"from {began:g} to {ended:g} s, got none; "
+                "import the trace from the log that the relations are of"
             )
 
     def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """The same, by relations between where the robot was, and by where it saw the dstates from there."""
+        """As `_Poses.seen_from`, from the robot's relative poses, and where it saw the dstates."""
         robots = self._relations.between(self._times, step)
         origin = self._seen[step]
         dx, dy, turned, way = np.array(
@@ -294,19 +332,25 @@ class _Related:
 
 
 def _degrees(radians: Array) -> Array:
-    """Turns without their side, from 0 to 180 degrees."""
+    """The sizes of turns, from 0 to 180 degrees."""
     return np.abs(np.degrees((radians + math.pi) % math.tau - math.pi))
 
 
 def _verdicts(
     truth: _Poses | _Related, visit: Steps, near: float, turned: float
 ) -> tuple[Verdicts, Verdicts]:
-    """What is true of each pair of visits, and of each pair of steps, the earlier one first. UNKNOWN where a pair is none.
+    """What is true of each pair of visits, (v, v), and of each pair of steps, (n, n).
 
-    visit  of each step, counted from 0
+    The earlier one of a pair comes first. Other entries are UNKNOWN.
+
+    Args:
+        truth: Has the distances.
+        visit: The visit of each step, (n,), counted from 0.
+        near: Metres within which two poses are one place.
+        turned: Degrees by which the headings of one dstate differ at most.
     """
     steps = np.arange(len(visit))
-    # A visit is where the first of its steps is whose pose is known.
+    # A visit has the pose of the first of its steps whose pose is known.
     at = np.array(
         [min(steps[visit == v], key=lambda t: not truth.told[t]) for v in range(visit[-1] + 1)]
     )
@@ -315,9 +359,8 @@ def _verdicts(
     for v, first in enumerate(at):
         distance, _, doubt = truth.seen_from(first)
         far, unknown = distance[at] > near, ~(np.abs(distance[at] - near) >= doubt[at])
-        left = (
-            np.cumsum((far & ~unknown)[v:-1]) > 0
-        )  # for each later visit, whether the robot was away at one before
+        # For each later visit, whether the robot was away at one before.
+        left = np.cumsum((far & ~unknown)[v:-1]) > 0
         places[v, v + 1 :] = np.where(unknown, UNKNOWN, np.where(far, APART, STAYED))[v + 1 :]
         places[v, v + 1 :][left & (places[v, v + 1 :] == STAYED)] = RETURN
         later = visit > v
@@ -332,22 +375,25 @@ def _verdicts(
 
 
 def _pairs(verdicts: Verdicts, visit: Steps) -> Pairs:
-    """How many pairs there are of each verdict. Of one visit there are none.
+    """How many pairs of different visits there are of each verdict.
 
-    visit  of each row
+    Args:
+        verdicts: What is true of each pair.
+        visit: The visit of each row.
     """
     told = Counter(verdicts[visit[:, None] < visit].tolist())
     return Pairs(told[APART] + told[RETURN], told[RETURN], told[STAYED], told[UNKNOWN])
 
 
 def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdicts) -> MapVisits:
+    """What a map says of the judged pairs."""
     at = [ssh_map.dstates[label] for label in ssh_map.labels]
     one = np.equal.outer(*[[s.id for s in at]] * 2)
     if not ssh_map.places:
         return MapVisits(None, _joined(one, dstates, len(ssh_map.dstates)))
-    own = np.array(
-        [math.nan if s.place is None else s.place for s in at]
-    )  # which is not equal to itself
+    # A step without a place is at no place with any other: NaN is not equal to itself.
+    own = np.array([math.nan if s.place is None else s.place for s in at])
+    # Two visits are at one place if some steps of them are.
     starts = np.flatnonzero(np.diff(visit, prepend=-1))
     together = np.logical_or.reduceat(
         np.logical_or.reduceat(np.equal.outer(own, own), starts, axis=0), starts, axis=1
@@ -358,8 +404,12 @@ def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdict
 
 
 def _joined(one: NDArray[np.bool_], verdicts: Verdicts, things: int) -> MapPairs:
-    """
-    one  of each pair, whether the map has it as one; pairs that are none are UNKNOWN, so that they do not count
+    """What a map says of the judged pairs.
+
+    Args:
+        one: Whether the map has each pair as one.
+        verdicts: What is true of each pair; UNKNOWN for what is no pair, so that it does not count.
+        things: How many places (or dstates) the map has.
     """
     right = int((one & (verdicts == RETURN)).sum())
     return MapPairs(

@@ -1,7 +1,9 @@
-"""Hand-checked relative poses between the scans of a log, as an independent judge of whether two moments were at one place.
+"""Hand-checked relative poses between the scans of a log.
 
-A file of relations (Kümmerle et al. 2009, "On measuring the accuracy of SLAM algorithms") has a line for each: two times, and where the robot was at the second
-one, as seen from where it was at the first: time1 time2 x y z roll pitch yaw, in seconds, metres and radians.
+They judge independently whether the robot was at one place at two times. A file of relations
+(Kümmerle et al. 2009, "On measuring the accuracy of SLAM algorithms") has a line for each:
+time1 time2 x y z roll pitch yaw, in seconds, metres and radians. The pose is that of the robot at
+the second time, as seen from where it was at the first.
 
 >>> from ssh_abduction.evaluation.relations import Relation, Relations
 >>> quarter = 1.5707963
@@ -10,8 +12,10 @@ one, as seen from where it was at the first: time1 time2 x y z roll pitch yaw, i
 >>> [(round(dx, 1), round(dy, 1), round(way)) for (dx, dy, _), way in seen]
 [(0.0, 0.0, 0), (4.0, 2.0, 6), (0.0, 4.0, 12)]
 
-The relations are a graph: its nodes are times, and relations are followed either way. A moment between two times that a relation joins is on the way from the one
-to the other. From one moment to another, relations are composed along the shortest way, and the longer that way is, the less the result is worth.
+The relations are the edges of a graph whose nodes are times. They are followed either way. At a
+moment between two times that a relation joins, the robot is on the way from the one to the other.
+From one moment to another, relations are composed along the shortest way. The longer that way is,
+the larger is the error of the result.
 """
 
 from __future__ import annotations
@@ -32,18 +36,25 @@ from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.odometry import Displacement
 from ssh_abduction.evaluation.trajectory import is_trajectory
 
-# A file of more bytes than this holds something else.
+# A file of more bytes than this holds no relations.
 LARGEST = 2**28
 FIELDS = ("time1", "time2", "x", "y", "z", "roll", "pitch", "yaw")
-# A moment that is not between two related times may be so many seconds from one: robots that map buildings drive at most a metre a second.
+# A moment that is not between two related times may be this many seconds from one, as robots that
+# map buildings drive at most a metre a second.
 NEAREST = 0.5
-# Each relation counts as so many metres more than it is long, as a relation between two near poses has an error, too.
+# Each relation counts as this many metres more than its length, as short ones have errors, too.
 EACH = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Where the robot was at the second time, as seen from where it was at the first: x ahead, y to the left, and turned counterclockwise."""
+    """Where the robot was at a second time, as seen from where it was at a first.
+
+    Attributes:
+        first: The first time in seconds.
+        second: The second time in seconds.
+        displacement: Metres ahead, metres to the left, and the turn counterclockwise in radians.
+    """
 
     first: float
     second: float
@@ -51,10 +62,19 @@ class Relation:
 
 
 class Relations:
-    """Relations as a graph of times, which can be asked where the robot was at one time, as seen from another."""
+    """Relations as a graph of times.
+
+    Args:
+        relations: One or more.
+
+    Raises:
+        TraceError: There are none.
+
+    Attributes:
+        times: The related times in seconds, sorted.
+    """
 
     def __init__(self, relations: Iterable[Relation]) -> None:
-        """Raises TraceError where there are none."""
         self._to: dict[tuple[int, int], Displacement] = {}
         relations = tuple(relations)
         if not relations:
@@ -77,12 +97,18 @@ class Relations:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Relations:
-        """Read a file of relations. Raises TraceError that names the line, and OSError."""
+        """Read a file of relations.
+
+        Raises:
+            TraceError: A line is malformed. The message names it.
+            OSError: The file cannot be read.
+        """
         try:
             text = read_at_most(path, LARGEST).decode("utf-8")
         except ValueError as error:  # bytes that are no text are one, too
             raise TraceError(
-                f"{named(path)}: expected a text of relations, got another file ({error}); give one of numbers"
+                f"{named(path)}: expected a text of relations, got another file ({error}); "
+                "give one of numbers"
             ) from None
         lines = [
             (number, fields)
@@ -91,28 +117,33 @@ class Relations:
         ]
         if is_trajectory(fields for _, fields in lines):
             raise TraceError(
-                f"{named(path)}: expected relations, {' '.join(FIELDS)}, got a trajectory: each line ends in a quaternion; "
-                f"give it as the truth of the steps (--truth)"
+                f"{named(path)}: expected relations, {' '.join(FIELDS)}, got a trajectory: "
+                "each line ends in a quaternion; give it as the truth of the steps (--truth)"
             )
         found = [_relation(fields, f"{named(path)}:{number}") for number, fields in lines]
         if not found:
             raise TraceError(
-                f"{named(path)}: expected lines of {' '.join(FIELDS)}, got none; give a file of relations"
+                f"{named(path)}: expected lines of {' '.join(FIELDS)}, got none; "
+                "give a file of relations"
             )
         return Relations(found)
 
     def covers(self, time: float | None) -> bool:
-        """Whether a moment has related times around it, or near it."""
+        """Whether a moment is between related times, or near one."""
         return self._near(time) is not None
 
     def between(
         self, times: Sequence[float | None], origin: int
     ) -> list[tuple[Pose, float] | None]:
-        """For each moment the pose of the robot as seen from where it was at the moment `origin`, and the metres of relations that were composed for it.
+        """The pose of the robot at each moment, as seen from where it was at one of them.
 
-        times  of the moments, in seconds; None where a moment has no time
+        Args:
+            times: The moments in seconds; None for one without a time.
+            origin: The index of the moment that the others are seen from.
 
-        None where relations do not lead there, or a moment has no related times around it.
+        Returns:
+            For each moment the pose, and the metres of relations that were composed for it. None if
+            relations do not lead there, or the moment is not near related times.
         """
         moments = [self._near(time) for time in times]
         start = moments[origin]
@@ -129,18 +160,12 @@ class Relations:
                 found.append(((0.0, 0.0, 0.0), 0.0))
             else:
                 pose = moved(self._composed(moment[0], before, poses), moment[1])
-                found.append(
-                    (
-                        pose,
-                        float(metres[moment[0]])
-                        + math.hypot(*offset[:2])
-                        + math.hypot(*moment[1][:2]),
-                    )
-                )
+                way = float(metres[moment[0]]) + math.hypot(*offset[:2])
+                found.append((pose, way + math.hypot(*moment[1][:2])))
         return found
 
     def _composed(self, node: int, before: Sequence[int], poses: dict[int, Pose]) -> Pose:
-        """The pose at a node: relations composed along the way on which the shortest one leads there. Poses on the way are noted."""
+        """The pose at a node, composed along the shortest way. It notes poses on the way."""
         way = []
         while node not in poses:
             way.append(node)
@@ -151,7 +176,10 @@ class Relations:
         return poses[node]
 
     def _near(self, time: float | None) -> tuple[int, Displacement] | None:
-        """The node nearest to a moment, and the displacement from there: a share of the relation to the node on the moment's other side."""
+        """The node nearest to a moment, and the displacement from there.
+
+        It is a share of the relation to the node on the other side of the moment.
+        """
         if time is None:
             return None
         after = bisect.bisect_left(self.times, time)
@@ -169,12 +197,13 @@ class Relations:
 
 
 def _relation(fields: Sequence[str], where: str) -> Relation:
-    """A relation from the fields of its line. Raises TraceError."""
+    """A relation from the fields of its line. Raises TraceError for a malformed one."""
     try:
         first, second, x, y, _, _, _, yaw = (float(field) for field in fields)
     except ValueError:
         raise TraceError(
-            f"{where}: expected the numbers {' '.join(FIELDS)}, got {brief(' '.join(fields))}; mend the line"
+            f"{where}: expected the numbers {' '.join(FIELDS)}, got {brief(' '.join(fields))}; "
+            "mend the line"
         ) from None
     if not all(math.isfinite(value) for value in (first, second, x, y, yaw)):
         raise TraceError(
@@ -182,6 +211,7 @@ def _relation(fields: Sequence[str], where: str) -> Relation:
         )
     if first == second:
         raise TraceError(
-            f"{where}: time2: expected another time than time1, got {fields[1]} twice; mend the line"
+            f"{where}: time2: expected another time than time1, got {fields[1]} twice; "
+            "mend the line"
         )
     return Relation(first, second, (x, y, yaw))

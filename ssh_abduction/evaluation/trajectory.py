@@ -1,9 +1,12 @@
-"""The true trajectory of a robot, as truth for the steps of a trace: a file in the format of the TUM RGB-D benchmark, as evo and many SLAM programs write it.
+"""The true trajectory of a robot, as truth for the steps of a trace.
 
-A line has `timestamp tx ty tz qx qy qz qw`: seconds, metres, and the orientation as a quaternion. Lines that begin with # are comments.
+Files are in the format of the TUM RGB-D benchmark, which evo and many SLAM programs write. A line
+has `timestamp tx ty tz qx qy qz qw`: seconds, metres, and the orientation as a quaternion. Lines
+that begin with # are comments.
 
 >>> from ssh_abduction.evaluation.trajectory import Trajectory
->>> driven = Trajectory([(0.0, (0.0, 0.0, 0.0)), (0.5, (1.0, 0.0, 1.0)), (9.0, (5.0, 0.0, 0.0))])
+>>> poses = [(0.0, 0.0, 0.0), (1.0, 0.0, 1.0), (5.0, 0.0, 0.0)]
+>>> driven = Trajectory(zip([0.0, 0.5, 9.0], poses))
 >>> driven.at(0.25), driven.at(8.75), driven.at(5.0)
 ((0.5, 0.0, 0.5), (5.0, 0.0, 0.0), None)
 """
@@ -25,14 +28,17 @@ from ssh_abduction.data.odometry import Pose, between, moved
 from ssh_abduction.data.trace import Step, Trace
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-# A file of more bytes than this holds something else.
+# A file of more bytes than this is no trajectory.
 LARGEST = 2**28
-# A step may be so many seconds from the nearest pose: robots that map buildings drive at most a metre a second. Poses twice as far apart are not joined by a line.
+# A step may be this many seconds from the nearest pose, as robots that map buildings drive at most
+# a metre a second. Poses twice as far apart are not joined by a line.
 NEAREST = 0.5
-# A quaternion may be so much longer or shorter than 1, as numbers in files are rounded.
+# The length of a quaternion may differ from 1 by this much, as numbers in files are rounded.
 ROUNDED = 0.01
-# Metres by which a way on one floor rises at most, and how far the axes of its poses may lean: the cosine of 30 degrees.
-FLAT, UPRIGHT = 1.0, math.cos(math.radians(30))
+# A way on one floor rises by at most this many metres.
+FLAT = 1.0
+# Its poses lean by at most 30 degrees, as a cosine.
+UPRIGHT = math.cos(math.radians(30))
 # Times in nanoseconds since 1970 are above this.
 NANOSECONDS = 1e15
 
@@ -58,21 +64,25 @@ class Trajectory:
         found = sorted(dict.fromkeys(poses))
         if not found:
             raise TraceError(
-                f"{named(source)}: expected lines of {' '.join(FIELDS)}, got none; give a trajectory in TUM format"
+                f"{named(source)}: expected lines of {' '.join(FIELDS)}, got none; "
+                "give a trajectory in TUM format"
             )
         self.times, self.poses = [time for time, _ in found], [pose for _, pose in found]
         for before, after in zip(self.times[:-1], self.times[1:], strict=True):
             if before == after:
                 raise TraceError(
-                    f"{named(source)}: expected one pose at a time, got different ones at {before:.10g} s; keep one of them"
+                    f"{named(source)}: expected one pose at a time, got different ones at "
+                    f"{before:.10g} s; keep one of them"
                 )
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Trajectory:
-        """Read a trajectory in TUM format: numbers with spaces, tabs or commas between, and comments that begin with #.
+        """Read a trajectory in TUM format.
+
+        Numbers are separated by spaces, tabs or commas.
 
         Raises:
-            TraceError: A line is malformed. The text names it.
+            TraceError: A line is malformed. The message names it.
             OSError: The file cannot be read.
         """
         source = os.fspath(path)
@@ -80,7 +90,8 @@ class Trajectory:
             text = read_at_most(path, LARGEST).decode("utf-8-sig")
         except ValueError as error:  # bytes that are no text are one, too
             raise TraceError(
-                f"{named(source)}: expected a trajectory in TUM format, got another file ({error}); give a text"
+                f"{named(source)}: expected a trajectory in TUM format, got another file "
+                f"({error}); give a text"
             ) from None
         found: list[tuple[float, Pose]] = []
         heights: list[float] = []
@@ -88,7 +99,7 @@ class Trajectory:
         for number, line in enumerate(text.splitlines(), 1):
             fields = re.split(r"[,;\s]+", line.partition("#")[0].strip(" \t,;"))
             if fields == [""] or (not found and not any(map(_is_number, fields))):
-                continue  # nothing, or a line with the names of the columns
+                continue  # an empty line, or the names of the columns
             time, pose, height, lean = _pose(fields, f"{named(source)}:{number}")
             found.append((time, pose))
             heights.append(height)
@@ -98,7 +109,10 @@ class Trajectory:
         return trajectory
 
     def at(self, time: float | None) -> Pose | None:
-        """Where the robot was at a time: on the line between two poses that are near enough in time, or at the nearest one; None where none is near."""
+        """Where the robot was at a time in seconds; None if no pose is near in time.
+
+        It is interpolated between two poses that are near enough in time, or else the nearest one.
+        """
         if time is None:
             return None
         after = bisect.bisect_left(self.times, time)
@@ -122,10 +136,10 @@ class Trajectory:
         )
 
     def told_to(self, trace: Trace) -> Trace:
-        """The trace with the poses of this trajectory as the truth of its steps, in place of others.
+        """The trace with the poses of this trajectory as the truth of its steps.
 
-        A step tells in `time` when the robot passed, and in `seen` where from there it saw the dstate, as imported logs do.
-        What else is true of a step is kept.
+        They replace other true poses. The rest of the truth is kept. As in imported logs, `time` of
+        a step says when the robot passed, and `seen` where from there it saw the dstate.
 
         Raises:
             TraceError: No step has a time, or none is near a time of this trajectory.
@@ -139,41 +153,46 @@ class Trajectory:
             raise TraceError(self._no_match(trace, [time for time in times if time is not None]))
         if told < len(times):
             warnings.warn(
-                f"{named(self.source)}: {len(times) - told} of {len(times)} steps have no pose within {NEAREST:g} s of their time, "
-                f"and no truth: expected poses all along the log",
+                f"{named(self.source)}: {len(times) - told} of {len(times)} steps have no pose "
+                f"within {NEAREST:g} s of their time, and no truth: "
+                "expected poses all along the log",
                 TrajectoryWarning,
                 stacklevel=2,
             )
-        return replace(
-            trace,
-            steps=tuple(
-                replace(
-                    step,
-                    truth=_truth(
-                        step,
-                        None
-                        if robot is None
-                        else moved(robot, checked_pose(step.extra.get("seen"), trace.at(t))),
-                    ),
-                )
-                for t, (step, robot) in enumerate(zip(trace.steps, robots, strict=True))
-            ),
-        )
+        steps = []
+        for t, (step, robot) in enumerate(zip(trace.steps, robots, strict=True)):
+            pose = None
+            if robot is not None:
+                pose = moved(robot, checked_pose(step.extra.get("seen"), trace.at(t)))
+            steps.append(replace(step, truth=_truth(step, pose)))
+        return replace(trace, steps=tuple(steps))
 
     def _no_match(self, trace: Trace, times: Sequence[float]) -> str:
         """Why no step of a trace has a pose, and what to do."""
         where = named(trace.source or "trace")
         if not times:
-            return f'{where}: time: expected the time of some step, in seconds, got none; import the trace from its log, or write "time" on its steps'
+            return (
+                f"{where}: time: expected the time of some step, in seconds, got none; "
+                'import the trace from its log, or write "time" on its steps'
+            )
         spans = [f"{min(span):.10g} to {max(span):.10g} s" for span in (self.times, times)]
-        mend = "take the trajectory of the log that the trace was imported from, or shift its times to those of the log"
+        mend = (
+            "take the trajectory of the log that the trace was imported from, "
+            "or shift its times to those of the log"
+        )
         if self.times[-1] > NANOSECONDS > max(times):
             mend = "the trajectory seems to have nanoseconds: divide its times by 1e9"
-        return f"{where}: time: expected steps within {NEAREST:g} s of poses of {named(self.source)}, which are from {spans[0]}, got none: steps are from {spans[1]}; {mend}"
+        return (
+            f"{where}: time: expected steps within {NEAREST:g} s of poses of {named(self.source)}, "
+            f"which are from {spans[0]}, got none: steps are from {spans[1]}; {mend}"
+        )
 
 
 def is_trajectory(lines: Iterable[Sequence[str]]) -> bool:
-    """Whether lines of eight numbers are poses in TUM format: the last four of each are a quaternion, and not merely a turn by a radian."""
+    """Whether lines of eight numbers are poses in TUM format.
+
+    Then the last four numbers of each line are a quaternion, and not merely a turn by a radian.
+    """
     try:
         tails = [[float(field) for field in fields[4:8]] for fields in lines]
     except ValueError:
@@ -187,7 +206,7 @@ def is_trajectory(lines: Iterable[Sequence[str]]) -> bool:
 
 
 def checked_time(value: Any, where: str) -> float | None:
-    """The time of a step in seconds. Raises TraceError."""
+    """The time of a step in seconds. Raises TraceError for anything else."""
     if value is not None and not is_finite(value):
         raise TraceError(
             f"{where}: time: expected seconds, got {brief(value)}; mend it, or leave it out"
@@ -196,7 +215,10 @@ def checked_time(value: Any, where: str) -> float | None:
 
 
 def checked_pose(value: Any, where: str) -> Pose:
-    """Where a robot saw a dstate, as JSON has it; in front of it where nothing is told. Raises TraceError."""
+    """The pose at which a robot saw a dstate, as JSON has it; by default its own pose.
+
+    Raises TraceError for anything else.
+    """
     if value is None:
         return 0.0, 0.0, 0.0
     if (
@@ -207,20 +229,18 @@ def checked_pose(value: Any, where: str) -> Pose:
     ):
         return float(value[0]), float(value[1]), float(value[2])
     raise TraceError(
-        f"{where}: seen: expected [x, y, heading] in metres and radians, got {brief(value)}; mend it"
+        f"{where}: seen: expected [x, y, heading] in metres and radians, got {brief(value)}; "
+        "mend it"
     )
 
 
 def _truth(step: Step, pose: Pose | None) -> Any:
-    """The truth of a step with this pose, and without another one."""
-    told = (
-        dict(step.truth)
-        if isinstance(step.truth, Mapping)
-        else {}
-        if step.truth is None
-        else {"dstate": step.truth}
-    )
-    told.pop("pose", None)
+    """The truth of a step with this pose in place of another one."""
+    told: dict[str, Any] = {}
+    if isinstance(step.truth, Mapping):
+        told = {name: value for name, value in step.truth.items() if name != "pose"}
+    elif step.truth is not None:
+        told = {"dstate": step.truth}
     if pose is not None:
         told["pose"] = list(pose)
     return told or None
@@ -234,20 +254,29 @@ def _is_number(field: str) -> bool:
 
 
 def _pose(fields: Sequence[str], where: str) -> tuple[float, Pose, float, float]:
-    """The time of a line, its pose on the floor, its height, and how upright it is: the cosine of what its axis leans. Raises TraceError."""
+    """Read a line.
+
+    Returns:
+        The time, the pose on the floor, the height, and the cosine of the lean.
+
+    Raises:
+        TraceError: The line is malformed.
+    """
     if len(fields) != len(FIELDS) or not all(map(_is_number, fields)):
         hint = {
             12: "; this looks like a file of KITTI, which has no times",
             17: "; this looks like a file of EuRoC: evo_traj converts it",
         }
+        mend = hint.get(len(fields), "; mend the line")
         raise TraceError(
-            f"{where}: expected the numbers {' '.join(FIELDS)}, got {brief(' '.join(fields))}{hint.get(len(fields), '; mend the line')}"
+            f"{where}: expected the numbers {' '.join(FIELDS)}, got {brief(' '.join(fields))}{mend}"
         )
     time, x, y, z, *quaternion = map(float, fields)
     length = math.hypot(*quaternion)
     if abs(length - 1) > ROUNDED:
         raise TraceError(
-            f"{where}: qx qy qz qw: expected a quaternion of length 1, got one of {length:.3g}; mend the line"
+            f"{where}: qx qy qz qw: expected a quaternion of length 1, got one of {length:.3g}; "
+            "mend the line"
         )
     qx, qy, qz, qw = (number / length for number in quaternion)
     heading = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
@@ -255,11 +284,12 @@ def _pose(fields: Sequence[str], where: str) -> tuple[float, Pose, float, float]
 
 
 def _warn_of_space(source: str, rise: float, leaning: int, count: int) -> None:
-    """Warn where a way is not on a floor, as that of a camera whose z axis looks ahead."""
+    """Warn if a way is not on a floor. A camera's z axis looks ahead, for example."""
     if rise > FLAT or 2 * leaning > count:
         warnings.warn(
-            f"{named(source)}: expected a way on a floor, x and y in metres, got one that rises by {rise:.1f} m, and {leaning} of {count} poses "
-            f"that lean by more than 30 degrees: tz and the lean are not read; give the poses of the robot, not of a camera",
+            f"{named(source)}: expected a way on a floor, x and y in metres, got one that rises by "
+            f"{rise:.1f} m, and {leaning} of {count} poses that lean by more than 30 degrees: "
+            "tz and the lean are not read; give the poses of the robot, not of a camera",
             TrajectoryWarning,
             stacklevel=3,
         )
