@@ -56,8 +56,8 @@ DOUBT, DOUBT_OF_WAY = 0.2, 0.01
 Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]
 Verdicts: TypeAlias = NDArray[np.uint8]
-# What is true of a pair: it is unknown; it is apart; it is a return; or it is near, but the robot was
-# not away in between.
+# What is true of a pair: it is unknown; it is apart; it is a return; or it is near, but the robot
+# was not away in between.
 UNKNOWN, APART, RETURN, STAYED = range(4)
 JUDGED = APART, RETURN
 
@@ -277,8 +277,8 @@ class _Poses:
         self.told = np.array([pose is not None for pose in poses])
         if not self.told.any():
             raise TraceError(
-                f"{named(trace.source or 'trace')}: truth.pose: expected the true pose of some step, "
-                'got none; write "truth": {"pose": [x, y, heading]} on the steps, '
+                f"{named(trace.source or 'trace')}: truth.pose: expected the true pose of some "
+                'step, got none; write "truth": {"pose": [x, y, heading]} on the steps, '
                 "as import does where a log has corrected poses"
             )
         self._poses = np.array([(math.nan,) * 3 if pose is None else pose for pose in poses])
@@ -311,8 +311,8 @@ class _Related:
         if not self.told.any():
             began, ended = relations.times[0], relations.times[-1]
             raise TraceError(
-                f"{named(trace.source or 'trace')}: time: expected steps at times that are related, "
-                f"from {began:g} to {ended:g} s, got none; "
+                f"{named(trace.source or 'trace')}: time: expected steps at times that are "
+                f"related, from {began:g} to {ended:g} s, got none; "
                 "import the trace from the log that the relations are of"
             )
 

@@ -1,8 +1,10 @@
-"""From a robot's log to the minimal maps of the building, and to a folder that tells the whole run.
+"""From a robot's log to the minimal maps of the building, and to a folder with the whole run.
 
-A building whose walls meet at right angles is mapped by the topological theory with stars. Elsewhere stars are too often misread, and what lies right of a path that bends is not to be said: there
-displacements tell places apart, and no sides are asked for. The same goes where doors are the places, as a path may lead across a room in any direction. And it goes
-for a building whose stars no map fits, as a junction was passed unnoticed, or one star misread.
+A building whose walls meet at right angles is mapped by the topological theory with stars.
+Elsewhere stars are too often misread, and the sides of a path that bends are not defined. There
+displacements tell places apart, and the theory has no sides. The same theory is used if doors are
+the places, as a path may lead across a room in any direction, and if no map fits the stars: a
+junction may have been passed unnoticed, or a star misread.
 """
 
 from __future__ import annotations
@@ -30,39 +32,49 @@ from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
 
-# A log is mapped in this share of the time that the robot drove, unless a limit is given: what the import took is taken off it, and the ladder has a quarter of the rest.
+# Without a time limit a log is mapped in this share of the time that the robot drove, the import
+# included. The ladder has the second share of what the import leaves.
 SHARE, LADDER = 1 / 20, 1 / 4
-# The minimal maps, and each rung of the ladder, have so many seconds at least, however short the drive was.
+# The minimal maps, and each rung of the ladder, have at least this many seconds.
 LEAST, LEAST_RUNG = 5.0, 1.0
-# A rung has so many seconds at most: the ladder is for the reader, and nothing depends on its proofs.
+# A rung has at most this many seconds: the ladder is for the reader only.
 RUNG = 10.0
-# Metres a second that the robot is taken to have driven where the log has no clock. Robots whose logs have one drove 0.2 to 0.4 on the average.
+# Speed of the robot in metres a second if the log has no clock. Robots whose logs have one drove
+# 0.2 to 0.4 on average.
 SPEED = 0.5
-# So many minimal maps are listed, and ranked by how well they close.
+# At most this many minimal maps are listed, and ranked by how well they close.
 MAPS = 300
-# What is said where no map fits the stars that the walls suggested to use.
-NO_STARS = "No map fits the stars of the log: some star was misread, or a place was passed unnoticed. So the log was mapped without stars and sides."
-# What is said where somebody ended the run before it was through.
-INTERRUPTED = "The run was interrupted: its map is the best one so far, and the log is mapped again by the next call."
-# Times between scans that are longer than so many times the usual one are gaps of the log, or clocks that jumped: they do not count as driving.
+# A note, if no map fits the stars.
+NO_STARS = (
+    "No map fits the stars of the log: some star was misread, or a place was passed unnoticed. "
+    "So the log was mapped without stars and sides."
+)
+# A note, if somebody ended the run.
+INTERRUPTED = (
+    "The run was interrupted: its map is the best one so far, "
+    "and the log is mapped again by the next call."
+)
+# Times between scans that are longer than this many times the usual one are gaps of the log, or
+# jumps of its clock. They do not count as driving.
 GAP = 20.0
 
-# The theory of buildings whose stars say nothing that one could rely on.
+# The theory for buildings whose stars cannot be relied on.
 BARE = Theory.topological().replace(star="none", boundary="none")
 
 
 @dataclass(frozen=True, eq=False)
 class LogMap:
-    """What became of a log.
+    """The maps of a log, and how they were made.
 
-    log       the scans
-    imported  the trace, and how it was made
-    solution  its minimal maps, in the order of how well they close
-    rungs     what each kind of evidence is worth; empty where that was not asked
-    seconds   processor time of each stage, from the track on
-    limit     seconds that there were for the minimal maps
-    notes     what is to be said of its track and of how it was mapped
-    interrupted  whether somebody ended the run before it was through
+    Attributes:
+        log: The scans.
+        imported: The trace, and how it was made.
+        solution: The minimal maps, those that close best first.
+        rungs: What each kind of evidence is worth; empty without a ladder.
+        seconds: Processor time of each stage in seconds, from the track on.
+        limit: Seconds that the search for the minimal maps had.
+        notes: Notes on the track, and on how it was mapped.
+        interrupted: Whether somebody ended the run.
     """
 
     log: RobotLog
@@ -76,11 +88,11 @@ class LogMap:
 
     @property
     def drove(self) -> float | None:
-        """Seconds that the robot drove, by the clock of the log; None where its times are cut, wrapped or missing."""
+        """Seconds that the robot drove, by `seconds_driven`."""
         return seconds_driven(self.log)
 
     def to_dict(self) -> dict[str, Any]:
-        """What run.json holds: settings, counts, and the time of each stage."""
+        """The contents of run.json: settings, counts, and the time of each stage."""
         solution, scale, trace = self.solution, self.imported.scale, self.imported.trace
         return {
             "format": "ssh-run",
@@ -112,7 +124,7 @@ class LogMap:
         }
 
     def files(self) -> dict[str, bytes]:
-        """The folder of a run, by name: trace.jsonl, maps.json, page.html, report.html and run.json, which comes last."""
+        """The files of the run's folder, by name; run.json comes last."""
         trace, solution = self.imported.trace, self.solution
         if not self.interrupted:
             shared = find_backbone(solution, trace, time_limit=self.limit)
@@ -129,38 +141,44 @@ class LogMap:
 
 
 def theory_for(imported: Imported) -> Theory:
-    """The theory that suits a building: with stars and sides where its places are junctions and its walls meet at right angles, else BARE."""
+    """The theory that suits a building.
+
+    It has stars and sides if places are junctions and walls meet at right angles; else it is BARE.
+    """
     return Theory.topological() if imported.trace.extra["right_angles"] else BARE
 
 
 def seconds_driven(log: RobotLog) -> float | None:
-    """Seconds that the robot drove, by the clock of a log; None where its times are cut, wrapped or missing."""
+    """Seconds that the robot drove, by the clock of a log.
+
+    None if its times are cut, wrapped or missing.
+    """
     times = [scan.time for scan in log.scans if scan.time is not None]
     steps = [later - earlier for earlier, later in itertools.pairwise(times)]
-    if (
-        not steps
-        or any(step < 0 for step in steps)
-        or sum(step > 0 for step in steps) < len(steps) / 2
-    ):
+    runs_back = any(step < 0 for step in steps)
+    if not steps or runs_back or sum(step > 0 for step in steps) < len(steps) / 2:
         return None
     usual = median(step for step in steps if step > 0)
     return math.fsum(step for step in steps if step < GAP * usual) or None
 
 
 def seconds_left(log: RobotLog, imported: Imported) -> float:
-    """What the import left of the time in which a log is to be mapped: the twentieth part of what the robot drove. Below 0 where it left none."""
+    """Seconds that the import leaves for the maps of a log; below 0 if it leaves none."""
     drove = seconds_driven(log) or float(imported.track.way[-1]) / SPEED
     return SHARE * drove - math.fsum(imported.seconds.values())
 
 
 class LogMapping(UnderWay):
-    """The mapping of a log that is under way. A handler of signals, or another thread, may end it, and ask what is known.
+    """The mapping of a log, which another thread or a signal handler may end."""
 
-    Attributes:
-        known: What is known once a search has begun, for a program that ends before the mapping is through.
-    """
+    def __init__(self) -> None:
+        super().__init__()
+        self.tell: Callable[[], LogMap] | None = None  # what `known` returns
 
-    known: Callable[[], LogMap]
+    def known(self) -> LogMap:
+        """What is known once a search has begun, for a program that ends before the mapping."""
+        assert self.tell
+        return self.tell()
 
 
 @renamed_parameters("limit", "maps")
@@ -180,27 +198,43 @@ def map_log(
 ) -> LogMap:
     """The minimal maps of a building, from a robot's log.
 
-    theory           the axioms. Where it is None, `theory_for` chooses, and if no map satisfies what it chose, the log is mapped again by BARE
-    choices          fields of Theory, laid over that: a choice about one thing leaves the others as they suit the log
-    gateway, radius  metres, as in perception.places.scale.Scale; what the log suggests, where they are None
-    doors            whether doors are the places, as in perception.places.importing.import_log; what the log suggests, where it is None
-    limit            seconds for the minimal maps; None for what is left of a twentieth of the time that the robot drove, and LEAST at least
-    maps             so many of them are listed at most
-    with_ladder      whether it is found out, too, what each kind of evidence is worth
-    mapping          what can interrupt this from elsewhere
+    Ctrl-C during a search ends it, and all that follows, with the best map so far. Then
+    `interrupted` is true.
 
-    Ctrl-C during a search ends it, and what follows, with the best map so far: `interrupted` says so. Raises LogError, and TheoryError for a theory that does not suit the trace.
+    Args:
+        log: The robot's log.
+        theory: The axioms. None takes `theory_for`; if then no map fits, the log is mapped again by
+            BARE.
+        choices: Fields of Theory that replace those of the theory. A choice about one thing leaves
+            the others as they suit the log.
+        gateway: Metres, as in perception.places.scale.Scale; None takes what the log suggests.
+        radius: Metres, as in perception.places.scale.Scale; None takes what the log suggests.
+        doors: Whether doors are the places, as in perception.places.importing.import_log; None
+            takes what the log suggests.
+        name: The name of the trace.
+        time_limit: Seconds for the minimal maps. None takes what is left of a twentieth of the time
+            that the robot drove, and at least LEAST.
+        max_maps: List at most this many minimal maps; None lists all.
+        with_ladder: Whether to find out what each kind of evidence is worth.
+        mapping: Interrupts the mapping from elsewhere.
+
+    Raises:
+        LogError: The log cannot be imported.
+        TheoryError: The theory does not suit the trace.
     """
     mapping = mapping or LogMapping()
+
+    # 1. Trace: import the log.
     imported = import_log(log, gateway, radius, name, doors)
-    seconds = dict(imported.seconds)
-    _log.info("%d visits, %d steps", len(imported.visits), len(imported.trace))
+    trace, seconds, notes = imported.trace, dict(imported.seconds), imported.notes
+    _log.info("%d visits, %d steps", len(imported.visits), len(trace))
+
+    # 2. Theory and time, as they suit the log.
     chosen = (theory or theory_for(imported)).replace(**choices or {})
     left = seconds_left(log, imported)
-    allowed = (
-        max(left * (1 - LADDER if with_ladder else 1), LEAST) if time_limit is None else time_limit
-    )
-    notes = imported.notes
+    allowed = time_limit
+    if allowed is None:
+        allowed = max(left * (1 - LADDER if with_ladder else 1), LEAST)
     climbed: list[Rung] = []
 
     def outcome(solution: Solution, interrupted: bool = True) -> LogMap:
@@ -209,28 +243,27 @@ def map_log(
             log, imported, solution, tuple(climbed), dict(seconds), allowed, said, interrupted
         )
 
-    mapping.known = lambda: outcome(mapping.snapshot())
+    # 3. Maps: solve the trace; without stars and sides if no map fits them.
+    mapping.tell = lambda: outcome(mapping.snapshot())
     begin = time.process_time()
-    solution = mapping.solve(imported.trace, chosen, time_limit=allowed, max_maps=max_maps)
-    if (
-        solution.status is Status.UNSATISFIABLE
-        and theory is None
-        and not {"star", "boundary", "level"} & set(choices or ())
-    ):
+    solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
+    may_relax = theory is None and not {"star", "boundary", "level"} & set(choices or ())
+    if solution.status is Status.UNSATISFIABLE and may_relax:
         bare = BARE.replace(**choices or {})
         if bare != chosen:
             chosen, notes = bare, (*notes, NO_STARS)
-            solution = mapping.solve(imported.trace, chosen, time_limit=allowed, max_maps=max_maps)
-    mapping.known = lambda: outcome(solution)
+            solution = mapping.solve(trace, chosen, time_limit=allowed, max_maps=max_maps)
+    mapping.tell = lambda: outcome(solution)
     seconds["maps"] = round(time.process_time() - begin, 3)
+
+    # 4. Ladder: what each kind of evidence is worth.
     if with_ladder and not mapping.interrupted:
         begin, stars = time.process_time(), chosen.star != "none"
-        share = (left - seconds["maps"]) / len(list(rungs(imported.trace, chosen, stars)))
-        most = min(max(share, LEAST_RUNG), RUNG)
+        share = (left - seconds["maps"]) / len(list(rungs(trace, chosen, stars)))
         climbed += ladder(
-            imported.trace,
+            trace,
             chosen,
-            time_limit=most,
+            time_limit=min(max(share, LEAST_RUNG), RUNG),
             max_maps=1,
             stars=stars,
             known=solution,

@@ -1,6 +1,6 @@
-"""The report of a run: the map over the laser scans, what each kind of evidence is worth, what is disbelieved, the rivals, and how long each stage took.
+"""The report of a run, as a page: the map over the laser scans, the ladder, faults, rivals, times.
 
-Scans are laid at corrected poses where the log has them, for the reader's eye alone: the map was made without.
+Scans are drawn at corrected poses if the log has them. The map was made without these.
 """
 
 from __future__ import annotations
@@ -20,24 +20,28 @@ from ssh_abduction.data.odometry import between, moved
 from ssh_abduction.data.words import counted
 from ssh_abduction.evaluation.ladder import Rung
 from ssh_abduction.output.drawing import COLOURS, escaped, page, text
-from ssh_abduction.solver import Solution
+from ssh_abduction.solver import Solution, Status
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]
 
-# The picture has one point of a wall in each square of so many metres.
+# The picture has one point of a wall in each square of this many metres.
 GRAIN = 0.2
-# So many units of the page are a metre; the picture is made smaller where it would be larger than this.
+# A metre has this many units of the page, or fewer, so that the picture is at most LARGEST wide.
 METRE, LARGEST = 14.0, 1500.0
-# Beams farther than this are left out of the picture, in metres: they are too far from each other to draw a wall.
+# Beams longer than this many metres are not drawn: their ends are too far apart to show a wall.
 DRAWN = 12.0
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c1c1c; --paper: #ffffff; --line: #c8c8c8 }
 @media (prefers-color-scheme: dark) { :root { --ink: #e6e6e6; --paper: #16181c; --line: #44484f } }
-body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 70rem; margin: 2rem auto; padding: 0 1rem }
-table { border-collapse: collapse; display: block; overflow-x: auto } th, td { border-bottom: 1px solid var(--line); padding: .2rem .8rem .2rem 0; text-align: left }
-figure { margin: 1rem 0; background: white; border: 1px solid var(--line) } figure svg { width: 100%; height: auto; display: block } figcaption { color: #333; padding: .4rem .6rem }
+body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper) }
+body { max-width: 70rem; margin: 2rem auto; padding: 0 1rem }
+table { border-collapse: collapse; display: block; overflow-x: auto }
+th, td { border-bottom: 1px solid var(--line); padding: .2rem .8rem .2rem 0; text-align: left }
+figure { margin: 1rem 0; background: white; border: 1px solid var(--line) }
+figure svg { width: 100%; height: auto; display: block }
+figcaption { color: #333; padding: .4rem .6rem }
 code { overflow-wrap: anywhere }
 """
 
@@ -51,7 +55,12 @@ def report(
 ) -> str:
     """The page, as HTML that loads nothing.
 
-    run  what run.json holds
+    Args:
+        log: The scans.
+        imported: The trace, and how it was made.
+        solution: The minimal maps.
+        rungs: What each kind of evidence is worth; empty without a ladder.
+        run: The contents of run.json.
     """
     name = imported.trace.name or "log"
     parts = [
@@ -69,8 +78,10 @@ def report(
         "<h2>Visits</h2>" + _visits(imported, solution),
     ]
     return (
-        f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">"
+        '<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width">'
+        '<meta http-equiv="Content-Security-Policy" '
+        "content=\"default-src 'none'; style-src 'unsafe-inline'\">"
         f"<title>{escaped(name)}</title><style>{STYLE}</style>\n"
         + "\n".join(part for part in parts if part)
         + "\n</html>\n"
@@ -78,19 +89,22 @@ def report(
 
 
 def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
+    """What was seen, and how large the map is, in two sentences."""
     log, cost = run["log"], solution.cost
-    seen = f"{log['scans']} scans on a way of {log['metres']:g} m; {run['visits']} visits to distinctive places, {run['steps']} steps."
+    seen = (
+        f"{log['scans']} scans on a way of {log['metres']:g} m; "
+        f"{run['visits']} visits to distinctive places, {run['steps']} steps."
+    )
     if cost is None:
         return f"{seen} No map of them: {solution.status.value}."
-    of = (
-        "one minimal map"
-        if solution.complete and solution.count == 1
-        else f"{'' if solution.complete else 'at least '}{solution.count} minimal maps"
-    )
-    proven = (
-        of if solution.status.value == "optimal" else "a map without a proof that it is minimal"
-    )
-    return f"{seen} {cost.places} places, {cost.paths} paths, {cost.dstates} distinctive states: {proven}."
+    if solution.status is not Status.OPTIMAL:
+        proven = "a map without a proof that it is minimal"
+    elif solution.complete and solution.count == 1:
+        proven = "one minimal map"
+    else:
+        proven = f"{'' if solution.complete else 'at least '}{solution.count} minimal maps"
+    size = f"{cost.places} places, {cost.paths} paths, {cost.dstates} distinctive states"
+    return f"{seen} {size}: {proven}."
 
 
 def _figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
@@ -102,6 +116,7 @@ def _figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
         else [_pose(row) for row in imported.track.poses]
     )
     walls = _walls(log, poses)
+    # The middle of each visit, as seen from the pose that is drawn.
     spots = {
         number: moved(
             poses[visit.scan],
@@ -109,39 +124,42 @@ def _figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
         )[:2]
         for number, visit in enumerate(imported.visits)
     }
-    extent = (
-        np.ptp(np.concatenate([walls, [p[:2] for p in poses]]), axis=0).max() if len(walls) else 1.0
-    )
-    unit = min(METRE, LARGEST / max(float(extent), 1.0))
+    extent = 1.0
+    if len(walls):
+        extent = float(np.ptp(np.concatenate([walls, [p[:2] for p in poses]]), axis=0).max())
+    unit = min(METRE, LARGEST / max(extent, 1.0))
 
     def on_page(point: Sequence[float]) -> Point:
         return point[0] * unit, -point[1] * unit
 
     dots = "".join(f"M{x * unit:.0f} {-y * unit:.0f}h0" for x, y in walls)
     way = " ".join(f"{x:.1f},{y:.1f}" for x, y in (on_page(pose[:2]) for pose in poses))
+    width = max(GRAIN * unit * 0.7, 1)
+    best = solution.maps[0] if solution.maps else None
     marks = [
-        f'<path d="{dots}" stroke="#9a9a9a" stroke-width="{max(GRAIN * unit * 0.7, 1):.1f}" stroke-linecap="round" fill="none"/>',
+        f'<path d="{dots}" stroke="#9a9a9a" stroke-width="{width:.1f}" stroke-linecap="round" '
+        'fill="none"/>',
         f'<polyline points="{way}" fill="none" stroke="#b9c7d6" stroke-width="1"/>',
-        *_streets(
-            imported,
-            solution.maps[0] if solution.maps else None,
-            {n: on_page(p) for n, p in spots.items()},
-        ),
+        *_streets(imported, best, {n: on_page(p) for n, p in spots.items()}),
     ]
+    points = [on_page(p) for p in walls] + [on_page(p[:2]) for p in poses]
+    picture = page(marks, points or [(0.0, 0.0)], margin=20)
     poses_said = (
         "corrected poses of the log, which were not read for the map"
         if corrected
         else "the poses of the track, which drifts"
     )
-    points = [on_page(p) for p in walls] + [on_page(p[:2]) for p in poses]
-    picture = page(marks, points or [(0.0, 0.0)], margin=20)
-    return f"<figure>{picture}<figcaption>The {'first map' if solution.maps else 'visits'} over the scans, at {poses_said}. Numbers are places; small dots are visits.</figcaption></figure>"
+    caption = (
+        f"The {'first map' if solution.maps else 'visits'} over the scans, at {poses_said}. "
+        "Numbers are places; small dots are visits."
+    )
+    return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
 
 def _streets(
     imported: Imported, ssh_map: SSHMap | None, spots: Mapping[int, Point]
 ) -> Iterator[str]:
-    """The streets between visits, and the places: each in the mean of where it was visited."""
+    """The streets between places, and the places, each at the mean of its visits."""
     trace = imported.trace
     if ssh_map is None:
         yield from (
@@ -162,24 +180,26 @@ def _streets(
     }
     for (t, before), (_, after) in pairwise(enumerate(ssh_map.labels)):
         if trace.actions[t].kind == "travel":
-            a, b, path = (
-                middle[of_label[before].place],
-                middle[of_label[after].place],
-                of_label[before].path,
+            a, b = (middle[of_label[label].place] for label in (before, after))
+            colour = COLOURS[(of_label[before].path or 0) % len(COLOURS)]
+            yield (
+                f'<path d="M{a[0]:.1f} {a[1]:.1f}L{b[0]:.1f} {b[1]:.1f}" stroke="{colour}" '
+                'stroke-width="5" stroke-opacity=".75" fill="none"/>'
             )
-            colour = COLOURS[(path or 0) % len(COLOURS)]
-            yield f'<path d="M{a[0]:.1f} {a[1]:.1f}L{b[0]:.1f} {b[1]:.1f}" stroke="{colour}" stroke-width="5" stroke-opacity=".75" fill="none"/>'
     yield from (f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="#444"/>' for x, y in spots.values())
     for place, (x, y) in middle.items():
         if place is not None:
             yield (
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="11" fill="white" stroke="#222" stroke-width="2"/>'
-                + text(x, y, str(place), "#222", 12, "bold")
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="11" fill="white" stroke="#222" '
+                'stroke-width="2"/>' + text(x, y, str(place), "#222", 12, "bold")
             )
 
 
 def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
-    """A point in each square of GRAIN metres in which some beam ended."""
+    """A point in each square of GRAIN metres in which a beam ended, (n, 2).
+
+    In long logs two beams must end there, so that few stray beams are drawn.
+    """
     found = []
     for scan, pose in zip(log.scans, poses, strict=True):
         x, y, heading = moved(pose, scan.laser.mount)
@@ -197,6 +217,7 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
 
 
 def _ladder(rungs: Sequence[Rung]) -> str:
+    """A row a rung."""
     rows = []
     for rung in rungs:
         cost = rung.solution.cost
@@ -208,6 +229,7 @@ def _ladder(rungs: Sequence[Rung]) -> str:
 
 
 def _faults(solution: Solution) -> str:
+    """What the first map disbelieves."""
     faults = solution.maps[0].faults
     if not faults:
         allowed = solution.theory.misread or solution.theory.slipped or solution.theory.jumped
@@ -220,41 +242,31 @@ def _faults(solution: Solution) -> str:
 
 
 def _settings(run: Mapping[str, Any]) -> str:
+    """What the places are, how they are measured, and the theory."""
+    scale = run["scale"]
     theory = ", ".join(
         f"{name} {value}"
         for name, value in run["theory"].items()
         if value not in (None, False, [], 0)
     )
-    rows = (
-        [
-            ("places", "doors", "those that the robot drove through; a path leads across a room"),
-            ("theory", theory, "the axioms, and the choices in them"),
-        ]
-        if run["scale"]["doors"]
-        else [
+    if scale["doors"]:
+        told = "those that the robot drove through; a path leads across a room"
+        rows = [("places", "doors", told)]
+    else:
+        walls = "right angles" if run["right_angles"] else "any angles"
+        leads = "how far a way out must lead from the middle of a place"
+        rows = [
             ("places", "junctions, corners, dead ends", "where ways part or bend"),
-            (
-                "gateway",
-                f"{run['scale']['gateway']:g} m",
-                "the least width of a way out that counts",
-            ),
-            (
-                "radius",
-                f"{run['scale']['radius']:g} m",
-                "how far a way out must lead from the middle of a place",
-            ),
-            (
-                "walls",
-                "right angles" if run["right_angles"] else "any angles",
-                "as the ways that the robot took suggest",
-            ),
-            ("theory", theory, "the axioms, and the choices in them"),
+            ("gateway", f"{scale['gateway']:g} m", "the least width of a way out that counts"),
+            ("radius", f"{scale['radius']:g} m", leads),
+            ("walls", walls, "as the ways that the robot took suggest"),
         ]
-    )
+    rows.append(("theory", theory, "the axioms, and the choices in them"))
     return _table(("", "", ""), rows)
 
 
 def _time(run: Mapping[str, Any]) -> str:
+    """The processor time of each stage, and the share of the drive."""
     total = math.fsum(run["seconds"].values())
     rows = [
         (stage, f"{seconds:.2f} s", f"{100 * seconds / max(total, 1e-9):.0f} %")
@@ -262,13 +274,15 @@ def _time(run: Mapping[str, Any]) -> str:
     ]
     told = f"All stages together took {total:.1f} s of processor time"
     if run["drove"]:
-        told = f"The robot drove {run['drove']:.0f} s. {told}, a share of 1/{run['drove'] / max(total, 1e-9):.0f}"
+        share = f"a share of 1/{run['drove'] / max(total, 1e-9):.0f}"
+        told = f"The robot drove {run['drove']:.0f} s. {told}, {share}"
     return _table(("stage", "processor", "share"), rows) + _paragraph(
         f"{told}. The search for the minimal maps had {run['limit']:g} s at most."
     )
 
 
 def _log(log: RobotLog, run: Mapping[str, Any]) -> str:
+    """The notes of the log's reader."""
     said = [f"{log.source}: {log.format}, {len(log)} scans.", *log.notes]
     if log.damaged:
         said.append(
@@ -279,6 +293,7 @@ def _log(log: RobotLog, run: Mapping[str, Any]) -> str:
 
 
 def _visits(imported: Imported, solution: Solution) -> str:
+    """A row a step: what was seen and done, and where the map has it."""
     labels = solution.maps[0].labels if solution.maps else None
     states = {state.id: state for state in solution.maps[0].dstates} if solution.maps else {}
     rows = []
