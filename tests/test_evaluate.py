@@ -1,4 +1,4 @@
-"""How right maps are: every figure compared with one that is counted naively, and maps whose figures are known."""
+"""Scores of maps against named truth: compared with naive counts, and with known figures."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def naive_accuracy(labels: Sequence[int], truths: Sequence[Any]) -> float | None
 
 
 def naive_edges(said: Sequence[int], true: Sequence[int]) -> set[tuple[float | None, float | None]]:
-    """Precision and recall of edges under each of the one-to-one assignments that fit most steps."""
+    """Precision and recall of edges under each one-to-one assignment that fits most steps."""
     own = sorted(set(said))
     spare = [*sorted(set(true)), *(-1 - x for x in own)]  # a negative place is none
     assignments = [
@@ -154,7 +154,7 @@ def test_names_make_no_difference(seed: int) -> None:
     )
 
     def figures(ids: Sequence[int], names: Sequence[Any], flip: int) -> Evaluation:
-        """With dstate i called ids[i] in the map and names[i] in the truth, and paths in the other direction."""
+        """Call dstate i ids[i] in the map and names[i] in the truth, and reverse the paths."""
         at = {ids[i]: i for i in range(6)}
         places = [ids[place[at[x]]] for x in range(6)]
         courses = [(1 - course[at[x]][0], flip * course[at[x]][1]) for x in range(6)]
@@ -241,7 +241,8 @@ def test_the_route_that_a_robot_drove_has_no_true_map_among_the_minimal_ones() -
 
 
 def test_edges_are_counted_by_hand() -> None:
-    # Truth: A – B – C – A, driven once around and back to B. The map takes C for A, so that it has one edge, A – B, and A – A.
+    # Truth: A – B – C – A, driven once around and back to B. The map takes C for A, so that it has
+    # the edges A – B and A – A.
     trace = walk([{"place": p} for p in "ABCABA"])
     found = one(labelled([0, 1, 0, 0, 1, 0], [0, 1]), trace)
     assert (found.edge_precision, found.edge_recall) == (1 / 2, 1 / 3)
@@ -400,7 +401,7 @@ def test_maps_that_cannot_be_used() -> None:
     trace = walk("aba")
     with pytest.raises(
         MapError,
-        match=r"^maps\[1\]: labels: expected 3, one for each step of the trace, got 2; solve this trace",
+        match=r"^maps\[1\]: labels: expected 3, one for each step of the trace, got 2; solve this",
     ):
         evaluate([labelled([0, 1, 0]), labelled([0, 1])], trace)
     with pytest.raises(
@@ -440,8 +441,8 @@ def test_the_shell_prints_a_table(solved: str, capsys: pytest.CaptureFixture[str
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "no map is the true one, of 4 maps"
     assert (
-        lines[1]
-        == "the truth, told at 23 of 23 steps: 22 dstates, 9 places; 13 % of the pairs of dstates share a view"
+        lines[1] == "the truth, told at 23 of 23 steps: 22 dstates, 9 places; "
+        "13 % of the pairs of dstates share a view"
     )
     assert re.sub(r"  +", "|", lines[3]).startswith("|1|no|19 wrong|10 wrong|–|0.826|")
     assert len(lines) == 3 + 4
@@ -500,12 +501,14 @@ def test_errors_of_the_shell_are_one_line(
         ),
         (
             [solved, str(short)],
-            f"{solved}: maps[0]: labels: expected 9, one for each step of the trace, got 23; solve this trace",
+            f"{solved}: maps[0]: labels: expected 9, one for each step of the trace, got 23; "
+            "solve this trace",
         ),
         ([str(none), ACES], f"{none}: maps: expected one to evaluate, got none"),
         (
             [ACES, solved],
-            f"{ACES}: expected a file of maps, got a trace; name the maps first, and then the trace",
+            f"{ACES}: expected a file of maps, got a trace; "
+            "name the maps first, and then the trace",
         ),
         ([solved, solved], f"{solved}:1: header: expected a trace, got maps, as solve prints them"),
         ([str(tmp_path / "nosuch"), ACES], "nosuch: expected a readable file of maps"),

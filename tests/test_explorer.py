@@ -1,4 +1,4 @@
-"""The explorer in tiny worlds: its map against the world itself, and that it says honestly why it ended."""
+"""The explorer in tiny worlds: its map against the world, and why it says that it ended."""
 
 from __future__ import annotations
 

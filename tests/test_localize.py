@@ -1,4 +1,4 @@
-"""Beliefs over the dstates of a map: against a Bayes filter written out from the equations, on kidnapped robots, and where the map has never been."""
+"""Beliefs over dstates: against a plain Bayes filter, for kidnapped robots, and off the map."""
 
 from __future__ import annotations
 
@@ -57,7 +57,10 @@ def true_map(truth: Sequence[object], trace: Trace) -> SSHMap:
 def drive(
     ssh_map: SSHMap, steps: int, seed: int, kidnapped: int | None = None
 ) -> tuple[Trace, list[int]]:
-    """A random walk along the links of a map, and where the robot is. At step `kidnapped` it is not where the link leads, but at a dstate that looks different."""
+    """A random walk along the links of a map, and where the robot is.
+
+    At step `kidnapped` it is not where the link leads, but at a dstate that looks different.
+    """
     chance = random.Random(seed)
     leads: dict[int, list[tuple[str, int]]] = {}
     for x, action, y in ssh_map.links:
@@ -86,7 +89,10 @@ def drive(
 def filtered(
     ssh_map: SSHMap, trace: Trace, chances: Chances, labelled: Trace | None = None
 ) -> list[tuple[Array, float]]:
-    """Equations 1 to 4 as dense tables over the dstates, and the two kinds of nowhere, strange and akin, as the last two. The belief after each step, and p(o) / q(o) by the belief before."""
+    """Equations 1 to 4 as dense tables. The last two rows are the strange and the akin nowhere.
+
+    Yields the belief after each step, and p(o) / q(o) by the belief before.
+    """
     n = len(ssh_map.dstates)
     steps = range(0) if labelled is None else range(len(labelled))
     prior = np.array([(1 - chances.unmapped) / n] * n + [chances.unmapped / 2] * 2)
@@ -188,7 +194,7 @@ def assert_as_filtered(localiser: Localiser, trace: Trace, labelled: Trace | Non
 
 
 def random_case(seed: int) -> tuple[SSHMap, Trace, Trace]:
-    """A map with some links, a trace that its labels contradict here and there, and another trace with what the map does not know."""
+    """A map, a trace that partly contradicts it, and another trace that is partly unknown to it."""
     chance = random.Random(seed)
     n = chance.randint(1, 5)
     views = [chance.choice("abc") for _ in range(n)]
@@ -230,7 +236,10 @@ def test_beliefs_are_those_of_a_filter_written_out_from_the_equations(seed: int)
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_trace_estimates_the_zeros_and_ones_of_its_map(seed: int) -> None:
-    """Equation 3 on the trace that a map explains is equation 4: beliefs are the same to the last bit, and those of a filter that counts only what is allowed."""
+    """On the trace that a map explains, equation 3 is equation 4, to the last bit.
+
+    The beliefs are also those of a filter that counts only what is allowed.
+    """
     walk = moore(9, 3, steps=300, seed=seed) if seed % 2 else maze(3, 3, steps=300, seed=seed)
     ssh_map = true_map(walk.truth, walk.trace)
     other, at = drive(ssh_map, 40, seed)
@@ -303,9 +312,7 @@ def test_one_misread_view_is_forgiven() -> None:
     assert beliefs[25].verdict is Verdict.LOCATED
 
 
-def test_dstates_that_nothing_tells_apart_stay_so_and_a_robot_is_found_where_it_is_as_sure_as_before() -> (
-    None
-):
+def test_a_robot_is_found_again_where_it_is_as_sure_as_before() -> None:
     """Opposite corners of the notched rectangle look alike, and what follows them does."""
     (ssh_map,) = solve(rectangle(40), Theory.topological()).maps
     views = [f"v{i % 4}" for i in range(9)] + [f"v{i % 4}" for i in range(3, 10)]
@@ -431,7 +438,10 @@ def test_densities_of_images_are_those_of_a_gaussian_about_the_nearest_image() -
 
 
 def test_a_localiser_reads_images() -> None:
-    """Two of the six places look the same; what follows tells them apart. In the middle somebody stands in front, and then the robot is carried elsewhere."""
+    """Two of the six places look the same; what follows tells them apart.
+
+    In the middle somebody stands in front, and then the robot is carried elsewhere.
+    """
     images, at = pictures(5, 8, seed=1)
     ring = map_of(["v"] * 6, [(i, "on", (i + 1) % 6) for i in range(6)])
     looks = [0, 1, 2, 3, 4, 2]

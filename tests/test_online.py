@@ -1,4 +1,4 @@
-"""The mapper that follows a robot: equal to solving anew after every step, quick, and never without a map."""
+"""The online mapper: as exact as solving anew after each step, quick, and never without a map."""
 
 from __future__ import annotations
 
@@ -203,7 +203,10 @@ def test_sketches_are_consistent(data: st.DataObject) -> None:
 
 
 def draft(trace: Trace, theory: Theory, known: int, which: int) -> list[bool]:
-    """A minimal map of so many steps goes on beyond them. After each step it is consistent, as it says; returns where it did not say so."""
+    """Let a minimal map of the first steps go on. After each step it is consistent if it says so.
+
+    Returns for each step whether the map did not say so.
+    """
     maps = solve(trace.prefix(known), theory, max_maps=5).maps
     if not maps:
         return []
@@ -241,7 +244,7 @@ def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> 
 
 
 def test_a_map_whose_turns_lead_back_is_not_sure_to_go_on() -> None:
-    """Two turns to the right lead back, so that a new place ahead would lie on both sides of a path."""
+    """Two turns to the right lead back, so a new place ahead would be on both sides of a path."""
     trace = Trace.from_steps("aaaa", ["right", "right", "travel"])
     theory = Theory(star="none", path_order="partial", all_on_paths=True).resolve(trace)
     assert draft(trace, theory, 3, 0) == [True]
@@ -346,7 +349,7 @@ def test_maps_are_guessed_while_the_robot_drives() -> None:
 
 
 def test_a_map_that_is_contradicted_is_mended() -> None:
-    """Maps of fewer steps, kept as far as can be: what does not fit is new. That has streets mostly."""
+    """A map of fewer steps is kept as far as possible, and what does not fit is new."""
     without = contradicted = 0
     for seed in range(6):
         trace = maze(3, 3, steps=120, seed=seed, stars=True).trace
@@ -522,7 +525,10 @@ def test_a_displacement_that_is_none_changes_nothing(given: dict[str, Any], mess
 def test_the_trace_settles_displacements_as_it_grows(
     theory: Theory, stars: bool, steps: int
 ) -> None:
-    """The first displacement comes late, and one is missing; the number of returns that may be true doubles several times."""
+    """The first displacement comes late, and one is missing.
+
+    The number of returns that may be true doubles several times.
+    """
     trace = maze(2, 2, steps=steps, seed=3, stars=stars, odometry=Odometry(along=0.02)).trace
     missing = {1, 2, 3, steps // 2}
     trace = replace(
@@ -562,7 +568,10 @@ def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:
 
 
 def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
-    """Without time for clingo, all maps are guessed or sketched, and displacements refuse none of them: not even those of steps before the threshold changed."""
+    """Without time for clingo, all maps are guessed or sketched, and displacements refuse none.
+
+    That includes maps of steps before the threshold changed.
+    """
     trace = maze(4, 4, steps=40, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
     given: list[Trace] = []
 

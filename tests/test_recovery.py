@@ -1,4 +1,4 @@
-"""The mapper that recovers from faults: exact after every step, and certain again when evidence is."""
+"""Recovery from faults: exact after each step, and certain again when the evidence suffices."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_after_every_step_the_maps_are_those_of_brute_force(
 @settings(max_examples=5)
 @given(st.data())
 def test_what_is_known_of_steps_and_places_is_obeyed(data: st.DataObject) -> None:
-    """Pairs of steps that somebody asserts, and places with stars, are more than the two causal axioms: the maps are those of solving anew, too."""
+    """With asserted pairs of steps, or places with stars, the maps are those of solving anew."""
     trace = data.draw(small_traces(max_steps=5))
     prices = {
         "misread": data.draw(st.sampled_from([0.0, 0.4, 1.0])),
@@ -197,7 +197,10 @@ def test_a_star_that_is_misread_is_told() -> None:
 
 
 def test_without_time_there_is_a_map_and_a_belief() -> None:
-    """Every search is stopped at once: the belief goes on by itself, and what it says is consistent, with a bound, but never certain."""
+    """Every search is stopped at once, and the belief goes on by itself.
+
+    Its maps are consistent and have a bound, but they are never certain.
+    """
     trace, alone = circuit(30, wrong=17), Speedups.without("processes")
     for mapper, solution in followed(trace, BOTH, NO_TIME, speedups=alone):
         assert solution.status is Status.FEASIBLE
@@ -226,7 +229,7 @@ def one_of_the_maps(
 def test_what_takes_too_long_for_a_step_is_solved_while_the_robot_drives(
     in_a_step: Callable[..., Solved],
 ) -> None:
-    """A second process is stood in for by what it would find, of steps that have been outgrown by then."""
+    """A stub stands in for the second process. Its answer is for fewer steps than there are."""
     trace, solved = circuit(30, wrong=17), solving.solved
     begun = []
 
@@ -304,7 +307,7 @@ def test_displacements_that_come_later_are_used() -> None:
 
 
 def test_what_is_decided_is_what_will_be() -> None:
-    """Two actions in a row, one of which slipped: which one it was nothing tells, and the map is certain."""
+    """One of two actions in a row slipped. Nothing tells which one, but the map is certain."""
     for seed in range(40):
         for mapper, solution in followed(
             bench.machine(seed, jumps=1).walk.trace.prefix(60),

@@ -17,7 +17,7 @@ from ssh_abduction.data.maps import DState, Fit, MapPath, Pose
 
 @pytest.fixture(scope="module")
 def square() -> SSHMap:
-    """Four places around a square of ten metres, driven round once; then the robot turned around."""
+    """Four places around a square of ten metres. The robot drives round once and turns around."""
     moves = [(10, 0, 0), (0, 0, 1.5708)] * 4
     trace = Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=moves)
     return solve(trace).maps[0]
@@ -120,7 +120,8 @@ def test_rivals_agree_where_their_links_lead_to_the_same_views() -> None:
     found = route(solution, 0, 3)
     assert (found.agree, found.maps) == (tuple(range(1, solution.count + 1)), solution.count)
     assert f"{solution.count} of {solution.count} maps" in found.sentence
-    # After the step from which the next experiment tells the rivals apart, only the map itself and those like it expect what it expects.
+    # Only the map itself, and those like it, expect the same views after the step from which the
+    # next experiment tells the rivals apart.
     odd = [
         route(solution, None, goal, map=m + 1)
         for m in range(solution.count)

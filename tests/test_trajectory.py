@@ -1,4 +1,4 @@
-"""Trajectories in TUM format are truth for steps by their times, and what does not fit a trace is said."""
+"""Trajectories in TUM format: truth for steps by their times, and messages if they do not fit."""
 
 from __future__ import annotations
 
@@ -167,23 +167,57 @@ def test_between_two_poses_the_robot_is_on_the_way(
 @pytest.mark.parametrize(
     ("text", "times", "message"),
     [
-        (tum(1e6), TIMES, "time: expected steps within 0.5 s of poses of .*true.tum, which are from 1001000 to 1001080 s, got none: .*1000 to 1080 s; take"),
-        (tum(-1000), TIMES, "which are from 0 to 80 s, got none: steps are from 1000 to 1080 s; take .* or shift its times"),
-        (tum().replace(" 0.1 ", " 0 ").replace("\n1", "\n1000000000001"), TIMES, "the trajectory seems to have nanoseconds"),
-        (tum(), (None,) * 5, "time: expected the time of some step, in seconds, got none; import the trace from its log"),
+        (
+            tum(1e6),
+            TIMES,
+            "time: expected steps within 0.5 s of poses of .*true.tum, which are from 1001000 to "
+            "1001080 s, got none: .*1000 to 1080 s; take",
+        ),
+        (
+            tum(-1000),
+            TIMES,
+            "which are from 0 to 80 s, got none: steps are from 1000 to 1080 s; "
+            "take .* or shift its times",
+        ),
+        (
+            tum().replace(" 0.1 ", " 0 ").replace("\n1", "\n1000000000001"),
+            TIMES,
+            "the trajectory seems to have nanoseconds",
+        ),
+        (
+            tum(),
+            (None,) * 5,
+            "time: expected the time of some step, in seconds, got none; import the trace from",
+        ),
         (HEAD, TIMES, "true.tum: expected lines of timestamp tx ty tz qx qy qz qw, got none"),
         ("", TIMES, "true.tum: expected lines of timestamp"),
-        (tum() + "1 2 3\n", TIMES, "true.tum:163: expected the numbers timestamp .*, got '1 2 3'; mend the line"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n", TIMES, "true.tum:1: .*this looks like a file of KITTI, which has no times"),
+        (
+            tum() + "1 2 3\n",
+            TIMES,
+            "true.tum:163: expected the numbers timestamp .*, got '1 2 3'; mend the line",
+        ),
+        (
+            "1 0 0 0 0 1 0 0 0 0 1 0\n",
+            TIMES,
+            "true.tum:1: .*this looks like a file of KITTI, which has no times",
+        ),
         ("1" + " 0" * 16, TIMES, "true.tum:1: .*EuRoC"),
         ("1 2 3 4 0 0 0 nan\n", TIMES, "true.tum:1: expected the numbers"),
         ("1 2 x 4 0 0 0 1\n", TIMES, "true.tum:1: expected the numbers"),
-        ("1 2 3 4 0 0 0 0\n", TIMES, "true.tum:1: qx qy qz qw: expected a quaternion of length 1, got one of 0"),
+        (
+            "1 2 3 4 0 0 0 0\n",
+            TIMES,
+            "true.tum:1: qx qy qz qw: expected a quaternion of length 1, got one of 0",
+        ),
         ("1 2 3 4 1 1 1 1\n", TIMES, "true.tum:1: qx qy qz qw: expected a quaternion"),
-        (line(1, 2) + line(1, 3), TIMES, "true.tum: expected one pose at a time, got different ones at 1 s"),
+        (
+            line(1, 2) + line(1, 3),
+            TIMES,
+            "true.tum: expected one pose at a time, got different ones at 1 s",
+        ),
         ("a\0b", TIMES, "true.tum"),
     ],
-)  # fmt: skip
+)
 def test_a_trajectory_that_does_not_fit_is_no_silent_nothing(
     text: str,
     times: tuple[float | None, ...],
@@ -220,8 +254,8 @@ def test_where_nothing_is_judged_that_is_said(
 ) -> None:
     assert evaluated(tmp_path, tum(), trace_at((TIMES[0], None, None, None, None))) == 0
     assert (
-        "judged by poses: expected pairs of visits to judge, got none: the trace has 5 visits; of 10 pairs poses do not tell"
-        in capsys.readouterr().err
+        "judged by poses: expected pairs of visits to judge, got none: "
+        "the trace has 5 visits; of 10 pairs poses do not tell" in capsys.readouterr().err
     )
     assert evaluated(tmp_path, tum(), trace_at((1000.0, 1000.5, 1001.0, 1001.5, 1002.0))) == 0
     assert (
@@ -264,6 +298,6 @@ def test_a_trajectory_is_no_file_of_relations(
             == 1
         )
         assert (
-            "got a trajectory: each line ends in a quaternion; give it as the truth of the steps (--truth)"
-            in capsys.readouterr().err
+            "got a trajectory: each line ends in a quaternion; "
+            "give it as the truth of the steps (--truth)" in capsys.readouterr().err
         )
