@@ -281,7 +281,7 @@ def test_a_way_that_is_on_no_floor_is_noticed(text: str, tmp_path: Path) -> None
 def test_a_trajectory_is_no_file_of_relations(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Both have eight numbers a line. Read as relations, a trajectory judged no pair and said nothing."""
+    """Both have eight numbers a line. A trajectory that was read as relations judged no pair."""
     for text in (tum(), line(1000, 0), HEAD + "5 2 3 4 0 0 0 1\n"):
         (tmp_path / "relations").write_text(text)
         trace_at().save(tmp_path / "trace.jsonl")
