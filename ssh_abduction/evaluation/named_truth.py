@@ -285,6 +285,7 @@ def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
     paths = _Sort([s.path for s in at], truth.paths)
     courses = _Sort([None if s.path is None else (s.path, s.direction) for s in at], truth.courses)
     actions = truth.trace.actions
+    # An edge joins two places either way; a link has an action and a direction.
     place_precision, place_recall = places.pairs()
     edge_precision, edge_recall = places.edges(
         truth.place_hops(), lambda _, here, there: frozenset((here, there))

@@ -89,6 +89,7 @@ class Relations:
             a, b = number[relation.first], number[relation.second]
             self._to[a, b] = relation.displacement
             self._to[b, a] = between(relation.displacement, (0.0, 0.0, 0.0))
+        # An edge is as long as the way that its relation spans.
         ends = np.array(list(self._to)).T
         metres = [math.hypot(x, y) + EACH for x, y, _ in self._to.values()]
         self._graph = coo_array(
@@ -149,6 +150,7 @@ class Relations:
         start = moments[origin]
         if start is None:
             return [None] * len(times)
+        # Find the shortest ways from the node nearest to the origin, and compose along each.
         node, offset = start
         metres, before = dijkstra(self._graph, indices=node, return_predecessors=True)
         poses: dict[int, Pose] = {node: between(offset, (0.0, 0.0, 0.0))}

@@ -123,6 +123,7 @@ class Trajectory:
         first, last = around[0], around[-1]
         if first == last or self.times[last] - self.times[first] > 2 * NEAREST:
             return self.poses[nearest]
+        # Interpolate; turn the shorter way.
         share = (time - self.times[first]) / (self.times[last] - self.times[first])
         (x, y, heading), (dx, dy, turned) = (
             self.poses[first],
@@ -159,6 +160,7 @@ class Trajectory:
                 TrajectoryWarning,
                 stacklevel=2,
             )
+        # The pose of a dstate is where the robot saw it from its own pose.
         steps = []
         for t, (step, robot) in enumerate(zip(trace.steps, robots, strict=True)):
             pose = None
@@ -278,6 +280,7 @@ def _pose(fields: Sequence[str], where: str) -> tuple[float, Pose, float, float]
             f"{where}: qx qy qz qw: expected a quaternion of length 1, got one of {length:.3g}; "
             "mend the line"
         )
+    # The yaw is the heading. The z axis of the rotation matrix has the cosine of the lean.
     qx, qy, qz, qw = (number / length for number in quaternion)
     heading = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
     return time, (x, y, heading), z, 1 - 2 * (qx * qx + qy * qy)

@@ -63,6 +63,7 @@ def labels_of(
                 f"maps: expected maps of one trace, {len(labels)} labels each, "
                 f"got {len(ssh_map.labels)} in map {i + 1}; solve one trace"
             )
+    # Maps number their dstates differently, so the first step at a dstate stands for it.
     first = [_first_steps(ssh_map) for ssh_map in maps]
     agreed = np.all([f == first[0] for f in first], axis=0)
     if not proven:
@@ -176,6 +177,7 @@ def _followed(
                 at = None if at is None else leads.get((at, trace.actions[step].name))
         else:
             ways.append(np.array(way, np.intp))
+    # Take the way that fits most images, if no other fits as many.
     ways.sort(key=lambda way: -np.count_nonzero(way == looks))
     fits = [np.count_nonzero(way == looks) for way in ways[:2]]
     sure = (

@@ -126,6 +126,7 @@ def second_map(
         time_limit=SECONDS if limit is None else min(limit, SECONDS),
         memory_limit=memory,
     )
+    # The maps are the same if they put the same steps at the same dstates and places.
     if {partition(m) for m in maps} & {partition(m) for m in solution.maps}:
         return None
     return SecondMap(

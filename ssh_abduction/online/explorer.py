@@ -292,6 +292,7 @@ class Explorer:
         )
 
     def _ending(self, unique: bool) -> Ending:
+        """Why the exploration ended, or would end now."""
         if self.solution.status is Status.UNSATISFIABLE:
             return "contradicted"
         if not self._is_stuck:
@@ -303,6 +304,7 @@ class Explorer:
         return "done" if unique else "inseparable" if self.solution.complete else "time"
 
     def _is_true(self, unique: bool) -> bool | None:
+        """Whether the unique map is true; None where the robot's looks do not tell the truth."""
         if all(truth is None for truth in self._truths):
             return None
         if not unique:
@@ -313,6 +315,7 @@ class Explorer:
         )
 
     def _look(self) -> Step:
+        """What the robot sees. Raises TraceError if that is no Step with a view."""
         seen = self._robot.look()
         if not isinstance(seen, Step) or seen.view is None:
             raise TraceError(
@@ -374,6 +377,7 @@ class Explorer:
         return ()
 
     def _experiment(self, maps: list[SSHMap]) -> Experiment:
+        """The experiment that tells maps apart, or tries what is untried in them."""
         return next_experiment(
             maps,
             self.mapper.trace,
@@ -403,6 +407,7 @@ def _is_unique(solution: Solution) -> bool:
         return False
     if solution.complete:
         return True
+    # Not all maps are listed: then the proof of what all of them share decides.
     shared = solution.backbone
     return (
         shared is not None

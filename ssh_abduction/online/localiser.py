@@ -241,6 +241,7 @@ class Localiser:
         """The belief after an action, before anything is observed: the sum of equation 2."""
         chances, p = self.chances, belief.probabilities
         links = self._links.get(action)
+        # `anywhere` is the probability that no link says where the robot is now.
         if links is None:
             moved, anywhere = np.zeros(self._number), 1 - belief.nowhere
         else:

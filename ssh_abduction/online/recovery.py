@@ -124,6 +124,7 @@ class Recovery:
         maps.drop_inconsistent()
         lead, solved = maps.lead, maps.solved
         assert solved is not None
+        # Without a proof the best rival is the answer.
         listed = tuple(rival.explained() for rival in maps.minimal)
         if lead and not listed:
             listed = (lead.explained(),)

@@ -193,6 +193,7 @@ class RivalMaps:
         new = [
             way for rival in rivals for way in rival.ways_on(done.name, step, seen, self._theory)
         ]
+        # Evidence is asked of the new step only: it refuses no more of the earlier ones.
         if self._has_evidence:
             trace = self._trace.prefix(t + 1)
             pairs = pairs_of(trace, self._theory.of_steps(0, t + 1))

@@ -135,6 +135,7 @@ class Confidence:
             where is None or self._has_recovered(where, lead, trace)
         )
         standing = Standing(certain, broke, self._hypotheses(rivals, shares), where)
+        # From here on only later faults are reported.
         if certain:
             self.known, self._located = listed[0], None
             self._broke.clear()

@@ -171,6 +171,7 @@ def _streets(
     place_of = {
         visit: of_label[label].place for visit, label in zip(visit_of, ssh_map.labels, strict=True)
     }
+    # A place is drawn at the mean of its visits.
     visited: dict[int | None, list[Point]] = {}
     for visit, place in place_of.items():
         visited.setdefault(place, []).append(spots[visit])
@@ -299,6 +300,7 @@ def _visits(imported: Imported, solution: Solution) -> str:
     rows = []
     for t, step in enumerate(imported.trace.steps):
         state = states[labels[t]] if labels else None
+        # A question mark stands for what was not seen for sure.
         star = " ".join(
             "?"
             if entry is None

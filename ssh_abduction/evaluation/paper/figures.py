@@ -41,6 +41,7 @@ def require_matplotlib() -> None:
 
 
 def _pyplot() -> Any:
+    """matplotlib.pyplot, with the style of all figures."""
     require_matplotlib()
     import matplotlib
 
@@ -64,6 +65,7 @@ def draw_quality(
     path: str | Path, quality: Mapping[int, float], uncertainty: Mapping[int, float], chosen: int
 ) -> None:
     """M, and U where it is known, against the number of clusters k."""
+    # M on the left axis, U on the right one.
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
     axes.plot(list(quality), list(quality.values()), "o-", color=BLUE, label="M")
     axes.axvline(chosen, color=GREY, linestyle=":", label=f"k = {chosen}")
@@ -110,6 +112,7 @@ def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None
     figure, (upper, lower) = pyplot.subplots(
         2, 1, figsize=(7, 3.8), sharex=True, height_ratios=(2, 1)
     )
+    # Shade the steps at which the robot was lost or nowhere, behind both curves.
     steps = np.arange(len(beliefs))
     for verdict, colour in (("lost", ORANGE), ("nowhere", GREY)):
         shaded = np.array([belief["verdict"] == verdict for belief in beliefs])
@@ -160,6 +163,7 @@ def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]])
             axes.plot([x1, x2], [y1, y2], color=ORANGE, linewidth=1)
     at = np.array(poses)
     axes.plot(at[:, 0], at[:, 1], ".", color=BLUE, markersize=3, alpha=0.5)
+    # An arrow for each dstate; few have their names at the tips, many only those of their places.
     size = 0.05 * max(world.bounds[2] - world.bounds[0], world.bounds[3] - world.bounds[1])
     for s in world.dstates:
         x, y, heading = s.pose
@@ -204,6 +208,7 @@ def draw_views(
     )
     for axes in grid.flat:
         axes.axis("off")
+    # All panels have one scale, which leaves a few outliers out.
     far = min(8.4, 1.05 * float(np.percentile(images, 98)))
     for axes, name in zip(grid.flat, names, strict=False):
         for image in images[views == name][:60]:
@@ -242,6 +247,7 @@ def draw_telling(
     figure, grid = _pyplot().subplots(
         len(found), len(methods), figsize=(3.2 * len(methods), 2.3 * len(found)), squeeze=False
     )
+    # A beam that tells the two apart has a dot, the larger the more it tells.
     bearings = np.radians((np.arange(ranges.shape[1]) + 0.5) * 180 / ranges.shape[1] - 90)
     for row, ((a, b), telling) in zip(grid, found.items(), strict=True):
         scans = [np.median(ranges[labels == name], axis=0) for name in (a, b)]
@@ -281,6 +287,7 @@ def draw_map(path: str | Path, ssh_map: SSHMap) -> None:
 
 def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
     """The largest offset from a dstate, tour by tour."""
+    # Positions on the left axis, headings on the right one.
     table = np.array(spread)
     figure, axes = _pyplot().subplots(figsize=(5.5, 2.8))
     axes.plot(
@@ -333,6 +340,7 @@ def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[flo
         "recognition rate (true labels)": 0.4,
         "k chosen by M": 2,
     }
+    # A panel a figure, a cell a notch and spread; text is dark on light cells.
     for axes, (title, value, colours) in zip(grid.flat, panels, strict=True):
         table = np.round([[value(cell[n, t]) for t in scales] for n in notches], 3)
         axes.imshow(table, origin="lower", cmap=colours, aspect="auto", vmin=lowest[title])

@@ -164,6 +164,7 @@ def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> 
     figures.draw_quality(folder / "quality.png", found.quality, found.uncertainty, found.k)
     figures.draw_learning(folder / "learning.png", {"labels from the map": run.curve})
     figures.draw_spread(folder / "spread.png", run.spread)
+    # The map from the views alone, and with the openings seen.
     starred = BootstrapLearner(WITH_STARS).fit(trace)
     for file, ssh_map in (("map", learner.map_), ("map-with-openings", starred.map_)):
         write_file(folder / f"{file}.svg", f"{to_svg(ssh_map)}\n".encode())
