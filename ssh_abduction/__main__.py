@@ -3,7 +3,7 @@
 import os
 import sys
 
-from ssh_abduction.data import program
+from ssh_abduction.runtime import program
 
 sys.path[:] = (
     program.search_path()

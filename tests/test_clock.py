@@ -13,8 +13,8 @@ import pytest
 from benchmarks.instances import maze, rectangle
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.data.clock import each_heeding, heeding, look_at_clock
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.clock import each_heeding, heeding, look_at_clock
 from ssh_abduction.solver import Status, candidates, fallback
 from ssh_abduction.solver.fit import fit
 from ssh_abduction.solver.guesses.tree import Sketch

@@ -19,10 +19,10 @@ from aces import ACES
 
 from ssh_abduction import AbductionError, Solution, Theory, Trace
 from ssh_abduction.cli import main
-from ssh_abduction.data import program
 from ssh_abduction.evaluation.ladder import UnderWay
 from ssh_abduction.evaluation.paper import report
 from ssh_abduction.robot_logs.log_maps import LogMapping
+from ssh_abduction.runtime import program
 from ssh_abduction.solver.asp import process, workers
 from ssh_abduction.solver.asp.limits import Watch
 

@@ -14,8 +14,8 @@ from perception.readers.echoes import Told, interpret_log, interpret_scan
 from perception.readers.lines import LONGEST_LINE, lines, opened
 from perception.readers.scans import Damage, Reading, RobotLog, Scan
 from ssh_abduction.data.errors import brief, named
-from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.odometry import Pose
+from ssh_abduction.runtime.logs import log_of
 
 _log = log_of("ssh_abduction.perception.readers")
 

@@ -38,10 +38,10 @@ from ssh_abduction.checker import (
     topological,
 )
 from ssh_abduction.checker.reading import Check, Reading
-from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 COHERENCE = "map_explains_trace"

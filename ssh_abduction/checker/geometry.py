@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammainccinv
 
-from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.float64]

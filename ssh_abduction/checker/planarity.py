@@ -19,8 +19,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
-from ssh_abduction.data.clock import each_looking, look_at_clock
 from ssh_abduction.data.star import Openings
+from ssh_abduction.runtime.clock import each_looking, look_at_clock
 from ssh_abduction.theory.planarity import can_be_drawn
 
 Arm: TypeAlias = tuple[int, int]  # of a dstate, ahead (1) or behind (-1)

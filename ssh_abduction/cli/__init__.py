@@ -44,8 +44,8 @@ from ssh_abduction.cli import reproduce as reproduction
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.parsing import Parser
 from ssh_abduction.cli.verbosity import add_verbosity, telling
-from ssh_abduction.data import program
 from ssh_abduction.data.errors import AbductionError, named, printable
+from ssh_abduction.runtime import program
 
 EXIT_ERROR = 1
 MENDS = {

@@ -40,9 +40,9 @@ from ssh_abduction.cli.outcome import (
 )
 from ssh_abduction.cli.text import headline
 from ssh_abduction.data.errors import AbductionError, SolverError, brief, named, printable
-from ssh_abduction.data.program import SIGNALLED, interrupted_code
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
+from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
 from ssh_abduction.solver import POLL, Backbone, Search, Solution, Start, workers
 from ssh_abduction.solver import Stop as SearchStop
 from ssh_abduction.theory.speedups import Speedups

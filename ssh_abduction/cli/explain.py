@@ -9,11 +9,11 @@ from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import dump, on_ctrl_c
 from ssh_abduction.data.errors import AbductionError
-from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.mend import TraceExplanation, TraceQuestion
 from ssh_abduction.explain.pairs import PairQuestion
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
+from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop
 
 EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30

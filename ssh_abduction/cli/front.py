@@ -7,9 +7,9 @@ import argparse
 from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.outcome import dump
 from ssh_abduction.cli.text import counted, table
-from ssh_abduction.data import program
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime import program
 from ssh_abduction.solver import Front, fault_front
 from ssh_abduction.theory.theory import Theory
 

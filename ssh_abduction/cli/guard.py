@@ -17,7 +17,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, NoReturn, Self
 
-from ssh_abduction.data import program
+from ssh_abduction.runtime import program
 from ssh_abduction.solver import POLL, Stop, end_all, resident_memory
 
 LATE = (

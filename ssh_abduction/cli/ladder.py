@@ -12,8 +12,8 @@ from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.cli.outcome import on_ctrl_c
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Stop
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from ssh_abduction.cli.outcome import exit_code, on_ctrl_c, warn
 from ssh_abduction.cli.text import counted
 from ssh_abduction.data.errors import AbductionError, SolverError, named
 from ssh_abduction.data.files import write_file
-from ssh_abduction.data.program import SIGNALLED, interrupted_code
+from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
 from ssh_abduction.solver import Stop, check_limit, workers
 from ssh_abduction.theory.theory import Theory
 

@@ -14,8 +14,8 @@ from ssh_abduction.data.errors import MapError, named, printable
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import maps_of
-from ssh_abduction.data.program import interrupted_code
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.program import interrupted_code
 from ssh_abduction.solver import Watch, check_limit
 from ssh_abduction.theory.theory import Theory
 

@@ -11,12 +11,12 @@ from itertools import zip_longest
 from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
-from ssh_abduction.data import program
 from ssh_abduction.data.files import json_line
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.learning.runner_up import second_map
+from ssh_abduction.runtime import program
 from ssh_abduction.solver import (
     Backbone,
     Cost,

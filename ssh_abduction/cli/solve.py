@@ -28,10 +28,10 @@ from ssh_abduction.cli.outcome import (
     warnings_of,
 )
 from ssh_abduction.cli.text import by_displacements, compared, describe, describe_backbone, headline
-from ssh_abduction.data.logs import PROGRESS
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
+from ssh_abduction.runtime.logs import PROGRESS
 from ssh_abduction.solver import (
     Backbone,
     Progress,

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 
 from ssh_abduction.data.errors import printable
-from ssh_abduction.data.logs import PACKAGE, PROGRESS
+from ssh_abduction.runtime.logs import PACKAGE, PROGRESS
 
 EVERY = 10.0  # Seconds between two lines of progress, and before the first one: a log is to be read, and most commands are done by then.
 LEVELS = {1: logging.INFO, 2: logging.DEBUG}

@@ -216,8 +216,8 @@ def _serve(
 ) -> int:
     import signal
 
-    from ssh_abduction.data import program
     from ssh_abduction.page.server import PageServer
+    from ssh_abduction.runtime import program
     from ssh_abduction.solver import end_all
 
     try:

@@ -1,6 +1,6 @@
 """The values that all other packages share: traces, maps, stars, odometry, files and errors.
 
-Each name is loaded when it is first used: `program` must be importable before any other module is.
+Each name is loaded when it is first used, so that a program loads only what it needs.
 """
 
 from ssh_abduction import lazy_names

@@ -21,10 +21,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.data.star import SPREAD, Frame, Star
 from ssh_abduction.data.trace import Action, Trace
+from ssh_abduction.runtime.clock import look_at_clock
 
 
 @dataclass(frozen=True)

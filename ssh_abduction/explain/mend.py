@@ -6,13 +6,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Step, Trace, View
 from ssh_abduction.explain.axioms import Axioms
 from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.question import Question
+from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Status, Stop
 from ssh_abduction.theory.theory import ASSERTIONS, Theory, checked_theory
 

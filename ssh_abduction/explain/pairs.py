@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from ssh_abduction.data.checks import a_count_of_maps
-from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import SolverError, TraceError, brief, is_whole
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.argument import derive
@@ -29,6 +28,7 @@ from ssh_abduction.explain.no_map import Explanation, explain
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.question import Question
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
+from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Cost, Status, Stop, facts
 from ssh_abduction.theory.theory import Theory, checked_theory
 

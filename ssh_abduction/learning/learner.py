@@ -21,8 +21,6 @@ from sklearn.base import BaseEstimator
 from perception.confidence import warn_of_doubts
 from perception.recognition import cloned, recogniser
 from perception.views import ISOLATED, ViewClusterer, as_view_clusterer
-from ssh_abduction.data.deprecated import renamed_parameters
-from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.learning.labels import (
     AmbiguousMapWarning,
@@ -34,6 +32,8 @@ from ssh_abduction.learning.labels import (
 )
 from ssh_abduction.learning.runner_up import RunnerUpWarning, warn_of_second_map
 from ssh_abduction.learning.traces import Traces
+from ssh_abduction.runtime.deprecated import renamed_parameters
+from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 

@@ -40,7 +40,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeAlias
 
 from ssh_abduction.data.checks import a_function
-from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
@@ -52,6 +51,7 @@ from ssh_abduction.online.return_doubts import ReturnDoubts
 from ssh_abduction.rivals.experiment import Experiment
 from ssh_abduction.rivals.explore import next_experiment
 from ssh_abduction.rivals.tour import next_tour
+from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Solution, Status, check_limit, find_backbone, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 

@@ -64,13 +64,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import TheoryError, TraceError, brief
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Action, Step, Trace, View
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.online.options import StepOptions
 from ssh_abduction.online.settler import TheorySettler
+from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Solution, check_limit
 from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory

@@ -23,7 +23,6 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import AbductionError, MapError, brief, is_whole
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.page import answers
@@ -31,6 +30,7 @@ from ssh_abduction.page.content import Called, content_of
 from ssh_abduction.page.html import html_of
 from ssh_abduction.page.replays import Run
 from ssh_abduction.rivals.listing import Listing
+from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import LimitError, Watch, in_process
 from ssh_abduction.theory.theory import Theory
 

@@ -48,7 +48,6 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from ssh_abduction.data.checks import a_flag, a_function, a_list, an_instance
-from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Trace, checked_trace
@@ -73,6 +72,7 @@ from ssh_abduction.rivals.machines import (
     machine_of,
     with_ends,
 )
+from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import LimitError, Solution, Stop, Watch, check_limit
 from ssh_abduction.theory.theory import Theory, checked_theory
 

@@ -21,12 +21,12 @@ from typing import Any
 
 from perception.places.importing import Imported, import_log
 from perception.readers.scans import RobotLog
-from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.files import json_line
-from ssh_abduction.data.logs import log_of
 from ssh_abduction.evaluation.ladder import Rung, UnderWay, ladder, rungs
 from ssh_abduction.page.html import view_page
 from ssh_abduction.robot_logs.log_report import report
+from ssh_abduction.runtime.deprecated import renamed_parameters
+from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver import Solution, Status, find_backbone
 from ssh_abduction.theory.theory import Theory
 

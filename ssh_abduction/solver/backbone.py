@@ -21,8 +21,8 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 
-from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.engines.base import Engine, Task
 from ssh_abduction.solver.engines.doubts import Doubt, Settled

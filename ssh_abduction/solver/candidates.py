@@ -9,9 +9,9 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
-from ssh_abduction.data.clock import each_looking, heeding
-from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.clock import each_looking, heeding
+from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines.base import Found, Task

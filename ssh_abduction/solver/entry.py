@@ -13,11 +13,11 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from ssh_abduction.data.checks import an_instance
-from ssh_abduction.data.clock import heeding
-from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import SolverError
 from ssh_abduction.data.maps import check_of_trace
 from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.runtime.clock import heeding
+from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.backbone import prove_backbone
 from ssh_abduction.solver.choosing import READABLE, may_name, new_engine, takes_all

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 
-from ssh_abduction.data.clock import heeding
-from ssh_abduction.data.logs import log_of
+from ssh_abduction.runtime.clock import heeding
+from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.map_list import Priced, note

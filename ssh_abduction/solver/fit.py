@@ -29,10 +29,10 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.sparse.linalg import lsqr, splu
 from scipy.special import gammaincc
 
-from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.maps import Fit, Pose, SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.evidence.loops import turned
 
 Array: TypeAlias = NDArray[np.float64]

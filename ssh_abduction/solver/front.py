@@ -16,10 +16,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import TheoryError, brief, is_whole
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.theory.theory import Theory, checked_theory

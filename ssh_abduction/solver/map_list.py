@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator
 from typing import TypeAlias
 
-from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.words import counted
+from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status

@@ -6,8 +6,8 @@ import logging
 import math
 from collections.abc import Callable
 
-from ssh_abduction.data.logs import PROGRESS
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.logs import PROGRESS
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.backbone import Rivals

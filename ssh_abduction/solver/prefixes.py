@@ -42,8 +42,8 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 
 from ssh_abduction.data.gateways import turned
-from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.limits import LAST, LimitError, StageTimeError
 from ssh_abduction.solver.engines.base import Engine, Found, Task

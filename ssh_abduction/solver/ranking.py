@@ -8,9 +8,9 @@ from dataclasses import replace
 from itertools import chain, islice
 from typing import TypeAlias
 
-from ssh_abduction.data.clock import heeding, look_at_clock
 from ssh_abduction.data.maps import Fit, SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.theory.evidence.displacement import jumped
 

@@ -15,13 +15,13 @@ from itertools import groupby
 from typing import get_args
 
 from ssh_abduction.data.checks import an_instance, one_of
-from ssh_abduction.data.clock import each_heeding, heeding
-from ssh_abduction.data.deprecated import renamed_parameters
 from ssh_abduction.data.errors import SolverError, TheoryError, brief
-from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap, checked_maps
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.data.words import counted
+from ssh_abduction.runtime.clock import each_heeding, heeding
+from ssh_abduction.runtime.deprecated import renamed_parameters
+from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver.answer import Answer
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Stop
 from ssh_abduction.solver.asp.rules import check_rules

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from ssh_abduction.data.logs import log_of
 from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
 from ssh_abduction.solver.candidates import FRAMING_SHARE

@@ -20,7 +20,6 @@ from simulator.laser import Laser
 from simulator.robot import Body
 from simulator.tours import simulate
 from simulator.world import World
-from ssh_abduction.data import program
 from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.files import write_file
 from ssh_abduction.evaluation.paper import figures
@@ -36,6 +35,7 @@ from ssh_abduction.evaluation.paper.experiments import (
 from ssh_abduction.evaluation.paper.notches import Outcome, outcome
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.output import to_svg
+from ssh_abduction.runtime import program
 from ssh_abduction.solver import workers
 
 # Depths of the notch in metres.

@@ -17,9 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import POLL

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
 
-from ssh_abduction.data.program import command, search_path
+from ssh_abduction.runtime.program import command, search_path
 from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch
 
 Result = TypeVar("Result")

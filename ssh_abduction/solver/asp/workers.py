@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, BinaryIO, NamedTuple
 
-from ssh_abduction.data.program import command, search_path
+from ssh_abduction.runtime.program import command, search_path
 
 # So many seconds a process may take to begin, at most, on a machine that has much else to do.
 STARTING = 10.0

@@ -30,11 +30,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.gateways import Sight, headings
 from ssh_abduction.data.maps import DState, MapPath, SSHMap
 from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Action, Step, Trace
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 from ssh_abduction.theory.theory import Theory
 

@@ -27,9 +27,9 @@ from functools import cached_property
 from operator import is_
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
 
-from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
 

@@ -22,10 +22,10 @@ from functools import cache
 from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, ClassVar, TypeAlias, TypeVar
 
-from ssh_abduction.data.clock import look_at_clock
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Openings
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 from ssh_abduction.theory.planarity import Ends, can_be_drawn, has_way, is_planar

@@ -20,7 +20,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ssh_abduction.data.clock import look_at_clock
+from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.evidence.loops import Array, Loops, Reckoning, Steps
 
 Mask: TypeAlias = NDArray[np.bool_]
