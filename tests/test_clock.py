@@ -1,4 +1,4 @@
-"""What takes long looks at the clock wherever it is called from, and an answer is left when the time is over."""
+"""Code that takes long checks the time limit, whoever calls it, and ends when time is up."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_whoever_uses_an_item_is_not_under_the_limit_of_whoever_makes_it() -> No
     ("steps", "wrong", "stars"), [(60, 0, False), (60, 6, False), (150, 20, False), (150, 20, True)]
 )
 def test_there_is_a_map_when_the_time_is_over(steps: int, wrong: int, stars: bool) -> None:
-    """Though the checker refuses the sketches that take places for some seen before, as displacements are wrong."""
+    """The checker refuses sketches with wrong returns, as displacements contradict them."""
     trace = driven(maze(4, 4, steps=steps, seed=steps, stars=stars).trace, wrong)
     with patch.multiple(fallback, OVERTIME=100.0):
         solution = solve(trace, time_limit=1e-6)

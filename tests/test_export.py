@@ -1,4 +1,4 @@
-"""Exported maps are what other programs load: held against their rules as their documentation states them, and read back."""
+"""Exported maps: checked against the documented rules of the programs that load them."""
 
 from __future__ import annotations
 
@@ -112,14 +112,14 @@ def looked_up(node: dict[str, Any], path: str) -> Any:
 
 
 def filled(goal: Any, node: dict[str, Any]) -> Any:
-    """A goal in which texts that begin with $ stand for fields of the node that the edge leads to."""
+    """A goal after texts that begin with $ became fields of the node that the edge leads to."""
     if isinstance(goal, dict):
         return {key: filled(value, node) for key, value in goal.items()}
     return looked_up(node, goal[1:]) if isinstance(goal, str) and goal.startswith("$") else goal
 
 
 def goals_of_humble(text: str) -> dict[str, tuple[str, dict[str, Any]]]:
-    """For each edge the frame and the pose that LCAS's navigation of ROS 2 Humble drives to. Fails where that would."""
+    """For each edge the frame and pose to which LCAS's navigation of ROS 2 Humble drives."""
     data = yaml.safe_load(text)
     nodes = {entry["node"]["name"]: entry for entry in data["nodes"]}
     found = {}
@@ -136,7 +136,7 @@ def goals_of_humble(text: str) -> dict[str, tuple[str, dict[str, Any]]]:
 
 
 def graph_of_lcas(text: str) -> nx.DiGraph[Any]:
-    """The graph that the later navigation plans on: weights are of properties, and actions are those of the map. Fails where that would."""
+    """The graph on which the later navigation plans, with weights from properties."""
     data = yaml.safe_load(text)
     for action in data["actions"].values():
         module, _, name = action["action_type"].rpartition(".")

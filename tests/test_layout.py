@@ -1,4 +1,4 @@
-"""Where maps are drawn: paths straight, turns to their side, nothing on top of anything else; and what maps offer of that."""
+"""Layouts: paths are straight, turns go to their side, and nothing lies on anything else."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SIX = streets(
 
 
 def mapped(edges: Streets) -> SSHMap:
-    """The true map of streets at right angles: all dstates, turns and travels, with a path for each line of streets. Nothing is solved."""
+    """The true map of streets at right angles, without solving: a path for each line of streets."""
     faced = [(place, heading) for place in edges for heading in HEADINGS]
     number = {pair: i for i, pair in enumerate(faced)}
     lines: list[list[str]] = []
@@ -65,7 +65,7 @@ def spiral(turns: int) -> SSHMap:
 
 
 def crossings(ssh_map: SSHMap, found: Layout) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Pairs of streets without a common end that touch, found by solving for where their lines meet."""
+    """Pairs of streets without a common end that touch."""
     ends = [pair for path in ssh_map.paths for pair in pairwise(path.order)]
     touching = []
     for e, f in combinations(ends, 2):
@@ -85,7 +85,7 @@ def crossings(ssh_map: SSHMap, found: Layout) -> list[tuple[tuple[int, int], tup
 
 
 def check(ssh_map: SSHMap, found: Layout, turns: Mapping[str, float] | None = None) -> None:
-    """Places are apart, paths straight with their dstates facing along, and turns go to their side."""
+    """Check that places are apart, paths straight, and turns on their side."""
     assert (
         min((math.dist(*pair) for pair in combinations(found.places.values(), 2)), default=1.0)
         > 0.9
@@ -164,7 +164,7 @@ def test_a_spiral_does_not_lie_on_itself(turns: int) -> None:
 
 
 def test_angles_may_be_any() -> None:
-    """A triangle that the robot drives round, turning right by 120 degrees; then a map whose places know the degrees."""
+    """A triangle with turns of 120 degrees, first by actions and then by headings at places."""
     dstates = tuple(DState(i, f"v{i}", (i + 1) // 2 % 3, i // 2, 1) for i in range(6))
     links = tuple((i, "travel" if i % 2 == 0 else "turn", (i + 1) % 6) for i in range(6))
     triangle = SSHMap(
@@ -187,7 +187,7 @@ def test_angles_may_be_any() -> None:
 
 
 def test_streets_that_no_straight_path_holds_are_straight_one_by_one() -> None:
-    """A square is driven round, and a map with few paths joins its north and its south side to one path, which would have to turn back."""
+    """A map with few paths may join the north and the south side of a square to one path."""
     square = mapped(SQUARE)
     north, south = (
         next(path for path in square.paths if path.id == square.dstates[4 * place + 1].path)

@@ -1,4 +1,4 @@
-"""What is written where: nothing but regular files is ever replaced, results come before pictures, lines stay lines, Ctrl-C is quiet."""
+"""Writing files: only regular files are replaced, and results come before pictures."""
 
 from __future__ import annotations
 
@@ -252,8 +252,8 @@ def test_matplotlib_is_looked_for_before_anything_is_done(
         captured = capsys.readouterr()
         assert captured.out == ""
         assert (
-            captured.err
-            == "ssh-abduction: plot: expected matplotlib to draw with, got none; pip install 'ssh-abduction[plot]'\n"
+            captured.err == "ssh-abduction: plot: expected matplotlib to draw with, got none; "
+            "pip install 'ssh-abduction[plot]'\n"
         )
         assert not never.exists()
     assert main(learnt) == 0

@@ -1,4 +1,4 @@
-"""The page of rival maps: its content against the maps, its server's refusals, and itself in a browser, where chromium and selenium are there."""
+"""The page of rival maps: its content, its server, and itself in a browser, if there is one."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_overview_counts_the_maps_that_have_each_place(
 
 
 def hostile() -> tuple[Solution, Trace]:
-    """A trace of which each text that the page shows tries to be HTML, and its maps, one of whose views is disbelieved."""
+    """A trace whose texts all try to be HTML, and its maps, with a view that is disbelieved."""
     trace = Trace.from_steps(views=[*HOSTILE, EVIL], actions=HOSTILE)
     trace = replace(trace, name=EVIL)
     solution = solve(trace, Theory.causal())
@@ -195,7 +195,8 @@ def test_colours_can_be_told_apart_by_the_colour_blind_and_from_the_paper() -> N
                 assert min(np.linalg.norm(a - b) for a, b in combinations(labs, 2)) > 20
 
 
-# What the eye makes of linear red, green and blue: as all see, and without one kind of cone (Machado, Oliveira & Fernandes 2009, severity 1).
+# How eyes see linear red, green and blue: with all cones, and without one kind of them (Machado,
+# Oliveira & Fernandes 2009, severity 1).
 DEFICIENT = {
     "none": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     "protanopia": [
@@ -380,7 +381,10 @@ def test_server_answers_only_who_knows_its_token_from_this_computer(server: Page
 def test_a_length_that_is_none_is_refused(server: PageServer, length: str) -> None:
     own = server.url.partition(str(server.port))[2]
     with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
-        head = f"POST {own}solve HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Type: application/json\r\nContent-Length: {length}\r\n\r\n{{}}"
+        head = (
+            f"POST {own}solve HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n"
+            f"Content-Type: application/json\r\nContent-Length: {length}\r\n\r\n{{}}"
+        )
         connection.sendall(head.encode())
         assert connection.recv(100).startswith(b"HTTP/1.0 403")
 
@@ -392,7 +396,8 @@ def test_question_whose_asker_is_gone_is_given_up(
     monkeypatch.setattr("ssh_abduction.page.answers.solved", sleep)
     with socket.create_connection(("127.0.0.1", server.port)) as connection:
         connection.sendall(
-            f"POST {own}solve HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{{}}".encode()
+            f"POST {own}solve HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n"
+            f"Content-Type: application/json\r\nContent-Length: 2\r\n\r\n{{}}".encode()
         )
         until(lambda: bool(_under_way))
     until(lambda: not _under_way)
@@ -467,7 +472,8 @@ class Shown:
         """Click the dstates of steps, as a pointer would."""
         for step in steps:
             self.browser.execute_script(
-                "document.querySelector(`.dstate[data-step='${arguments[0]}']`).dispatchEvent(new MouseEvent('click', {bubbles: true}))",
+                "document.querySelector(`.dstate[data-step='${arguments[0]}']`)"
+                ".dispatchEvent(new MouseEvent('click', {bubbles: true}))",
                 step,
             )
 
@@ -496,7 +502,8 @@ def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, An
     page = Shown(browser, file.as_uri())
     assert (
         page["sentence"].text
-        == "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ"
+        == "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; "
+        "the paths of steps 18–22 differ"
     )
     page.click("one")
     page.click("paths")
@@ -515,7 +522,8 @@ def test_page_in_the_browser(browser: Any, tmp_path: Path, content: dict[str, An
     assert page["verdict"].text.startswith("Steps 0 and 2: different dstates in every minimal map")
     page.click("same")
     assert page["answer"].text.startswith(
-        "ssh-abduction solve TRACE --json --same 0,2 > assumed.json\nssh-abduction view assumed.json TRACE"
+        "ssh-abduction solve TRACE --json --same 0,2 > assumed.json\n"
+        "ssh-abduction view assumed.json TRACE"
     )
     assert "more than the 19 dstates" in page["costs"].text
     browser.set_window_size(500, 900)
@@ -554,7 +562,8 @@ def test_assuming_and_explaining_in_the_browser(browser: Any, server: PageServer
     )  # which is asked as soon as two are chosen
     assert "no map satisfies the axioms" in page["costs"].text
     page.browser.execute_script(
-        "for (const [id, t] of [['first', 0], ['later', 4]]) $(id).value = t; $('later').dispatchEvent(new Event('change'))"
+        "for (const [id, t] of [['first', 0], ['later', 4]]) $(id).value = t;"
+        "$('later').dispatchEvent(new Event('change'))"
     )
     page.click("different")  # which gives up what was asked before
     page.until("answer", "With steps 0 and 4 assumed different: optimal: 5 dstates")

@@ -1,4 +1,4 @@
-"""How the program starts and ends: no file of the current folder is run, and signals end it with their codes, and with all that it began."""
+"""Start and end of the program: it runs no file of the current folder, and signals end it."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from ssh_abduction.solver.asp import process, workers
 from ssh_abduction.solver.asp.limits import Watch
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="sends signals, which Windows has none of")
-SOON = 60  # seconds in which what has to end soon has ended also on a slow machine that has much else to do
+SOON = 60  # seconds, enough on a slow and busy machine
 MODULES = """
-    argparse collections copy csv dataclasses enum functools inspect json logging math pickle queue random re shutil signal socket string struct
-    subprocess tempfile threading typing
+    argparse collections copy csv dataclasses enum functools inspect json logging math pickle queue
+    random re shutil signal socket string struct subprocess tempfile threading typing
 """.split()  # noqa: SIM905 - one a line would take a page
 
 
 @pytest.fixture
 def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder has a file named after each of these modules, which leaves a mark where it is run."""
+    """A folder with a file named after each of these modules, which leaves a mark if it is run."""
     for name in MODULES:
         (tmp_path / f"{name}.py").write_text(
             f"open({str(tmp_path / 'mark')!r}, 'a').write({name!r})"
@@ -102,7 +102,7 @@ def test_the_program_runs_no_file_of_the_current_folder(hostile: Path, words: li
 
 
 def test_without_p_the_program_puts_the_current_folder_behind_all_others(tmp_path: Path) -> None:
-    """Python itself has loaded some modules by then, which are left out here; runpy does not load these ones."""
+    """Python has loaded some other modules by then. runpy does not load these ones."""
     for name in ("csv", "signal", "json", "argparse", "numpy", "clingo"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit(99)")
     done = subprocess.run(

@@ -28,9 +28,12 @@ def written(folder: Path, *lines: str) -> Path:
 
 def test_a_trace_survives_a_round_trip(tmp_path: Path) -> None:
     lines = [
-        '{"format": "ssh-trace", "version": 1, "name": "n", "images": "i.npz", "robot": {"wheels": 4}}',
-        '{"view": "ä", "image": [1.5, 2], "action": {"name": "go", "kind": "travel", "speed": 1}, "star": [0, 90.5], "battery": 0.5}',
-        '{"view": 7, "action": {"name": "spin", "kind": "turn", "turn": "left"}, "displacement": [1, 0, -0.5], "truth": {"place": "x"}}',
+        '{"format": "ssh-trace", "version": 1, "name": "n", "images": "i.npz",'
+        ' "robot": {"wheels": 4}}',
+        '{"view": "ä", "image": [1.5, 2], "action": {"name": "go", "kind": "travel", "speed": 1},'
+        ' "star": [0, 90.5], "battery": 0.5}',
+        '{"view": 7, "action": {"name": "spin", "kind": "turn", "turn": "left"},'
+        ' "displacement": [1, 0, -0.5], "truth": {"place": "x"}}',
         '{"view": "v", "action": "look", "image": 3}',
         '{"image": 4, "note": null}',
     ]
@@ -200,14 +203,16 @@ BAD: dict[str, tuple[list[str], str]] = {
     "covariance not positive": (
         [
             HEADER,
-            '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 2, 0], [2, 1, 0], [0, 0, 1]]}',
+            '{"view": "a", "displacement": [1, 0, 0], "covariance": '
+            "[[1, 2, 0], [2, 1, 0], [0, 0, 1]]}",
         ],
         "2: covariance: expected a positive definite matrix",
     ),
     "covariance not symmetric": (
         [
             HEADER,
-            '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}',
+            '{"view": "a", "displacement": [1, 0, 0], "covariance": '
+            "[[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}",
         ],
         "2: covariance: expected a symmetric matrix",
     ),
@@ -218,7 +223,8 @@ BAD: dict[str, tuple[list[str], str]] = {
     "covariance with a text": (
         [
             HEADER,
-            '{"view": "a", "displacement": [1, 0, 0], "covariance": [[1, 0, 0], [0, "x", 0], [0, 0, 1]]}',
+            '{"view": "a", "displacement": [1, 0, 0], "covariance": '
+            '[[1, 0, 0], [0, "x", 0], [0, 0, 1]]}',
         ],
         "2: covariance[1][1]: expected a finite number",
     ),
