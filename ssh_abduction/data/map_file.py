@@ -156,6 +156,7 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
     dstates = read.each(record, "dstates", lambda s, name: _dstate(read, s, name))
     places = read.each(record, "places", read.integer, optional=True)
     paths = read.each(record, "paths", lambda p, name: _path(read, p, name), optional=True)
+    # Fields refer to dstates, places and paths by their ids, so check these first.
     ids = [s.id for s in dstates]
     if ids != list(range(len(dstates))):
         raise MapError(
@@ -205,6 +206,7 @@ def _check_used(where: str, name: str, known: tuple[int, ...], used: set[int | N
 
 
 def _dstate(read: FieldReader, value: Any, name: str) -> DState:
+    """A dstate, checked by itself."""
     record = read.mapping(value, name)
     expected = "a text or an integer, or null where it is unknown"
     if "view" not in record:
@@ -235,6 +237,7 @@ def _path(read: FieldReader, value: Any, name: str) -> MapPath:
 
 
 def _link(read: FieldReader, value: Any, ids: set[int], name: str) -> tuple[int, str, int]:
+    """A link between dstates with these ids."""
     good = (
         isinstance(value, list)
         and len(value) == 3
@@ -253,6 +256,7 @@ def _pair(read: FieldReader, value: Any, name: str) -> tuple[int, int]:
 
 
 def _fault(read: FieldReader, value: Any, steps: int, name: str) -> Fault:
+    """A fault at one of so many steps."""
     record = read.mapping(value, name)
     if record.get("kind") not in FAULTS:
         raise read.wrong(f"{name}.kind", " or ".join(FAULTS), record.get("kind"))

@@ -202,6 +202,7 @@ class SSHMap:
             "places": list(self.places),
             "paths": [{"id": p.id, "order": list(p.order)} for p in self.paths],
         }
+        # Fields that most maps lack are written only if they are there.
         if self.excused:
             data["excused"] = [list(pair) for pair in self.excused]
         if self.faults:

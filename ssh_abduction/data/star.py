@@ -293,6 +293,7 @@ def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
             f"{where}.open: expected true, or null where it was not observed, "
             f"got {brief(is_open)}; leave out what is closed"
         )
+    # An observed gateway is more certain than one that may not exist.
     widest = WIDEST if is_open is None else WIDEST / 2
     if not is_finite(spread) or not 0 <= spread <= widest:
         raise TraceError(

@@ -270,6 +270,7 @@ class Trace:
                 f"trace: expected one view more than actions, got {len(seen)} views and "
                 f"{len(done)} actions; each action leads from one view to the next"
             )
+        # Stars belong to steps; displacements belong to actions, and each to the step after it.
         openings = [None] * len(seen) if stars is None else _listed(stars, "stars")
         if len(openings) != len(seen):
             raise TraceError(

@@ -107,7 +107,7 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
             f"{where}: line: expected text in UTF-8, got a null byte at column "
             f"{raw.index(0) + 1}; is this a binary file?"
         )
-    try:
+    try:  # only the first line may begin with a byte order mark
         record = parse_json(raw.rstrip().decode("utf-8-sig" if is_first else "utf-8"))
     except UnicodeDecodeError as error:
         raise TraceError(
@@ -165,7 +165,7 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
             f'{where}: format: expected "{FORMAT}" in a header, got {came}; '
             f'put {{"format": "{FORMAT}", "version": {VERSION}}} on the first line'
         )
-    version = record.get("version")
+    version = record.get("version")  # True equals 1, so check the type, too
     if version != VERSION or isinstance(version, bool):
         raise TraceError(
             f"{where}: version: expected {VERSION}, got {brief(version)}; "

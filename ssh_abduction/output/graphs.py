@@ -69,6 +69,7 @@ def to_graphml(ssh_map: SSHMap) -> str:
 
 
 def _causal(ssh_map: SSHMap) -> nx.MultiDiGraph[Any]:
+    """Dstates and links. Attributes that are None are left out."""
     graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
     for s in ssh_map.dstates:
         facts = {
@@ -85,6 +86,7 @@ def _causal(ssh_map: SSHMap) -> nx.MultiDiGraph[Any]:
 
 
 def _topological(ssh_map: SSHMap) -> nx.Graph[Any]:
+    """Places and paths, as a bipartite graph."""
     graph: nx.Graph[Any] = nx.Graph()
     graph.add_nodes_from((("place", p) for p in ssh_map.places), bipartite=0)
     graph.add_nodes_from((("path", p.id) for p in ssh_map.paths), bipartite=1)
@@ -95,6 +97,7 @@ def _topological(ssh_map: SSHMap) -> nx.Graph[Any]:
 
 
 def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
+    """Places and the streets between neighbours on paths."""
     from ssh_abduction.output.layout import layout, travelled  # loads scipy
 
     found = layout(ssh_map, turns)

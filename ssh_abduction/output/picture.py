@@ -77,6 +77,7 @@ def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]
 
 
 def _circle(x: float, y: float, colour: str) -> str:
+    """The circle of a place or dstate."""
     return element(
         "circle",
         cx=f"{x:.1f}",

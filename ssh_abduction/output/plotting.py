@@ -42,6 +42,7 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
     spots = list(found.places.values()) or [(x, y) for x, y, _ in found.dstates]
     unit = _nearest(spots)
     axes = _new_axes(spots, unit) if ax is None else ax
+    # Later marks lie on top of earlier ones.
     if ssh_map.places:
         _draw_paths(axes, ssh_map, found)
     else:

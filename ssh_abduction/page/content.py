@@ -66,6 +66,7 @@ def content_of(
         check_of_trace(listing.maps[:1], trace, listing.source)
     found = compare(listing)
     maps = [ssh_map.renumbered() for ssh_map in listing.maps]
+    # List what maps share once, and let each map refer to it by number.
     labelings, places, orders, faults = _Pool(), _Pool(), _Pool(), _Pool()
     told: list[dict[str, Any]] = []
     for ssh_map, name in zip(maps, found.ids, strict=True):

@@ -89,6 +89,7 @@ def drawn_images(trace: Trace) -> dict[str, Any] | None:
         return _panoramas(held, panorama, MOST // len(known))
     most = max(len(image) for image in known)
     first, step = beams_of(trace, most)
+    # Leave out beams until all images fit, but no more than an image can spare.
     every = max(-(-most // BEAMS), -(-most * len(known) // MOST))
     if -(-most // every) < min(FEWEST, most):
         _warn_of_too_many(len(known))
@@ -135,6 +136,7 @@ def _panoramas(
         return None
     if any(image is not None and len(image) != math.prod(shape) for image in held):
         return None
+    # Halve the rows and columns until an image is short enough.
     rows, columns = min(PIXELS[0], shape[0]), min(PIXELS[1], shape[1])
     while rows * columns * shape[2] > each:
         if rows * columns == 1:

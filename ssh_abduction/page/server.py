@@ -185,12 +185,14 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = 60
 
     def do_GET(self) -> None:
+        """Send the page."""
         if self._asked() == "":
             self._send(HTTPStatus.OK, self.server.page(), "text/html; charset=utf-8")
         else:
             self._refuse()
 
     def do_POST(self) -> None:
+        """Answer a question of the page."""
         asked = self._asked()
         lengths = self.headers.get_all("Content-Length", [])
         length = (
@@ -233,6 +235,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
 
     def _send(self, status: HTTPStatus, body: bytes, kind: str) -> None:
+        """Send an answer that browsers neither store nor show inside another page."""
         self.send_response(status)
         for name, value in {
             "Content-Type": kind,

@@ -52,6 +52,7 @@ def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
 
 
 def _edge(road: Road, number: int) -> dict[str, Any]:
+    """An edge, with what is known of its action and path, as Nav2 reads no null."""
     known = {"action": road.action, "path": road.path, "direction": road.direction}
     metadata = {
         "travelled": road.action is not None,

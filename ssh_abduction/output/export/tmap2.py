@@ -40,6 +40,7 @@ def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) 
     leaving: dict[int, list[Road]] = {stop.id: [] for stop in roads.stops}
     for road in roads.roads:
         leaving[road.start].append(road)
+    # Edges name their action, which the map describes once.
     data = {
         "meta": {
             "last_updated": (updated or datetime.now(UTC)).strftime("%Y-%m-%d_%H-%M-%S"),
@@ -79,6 +80,7 @@ def _action() -> dict[str, Any]:
 def _node(
     stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str, frame: str, facing: float
 ) -> dict[str, Any]:
+    """A node: its goal tolerances, the octagon around it, and the edges that leave it."""
     corners = [math.tau * (i + 0.5) / 8 for i in range(8)]
     return {
         "meta": {"map": pointset, "node": names[stop.id], "pointset": pointset},
@@ -107,6 +109,7 @@ def _node(
 
 
 def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
+    """An edge for both generations of the navigation."""
     return {
         "edge_id": f"{names[road.start]}_{names[road.end]}",
         "node": names[road.end],
