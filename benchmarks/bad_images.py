@@ -1,6 +1,6 @@
 """The loop where one image of twenty is bad: whether its map is right, which bad images it names, and what its recogniser is worth.
 
-    python benchmarks/bad_images.py [--world notched-rectangle] [--tours 10] [--seeds 300-309] [--only TEXT] [--page docs/reproduction.md]
+    python benchmarks/bad_images.py [--world notched-rectangle] [--tours 10] [--seeds 300-309] [--only TEXT] [--page docs/measurements/reproduction.md]
 
 Bad images show a person in front of the laser, a person at its side, or anything at random (benchmarks/doubts.py). Maps are sought for at most ten seconds, by the
 default theory: openings and displacements are told. The recogniser is tried on the images of another drive, of three circuits, none of them bad.

@@ -1,6 +1,6 @@
-"""Where M chooses too few or too many views, whether anything says so, and what trimmed M chooses: the table of docs/reproduction.md.
+"""Where M chooses too few or too many views, whether anything says so, and what trimmed M chooses: the table of docs/measurements/reproduction.md.
 
-    python benchmarks/doubts.py [--seeds 200-204] [--tours 10] [--page docs/reproduction.md]
+    python benchmarks/doubts.py [--seeds 200-204] [--tours 10] [--page docs/measurements/reproduction.md]
     python benchmarks/doubts.py --tolerances      # how far poses spread, and k, by the tolerance of hill-climbing
 
 Each row is the notched rectangle with one thing changed: the size of the room, the notch, noise, images that are not medians of nine scans, or images that show

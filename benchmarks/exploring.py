@@ -2,7 +2,7 @@
 
     python benchmarks/exploring.py --family mazes --cells 3 --seeds 20 --out results.jsonl
     python benchmarks/exploring.py --family plans --only Borchen4,Sabadell1 --out results.jsonl
-    python benchmarks/exploring.py --table results.jsonl [--plot docs/exploring.png]
+    python benchmarks/exploring.py --table results.jsonl [--plot docs/figures/exploring.png]
 
 Runs are paired: all begin in the same world and at the same dstate. A robot *has the map* after so many steps if all minimal maps of these steps have the true dstates, all of them, and the true places, if the
 theory has places; and if it has done every travel. Maps that differ in paths alone count as one. For the walks this is sought in the trace afterwards: from the step on at which everything was visited, after

@@ -1,6 +1,6 @@
 """Maps of whole logs, beside the skeleton of the metric map, under the same measures: tables in Markdown.
 
-    python benchmarks/logs.py [LOG ...] [--plans FOLDER] --out rows.jsonl [--runs FOLDER] [--page docs/logs.md]
+    python benchmarks/logs.py [LOG ...] [--plans FOLDER] --out rows.jsonl [--runs FOLDER] [--page docs/measurements/logs.md]
 
 With --plans a robot is simulated in each floor plan of a folder, a drive for each seed, and its logs are mapped like others. Each log is mapped by `ssh-abduction map`, and its events and the first of its maps are judged; then by the skeleton of a grid of its scans at their corrected poses, which a robot does not have, without and with nodes at doors, and by that of a grid at the
 poses of its odometry, which is what a robot has that maps nothing. A log NAME.log with NAME.truth.json beside it is a simulated one, and judged by that. Rows that are in the file of rows already are not made again.

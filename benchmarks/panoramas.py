@@ -1,7 +1,7 @@
-"""The bootstrap loop on panoramas of the simulated worlds: which features and which clusterings suit them. The tables and the figure of docs/panoramas.md.
+"""The bootstrap loop on panoramas of the simulated worlds: which features and which clusterings suit them. The tables and the figure of docs/measurements/panoramas.md.
 
-    python benchmarks/panoramas.py [--seeds 300-302] [--page docs/panoramas.md]
-    python benchmarks/panoramas.py --figure docs/panoramas.png
+    python benchmarks/panoramas.py [--seeds 300-302] [--page docs/measurements/panoramas.md]
+    python benchmarks/panoramas.py --figure docs/figures/panoramas.png
 
 A drive is clustered (k by M, at most 24), mapped from the views alone for at most two seconds, and its recogniser is asked for the dstates of a second drive, at other hours. Each
 seed has its own drive, noise and textures.

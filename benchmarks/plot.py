@@ -2,7 +2,7 @@
 
     python benchmarks/plot.py RESULTS.json [PICTURE]
 
-The picture is docs/growth.png where none is named.
+The picture is docs/figures/growth.png where none is named.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ mpl.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.lines import Line2D
 
-PICTURE = Path(__file__).parent.parent / "docs" / "growth.png"
+PICTURE = Path(__file__).parent.parent / "docs" / "figures" / "growth.png"
 STYLES = {  # Okabe and Ito's colours, and shapes, so that neither is needed alone
     "ssh-abduction": ("#000000", "o", "ssh-abduction"),
     "plain.lp": ("#D55E00", "s", "plain.lp"),

@@ -211,7 +211,7 @@ def _spread(found: list[float]) -> str:
 
 
 def page(results: dict[str, Any], stored: Path) -> str:
-    """What docs/pruning.md says."""
+    """What docs/measurements/pruning.md says."""
     on, versions = (
         results["machine"],
         ", ".join(f"{package} {number}" for package, number in results["packages"].items()),
@@ -233,7 +233,7 @@ the clock on the wall, on a machine that does nothing else.
 
 {table(results)}
 
-From [`{stored.relative_to(ROOT).as_posix()}`](../{stored.relative_to(ROOT).as_posix()}).
+From [`{stored.relative_to(ROOT).as_posix()}`](../../{stored.relative_to(ROOT).as_posix()}).
 """
 
 

@@ -1,9 +1,9 @@
-"""Writes the tables of a stored run into the pages that show them.
+"""Writes the tables of a stored run into docs/measurements/performance.md.
 
-    python benchmarks/readme.py RESULTS.json             # of bench.py: three rows into the README, all rows into docs/performance.md
-    python benchmarks/readme.py RESULTS.json ablation    # of ablation.py: into docs/performance.md
+    python benchmarks/readme.py RESULTS.json             # of bench.py
+    python benchmarks/readme.py RESULTS.json ablation    # of ablation.py
 
-Each table stands between two comments that name it; what is around them stays.
+Each table stands between two comments that name it. The text around them stays.
 """
 
 from __future__ import annotations
@@ -18,15 +18,10 @@ from typing import Any
 from table import times
 
 ROOT = Path(__file__).parent.parent
-PROJECT = "https://github.com/ssh-abduction/ssh-abduction/blob/main"  # links of the README are absolute, as it is shown on PyPI, too
 PAGES = {
-    "few": ROOT / "README.md",
-    "peers": ROOT / "docs" / "performance.md",
-    "ablation": ROOT / "docs" / "performance.md",
+    "peers": ROOT / "docs" / "measurements" / "performance.md",
+    "ablation": ROOT / "docs" / "measurements" / "performance.md",
 }
-
-# The rows of the README: one that some peers prove sooner, one that nobody proves, and one that only we prove.
-FEW = ("rectangle n=400", "moore 50/2 n=3200", "maze 4x4 n=1600")
 
 
 def block(name: str, results: dict[str, Any], path: Path) -> str:
@@ -37,11 +32,6 @@ def block(name: str, results: dict[str, Any], path: Path) -> str:
     )
     measured = f"{results['date']}, {machine['cpu']}, {machine['cores']} cores"
     limits = f"{results['limit']:g} s and {results['memory']:,} MiB a cell"
-    if name == "few":
-        shown = times(
-            {**results, "cells": [cell for cell in results["cells"] if cell["instance"] in FEW]}
-        )
-        return f"{_narrow(shown)}\n\n{measured}; {limits}. From [this run]({PROJECT}/{path.relative_to(ROOT).as_posix()}).\n"
     seeds = (
         "one trace of each kind"
         if results["seeds"] == 1
@@ -70,7 +60,7 @@ def rewritten(page: str, name: str, results: dict[str, Any], path: Path) -> str:
 def main() -> None:
     path = Path(sys.argv[1]).resolve()
     results = json.loads(path.read_text(encoding="utf-8"))
-    for name in sys.argv[2:] or ["few", "peers"]:
+    for name in sys.argv[2:] or ["peers"]:
         page = PAGES[name]
         page.write_text(
             rewritten(page.read_text(encoding="utf-8"), name, results, path), encoding="utf-8"

@@ -37,7 +37,7 @@ MANY = 5_000
 # all images from the best centres of the sample.
 ROUNDS = 30
 # There is a runner-up if trimmed M of the chosen k is below this multiple of the largest trimmed M
-# of the others. docs/reproduction.md has measurements.
+# of the others. docs/measurements/reproduction.md has measurements.
 NEAR = 1.5
 # A larger k is also a runner-up if its trimmed M is at least this. A few views that are far apart
 # can each hide several well-separated ones.
@@ -50,7 +50,7 @@ NEIGHBOURS = 3
 # More starts of k-means than this are an error, since each takes as long as the first.
 MOST_STARTS = 10_000
 # The value of `isolated` that the learning loop uses when the theory allows wrong views.
-# docs/reproduction.md has measurements.
+# docs/measurements/reproduction.md has measurements.
 ISOLATED = 10.0
 
 

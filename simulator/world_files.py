@@ -144,7 +144,7 @@ class WorldReader:
         """The error that a field is wrong."""
         return SimulatorError(
             f"{self.where}: {name}: expected {expected}, got {brief(value)}; mend it "
-            "(docs/worlds.md)"
+            "(docs/reference/worlds.md)"
         )
 
     def list(self, data: Mapping[str, Any], name: str) -> list[Any]:

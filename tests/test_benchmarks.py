@@ -240,15 +240,6 @@ def test_each_table_shows_a_stored_run(name: str) -> None:
     assert readme.block(name, run, stored(text, name)) in text
 
 
-def test_the_tables_of_peers_are_of_one_run_and_the_short_one_has_few_rows() -> None:
-    path = stored(readme.PAGES["few"].read_text(), "few")
-    assert path == stored(readme.PAGES["peers"].read_text(), "peers")
-    run = json.loads(path.read_text())
-    rows = [line for line in readme.block("few", run, path).splitlines() if line.startswith("| ")]
-    assert len(rows) == len(readme.FEW) + 2 == 5
-    assert set(readme.FEW) <= set(SUITE)
-
-
 def test_the_table_of_speedups_has_each_of_them() -> None:
     run = json.loads(stored(readme.PAGES["ablation"].read_text(), "ablation").read_text())
     off = {cell["tool"].removeprefix("−") for cell in run["cells"]} - {"ssh-abduction", "all"}
@@ -310,7 +301,7 @@ def test_following_is_no_speedup_of_a_user_and_can_be_left_out() -> None:
 
 def test_the_page_of_pruning_shows_its_stored_run() -> None:
     path = ROOT / "benchmarks" / "results" / "pruning.json"
-    assert (ROOT / "docs" / "pruning.md").read_text() == pruning.page(
+    assert (ROOT / "docs" / "measurements" / "pruning.md").read_text() == pruning.page(
         json.loads(path.read_text()), path
     )
 

@@ -1,4 +1,4 @@
-"""The brute force reproduces the tables of docs/theory.md that are small enough for it."""
+"""The brute force reproduces the tables of docs/explanation/theory.md that are small enough for it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LETTERS = {
 
 
 def read(text: str) -> Trace:
-    """A trace in the notation of docs/theory.md: views and letters of actions in turn."""
+    """A trace in the notation of docs/explanation/theory.md: views and letters of actions in turn."""
     words = text.split()
     return Trace.from_steps(words[::2], [LETTERS[word] for word in words[1::2]])
 

@@ -633,7 +633,7 @@ def test_a_mutated_map_never_raises(mutant: tuple[Case, SSHMap], theory: Theory 
         assert str(violation.message)
 
 
-# All maps of tiny traces, against the numbers in docs/theory.md
+# All maps of tiny traces, against the numbers in docs/explanation/theory.md
 
 
 def growths(n: int) -> Iterator[tuple[int, ...]]:

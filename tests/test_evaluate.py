@@ -361,7 +361,7 @@ def test_values_print_as_they_are_called() -> None:
         "ambiguity",
         "maps",
     }
-    text = (ROOT / "docs" / "formats.md").read_text()
+    text = (ROOT / "docs" / "reference" / "formats.md").read_text()
     for name in (*data, *data["maps"][0]):
         assert f"`{name}`" in text
 

@@ -220,19 +220,23 @@ def test_the_command_line_knows_all_that_is_shown() -> None:
 
 
 def test_the_usage_page_begins_with_all_commands() -> None:
-    table = (ROOT / "docs" / "usage.md").read_text().partition("## One trace")[0]
+    table = (ROOT / "docs" / "how-to" / "usage.md").read_text().partition("## One trace")[0]
     assert set(re.findall(r"`([a-z-]+)`[,|]", table.replace("` |", "`|"))) == set(parser().verbs)
 
 
 def test_the_trace_of_the_formats_page_has_a_map(tmp_path: Path) -> None:
     written = tmp_path / "trace.jsonl"
-    written.write_text((ROOT / "docs" / "formats.md").read_text().split("```")[1].lstrip())
+    written.write_text(
+        (ROOT / "docs" / "reference" / "formats.md").read_text().split("```")[1].lstrip()
+    )
     assert solve(Trace.load(written)).status is Status.OPTIMAL
 
 
 def test_the_picture_is_the_map() -> None:
     (ssh_map,) = solve(Trace.load(ROOT / "examples" / "notched-rectangle.jsonl")).maps
-    assert (ROOT / "docs" / "notched-rectangle.svg").read_text() == to_svg(ssh_map) + "\n"
+    assert (ROOT / "docs" / "figures" / "notched-rectangle.svg").read_text() == to_svg(
+        ssh_map
+    ) + "\n"
 
 
 @pytest.mark.parametrize("name", figures.DRAWN)
@@ -272,7 +276,9 @@ def test_the_design_tells_the_floors_as_they_are_checked() -> None:
     ]
     layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
     (told,) = re.findall(
-        r"From the top: (.*?)\. ", (ROOT / "docs" / "design.md").read_text(), re.DOTALL
+        r"From the top: (.*?)\. ",
+        (ROOT / "docs" / "explanation" / "design.md").read_text(),
+        re.DOTALL,
     )
     assert [set(re.findall(r"`(\w+)`", floor)) for floor in told.split(";")] == [
         set(re.findall(r"(\w+)(?= \||$)", layer)) for layer in layers
@@ -281,7 +287,9 @@ def test_the_design_tells_the_floors_as_they_are_checked() -> None:
 
 def test_the_rule_of_the_theory_page_is_obeyed() -> None:
     (rule,) = [
-        text for language, text in BLOCKS[ROOT / "docs" / "theory.md"] if language == "prolog"
+        text
+        for language, text in BLOCKS[ROOT / "docs" / "explanation" / "theory.md"]
+        if language == "prolog"
     ]
     trace = Trace.load(ROOT / "examples" / "notched-rectangle.jsonl").prefix(24)
     assert fewest(trace, Theory.causal()) == 4

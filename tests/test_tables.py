@@ -1,4 +1,4 @@
-"""The tables of docs/theory.md: minimal maps of known traces under known theories, each solved, counted and checked."""
+"""The tables of docs/explanation/theory.md: minimal maps of known traces under known theories, each solved, counted and checked."""
 
 from __future__ import annotations
 

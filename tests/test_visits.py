@@ -267,7 +267,7 @@ def test_names_and_poses_are_judged_where_both_are_asked_for(
     assert told[0]["maps"][0]["place_recall"] == 1
     assert {k: v for k, v in told[1].items() if k != "poses"} == told[0]
     assert (told[1]["poses"]["near"], told[1]["poses"]["places"]["returns"]) == (0.5, 0)
-    text = (Path(__file__).parent.parent / "docs" / "formats.md").read_text()
+    text = (Path(__file__).parent.parent / "docs" / "reference" / "formats.md").read_text()
     names = [told[1]["poses"], told[1]["poses"]["places"], told[1]["poses"]["maps"][0]["places"]]
     assert all(f"`{name}`" in text for fields in names for name in fields)
 

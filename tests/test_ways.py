@@ -158,7 +158,7 @@ def test_a_maze_without_stars(off: str) -> None:
 
 
 def test_the_route_of_a_robot() -> None:
-    """As the table of docs/theory.md has it: (19, 9, 4), 38 maps."""
+    """As the table of docs/explanation/theory.md has it: (19, 9, 4), 38 maps."""
     trace = Trace.load(EXAMPLES / "aces3-route.jsonl")
     with patch.multiple(choosing, FRAME_AFTER=-1.0, FEW_STEPS=0):
         search = Search(trace, Theory(star="none"), max_maps=None)

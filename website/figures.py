@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/how.md into docs/figures, from one simulated drive and one example.
+"""Draws the pictures of docs/explanation/how.md into docs/figures, from one simulated drive and one example.
 
 python website/figures.py
 """

@@ -178,17 +178,7 @@ def reference() -> Iterator[tuple[str, str]]:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    return with_titles(to_github(markdown, page.file.src_uri))
-
-
-def with_titles(markdown: str) -> str:
-    """The text of a page, in which links that are called as their file, as GitHub's readers know it, have the title of the page."""
-
-    def titled(link: re.Match[str]) -> str:
-        heading, *_ = (ROOT / "docs" / link[1]).read_text(encoding="utf-8").splitlines()
-        return f"[{heading.removeprefix('# ')}]("
-
-    return re.sub(r"\[(\w+\.md)\]\(", titled, markdown)
+    return to_github(markdown, page.file.src_uri)
 
 
 def to_github(markdown: str, uri: str) -> str:

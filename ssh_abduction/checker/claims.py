@@ -33,7 +33,7 @@ def false_claims(
 ) -> tuple[str, ...]:
     """What is wrong with the claims of an answer, a sentence each. None of the claims is taken for granted.
 
-    answer  as `solve --json` prints it (docs/formats.md)
+    answer  as `solve --json` prints it (docs/reference/formats.md)
     maps    the maps that it lists
     steps   how many steps the trace has
     theory  the theory that the answer is of, resolved

@@ -41,7 +41,7 @@ _Found: TypeAlias = tuple[
     tuple[Return, ...], float, float
 ]  # returns that are refused, their chi-square and the threshold
 
-# What docs/theory.md says of one_pose: the errors of heading that are reckoned with, the uncertainty at which a heading is lost, the steps in which a drift is tried and how far.
+# What docs/explanation/theory.md says of one_pose: the errors of heading that are reckoned with, the uncertainty at which a heading is lost, the steps in which a drift is tried and how far.
 SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
 # So many sets are worked on in one go.
 AT_A_TIME = 50_000

@@ -38,7 +38,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("--diff", nargs=2, metavar=("I", "J"), help=diff)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
-    parser.epilog = "Questions that decide are chosen greedily: none can be left out, but there may be fewer. docs/formats.md says what the JSON has."
+    parser.epilog = "Questions that decide are chosen greedily: none can be left out, but there may be fewer. docs/reference/formats.md says what the JSON has."
 
 
 def run(options: argparse.Namespace) -> int:

@@ -73,7 +73,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.set_defaults(run=run)
     parser.epilog = (
         "Of pairs at the same place, edges and links, the two shares are precision and recall. Where steps tell poses and no names, as those "
-        "of an imported log do, visits near each other are judged. docs/formats.md says what is counted."
+        "of an imported log do, visits near each other are judged. docs/reference/formats.md says what is counted."
     )
 
 

@@ -48,7 +48,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_setting("name", "the name of the map (default: ssh-abduction)", "ssh-abduction")
     parser.add_setting("frame", "the coordinate frame of the positions (default: map)", "map")
     parser.set_defaults(run=run)
-    parser.epilog = "Positions are metres, seen from the first dstate, where the map has poses; else they are of a layout, and this is said. docs/formats.md says what each file has."
+    parser.epilog = "Positions are metres, seen from the first dstate, where the map has poses; else they are of a layout, and this is said. docs/reference/formats.md says what each file has."
 
 
 def run(options: argparse.Namespace) -> int:

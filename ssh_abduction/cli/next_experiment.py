@@ -57,7 +57,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.set_defaults(run=run)
     parser.epilog = (
         "The plan for two maps is the shortest one. That for more is greedy, as the best one is hard to find (PSPACE-complete: Lee & Yannakakis 1994). "
-        "Exit codes: 0 done; 10 a limit ended the search, and there may be a better plan; 30 no plan in time. docs/formats.md says what --json prints."
+        "Exit codes: 0 done; 10 a limit ended the search, and there may be a better plan; 30 no plan in time. docs/reference/formats.md says what --json prints."
     )
 
 

@@ -46,7 +46,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
-    parser.epilog = "ssh-abduction show lists the dstates and places of a map. docs/formats.md says what the JSON has."
+    parser.epilog = "ssh-abduction show lists the dstates and places of a map. docs/reference/formats.md says what the JSON has."
 
 
 def run(options: argparse.Namespace) -> int:

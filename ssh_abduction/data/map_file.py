@@ -1,4 +1,4 @@
-"""Reading and writing the JSON of maps. See docs/formats.md."""
+"""Reading and writing the JSON of maps. See docs/reference/formats.md."""
 
 from __future__ import annotations
 

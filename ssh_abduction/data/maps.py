@@ -182,7 +182,7 @@ class SSHMap:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The map as plain data, as `solve --json` prints it (docs/formats.md)."""
+        """The map as plain data, as `solve --json` prints it (docs/reference/formats.md)."""
         dstates = [
             {
                 "id": s.id,

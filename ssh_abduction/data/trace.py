@@ -6,7 +6,7 @@
 (3, ('a', 'b', 'a'), ['travel', 'turn'])
 
 A file of a trace holds JSON lines: a header, and then for each step a line with what was observed
-and the action taken next. See docs/formats.md.
+and the action taken next. See docs/reference/formats.md.
 """
 
 from __future__ import annotations

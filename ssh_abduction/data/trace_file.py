@@ -1,6 +1,6 @@
 """Reading trace files: JSON lines, of which the first is the header and each other one a step.
 
-See docs/formats.md.
+See docs/reference/formats.md.
 """
 
 from __future__ import annotations

@@ -164,7 +164,7 @@ class Belief:
         return tuple((int(s), float(self.probabilities[s])) for s in found)
 
     def to_dict(self) -> dict[str, Any]:
-        """The belief as `localise --json` prints it (docs/formats.md)."""
+        """The belief as `localise --json` prints it (docs/reference/formats.md)."""
         return {
             "verdict": self.verdict.value,
             "dstate": self.dstate,

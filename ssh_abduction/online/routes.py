@@ -147,7 +147,7 @@ class Route:
         return f"from dstate {self.start} to {self.goal}: {', '.join(parts)}"
 
     def to_dict(self) -> dict[str, Any]:
-        """The route as plain data, as `route --json` prints it (docs/formats.md)."""
+        """The route as plain data, as `route --json` prints it (docs/reference/formats.md)."""
         length = self.metres
         return {
             "map": self.map,

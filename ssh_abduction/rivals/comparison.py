@@ -226,7 +226,7 @@ class Comparison:
         return found
 
     def to_dict(self) -> dict[str, Any]:
-        """As `compare --json` prints it (docs/formats.md)."""
+        """As `compare --json` prints it (docs/reference/formats.md)."""
         data: dict[str, Any] = {
             "summary": self.sentence,
             "count": len(self.ids),

@@ -149,7 +149,7 @@ class Difference:
         return "\n".join(self.lines) or "the maps are the same"
 
     def to_dict(self) -> dict[str, Any]:
-        """As `compare --diff --json` prints it (docs/formats.md)."""
+        """As `compare --diff --json` prints it (docs/reference/formats.md)."""
         sizes = [
             dict(zip(("dstates", "places", "paths", "links"), size, strict=True))
             for size in self.sizes

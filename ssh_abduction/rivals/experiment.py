@@ -194,7 +194,7 @@ class Experiment:
         return "; ".join(told) or None
 
     def to_dict(self) -> dict[str, Any]:
-        """As `ssh-abduction next --json` prints it (docs/formats.md)."""
+        """As `ssh-abduction next --json` prints it (docs/reference/formats.md)."""
         return {
             "count": self.count,
             "complete": self.complete,

@@ -85,7 +85,7 @@ class Listing:
 
     @classmethod
     def from_dict(cls, data: Any, where: str = "maps") -> Listing:
-        """What `solve --json` printed (docs/formats.md). Raises MapError with the field that is wrong."""
+        """What `solve --json` printed (docs/reference/formats.md). Raises MapError with the field that is wrong."""
         a_text("where", where, MapError)
         maps = tuple(ssh_map.renumbered() for ssh_map in maps_of(data, where))
         told: Mapping[str, Any] = data if isinstance(data, Mapping) and "maps" in data else {}

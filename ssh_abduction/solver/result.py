@@ -266,7 +266,7 @@ class Solution:
         return self.effort.evidence
 
     def to_dict(self) -> dict[str, Any]:
-        """The answer as plain data, as `solve --json` prints it (docs/formats.md).
+        """The answer as plain data, as `solve --json` prints it (docs/reference/formats.md).
 
         What needs a search of its own is left out: why there is no map, and the runner-up.
 

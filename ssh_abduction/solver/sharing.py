@@ -125,7 +125,7 @@ class Backbone:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As `solve --json` prints it (docs/formats.md): the dstates by step, and the rest by dstate, so that it is short for a long trace."""
+        """As `solve --json` prints it (docs/reference/formats.md): the dstates by step, and the rest by dstate, so that it is short for a long trace."""
         labels = self.dstates.always
         firsts = {number: t for t, number in reversed(list(enumerate(labels)))}
         by_dstate = [firsts[number] for number in sorted(firsts)]

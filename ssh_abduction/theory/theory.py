@@ -40,7 +40,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
 # The readings of stars that take each gateway to be in its direction as far as its spread says.
 IN_TOLERANCE = ("alike", "gateways")
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
-# What is preferred unless a user says so. Displacements tell places apart, so that fewest places are seldom too few; without them it is the other way round (docs/truth.md).
+# What is preferred unless a user says so. Displacements tell places apart, so that fewest places are seldom too few; without them it is the other way round (docs/measurements/truth.md).
 AUTO: tuple[Count, ...] = ("auto",)
 PREFERRED: tuple[Count, ...] = ("dstates", "paths", "places")
 WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
@@ -96,7 +96,7 @@ CAUSAL = "Theory.causal() (--theory causal)"  # in error messages
 class Theory:
     """A frozen choice of axioms and of what is minimised: a preset, `replace`, or field by field.
 
-    docs/theory.md has the axioms and their sources; `ssh-abduction theory` prints them.
+    docs/explanation/theory.md has the axioms and their sources; `ssh-abduction theory` prints them.
 
     Attributes:
         level: Which maps are sought: causal ones (dstates only), or topological ones (dstates,

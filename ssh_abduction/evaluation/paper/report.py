@@ -198,7 +198,7 @@ def _dump(path: Path, value: Any) -> None:
 DIFFERENCES = {
     "notched-rectangle": (
         "The notch: the paper's room has its notch at a corner; here it is a recess in a wall, "
-        "1.2 m wide and 3 cm deep. Notches at a corner are in docs/reproduction.md.",
+        "1.2 m wide and 3 cm deep. Notches at a corner are in docs/measurements/reproduction.md.",
         "The room: 4 m by 2 m, with the robot 0.6 m from the walls, is a choice of ours. In a room "
         "a tenth longer and wider M chooses another k.",
         "The images: each is the median of nine scans, beam by beam. With single scans, lost beams "
