@@ -1,14 +1,14 @@
-"""What a map says of an action: where it leads where it was tried, and what follows for it where it was not.
+"""What a map predicts for an action: its known end, or what the axioms or a path imply for it.
 
-An action that was never tried in a dstate may still have an end that the axioms, or the order of a
-path, tell:
+The axioms, or the order of a path, may imply the end of an action that was never tried in a dstate:
 
-    a turn, where places have frames          to the slot that many quarters on (turn_rotates),
-    whose dstate is known (one_dstate_per_heading), or whose star is that of the place, turned a
-    turn around, along a path               back along it (turn_around_reverses), where at most one
-    dstate is (one_dstate_per_course) a travel along a path                     to the next place in
-    the order of the path. That is expected only: a map's order is one of several, and a place may
-    be between that nobody saw
+- a turn, if places have frames: it leads to the slot that many quarters on (turn_rotates). Its
+dstate
+  is known (one_dstate_per_heading), or at least its star, which is that of the place, turned;
+- a turn around along a path: it leads back along the path (turn_around_reverses), where at most one
+  dstate is (one_dstate_per_course);
+- a travel along a path: it leads to the next place in the order of the path. This is only expected,
+  as the order of a map is one of several, and there may be an unseen place between.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ _OF_COURSES = frozenset({"turn_around_reverses", "one_dstate_per_course"})
 
 @dataclass(frozen=True, slots=True)
 class Consequence:
-    """What a map says of an action in a dstate.
+    """What a map predicts for an action in a dstate.
 
-    how     link: it was tried; implied: the axioms tell; expected: the order of a path tells; open:
-        nothing is known
-    dstate  where it leads, None where that is not known
-    seen    what is seen there, as far as it is known
+    Attributes:
+        how: link if the action was tried; implied if the axioms imply the end; expected if the
+            order of a path suggests it; open if nothing is known.
+        dstate: Where the action leads; None if unknown.
+        seen: What is seen there, as far as it is known.
     """
 
     how: How
@@ -45,11 +46,11 @@ class Consequence:
 
     @property
     def is_sure(self) -> bool:
-        """Whether the map is wrong if something else comes."""
+        """Whether any other outcome refutes the map."""
         return self.how in ("link", "implied")
 
     def clashes(self, other: Consequence) -> bool:
-        """Whether the two maps cannot both be right about it, whatever comes."""
+        """Whether each outcome refutes one of the two maps."""
         if not (self.is_sure and other.is_sure and self.seen and other.seen):
             return False
         one, two = self.seen, other.seen
@@ -59,6 +60,7 @@ class Consequence:
         )
 
     def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `next --json` prints it."""
         return {"how": self.how, "dstate": self.dstate} | (
             self.seen.to_dict() if self.seen else {"view": None}
         )
@@ -68,11 +70,13 @@ OPEN = Consequence("open")
 
 
 class Consequences:
-    """What one map says of actions.
+    """What one map predicts for actions.
 
-    links   for each dstate the actions that were tried there, and where they lead
-    looks   what each dstate looks like
-    theory  the axioms that tell; None for all
+    Args:
+        ssh_map: The map.
+        links: For each dstate the actions that were tried there, and where they lead.
+        looks: What each dstate looks like.
+        theory: The theory, whose axioms may imply ends; None if all axioms hold.
     """
 
     def __init__(
@@ -101,7 +105,7 @@ class Consequences:
         self._orders = {path.id: path.order for path in ssh_map.paths}
 
     def of(self, dstate: int, action: Action) -> Consequence:
-        """What the map says of an action in a dstate."""
+        """What the map predicts for an action in a dstate."""
         there = self._links[dstate].get(action.name)
         if there is not None:
             return self._to(there, "link")
@@ -113,7 +117,7 @@ class Consequences:
         return OPEN
 
     def sure_ends(self, actions: Sequence[Action]) -> tuple[tuple[int, str, int], ...]:
-        """Dstates, actions that were never tried there, and the dstates that the axioms imply for their ends."""
+        """Untried actions with implied ends, as triples of dstate, action and end."""
         turns = [action for action in actions if action.kind == "turn"]
         if not (self._framed or (self._turns_back and self._at)):
             return ()
@@ -169,7 +173,10 @@ def _is_four(seen: Seen) -> bool:
 
 
 def is_possible(action: Action, seen: Seen) -> bool:
-    """Whether an action can be done where this is seen, as far as the star tells: a travel goes through a gateway ahead, a turn to a gateway needs it."""
+    """Whether the star allows an action.
+
+    A travel needs a gateway ahead, and a turn to a gateway needs that gateway.
+    """
     if seen.star is None:
         return True
     if _is_four(seen):

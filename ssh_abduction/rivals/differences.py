@@ -1,14 +1,14 @@
-"""What tells two maps of one trace apart.
+"""What differs between two maps of one trace.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
 >>> found = difference(SSHMap((0, 0, 1), (a, b), ()), SSHMap((0, 1, 1), (a, b), ()))
 >>> print(found)
-dstates: in the first map steps 0–1 | 2 are two, in the other one steps 0 | 1–2 are two
+dstates: the first map groups steps 0–1 | 2; the other one groups steps 0 | 1–2
 
-The steps of a dstate in one map may be at several dstates in the other one, whose steps may be at
-further dstates of the first one. What hangs together so is one `Change`, and all else is the same
-in both maps. Places, paths and courses are compared likewise.
+The steps of one dstate in a map may be at several dstates in the other map. Dstates of both maps
+that share steps are connected. Each connected part that differs is one `Change`; all else is the
+same in both maps. Places, paths and courses are compared in the same way.
 """
 
 from __future__ import annotations
@@ -28,39 +28,26 @@ from ssh_abduction.solver import Sort, stretches
 Steps: TypeAlias = tuple[int, ...]
 Link: TypeAlias = tuple[int, str, int]
 
-NUMBERS = (
-    "no",
-    "one",
-    "two",
-    "three",
-    "four",
-    "five",
-    "six",
-    "seven",
-    "eight",
-    "nine",
-    "ten",
-    "eleven",
-    "twelve",
-)
 SORTED_BY = {
     "dstates": "dstates",
     "places": "places",
     "paths": "paths",
     "courses": "directions along paths",
 }
-# So many changes of a sort, and so many links, are told in words, at most.
+# At most this many changes of a sort, and links, are put into words.
 TOLD = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Steps which two maps group differently: by dstate, place, path or course.
+    """Steps that two maps group differently, by dstate, place, path or course.
 
-    sort   what they are grouped by
-    first  the groups of the first map, by their first steps
-    other  the groups of the other map
-    first_none, other_none  steps that are along no path, or at no place, in that map
+    Attributes:
+        sort: What they are grouped by.
+        first: The groups of the first map, by their first steps.
+        other: The groups of the other map.
+        first_none: Steps that are at no place, or along no path, in the first map.
+        other_none: The same for the other map.
     """
 
     sort: Sort
@@ -70,13 +57,12 @@ class Change:
     other_none: Steps = ()
 
     def told(self, names: tuple[str, str]) -> str:
-        """The change in words, where the two maps are called so."""
+        """The change in words, with these names for the two maps."""
         sides = ((self.first, self.first_none), (self.other, self.other_none))
-        return ", ".join(
-            f"in {name} {_told(*side)}" for name, side in zip(names, sides, strict=True)
-        )
+        return "; ".join(f"{name} {_told(*side)}" for name, side in zip(names, sides, strict=True))
 
     def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `compare --diff --json` prints it."""
         data: dict[str, Any] = {
             "sort": self.sort,
             "first": [list(g) for g in self.first],
@@ -89,16 +75,18 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """What tells two maps of one trace apart.
+    """What differs between two maps of one trace.
 
-    ids      the ids of both maps
-    names    what the maps are called in words
-    sizes    for both maps how many dstates, places, paths and links they have
-    changes  steps that are grouped differently
-    links    for both maps the links that only it has, of those between dstates that are the same in
-    both. A dstate is named by its first step faults   for both maps what only it disbelieves chi2
-    for both maps how well it closes, where both have a fit has_places  for both maps whether it has
-    places
+    Attributes:
+        ids: The ids of both maps.
+        names: The names of both maps in words.
+        sizes: For both maps the numbers of dstates, places, paths and links.
+        changes: Steps that are grouped differently.
+        links: For both maps the links that only it has, among dstates that are the same in both. A
+            dstate is named by its first step.
+        faults: For both maps the faults that only it has.
+        chi2: The chi-square of both maps, if both have a fit.
+        has_places: For both maps whether it has places.
     """
 
     ids: tuple[str, str]
@@ -175,9 +163,15 @@ class Difference:
 def difference(
     first: SSHMap, other: SSHMap, names: tuple[str, str] = ("the first map", "the other one")
 ) -> Difference:
-    """What tells two maps of one trace apart. Raises MapError where they have other numbers of steps.
+    """Find what differs between two maps of one trace.
 
-    names  what the maps are called in words
+    Args:
+        first: A map.
+        other: Another map.
+        names: The names of the maps in words.
+
+    Raises:
+        MapError: The maps have different numbers of steps.
     """
     checked_map(first, "first")
     checked_map(other, "other")
@@ -234,7 +228,7 @@ def difference(
 
 
 def _changes(table: Table, sort: Sort) -> Iterable[Change]:
-    """The classes that two maps group differently, in the order of their first steps."""
+    """The classes of steps that two maps group differently, by their first steps."""
     ones = table.ones[sort]
     linked: nx.Graph[int] = nx.Graph()
     linked.add_nodes_from(range(ones.shape[1]))
@@ -269,7 +263,7 @@ def _named_links(ssh_map: SSHMap) -> set[Link]:
 
 
 def _unmoved(first: SSHMap, other: SSHMap) -> set[int]:
-    """The first steps of dstates that have the same steps in both maps."""
+    """The first steps of the dstates that have the same steps in both maps."""
     sets: list[set[Steps]] = []
     for ssh_map in (first, other):
         steps: dict[int, list[int]] = {}
@@ -284,14 +278,11 @@ def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
 
 
 def _told(groups: Sequence[Steps], none: Steps) -> str:
-    steps = [t for group in groups for t in group]
-    number = NUMBERS[len(groups)] if len(groups) < len(NUMBERS) else str(len(groups))
-    told = (
-        f"{'step' if len(steps) == 1 else 'steps'} {' | '.join(map(stretches, groups))} "
-        f"{'is' if len(steps) == 1 else 'are'} {number}"
-    )
-    off = (
-        f"{'step' if len(none) == 1 else 'steps'} {stretches(none)} "
-        f"{'is' if len(none) == 1 else 'are'} none"
-    )
-    return " and ".join(([told] if groups else []) + ([off] if none else []))
+    """What one map does with the steps: groups steps 0–1 | 2 and leaves out step 5."""
+    grouped = f"groups {_steps(sum(map(len, groups)))} {' | '.join(map(stretches, groups))}"
+    left = f"leaves out {_steps(len(none))} {stretches(none)}"
+    return " and ".join(([grouped] if groups else []) + ([left] if none else []))
+
+
+def _steps(count: int) -> str:
+    return "step" if count == 1 else "steps"

@@ -1,18 +1,17 @@
 """Which questions decide between maps, and which of them are independent of each other.
 
-A question is a column of truth values, one a map. Some questions *decide* if no two maps give the
-same answers to all of them. They are chosen greedily: next comes the question that splits most
-pairs of maps that are not told apart yet, and of equal ones the earliest; then those are dropped
-again that the others make superfluous. No question can be left out of what remains, but a smaller
-choice may exist: to find the smallest is NP-hard (minimum test set, Garey & Johnson 1979, SP6).
+A question is a column of truth values, one for each map. Some questions *decide* if no two maps
+give the same answers to all of them. They are chosen greedily: the next one splits most pairs of
+maps that are not told apart yet, and ties go to the earliest. Then superfluous ones are dropped. A
+smaller set may exist: to find the smallest is NP-hard (minimum test set, Garey & Johnson 1979,
+SP6).
 
-Maps, as answers to questions, are a set of rows. A choice is a set of questions, its *options* are
-the different answers to these. Choices are *independent* if each combination of their options is a
-map, so that the numbers of their options, multiplied, give the number of maps. There is one finest
-division of the questions into independent choices, and it is found so: a smallest set of choices
-that are not independent of each other, no part of which is dependent, lies within one choice of
-that division (if two independent ones shared it, its parts would be independent, and so would be
-the whole). So its members are made one, until all are independent.
+A *choice* is a set of questions, and its *options* are the different answers to them. Choices are
+*independent* if each combination of their options is a map, so that the product of the numbers of
+options is the number of maps. There is one finest division into independent choices. It is found by
+merging: a minimal set of dependent choices lies within one choice of that division (if two
+independent choices shared it, its parts would be independent, and so the whole). So the members of
+such a set are merged until all choices are independent.
 
 >>> import numpy as np
 >>> rows = np.array([[0, 0, 0], [0, 1, 1], [1, 0, 0], [1, 1, 1]], dtype=bool)
@@ -35,16 +34,20 @@ from ssh_abduction.rivals.table import Bools
 
 
 def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] = ()) -> list[int]:
-    """Questions that tell all maps apart which questions can tell apart, chosen greedily, in the order in which they are chosen. None is superfluous.
+    """Choose questions that tell apart all maps that can be told apart.
 
-    columns  for each question, the most important first where they split equally, what each of the
-    maps answers
-    tiers    for each question its tier: those of a higher one are asked only once those of lower
-        ones tell nothing more apart. One tier by default
+    Args:
+        columns: For each question the answers of the maps. Earlier questions win ties.
+        maps: The number of maps.
+        tiers: The tier of each question. Questions of a higher tier are asked only once those of
+            lower tiers split nothing more. One tier by default.
+
+    Returns:
+        The indices of the questions, in the order of choice. None is superfluous.
     """
     groups = np.zeros(maps, dtype=np.intp)
-    # What a question splits becomes less as others are asked. So it need be counted again only when
-    # it seems to be the best one.
+    # The split of a question only shrinks as others are chosen. So it is counted again only when it
+    # is at the top of the heap.
     waiting = [
         (tier, -_split(column, groups), i)
         for i, (column, tier) in enumerate(zip(columns, tiers or [0] * len(columns), strict=True))
@@ -69,10 +72,13 @@ def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] =
 
 
 def independent(columns: Sequence[Bools] | Bools) -> list[list[int]]:
-    """The finest division of questions into independent choices. The choices come in the order of their first questions.
+    """Divide questions into the finest independent choices.
 
-    columns  for each question, what each of the maps answers; maps that give the same answers
-    throughout count once
+    Args:
+        columns: For each question the answers of the maps. Equal maps count once.
+
+    Returns:
+        The choices as lists of indices, in the order of their first questions.
     """
     if not len(columns):
         return []
@@ -89,7 +95,15 @@ def independent(columns: Sequence[Bools] | Bools) -> list[list[int]]:
 
 
 def options_of(columns: Sequence[Bools] | Bools, maps: int) -> NDArray[np.intp]:
-    """For each map the number of its answers to some questions, from 0: maps of one number answer all of them alike. Numbers are in the order of the maps."""
+    """Number the answers of each map to some questions.
+
+    Args:
+        columns: For each question the answers of the maps.
+        maps: The number of maps.
+
+    Returns:
+        A number for each map, from 0 in the order of the maps. Equal numbers mean equal answers.
+    """
     if not len(columns):
         return np.zeros(maps, dtype=np.intp)
     packed = np.packbits(np.asarray(columns, dtype=bool), axis=0)
@@ -100,14 +114,18 @@ def options_of(columns: Sequence[Bools] | Bools, maps: int) -> NDArray[np.intp]:
 
 
 def _split(column: Bools, groups: NDArray[np.intp]) -> int:
-    """How many pairs of maps of one group give different answers."""
+    """The number of pairs of maps in one group that give different answers."""
     sizes = np.bincount(groups)
     yes = np.bincount(groups, weights=column).astype(np.int64)
     return int((yes * (sizes - yes)).sum())
 
 
 def _linked(table: Bools) -> list[list[int]]:
-    """Questions put together of which two depend on each other: the answers to both are not as frequent as they are where each is given with each."""
+    """Group questions that are pairwise dependent, directly or through others.
+
+    Two questions depend on each other if their joint answers are not as frequent as the product of
+    the frequencies of each.
+    """
     counts = table.astype(np.int64)
     yes, maps = counts.sum(axis=1), table.shape[1]
     waiting = np.arange(len(table))
@@ -125,7 +143,7 @@ def _linked(table: Bools) -> list[list[int]]:
 
 
 def _dependent(options: Sequence[NDArray[np.intp]]) -> set[int] | None:
-    """A set of choices that are not independent, of which each smaller part is; None where all are independent."""
+    """A minimal set of dependent choices; None if all are independent."""
 
     def are_independent(which: Sequence[int]) -> bool:
         together = np.unique(np.stack([options[k] for k in which]), axis=1).shape[1] if which else 1

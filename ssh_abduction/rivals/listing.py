@@ -1,4 +1,4 @@
-"""Maps of one trace as they are listed, and what is known of those that are not: of a solution, of a file, or of maps alone.
+"""Maps of one trace from a solution, a file or a list, and what is known about unlisted maps.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> one = SSHMap((0, 0), (DState(0, "hall"),), ())
@@ -27,14 +27,16 @@ from ssh_abduction.theory.theory import Theory
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """Maps of one trace, and what is known of the others.
+    """Maps of one trace, and what is known about the maps that are not listed.
 
-    maps      the maps, in the order in which they are listed
-    minimal   how many of them, from the first one on, are minimal, as was proven; None where nobody
-    says so complete  whether no further minimal map exists; None where nobody says so stopped   why
-    listing ended before it was complete, where that is known backbone  what all minimal maps share,
-    as far as it was found out by reasoning or from all maps; None where that is not known source
-    where the maps are from, as messages name it
+    Attributes:
+        maps: The maps.
+        minimal: The number of maps, from the first one on, that are proven minimal; None if
+            unknown.
+        complete: Whether there is no further minimal map; None if unknown.
+        stopped: Why listing ended before it was complete, if known.
+        backbone: What all minimal maps share, by reasoning or from all maps; None if unknown.
+        source: Where the maps are from, for messages.
     """
 
     maps: tuple[SSHMap, ...]
@@ -46,12 +48,16 @@ class Listing:
 
     @property
     def steps(self) -> int:
-        """How many steps the trace has."""
+        """The number of steps of the trace."""
         return len(self.maps[0].labels)
 
     @classmethod
     def of(cls, source: Maps) -> Listing:
-        """What a solution lists, or maps alone. Raises MapError for maps of several traces, and for none."""
+        """The listing of a solution, or of maps.
+
+        Raises:
+            MapError: There are no maps, or they are maps of several traces.
+        """
         if isinstance(source, Listing):
             return source
         if isinstance(source, Solution):
@@ -80,12 +86,27 @@ class Listing:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Listing:
-        """What `solve --json` printed into a file, or the one map that `SSHMap.save` wrote; - for standard input. Raises MapError."""
+        """Read what `solve --json` printed, or the one map that `SSHMap.save` wrote.
+
+        Args:
+            path: The file; - for standard input.
+
+        Raises:
+            MapError: The file cannot be read, or does not hold maps of one trace.
+        """
         return cls.from_dict(read_json(path), "standard input" if str(path) == "-" else named(path))
 
     @classmethod
     def from_dict(cls, data: Any, where: str = "maps") -> Listing:
-        """What `solve --json` printed (docs/reference/formats.md). Raises MapError with the field that is wrong."""
+        """The listing of what `solve --json` printed (docs/reference/formats.md).
+
+        Args:
+            data: The JSON value.
+            where: What messages call it.
+
+        Raises:
+            MapError: A field is wrong; the message names it.
+        """
         a_text("where", where, MapError)
         maps = tuple(ssh_map.renumbered() for ssh_map in maps_of(data, where))
         told: Mapping[str, Any] = data if isinstance(data, Mapping) and "maps" in data else {}
@@ -148,9 +169,13 @@ class Listing:
         return listing.checked(one_view=theory is None or _has_one_view(theory))
 
     def checked(self, *, one_view: bool = True) -> Listing:
-        """The same, if the maps can be those of one trace. Raises MapError.
+        """Return the listing if its maps can be those of one trace.
 
-        one_view  whether dstates have one view each, so that maps tell what was seen at each step
+        Args:
+            one_view: Whether each dstate has one view, so that maps say what was seen at each step.
+
+        Raises:
+            MapError: There are no maps, or they are maps of several traces.
         """
         a_flag("one_view", one_view, MapError)
         if not self.maps:
@@ -174,7 +199,7 @@ class Listing:
         return self
 
     def check_same_trace(self, other: Listing) -> None:
-        """Raises MapError where the maps of another listing are of another trace."""
+        """Raise MapError if the maps of another listing are of another trace."""
         an_instance(
             "other", other, Listing, MapError, mend="make one with Listing.of or Listing.load"
         )
@@ -195,7 +220,14 @@ class Listing:
                 )
 
     def number(self, name: str) -> int:
-        """Which map is meant, from 0: by its number, counted from 1, or by its id. Raises MapError."""
+        """The index of a map.
+
+        Args:
+            name: The number of the map, counted from 1, or its id.
+
+        Raises:
+            MapError: There is no such map.
+        """
         text = str(name)
         if (
             len(text) < ID_LENGTH
@@ -234,7 +266,7 @@ def _has_one_view(theory: Theory) -> bool:
 
 
 def _seen(ssh_map: SSHMap) -> tuple[View | None, ...]:
-    """What was seen at each step, as far as a map of dstates with one view each tells."""
+    """The view at each step, by a map whose dstates have one view each."""
     views = [s.view for s in ssh_map.dstates]
     seen = [views[label] for label in ssh_map.labels]
     for fault in ssh_map.faults:

@@ -1,11 +1,10 @@
 """Maps as machines: what each predicts from the current dstate on, along the links that it knows.
 
-Maps whose machines are equal predict the same for ever, so they are merged: of 780 rivals that
-differ in paths alone one machine is left.
+Maps with equal machines predict the same forever, so they are merged: 780 rivals that differ only
+in paths have one machine.
 
-A robot that follows links which all rivals know is, in each rival, at one dstate. These dstates
-together are a *joint state*: a row of numbers, one for each machine. From row to row numpy goes for
-all rows of one depth at once.
+A robot that follows links which all rivals know is at one dstate in each rival. These dstates are a
+*joint state*: a row of numbers, one for each machine. numpy moves all rows of one depth at once.
 """
 
 from __future__ import annotations
@@ -27,20 +26,26 @@ from ssh_abduction.theory.theory import IN_TOLERANCE, Theory
 
 Array: TypeAlias = NDArray[np.int32]
 Row: TypeAlias = tuple[int, ...]
-UNKNOWN = -1  # stands for the end of a link that a machine does not have
-# So many numbers, at most, are in the rows that are worked on at once: some ten megabytes.
+UNKNOWN = -1  # the end of a link that a machine does not have
+# The greatest number of entries in the rows that are moved at once: some ten megabytes.
 CHUNK = 2**21
 
 
 class Limits(Protocol):
-    """What is asked now and then whether to go on; it raises where not."""
+    """Limits of a search. `check` raises an exception if one is over."""
 
-    def check(self) -> None: ...
+    def check(self) -> None:
+        """Raise an exception if a limit is over."""
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What is seen at a dstate: its view, None where it is not known; and its star as a trace writes it, None where stars say nothing."""
+    """What is seen at a dstate.
+
+    Attributes:
+        view: The view; None if unknown.
+        star: The star as a trace writes it; None if stars are not used.
+    """
 
     view: View | None
     star: tuple[Any, ...] | None = None
@@ -50,6 +55,7 @@ class Seen:
         return view if self.star is None else f"{view} {_star_text(self.star)}"
 
     def to_dict(self) -> dict[str, Any]:
+        """Plain data, as `next --json` prints it."""
         return {"view": self.view} | (
             {} if self.star is None else {"star": [_entry(entry) for entry in self.star]}
         )
@@ -81,22 +87,26 @@ def _star_text(star: Sequence[Any]) -> str:
 
 
 class Sights:
-    """What the dstates of rival maps look like. Two dstates have the same number exactly if nobody can tell them apart by one look.
+    """What the dstates of rival maps look like.
 
-    Without a trace that is their views. Stars are read as the theory reads them: four openings;
-    turned in any way, where it does not say how stars are turned; and where they agree in tolerance
-    only, stars that could be one, directly or by way of others, count as one, so that no difference
-    is promised which might not be seen. Where no theory is given, stars are read unless some map
-    has a dstate with two stars.
+    Two dstates have the same number if and only if one look cannot tell them apart. Without a trace
+    only views count. Stars are read as the theory reads them: as four openings; or turned in any
+    way, if the theory does not say how stars are turned. Where stars agree in tolerance only, stars
+    that could be one, directly or through others, count as one, so that no predicted difference may
+    be invisible. Without a theory, stars are read unless some map has a dstate with two stars.
+
+    Attributes:
+        seen: What is seen, by number.
+        of: For each map, the number of each dstate.
     """
 
     def __init__(self, maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> None:
         self._numbers: dict[object, int] = {}
-        self.seen: list[Seen] = []  # by number
+        self.seen: list[Seen] = []
         reading = _reading(maps, trace, theory)
         self.of = [
             self._of(ssh_map, None if reading is None else trace, reading) for ssh_map in maps
-        ]  # for each map, the number of each dstate
+        ]
 
     def _of(self, ssh_map: SSHMap, trace: Trace | None, reading: _Reading | None) -> list[int]:
         stars = _first_steps(ssh_map) if trace is not None and reading is not None else {}
@@ -118,7 +128,10 @@ class Sights:
 
 
 class _Reading:
-    """How the star of a step is read: what stands for all stars that are not told apart from it, and the star itself."""
+    """Reads the star of a step.
+
+    A call gives a key, which stars share that are not told apart, and the star itself.
+    """
 
     def __init__(self, trace: Trace, theory: Theory, steps: Sequence[int] = ()) -> None:
         self._trace, self._theory = trace, theory
@@ -132,7 +145,7 @@ class _Reading:
 
 
 def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> _Reading | None:
-    """How stars are read; None where they say nothing."""
+    """How stars are read; None if they are not used."""
     if trace is None or not trace.has_stars:
         return None
     if theory is not None:
@@ -164,13 +177,13 @@ def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None)
 
 
 def _sound(ssh_map: SSHMap) -> list[tuple[int, int]]:
-    """The steps of a map at which it believes what was seen, and the dstate of each."""
+    """The steps whose observation the map believes, each with its dstate."""
     wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
     return [(t, label) for t, label in enumerate(ssh_map.labels) if t not in wrong]
 
 
 def _first_steps(ssh_map: SSHMap) -> dict[int, int]:
-    """For each dstate, the first step at which it was seen as it is."""
+    """For each dstate, the first step whose observation the map believes."""
     first: dict[int, int] = {}
     for t, label in _sound(ssh_map):
         first.setdefault(label, t)
@@ -178,7 +191,10 @@ def _first_steps(ssh_map: SSHMap) -> dict[int, int]:
 
 
 def _classes(trace: Trace, steps: Sequence[int]) -> dict[int, int]:
-    """For each of these steps a number. Steps with one view have the same number if their stars could be one, directly or by way of others."""
+    """A number for each of these steps.
+
+    Steps with one view share a number if their stars could be one, directly or through others.
+    """
     stars = {t: trace.steps[t].gateways or Star(()) for t in steps}
     groups: dict[object, list[list[int]]] = {}  # for each view
     for t in steps:
@@ -195,8 +211,11 @@ def _classes(trace: Trace, steps: Sequence[int]) -> dict[int, int]:
 class Machine:
     """What a map predicts from the current dstate on.
 
-    sights  what is seen in each state, as a number of Sights; states are numbered by how they are
-    reached, the current one is 0 ends    for each state, the state that each action leads to
+    States are numbered by how they are reached; the current one is 0.
+
+    Attributes:
+        sights: The number (of Sights) of what is seen in each state.
+        ends: For each state, the actions with the states that they lead to.
     """
 
     sights: tuple[int, ...]
@@ -204,7 +223,15 @@ class Machine:
 
 
 def links_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
-    """For each dstate the actions that were tried there, in the order of their names, and where they lead. Raises MapError where an action leads to two dstates."""
+    """For each dstate the actions that were tried there, by name, and where they lead.
+
+    Args:
+        ssh_map: The map.
+        number: The index of the map, for messages.
+
+    Raises:
+        MapError: An action leads to two dstates.
+    """
     found: dict[int, dict[str, int]] = {s.id: {} for s in ssh_map.dstates}
     for source, action, target in sorted(ssh_map.links):
         if found[source].setdefault(action, target) != target:
@@ -220,7 +247,7 @@ def links_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
 def with_ends(
     links: Mapping[int, Mapping[str, int]], ends: Sequence[tuple[int, str, int]]
 ) -> dict[int, dict[str, int]]:
-    """Links, and others beside them, in the order of the names of actions."""
+    """Add links to others, in the order of the names of actions."""
     found: dict[int, dict[str, int]] = {s: dict(tried) for s, tried in links.items()}
     for source, action, target in ends:
         found[source][action] = target
@@ -230,7 +257,7 @@ def with_ends(
 def machine_of(
     start: int, links: Mapping[int, Mapping[str, int]], sights: Sequence[int]
 ) -> tuple[Machine, tuple[int, ...]]:
-    """The machine of a map, and the dstate that each of its states is."""
+    """The machine of a map, and the dstate of each of its states."""
     number, reached = {start: 0}, [start]
     ends: list[tuple[tuple[str, int], ...]] = []
     for s in reached:
@@ -243,10 +270,11 @@ def machine_of(
 
 
 class Table:
-    """Machines as tables of numbers, for all of which an action is followed at once.
+    """Machines as arrays, so that an action is followed in all of them at once.
 
-    ends    (machines, states, actions): the state that an action leads to, or UNKNOWN
-    sights  (machines, states): what is seen there
+    Attributes:
+        ends: (machines, states, actions): the state that an action leads to, or UNKNOWN.
+        sights: (machines, states): the number of what is seen there.
     """
 
     def __init__(self, machines: Sequence[Machine], actions: Sequence[str]) -> None:
@@ -261,9 +289,15 @@ class Table:
                     self.ends[i, s, column[action]] = target
 
     def follow(self, group: Array, rows: Array, action: int) -> tuple[Array, Array]:
-        """Where an action leads from joint states, and what is seen there; UNKNOWN where a machine does not know it.
+        """Follow an action from joint states.
 
-        group  the machines, (m,);  rows  the joint states, (n, m)
+        Args:
+            group: The machines, shape (m,).
+            rows: The joint states, shape (n, m).
+            action: The number of the action.
+
+        Returns:
+            The joint states after it, and what is seen there; UNKNOWN if a machine lacks the link.
         """
         there = self.ends[group, rows, action]
         return there, np.where(there < 0, UNKNOWN, self.sights[group, there])
@@ -271,9 +305,12 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """The joint states that as many actions lead to, and no fewer, without any difference being seen.
+    """The joint states that are first reached after `depth` actions, without a visible difference.
 
-    rows  (n, m);  first  the number of the first row, counted over all layers
+    Attributes:
+        depth: The number of actions.
+        first: The number of the first row, counted over all layers.
+        rows: The joint states, shape (n, m).
     """
 
     depth: int
@@ -282,7 +319,7 @@ class Layer:
 
 
 class Walk:
-    """Follows links that all machines of a group know, as long as these see the same: breadth first, so by fewest actions.
+    """Follows links that all machines of a group know, breadth first, while they see the same.
 
     >>> blind = Machine((0, 0), ((("a", 1),), (("a", 0),)))
     >>> walk = Walk(Table([blind, blind], ["a"]), [0, 1], (0, 0), None)
@@ -295,9 +332,8 @@ class Walk:
     ) -> None:
         self.table, self.group, self._limits = table, np.array(group, np.int32), limits
         self._start = start
-        self._came: list[tuple[int, int]] = [
-            (0, 0)
-        ]  # for each row the row before it, and the action
+        # for each row the row before it, and the action
+        self._came: list[tuple[int, int]] = [(0, 0)]
 
     def layers(self) -> Iterator[Layer]:
         """The joint states, the nearest first."""
@@ -322,7 +358,12 @@ class Walk:
             )
 
     def moves(self, layer: Layer) -> Iterator[tuple[int, int, Array, Array]]:
-        """For parts of a layer and each action: the number of the part's first row, the action, where it leads, and what is seen there."""
+        """Follow each action from the joint states of a layer, part by part.
+
+        Yields:
+            The number of the part's first row, the action, the joint states after it, and what is
+            seen there.
+        """
         size = max(CHUNK // len(self.group), 1)
         for start in range(0, len(layer.rows), size):
             part = layer.rows[start : start + size]

@@ -1,8 +1,8 @@
 """Maps of one trace as arrays, so that thousands of them are compared in seconds.
 
-Steps that are one dstate in all maps are a *class*, and stand in the first step of it. Of each sort
-(dstates, places, paths, courses) the table has for each map and class the first class that is one
-with it: so the numbers that maps give to their dstates, places and paths play no part.
+Steps that are one dstate in all maps are a *class*, which its first step stands for. For each sort
+(dstates, places, paths, courses) the table has, for each map and class, the first class that is one
+with it. So the numbers that maps give to their dstates, places and paths do not matter.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
@@ -26,16 +26,17 @@ from ssh_abduction.solver import SORTS, Backbone, Shared, Sort
 
 Ints: TypeAlias = NDArray[np.int32]
 Bools: TypeAlias = NDArray[np.bool_]
-NONE = -1  # what stands for no place, path or course
+NONE = -1  # no place, path or course
 
 
 class Table:
     """Maps of one trace as arrays.
 
-    firsts   the first step of each class
-    classes  the class of each step
-    ones     for each sort that all maps have: for each map and class the first class that is one
-        with it, NONE where there is no place, path or course
+    Attributes:
+        firsts: The first step of each class.
+        classes: The class of each step.
+        ones: For each sort that all maps have, an array (maps, classes) with the first class that
+            is one with each class; NONE if it has no place, path or course.
     """
 
     def __init__(self, maps: Sequence[SSHMap]) -> None:
@@ -58,7 +59,7 @@ class Table:
             self.ones[sort] = np.array(rows, dtype=np.int32)
 
     def __len__(self) -> int:
-        """How many maps there are."""
+        """The number of maps."""
         return len(self.ones["dstates"])
 
     def steps_of(self, classes: Sequence[int]) -> tuple[int, ...]:
@@ -66,23 +67,28 @@ class Table:
         return tuple(np.flatnonzero(np.isin(self.classes, classes)).tolist())
 
     def variants(self, sort: Sort) -> int:
-        """How many different ones of a sort there are: how many labelings, for example."""
+        """The number of different labelings, placings, … of a sort."""
         return len(np.unique(self.ones[sort], axis=0))
 
     def heads(self, sort: Sort) -> Ints:
-        """For each class the first class that goes with it in every map: they are one in all maps, or have no place, path or course in the same ones."""
+        """For each class the first class that goes with it in every map.
+
+        Two classes go together if in all maps they are one, or both have no place, path or course.
+        """
         _, first, inverse = np.unique(
             self.ones[sort], axis=1, return_index=True, return_inverse=True
         )
         return first[inverse.reshape(-1)].astype(np.int32)
 
     def questions(self, sort: Sort) -> Iterator[tuple[int, int, Bools]]:
-        """Questions that tell maps apart: two classes, the earlier one first, and for each map whether they are one in it. Of a class with itself: whether it is
-        along a path (at a place) at all.
+        """Questions that tell maps apart.
 
-        Only such pairs are asked about in which the earlier class is the first one of its kind in
-        some map. That is enough: where two maps differ in what a class is one with, they differ in
-        the first such class.
+        Only pairs are asked about whose earlier class is the first of its kind in some map. That is
+        enough: if two maps differ in what a class is one with, they differ in the first such class.
+
+        Yields:
+            Two classes, the earlier first, and for each map whether they are one in it. If both are
+            the same class, whether it is along a path (at a place) at all.
         """
         ones = self.ones[sort]
         for c in np.flatnonzero((ones != ones[0]).any(axis=0)).tolist():
@@ -126,7 +132,7 @@ class Table:
 
 
 def _common_classes(labelings: Sequence[Ints]) -> Ints:
-    """Classes of steps that have one label in each labeling, numbered by first visit."""
+    """The classes of steps that have one label in each labeling, numbered by first visit."""
     classes = labelings[0].astype(np.int64)
     for labels in labelings[1:]:
         _, classes = np.unique(classes * (int(labels.max()) + 1) + labels, return_inverse=True)
@@ -137,7 +143,7 @@ def _common_classes(labelings: Sequence[Ints]) -> Ints:
 
 
 def _firsts_of(names: Sequence[Hashable]) -> Ints:
-    """For each name where it comes first; NONE for no name."""
+    """For each name the index where it comes first; NONE for no name."""
     first: dict[Hashable, int] = {}
     return np.array(
         [NONE if name is None else first.setdefault(name, i) for i, name in enumerate(names)],
