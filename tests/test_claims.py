@@ -72,20 +72,20 @@ def test_that_there_is_no_map_is_no_lie(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = {
-    "more maps than listed": ({"count": 5}, "count: expected 4, as so many maps are listed, got 5"),
+    "more maps than listed": ({"count": 5}, "count: expected 4, the number of maps listed, got 5"),
     "true is no number": (
         {"count": True},
-        "count: expected 4, as so many maps are listed, got True",
+        "count: expected 4, the number of maps listed, got True",
     ),
     "fewer maps than listed": (
         lambda d: d["maps"].pop(),
-        "count: expected 3, as so many maps are listed, got 4",
+        "count: expected 3, the number of maps listed, got 4",
     ),
     "a map twice": (
         lambda d: d["maps"].append(d["maps"][1]),
         "maps: expected each map once, got maps 2 and 5, which are the same",
     ),
-    "another trace": ({"steps": 22}, "steps: expected 23, as the trace has so many, got 22"),
+    "another trace": ({"steps": 22}, "steps: expected 23, the number of steps of the trace, got 22"),
     "a prefix longer than the trace": ({"prefix": 99}, "prefix: expected 0 to 23"),
     "a smaller cost": (
         lambda d: d["cost"].update(dstates=18),

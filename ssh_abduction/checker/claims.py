@@ -1,11 +1,12 @@
-"""Compares what a file of maps says of itself with the maps and the proof that are in it.
+"""Check the claims of a file of maps against its maps and its proof.
 
 >>> from ssh_abduction.checker.claims import false_claims
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> from ssh_abduction.theory.theory import Theory
 >>> one = SSHMap((0,), (DState(0, "a"),), ())
->>> false_claims({"status": "optimal", "count": 2, "bound": {"dstates": 1}}, [one], 1, Theory.causal(), 1)
-('count: expected 1, as so many maps are listed, got 2',)
+>>> answer = {"status": "optimal", "count": 2, "bound": {"dstates": 1}}
+>>> false_claims(answer, [one], 1, Theory.causal(), 1)
+('count: expected 1, the number of maps listed, got 2',)
 """
 
 from __future__ import annotations
@@ -19,25 +20,30 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.theory.theory import COUNTS, Theory
 
 STATUSES = ("optimal", "feasible", "unsatisfiable", "unknown")
+# Why a search may have been stopped.
 REASONS = (
     "time limit",
     "memory limit",
     "interrupted",
     "maps limit",
     "no proof",
-)  # why a search may have been stopped
+)
 
 
 def false_claims(
     answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int
 ) -> tuple[str, ...]:
-    """What is wrong with the claims of an answer, a sentence each. None of the claims is taken for granted.
+    """Find what is wrong with the claims of an answer. No claim is taken for granted.
 
-    answer  as `solve --json` prints it (docs/reference/formats.md)
-    maps    the maps that it lists
-    steps   how many steps the trace has
-    theory  the theory that the answer is of, resolved
-    proven  the number of dstates that its certificate proves, if clingo's part in it is believed
+    Args:
+        answer: The answer as `solve --json` prints it (docs/reference/formats.md).
+        maps: The maps that it lists.
+        steps: The number of steps of the trace.
+        theory: The theory of the answer, resolved.
+        proven: The number of dstates that its certificate proves, if clingo's part is believed.
+
+    Returns:
+        A sentence for each false claim.
     """
     claims = _Claims(answer, maps, steps, theory, proven)
     return tuple(
@@ -50,7 +56,19 @@ def false_claims(
 def contradictions(
     answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory
 ) -> Iterator[str]:
-    """In what an answer contradicts itself, a sentence each. Its certificate is taken for granted, as only the trace could tell. Parameters as of `false_claims`."""
+    """Find where an answer contradicts itself.
+
+    Its certificate is taken for granted, as it takes the trace to check it.
+
+    Args:
+        answer: The answer, as for `false_claims`.
+        maps: The maps that it lists.
+        steps: The number of steps of the trace.
+        theory: The theory of the answer, resolved.
+
+    Yields:
+        A sentence for each contradiction.
+    """
     claims = _Claims(answer, maps, steps, theory, sys.maxsize)
     for check in (
         claims.sizes,
@@ -62,7 +80,7 @@ def contradictions(
 
 
 class _Claims:
-    """The claims of an answer. Each method yields what is wrong with some of them."""
+    """The claims of an answer. Each method yields a sentence for each false claim."""
 
     def __init__(
         self,
@@ -87,12 +105,21 @@ class _Claims:
         """The claimed numbers of steps and maps are right."""
         listed = len(self.maps)
         if "count" in self.answer and not _is(self.answer["count"], listed):
-            yield f"count: expected {listed}, as so many maps are listed, got {brief(self.answer['count'])}"
+            yield (
+                f"count: expected {listed}, the number of maps listed, got "
+                f"{brief(self.answer['count'])}"
+            )
         if "steps" in self.answer and not _is(self.answer["steps"], self.steps):
-            yield f"steps: expected {self.steps}, as the trace has so many, got {brief(self.answer['steps'])}"
+            yield (
+                f"steps: expected {self.steps}, the number of steps of the trace, got "
+                f"{brief(self.answer['steps'])}"
+            )
         prefix = self.answer.get("prefix", 0)
         if not is_whole(prefix) or not 0 <= prefix <= self.steps:
-            yield f"prefix: expected 0 to {self.steps}, as the trace has so many steps, got {brief(prefix)}"
+            yield (
+                f"prefix: expected 0 to {self.steps}, the number of steps of the trace, got "
+                f"{brief(prefix)}"
+            )
 
     def twice(self) -> Iterator[str]:
         """Each map is listed once."""
@@ -100,10 +127,13 @@ class _Claims:
         for i, ssh_map in enumerate(self.maps):
             first = seen.setdefault(ssh_map.renumbered(), i)
             if first < i:
-                yield f"maps: expected each map once, got maps {first + 1} and {i + 1}, which are the same up to renaming"
+                yield (
+                    f"maps: expected each map once, got maps {first + 1} and {i + 1}, which are "
+                    "the same up to renaming"
+                )
 
     def status(self) -> Iterator[str]:
-        """The status, whether the list is complete, and why the search ended fit together and fit the maps."""
+        """The status, `complete` and `stopped` fit each other and the maps."""
         status, complete, stopped = (
             self.answer.get(name) for name in ("status", "complete", "stopped")
         )
@@ -128,7 +158,9 @@ class _Claims:
         elif complete and status in ("feasible", "unknown"):
             yield f"complete: expected false, as the status is {status}, got true"
         elif complete and self.maps and stopped is not None:
-            yield f"complete: expected false, as the search was stopped ({brief(stopped)}), got true"
+            yield (
+                f"complete: expected false, as the search was stopped ({brief(stopped)}), got true"
+            )
         elif not complete and status == "unsatisfiable":
             yield "complete: expected true, as the status is unsatisfiable, got false"
 
@@ -154,17 +186,22 @@ class _Claims:
         for i in range(len(self.counts)):
             if (here := self._preferred(i)) != best:
                 preferred = ", ".join(self.theory.priorities)
-                yield f"maps: expected equal numbers of {preferred}, as minimal maps have, got {best} in map 1 and {here} in map {i + 1}"
+                yield (
+                    f"maps: expected equal numbers of {preferred}, as minimal maps have, got "
+                    f"{best} in map 1 and {here} in map {i + 1}"
+                )
 
     def _preferred(self, i: int) -> list[int]:
-        """What a map has of what the theory prefers, first to last; nothing, where there is no such map."""
+        """The counts of a map in the order of preference; empty if there is no such map."""
         return [
             counts[name] for counts in self.counts[i : i + 1] for name in self.theory.priorities
         ]
 
     def _costs_within(self, within: Any) -> Iterator[str]:
-        """Maps come by their number of dstates, or of what else the theory prefers first, excuses aside: none has too many, those that have equally many
-        are as good as each other, and each map and each level costs what is claimed.
+        """The maps are sorted by level, and each map and each level costs what is claimed.
+
+        A level is the number of dstates, or of what else the theory prefers first, without excuses.
+        No level is above the claimed limit, and maps of one level are equally good.
         """
         counted = next((name for name in self.theory.priorities if name != "excuses"), None)
         if not is_whole(within) or within < 0:
@@ -174,13 +211,19 @@ class _Claims:
             last = self.counts[max(i - 1, 0)]
             most = self.counts[0][counted] + within if counted else 0
             if counted and not last[counted] <= counts[counted] <= most:
-                yield f"maps: expected {last[counted]} to {most} {counted} in map {i + 1}, as within is {within}, got {counts[counted]}"
+                yield (
+                    f"maps: expected {last[counted]} to {most} {counted} in map {i + 1}, as within "
+                    f"is {within}, got {counts[counted]}"
+                )
             elif (not counted or last[counted] == counts[counted]) and self._preferred(
                 i
             ) != self._preferred(max(i - 1, 0)):
                 best, here = self._preferred(i - 1), self._preferred(i)
                 preferred = ", ".join(self.theory.priorities)
-                yield f"maps: expected equal numbers of {preferred}, as those of one level have, got {best} in map {i} and {here} in map {i + 1}"
+                yield (
+                    f"maps: expected equal numbers of {preferred}, as those of one level have, got "
+                    f"{best} in map {i} and {here} in map {i + 1}"
+                )
         shown = [{k: v for k, v in counts.items() if v or k != "excuses"} for counts in self.counts]
         yield from self._costs_of_each(shown)
         begins = [
@@ -192,19 +235,29 @@ class _Claims:
             for begin, end in zip(begins, ends, strict=False)
         ]
         if "levels" in self.answer and self.answer["levels"] != levels:
-            yield f"levels: expected {brief(levels)}, as the maps have these, got {brief(self.answer['levels'])}"
+            yield (
+                f"levels: expected {brief(levels)}, as the maps have these, got "
+                f"{brief(self.answer['levels'])}"
+            )
 
     def _costs_of_each(self, shown: Sequence[Mapping[str, int]]) -> Iterator[str]:
-        """Each map costs what it is said to cost."""
+        """Each map has the cost that is claimed for it."""
         listed = self.answer.get("maps")
         for i, (said, counts) in enumerate(
             zip(listed if isinstance(listed, Sequence) else (), shown, strict=False)
         ):
             if isinstance(said, Mapping) and said.get("cost", counts) != counts:
-                yield f"maps[{i}].cost: expected {_text(counts)}, as the map has these, got {_text(said['cost'])}"
+                yield (
+                    f"maps[{i}].cost: expected {_text(counts)}, as the map has these, got "
+                    f"{_text(said['cost'])}"
+                )
 
     def _least(self, cost: Any) -> dict[str, int]:
-        """The counts of the first map. Where axioms are left out, clingo may count more than the map can show, so a larger claim is accepted."""
+        """The counts of the first map.
+
+        If axioms are left out, clingo may count more than the map shows. Then a larger claim is
+        accepted.
+        """
         shown = self.counts[0]
         if not self.theory.without or not isinstance(cost, Mapping):
             return shown
@@ -216,7 +269,11 @@ class _Claims:
         return shown | more
 
     def bound(self) -> Iterator[str]:
-        """No map is below a claimed bound, the certificate proves the bound on dstates, and where the status is optimal the bound is the cost."""
+        """The claimed bounds hold.
+
+        No map is below a bound, the certificate proves the bound on dstates, and the bound is the
+        cost if the status is optimal.
+        """
         bound = self.answer.get("bound", {})
         if not isinstance(bound, Mapping) or not all(
             name in COUNTS and is_whole(value) and value >= 0 for name, value in bound.items()
@@ -233,9 +290,15 @@ class _Claims:
                 yield f"bound: expected none of {name}, as {preferred}, got {value}"
             below = [i for i, counts in enumerate(self.counts) if counts[name] < value]
             if below and not self.theory.without:
-                yield f"bound: expected at most {self.counts[below[0]][name]} {name}, as map {below[0] + 1} has no more, got {value}"
+                yield (
+                    f"bound: expected at most {self.counts[below[0]][name]} {name}, as map "
+                    f"{below[0] + 1} has no more, got {value}"
+                )
         if bound.get("dstates", 0) > self.proven:
-            yield f"bound: expected at most {self.proven} dstates, as the certificate proves no more, got {bound['dstates']}"
+            yield (
+                f"bound: expected at most {self.proven} dstates, as the certificate proves no "
+                f"more, got {bound['dstates']}"
+            )
         if (
             self.is_optimal
             and self.maps
@@ -246,7 +309,10 @@ class _Claims:
             least = self.counts[0][self.first]
             if bound.get(self.first, 0) < least:
                 got = bound.get(self.first, "none")
-                yield f"bound: expected {least} {self.first}, the cost of map 1, as the status is optimal, got {got}"
+                yield (
+                    f"bound: expected {least} {self.first}, the cost of map 1, as the status is "
+                    f"optimal, got {got}"
+                )
 
 
 def _counts(ssh_map: SSHMap) -> dict[str, int]:

@@ -1,17 +1,12 @@
-"""Whether the returns of a map agree with the displacements of its trace: the judge's own account of the axiom `one_pose`.
+"""Whether the returns of a map agree with the displacements of its trace (axiom `one_pose`).
 
-It follows the error of the robot's pose as a Kalman filter predicts it. Let E(t) be the error of the pose by dead reckoning at step t, in the frame of the
-first step, and V(t) its covariance. What was wrong at step i is wrong at a later step j, too, turned about where the robot was:
+How the error of the pose grows is computed in `dead_reckoning`.
 
-    F(j, i) = [[1, S (p(j) - p(i))], [0, 1]]        with S a quarter turn, and p where the robot was.
-
-So the loop from i to j closes with the error E(j) - F(j, i) E(i). Its covariance is V(j) - F(j, i) V(i) F(j, i)', as what is new at each step is independent of what
-was before; and two loops have in common what was new between the later of their beginnings b and the earlier of their ends e. A scale that is wrong and a
-heading that drifts are carried along as two more errors, which never change.
-
-Most sets of two are passed by a bound. Let z and y be the chi-squares of two returns alone. If what both have in common is a share s of what there is of the first
-one, in any direction, at most, then together they have a chi-square of (z + y) / (1 - sqrt(s)) at most. The trace of the share is a bound on it, and is the difference
-of two values of a table; so is the share itself, and the square root of the trace of its square is another bound.
+A bound passes most sets of two returns. Let z and y be the chi-squares of the returns alone. If the
+noise that both share is at most a share s of the covariance of the first one, in any direction,
+then the chi-square of both is at most (z + y) / (1 - sqrt(s)). The trace of the share bounds s, and
+it is the difference of two values of a table. So is the share itself, and the square root of the
+trace of its square is another bound.
 """
 
 from __future__ import annotations
@@ -20,42 +15,45 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammainccinv
 
+from ssh_abduction.checker.dead_reckoning import FEW, Array, Drifts, ErrorFilter
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.theory import Theory
 
-Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]
-Return: TypeAlias = tuple[
-    int, int, int
-]  # two steps, and the degrees of freedom: 2 at one place, 3 at one dstate
-_Found: TypeAlias = tuple[
-    tuple[Return, ...], float, float
-]  # returns that are refused, their chi-square and the threshold
+# Two steps, and the degrees of freedom: 2 at one place, 3 at one dstate.
+Return: TypeAlias = tuple[int, int, int]
+# Returns that are refused, their chi-square, and the threshold.
+_Found: TypeAlias = tuple[tuple[Return, ...], float, float]
 
-# What docs/explanation/theory.md says of one_pose: the errors of heading that are reckoned with, the uncertainty at which a heading is lost, the steps in which a drift is tried and how far.
-SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
-# So many sets are worked on in one go.
+# The number of sets that numpy works on at once.
 AT_A_TIME = 50_000
-# Of a map with more sets of two returns that the bound does not pass so many are looked at, which takes a second or two.
+# If the bound does not pass more sets of two returns than this, only so many are checked, evenly
+# spread. That takes a second or two.
 MOST_SETS = 300_000
-# A bound passes a set only if it is this far from not doing so, as numbers are rounded.
+# A bound has to pass a set by this margin, because numbers are rounded.
 MARGIN = 1e-3
-# Between two looks at the clock so many steps or returns are read, which takes some milliseconds.
-FEW = 64
 
 
 @dataclass(frozen=True)
 class Closing:
-    """How far off a loop closes by dead reckoning, with standard deviations, in metres and degrees, and how many metres it is long."""
+    """How far off a loop closes by dead reckoning.
+
+    Attributes:
+        way: The length of the loop in metres.
+        size: The distance in metres.
+        size_sigma: Its standard deviation.
+        turned: The angle in degrees.
+        turned_sigma: Its standard deviation.
+    """
 
     way: float
     size: float
@@ -66,7 +64,14 @@ class Closing:
 
 @dataclass(frozen=True)
 class Refused:
-    """Returns of a map that are refused, alone or two together: their steps, how far off they close, and the chi-square of that and its threshold."""
+    """One return or two returns of a map that displacements refuse.
+
+    Attributes:
+        returns: The steps and degrees of freedom of each.
+        closings: How far off each closes.
+        square: The chi-square of all.
+        most: The threshold.
+    """
 
     returns: tuple[Return, ...]
     closings: tuple[Closing, ...]
@@ -74,7 +79,7 @@ class Refused:
     most: float
 
     def __str__(self) -> str:
-        """In words: how far apart the steps of one return are, or how far off the loops of two close."""
+        """How far apart the steps of one return are, or how far off the loops of two close."""
         if len(self.closings) == 2:
             ways, sizes = (
                 " and ".join(f"{value:{form}} m" for value in values)
@@ -95,20 +100,25 @@ class Refused:
 
 
 def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Refused]:
-    """The return of a map that is refused most clearly, and the set of two, if there are any.
+    """Find the return that is refused most clearly, and the pair of returns.
 
-    trace   the whole trace
-    theory  resolved, so that it says how many returns may be true
+    Args:
+        trace: The whole trace.
+        ssh_map: A map of it.
+        theory: The theory, resolved, so that it says how many returns may be true.
+
+    Yields:
+        At most one single return, then at most one pair.
     """
     if not trace.has_displacements:
         return
-    drifts = _Drifts(trace)
+    drifts = Drifts(trace)
     for returns, square, most in _refused(trace, ssh_map, theory, drifts):
         yield Refused(returns, tuple(_closing(trace, i, j) for i, j, _ in returns), square, most)
 
 
-def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: _Drifts) -> Iterator[_Found]:
-    """What is refused alone comes first: it is found fast, and a caller may need no more."""
+def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts) -> Iterator[_Found]:
+    """Single returns come first: they are found fast, and a caller may need no more."""
     yield from _refused_alone(list(_returns(trace, ssh_map, theory, drifts)), drifts, theory)
     if theory.joint > 1:
         yield from _refused_together(
@@ -117,9 +127,9 @@ def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: _Drifts) -> 
 
 
 def _closing(trace: Trace, first: int, last: int) -> Closing:
-    """How far off a loop closes if the heading drifts by nothing; that it may drift is part of the uncertainty."""
+    """How far off a loop closes without drift; the drift is part of the uncertainty."""
     odometry = trace.odometry or Odometry()
-    filtered = _Filter(trace.prefix(last + 1), odometry, 0.0, odometry.bend)
+    filtered = ErrorFilter(trace.prefix(last + 1), odometry, 0.0, odometry.bend)
     off, covariance = filtered.closing(first, last), filtered.covariance(first, last)
     size = float(np.hypot(*off[:2]))
     ahead = off[:2] / size if size else np.array([1.0, 0.0])
@@ -136,164 +146,18 @@ def _closing(trace: Trace, first: int, last: int) -> Closing:
     )
 
 
-class _Filter:
-    """Poses by dead reckoning, and the covariance of their errors, of pose (3), scale and drift."""
-
-    def __init__(self, trace: Trace, odometry: Odometry, bend: float, drift: float) -> None:
-        size = len(trace)
-        self.pose = np.zeros((size, 3))
-        self.white = np.zeros((size, 3, 3))  # covariance of the error of the pose by noise alone
-        self.repeated = np.zeros(
-            (size, 3, 2)
-        )  # how the pose moves with the scale, and with the drift
-        self.broken = np.zeros(size, dtype=int)  # displacements that are missing so far
-        self.sigma = np.array([odometry.scale, drift])
-        self.at_ends = (
-            2 * np.diag([odometry.offset, odometry.offset, odometry.facing]) ** 2
-        )  # where a dstate is taken to be, at both ends of a loop
-        for t in range(1, size):
-            if t % FEW == 0:
-                look_at_clock()
-            x, y, heading = self.pose[t - 1]
-            displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
-            self.broken[t] = self.broken[t - 1] + (displacement is None)
-            if displacement is None or covariance is None:
-                self.pose[t], self.white[t], self.repeated[t] = (
-                    self.pose[t - 1],
-                    self.white[t - 1],
-                    self.repeated[t - 1],
-                )
-                continue
-            dx, dy, turned = displacement
-            way = math.hypot(dx, dy)
-            cos, sin = math.cos(heading - bend * way / 2), math.sin(heading - bend * way / 2)
-            moved = np.array([cos * dx - sin * dy, sin * dx + cos * dy])
-            self.pose[t] = x + moved[0], y + moved[1], heading + turned - bend * way
-            onward = _onward(moved)
-            cos, sin = math.cos(heading), math.sin(heading)
-            turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-            self.white[t] = (
-                onward @ self.white[t - 1] @ onward.T + turn @ np.array(covariance) @ turn.T
-            )
-            new = np.array(
-                [[moved[0], -moved[1] * way / 2], [moved[1], moved[0] * way / 2], [0.0, way]]
-            )
-            self.repeated[t] = onward @ self.repeated[t - 1] + new
-
-    def onward(self, first: Any, last: Any) -> Array:
-        """F(last, first), m x 3 x 3."""
-        return _onward(self.pose[last, :2] - self.pose[first, :2])
-
-    def since(self, first: Any, last: Any) -> Array:
-        """The covariance, by noise alone, of what went wrong between two steps."""
-        onward = self.onward(first, last)
-        covariance: Array = self.white[last] - onward @ self.white[first] @ onward.swapaxes(-1, -2)
-        return covariance
-
-    def new_until(self, end: int) -> Array:
-        """The covariance, by noise alone, that what went wrong up to each step has at step `end`, m x 9."""
-        steps = np.arange(end + 1)
-        onward = self.onward(steps, np.full(end + 1, end))
-        covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(
-            -1, 9
-        )
-        return covariance
-
-    def repeated_since(self, first: Any, last: Any) -> Array:
-        """How a loop moves with the scale and the drift, times the standard deviation of these: m x 3 x 2."""
-        moved: Array = (
-            self.repeated[last] - self.onward(first, last) @ self.repeated[first]
-        ) * self.sigma
-        return moved
-
-    def covariance(self, first: Any, last: Any) -> Array:
-        """The covariance of closings, with what is added as errors of heading are no longer small."""
-        white, repeated = self.since(first, last), self.repeated_since(first, last)
-        heading = self.lost(first, last)
-        moved = self._moved_by_heading(first, last) + (repeated[..., :2, 1] ** 2).sum(-1)
-        bent = (SIGMAS / 2) ** 2 * heading * moved + ROUNDED**2
-        added = (
-            bent[..., None, None] * np.diag([1.0, 1.0, 0.0])
-            + ROUNDED**2 * np.diag([0.0, 0.0, 1.0])
-            + self.at_ends
-        )
-        total: Array = white + repeated @ repeated.swapaxes(-1, -2) + added
-        return total
-
-    def lost(self, first: Any, last: Any) -> Array:
-        """The variance of the heading at the end of loops."""
-        variance: Array = (
-            self.since(first, last)[..., 2, 2] + self.repeated_since(first, last)[..., 2, 1] ** 2
-        )
-        return variance
-
-    def _moved_by_heading(self, first: Any, last: Any) -> Array:
-        """The variance of the end of loops that comes of the noise of headings: the sum, over the steps of a loop, of that noise times the squared distance to the end."""
-        angle = np.diff(self.white[:, 2, 2], prepend=0.0)
-        x, y = self.pose[:, 0], self.pose[:, 1]
-        sums = [np.cumsum(angle * factor) for factor in (np.ones_like(x), x, y, x * x + y * y)]
-        one, by_x, by_y, square = (s[last] - s[first] for s in sums)
-        moved: Array = np.maximum(
-            square - 2 * (by_x * x[last] + by_y * y[last]) + one * (x[last] ** 2 + y[last] ** 2),
-            0.0,
-        )
-        return moved
-
-    def is_known(self, first: Any, last: Any) -> NDArray[np.bool_]:
-        """Whether loops have all their displacements, and the heading is not lost along any loop that ends where they do and begins later."""
-        known: NDArray[np.bool_] = (self.broken[first] == self.broken[last]) & (
-            self.lost(first, last) <= LOST**2
-        )
-        return known
-
-    def closing(self, first: Any, last: Any) -> Array:
-        """How far off loops close, m x 3."""
-        off: Array = self.pose[last] - self.pose[first]
-        off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
-        return off
-
-
-def _onward(moved: Array) -> Array:
-    """What an error of the pose becomes once the robot has moved on by so much, m x 2."""
-    onward = np.zeros((*moved.shape[:-1], 3, 3))
-    onward[..., range(3), range(3)] = 1.0
-    onward[..., 0, 2], onward[..., 1, 2] = -moved[..., 1], moved[..., 0]
-    return onward
-
-
-class _Drifts:
-    """The poses for each drift of the heading, and the chi-square of that drift, no drift first. Each is made when it is first asked for."""
-
-    def __init__(self, trace: Trace) -> None:
-        self._trace, self._odometry = trace, trace.odometry or Odometry()
-        self._made: dict[int, _Filter] = {}
-
-    @property
-    def none(self) -> _Filter:
-        """The poses without a drift."""
-        return self._filter(0)
-
-    def _filter(self, number: int) -> _Filter:
-        step = self._odometry.bend / BENDS_A_SIGMA
-        if number not in self._made:
-            self._made[number] = _Filter(self._trace, self._odometry, number * step, step / 2)
-        return self._made[number]
-
-    def __iter__(self) -> Iterator[tuple[_Filter, float]]:
-        numbers = (
-            range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1)
-            if self._odometry.bend
-            else [0]
-        )
-        for n in sorted(numbers, key=lambda n: (abs(n), n)):
-            look_at_clock()
-            yield self._filter(n), max(abs(n) - 0.5, 0.0) ** 2 / BENDS_A_SIGMA**2
-
-
 def _returns(
-    trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: _Drifts, of_arrivals: bool = False
+    trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts, of_arrivals: bool = False
 ) -> Iterator[Return]:
-    """The returns of a map about which displacements say something; all of them, or those between the first steps of visits."""
+    """The returns of a map that displacements say something about.
+
+    Args:
+        trace: The trace.
+        ssh_map: A map of it.
+        theory: The theory, resolved.
+        drifts: The poses.
+        of_arrivals: Whether to give only the returns between first steps of visits.
+    """
     place = {s.id: s.place for s in ssh_map.dstates}
     size = min(len(trace), len(ssh_map.labels))
     labels = ssh_map.labels[:size]
@@ -324,7 +188,8 @@ def _most(theory: Theory, freedom: int, together: bool) -> float:
     return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
 
-def _refused_alone(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -> Iterator[_Found]:
+def _refused_alone(returns: Sequence[Return], drifts: Drifts, theory: Theory) -> Iterator[_Found]:
+    """The single return that is refused most clearly."""
     for freedom in (2, 3) if returns else ():
         rows = np.array([r for r in returns if r[2] == freedom], dtype=int).reshape(-1, 3)
         most, least = _most(theory, freedom, together=False), np.full(len(rows), np.inf)
@@ -346,9 +211,12 @@ def _refused_alone(returns: Sequence[Return], drifts: _Drifts, theory: Theory) -
 
 
 def _refused_together(
-    returns: Sequence[Return], drifts: _Drifts, theory: Theory
+    returns: Sequence[Return], drifts: Drifts, theory: Theory
 ) -> Iterator[_Found]:
-    """The set of two that is refused most clearly. Of more than MOST_SETS sets that the bound does not pass, as many are looked at, evenly spread."""
+    """The pair of returns that is refused most clearly.
+
+    If the bound does not pass more than MOST_SETS pairs, as many are checked, evenly spread.
+    """
     if len(returns) < 2:
         return
     rows = np.array(sorted(returns, key=lambda r: r[1]), dtype=int).reshape(-1, 3)
@@ -376,11 +244,13 @@ def _refused_together(
         yield worst
 
 
-def _sets(rows: Steps, filtered: _Filter, most: float) -> Iterator[tuple[Steps, Steps]]:
-    """The sets of two rows whose loops share displacements and that the bound does not pass, in portions.
+def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Steps, Steps]]:
+    """The pairs of rows that share displacements and that the bound does not pass, in portions.
 
-    rows  by last step
-    most  the least chi-square at which a set may be refused
+    Args:
+        filtered: The poses.
+        rows: The returns, by last step.
+        most: The least chi-square at which a pair may be refused.
     """
     alone = _Alone(filtered, rows)
     found = []
@@ -396,9 +266,15 @@ def _sets(rows: Steps, filtered: _Filter, most: float) -> Iterator[tuple[Steps, 
 
 
 class _Alone:
-    """Of each row alone: the inverse of its covariance (m x 9), its chi-square, and what errors that repeat contribute to the covariance (m x 9)."""
+    """Values of each row alone.
 
-    def __init__(self, filtered: _Filter, rows: Steps) -> None:
+    Attributes:
+        inverse: The inverse of its covariance, m x 9.
+        square: Its chi-square, m.
+        repeated: The part of scale and drift in its covariance, m x 9.
+    """
+
+    def __init__(self, filtered: ErrorFilter, rows: Steps) -> None:
         first, last = rows[:, 0], rows[:, 1]
         places = rows[:, 2] == 2
         off, covariance, repeated = (
@@ -409,7 +285,7 @@ class _Alone:
         covariance[places, 2, :] = covariance[places, :, 2] = 0.0
         covariance[places, 2, 2] = 1.0
         inverse = np.linalg.inv(covariance)
-        inverse[places, 2, 2] = 0.0  # the heading of a return to a place is not asked for
+        inverse[places, 2, 2] = 0.0  # the heading of a return to a place does not count
         self.square = np.einsum("mi,mij,mj->m", off, inverse, off)
         self.inverse, self.repeated = (
             inverse.reshape(-1, 9),
@@ -418,9 +294,9 @@ class _Alone:
 
 
 def _unsafe(
-    filtered: _Filter, rows: Steps, alone: _Alone, end: int, most: float
+    filtered: ErrorFilter, rows: Steps, alone: _Alone, end: int, most: float
 ) -> tuple[Steps, Steps]:
-    """The sets of a row that ends at a step and another one that ends no later, if the bound does not pass them."""
+    """The pairs of a row that ends at a step with earlier rows, unless the bound passes them."""
     later = np.arange(*np.searchsorted(rows[:, 1], [end, end + 1]))
     earlier = np.arange(
         np.searchsorted(rows[:, 1], rows[later, 0].min(), side="right"), later[-1] + 1
@@ -446,14 +322,20 @@ def _unsafe(
 
 
 def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
-    """Whether sets are not refused, by a bound on the share that both rows have in common, and the sum of their chi-squares."""
+    """Whether the bound passes pairs.
+
+    Args:
+        share: A bound on the share of the covariance that both rows have in common.
+        squares: The sum of their chi-squares.
+        most: The least chi-square at which a pair may be refused.
+    """
     left = 1 - squares / most
     safe: NDArray[np.bool_] = (left > 0) & (share + MARGIN <= left**2)
     return safe
 
 
-def _square_together(filtered: _Filter, rows: Steps, here: Steps, others: Steps) -> Array:
-    """The chi-square of rows together with other rows; 0 where nothing is known of one of the two."""
+def _square_together(filtered: ErrorFilter, rows: Steps, here: Steps, others: Steps) -> Array:
+    """The chi-square of pairs of rows; 0 if one of them is not known."""
     m = len(others)
     begin, end = (
         np.maximum(rows[others, 0], rows[here, 0]),
@@ -474,9 +356,8 @@ def _square_together(filtered: _Filter, rows: Steps, here: Steps, others: Steps)
         off[:, part] = filtered.closing(rows[which, 0], rows[which, 1])
         joint[:, part, part] = filtered.covariance(rows[which, 0], rows[which, 1])
     joint[:, :3, 3:], joint[:, 3:, :3] = mixed, mixed.swapaxes(1, 2)
-    for k, which in enumerate(
-        (here, others)
-    ):  # the heading of a return to a place is not asked for
+    # the heading of a return to a place does not count
+    for k, which in enumerate((here, others)):
         free = rows[which, 2] == 2
         off[free, 3 * k + 2] = 0.0
         joint[free, 3 * k + 2, :] = joint[free, :, 3 * k + 2] = 0.0
@@ -489,11 +370,12 @@ def _square_together(filtered: _Filter, rows: Steps, here: Steps, others: Steps)
 
 
 def _square(off: Array, covariance: Array) -> Array:
+    """The chi-squares of closings."""
     square: Array = np.einsum("mi,mi->m", off, np.linalg.solve(covariance, off[..., None])[..., 0])
     return square
 
 
 def returns_row(row: Steps) -> Return:
-    """A return from its row."""
+    """The return of a row."""
     first, last, freedom = map(int, row)
     return first, last, freedom

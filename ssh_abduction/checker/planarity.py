@@ -1,4 +1,4 @@
-"""Judges whether the edges of a map can be drawn in the plane without a crossing.
+"""Whether the edges of a map can be drawn in the plane without a crossing.
 
 >>> there_back_and_there = [(0, 1), (2, 3), (4, 5)]
 >>> edges = Edges(there_back_and_there, [], {0: 0, 1: 1, 2: 1, 3: 0, 4: 0, 5: 1})
@@ -7,10 +7,13 @@ True
 >>> edges.can_be_drawn_by({0: 1, 1: 1, 2: 2, 3: 2, 4: 3, 5: 2})
 False
 
-A travel leads from the arm ahead of one dstate to the arm behind another one. Arms lie around a place in some order, and some of them may be one gateway. Where places
-have frames this module makes all headings that turns and stars leave open, and tries them, place by place: with the right ones each gateway is joined to one
-other, and V - E + F = 2 for each connected part (Heffter, Edmonds; see Mohar & Thomassen, Graphs on Surfaces, 2001). Without frames it makes the orders that
-sides leave open, and shares with the evidence what seeks a drawing with them (theory/drawing.py), which the tests compare with networkx and with a brute force.
+A travel leads from the arm ahead of one dstate to the arm behind another one. Arms lie around a
+place in some order, and some of them may be one gateway. If places have frames, this module lists
+all headings that turns and stars allow, and tries them place by place. With the right ones each
+gateway is joined to one other, and V - E + F = 2 for each connected part (Heffter, Edmonds; see
+Mohar & Thomassen, Graphs on Surfaces, 2001). Without frames it lists the orders that sides allow.
+The search for a drawing with these orders is shared with the evidence (`theory/planarity.py`); the
+tests compare it with networkx and with a brute force.
 """
 
 from __future__ import annotations
@@ -23,10 +26,10 @@ from ssh_abduction.data.star import Openings
 from ssh_abduction.runtime.clock import each_looking, look_at_clock
 from ssh_abduction.theory.planarity import can_be_drawn
 
-Arm: TypeAlias = tuple[int, int]  # of a dstate, ahead (1) or behind (-1)
-Option: TypeAlias = Mapping[
-    Arm, int
-]  # the position of each arm around its place, clockwise; those of one gateway have one
+# A dstate, and 1 (ahead) or -1 (behind).
+Arm: TypeAlias = tuple[int, int]
+# The clockwise position of each arm around its place. Arms of one gateway share a position.
+Option: TypeAlias = Mapping[Arm, int]
 
 QUARTERS = {"right": 1, "around": 2, "left": 3}
 
@@ -34,9 +37,11 @@ QUARTERS = {"right": 1, "around": 2, "left": 3}
 class Edges:
     """The travels and turns of a map.
 
-    travels   from a dstate to a dstate
-    turns     a dstate, which way (right, left, around), and the dstate that is faced then; turns between places tell nothing
-    place_of  the place of each dstate
+    Args:
+        travels: Pairs of dstates.
+        turns: A dstate, the way (right, left, around), and the dstate that is faced then. Turns
+            between places are ignored.
+        place_of: The place of each dstate.
     """
 
     def __init__(
@@ -54,7 +59,11 @@ class Edges:
             self._at[p].append(s)
 
     def can_be_drawn_by(self, headings: Mapping[int, int]) -> bool:
-        """Whether these slots of a frame of four, one for each dstate, make a drawing without a crossing."""
+        """Whether headings make a drawing without a crossing.
+
+        Args:
+            headings: The slot, 0 to 3, that each dstate faces.
+        """
         return self._is_drawing(
             {(s, side): (headings[s] + (1 - side)) % 4 for s in self.place_of for side in (1, -1)}
         )
@@ -64,9 +73,10 @@ class Edges:
     ) -> bool:
         """Whether some headings make such a drawing.
 
-        stars     seen at each dstate; those at one place agree in its frame
-        turned    turns rotate the heading
-        distinct  no two dstates face one slot
+        Args:
+            stars: The stars seen at each dstate. Those at one place agree in its frame.
+            turned: Whether turns rotate the heading.
+            distinct: Whether no two dstates face one slot.
         """
         options: list[list[Option]] = []
         for here in self._at.values():
@@ -108,9 +118,10 @@ class Edges:
         return self._some_option_draws(options)
 
     def can_be_drawn(self, *, crossing: bool) -> bool:
-        """Whether some orders of gateways make such a drawing, where turns tell no more than sides.
+        """Whether some orders of gateways make such a drawing, if turns show sides only.
 
-        crossing  a turn leads from one edge to another that crosses it, rather than to a branch of it
+        Args:
+            crossing: Whether a turn leads to an edge that crosses this one, not only to a branch.
         """
         one = self._gateways()
         if one is None:
@@ -126,9 +137,8 @@ class Edges:
             - at_edge
         ):
             at_edge |= more
-        told: dict[int, list[list[Arm]]] = defaultdict(
-            list
-        )  # gateways of each place that are met one after another, clockwise
+        # gateways of each place that follow each other clockwise
+        told: dict[int, list[list[Arm]]] = defaultdict(list)
         for s, turn, t in self.turns:
             if turn != "around" and {s, t} <= at_edge:
                 side = 1 if turn == "right" else -1
@@ -157,7 +167,10 @@ class Edges:
         )
 
     def _gateways(self) -> dict[Arm, Arm] | None:
-        """For each arm, one that stands for its gateway: who turns around faces what was behind, and a gateway leads to one gateway. None if it leads to two places."""
+        """For each arm, an arm that represents its gateway; None if a gateway leads to two places.
+
+        A turn around faces what was behind, and a gateway leads to one gateway.
+        """
         one = {(s, side): (s, side) for s in self.place_of for side in (1, -1)}
 
         def join(first: Arm, second: Arm) -> bool:
@@ -185,7 +198,10 @@ class Edges:
         return one
 
     def _some_option_draws(self, options: list[list[Option]]) -> bool:
-        """Whether some choice of an option for each place makes a drawing. Where part of a choice does not, nothing is added to it."""
+        """Whether some choice of an option for each place makes a drawing.
+
+        A partial choice that makes none is not extended.
+        """
         settled = {arm: k for some in options if len(some) == 1 for arm, k in some[0].items()}
         others = sorted((some for some in options if len(some) != 1), key=len)
         if not self._is_drawing(settled):
@@ -204,7 +220,10 @@ class Edges:
         return False
 
     def _is_drawing(self, position: Option) -> bool:
-        """Whether the travels both arms of which have positions join each gateway to one other, with V - E + F = 2 for each connected part."""
+        """Whether the travels whose arms both have positions make a drawing.
+
+        Each gateway has to be joined to one other, and V - E + F = 2 for each connected part.
+        """
         joined = {
             frozenset(((self.place_of[s], position[s, 1]), (self.place_of[t], position[t, -1])))
             for s, t in self.travels
@@ -219,17 +238,16 @@ class Edges:
         around: dict[int, list[tuple[int, int]]] = defaultdict(list)
         for gateway in sorted(beyond):
             around[gateway[0]].append(gateway)
+        # the next gateway counterclockwise
         after = {
             gateway: gateways[i - 1]
             for gateways in around.values()
             for i, gateway in enumerate(gateways)
-        }  # counterclockwise
-        places = len(around) + sum(
-            len(edge) == 1 for edge in joined
-        )  # an edge that leads back to its gateway turns at a place of its own
-        return places - len(joined) + _cycles(
-            {gateway: after[other] for gateway, other in beyond.items()}
-        ) == 2 * _parts(around, beyond)
+        }
+        # an edge that leads back to its gateway gets a place of its own at its other end
+        places = len(around) + sum(len(edge) == 1 for edge in joined)
+        faces = _cycles({gateway: after[other] for gateway, other in beyond.items()})
+        return places - len(joined) + faces == 2 * _parts(around, beyond)
 
 
 def _cycles(following: Mapping[tuple[int, int], tuple[int, int]]) -> int:
@@ -258,13 +276,13 @@ def _parts(
 
 
 def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
-    """Whether a turn rotates the heading, as far as headings are there already."""
+    """Whether a turn rotates the heading, or one of its headings is not chosen yet."""
     s, quarters, t = turn
     return s not in faced or t not in faced or (faced[s] + quarters - faced[t]) % 4 == 0
 
 
 def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
-    """Whether what is there already of some gateways, which have to be different, comes in this order going round once."""
+    """Whether these gateways are distinct, and those in the order follow each other clockwise."""
     there = [order.index(gateway) for gateway in told if gateway in order]
     return (
         len(set(told)) == len(told)
@@ -273,7 +291,7 @@ def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
 
 
 def _orders(gateways: Sequence[Arm], told: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
-    """The clockwise orders of some gateways, the first one first, that agree with what is told."""
+    """All clockwise orders of gateways, the first one first, in which `told` sequences hold."""
     orders: list[tuple[Arm, ...]] = [()]
     for gateway in gateways:
         longer = (

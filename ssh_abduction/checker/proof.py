@@ -1,4 +1,4 @@
-"""Checks the proof that no map of a trace has fewer dstates, in plain Python that shares nothing with the solver.
+"""Check the proof that no map of a trace has fewer dstates, in plain Python.
 
 >>> from ssh_abduction import Trace
 >>> from ssh_abduction.checker.proof import check_bound
@@ -22,9 +22,10 @@ from ssh_abduction.data.trace import Step, Trace
 class ProvenBound:
     """What a certificate proves.
 
-    dstates  every map has at least so many, if there are no faults
-    refuted  the numbers of dstates above that for which clingo found no map; this is taken on its word, and not checked here
-    faults   what is wrong with the certificate
+    Attributes:
+        dstates: A lower bound on the dstates of every map, if there are no faults.
+        refuted: Larger numbers of dstates for which clingo found no map. They are not checked here.
+        faults: What is wrong with the certificate.
     """
 
     dstates: int
@@ -33,11 +34,19 @@ class ProvenBound:
 
 
 def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
-    """Check the certificate of a lower bound on dstates, as `Certificate.to_dict` wrote it.
+    """Check the certificate of a lower bound on dstates.
 
-    Two steps are different dstates if the same actions lead from them to different views, as a dstate has one view and actions are
-    deterministic. So each pair of the clique is followed along the trace by its word, to see whether the views differ. Where the certificate has no words at
-    all, the word of a pair is what was done after both steps. Raises MapError where the certificate is malformed.
+    Two steps are different dstates if the same actions lead from them to different views, because a
+    dstate has one view and actions are deterministic. So each pair of the clique is followed along
+    the trace by its word (a list of actions) to see whether the views differ. If the certificate
+    has no words at all, the word of a pair is what was done after both steps.
+
+    Args:
+        trace: The trace.
+        certificate: The certificate as `Certificate.to_dict` writes it.
+
+    Raises:
+        MapError: The certificate is malformed.
     """
     if not isinstance(certificate, Mapping):
         raise MapError(
@@ -52,11 +61,13 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
         or len(set(steps)) < len(steps)
     ):
         raise MapError(
-            f"certificate: clique: expected different steps, 0 to {len(trace) - 1}, got {brief(steps)}"
+            f"certificate: clique: expected different steps, 0 to {len(trace) - 1}, got "
+            f"{brief(steps)}"
         )
     if not _integers(refuted) or refuted != list(range(len(steps), len(steps) + len(refuted))):
         raise MapError(
-            f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got {brief(refuted)}"
+            f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got "
+            f"{brief(refuted)}"
         )
     word_of: dict[frozenset[int], list[str]] = {}
     has_words = "words" in certificate
@@ -91,12 +102,15 @@ def _integers(values: Any) -> bool:
 
 
 def _look_different(here: Step, there: Step) -> bool:
-    """Whether both views are known, and are different."""
+    """Whether both views are known and different."""
     return None not in (here.view, there.view) and here.view != there.view
 
 
 def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
-    """The actions done after both steps, until the views differ, the actions differ, or the trace ends: the word of a pair if a certificate has no words."""
+    """The actions done after both steps, until the views or actions differ, or the trace ends.
+
+    This is the word of a pair if a certificate has no words.
+    """
     word: list[str] = []
     for here, there in zip(trace.steps[i:], trace.steps[j:], strict=False):
         if (

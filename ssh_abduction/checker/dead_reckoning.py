@@ -1,0 +1,197 @@
+"""Poses by dead reckoning, and the covariance of their errors.
+
+The error of the robot's pose is predicted as in a Kalman filter. Let E(t) be the error of the pose
+by dead reckoning at step t, in the frame of the first step, and V(t) its covariance. An error at
+step i persists at a later step j, rotated about where the robot was:
+
+    F(j, i) = [[1, S (p(j) - p(i))], [0, 1]]        with S a quarter turn, and p the position.
+
+So the loop from i to j closes with the error E(j) - F(j, i) E(i). Its covariance is
+V(j) - F(j, i) V(i) F(j, i)', because the noise of each step is independent of the steps before. Two
+loops share the noise between the later of their first steps and the earlier of their last steps. A
+wrong scale and a drift of the heading are two more errors, which never change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssh_abduction.data.odometry import Odometry
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
+
+Array: TypeAlias = NDArray[np.float64]
+# The numbers of `one_pose` in docs/explanation/theory.md: errors of the heading that count, in standard
+# deviations; the uncertainty in radians at which a heading is lost; the steps of a drift per
+# standard deviation, and the greatest drift, in standard deviations; and the rounding error in
+# metres.
+SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
+# The number of steps or returns between two looks at the clock; they take some milliseconds.
+FEW = 64
+
+
+class ErrorFilter:
+    """Poses by dead reckoning, and the covariance of their errors: pose (3), scale and drift."""
+
+    def __init__(self, trace: Trace, odometry: Odometry, bend: float, drift: float) -> None:
+        size = len(trace)
+        self.pose = np.zeros((size, 3))
+        self.white = np.zeros((size, 3, 3))  # covariance of the pose by noise alone
+        self.repeated = np.zeros((size, 3, 2))  # derivative of the pose by scale and drift
+        self.broken = np.zeros(size, dtype=int)  # number of missing displacements so far
+        self.sigma = np.array([odometry.scale, drift])
+        # at both ends of a loop the robot may be off the pose of the dstate
+        ends = np.diag([odometry.offset, odometry.offset, odometry.facing])
+        self.at_ends = 2 * ends**2
+        for t in range(1, size):
+            if t % FEW == 0:
+                look_at_clock()
+            x, y, heading = self.pose[t - 1]
+            displacement, covariance = trace.steps[t].displacement, trace.covariance(t)
+            self.broken[t] = self.broken[t - 1] + (displacement is None)
+            if displacement is None or covariance is None:
+                self.pose[t], self.white[t], self.repeated[t] = (
+                    self.pose[t - 1],
+                    self.white[t - 1],
+                    self.repeated[t - 1],
+                )
+                continue
+            dx, dy, turned = displacement
+            way = math.hypot(dx, dy)
+            cos, sin = math.cos(heading - bend * way / 2), math.sin(heading - bend * way / 2)
+            moved = np.array([cos * dx - sin * dy, sin * dx + cos * dy])
+            self.pose[t] = x + moved[0], y + moved[1], heading + turned - bend * way
+            onward = _onward(moved)
+            cos, sin = math.cos(heading), math.sin(heading)
+            turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+            self.white[t] = (
+                onward @ self.white[t - 1] @ onward.T + turn @ np.array(covariance) @ turn.T
+            )
+            new = np.array(
+                [[moved[0], -moved[1] * way / 2], [moved[1], moved[0] * way / 2], [0.0, way]]
+            )
+            self.repeated[t] = onward @ self.repeated[t - 1] + new
+
+    def onward(self, first: Any, last: Any) -> Array:
+        """F(last, first), m x 3 x 3."""
+        return _onward(self.pose[last, :2] - self.pose[first, :2])
+
+    def since(self, first: Any, last: Any) -> Array:
+        """The covariance of the noise between two steps."""
+        onward = self.onward(first, last)
+        covariance: Array = self.white[last] - onward @ self.white[first] @ onward.swapaxes(-1, -2)
+        return covariance
+
+    def new_until(self, end: int) -> Array:
+        """The covariance at step `end` of the noise up to each step, m x 9."""
+        steps = np.arange(end + 1)
+        onward = self.onward(steps, np.full(end + 1, end))
+        covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(
+            -1, 9
+        )
+        return covariance
+
+    def repeated_since(self, first: Any, last: Any) -> Array:
+        """The derivative of a loop by scale and drift, in standard deviations, m x 3 x 2."""
+        moved: Array = (
+            self.repeated[last] - self.onward(first, last) @ self.repeated[first]
+        ) * self.sigma
+        return moved
+
+    def covariance(self, first: Any, last: Any) -> Array:
+        """The covariance of closings, enlarged where errors of the heading are not small."""
+        white, repeated = self.since(first, last), self.repeated_since(first, last)
+        heading = self.lost(first, last)
+        moved = self._moved_by_heading(first, last) + (repeated[..., :2, 1] ** 2).sum(-1)
+        bent = (SIGMAS / 2) ** 2 * heading * moved + ROUNDED**2
+        added = (
+            bent[..., None, None] * np.diag([1.0, 1.0, 0.0])
+            + ROUNDED**2 * np.diag([0.0, 0.0, 1.0])
+            + self.at_ends
+        )
+        total: Array = white + repeated @ repeated.swapaxes(-1, -2) + added
+        return total
+
+    def lost(self, first: Any, last: Any) -> Array:
+        """The variance of the heading at the end of loops."""
+        variance: Array = (
+            self.since(first, last)[..., 2, 2] + self.repeated_since(first, last)[..., 2, 1] ** 2
+        )
+        return variance
+
+    def _moved_by_heading(self, first: Any, last: Any) -> Array:
+        """The variance of the end of loops that the noise of headings causes.
+
+        It is the sum, over the steps of a loop, of that noise times the squared distance to the
+        end.
+        """
+        angle = np.diff(self.white[:, 2, 2], prepend=0.0)
+        x, y = self.pose[:, 0], self.pose[:, 1]
+        sums = [np.cumsum(angle * factor) for factor in (np.ones_like(x), x, y, x * x + y * y)]
+        one, by_x, by_y, square = (s[last] - s[first] for s in sums)
+        moved: Array = np.maximum(
+            square - 2 * (by_x * x[last] + by_y * y[last]) + one * (x[last] ** 2 + y[last] ** 2),
+            0.0,
+        )
+        return moved
+
+    def is_known(self, first: Any, last: Any) -> NDArray[np.bool_]:
+        """Whether the closings of loops are known.
+
+        No displacement is missing, and the heading is not lost along the loop.
+        """
+        known: NDArray[np.bool_] = (self.broken[first] == self.broken[last]) & (
+            self.lost(first, last) <= LOST**2
+        )
+        return known
+
+    def closing(self, first: Any, last: Any) -> Array:
+        """How far off loops close, m x 3."""
+        off: Array = self.pose[last] - self.pose[first]
+        off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
+        return off
+
+
+def _onward(moved: Array) -> Array:
+    """F for a movement, m x 2: how errors of the pose change."""
+    onward = np.zeros((*moved.shape[:-1], 3, 3))
+    onward[..., range(3), range(3)] = 1.0
+    onward[..., 0, 2], onward[..., 1, 2] = -moved[..., 1], moved[..., 0]
+    return onward
+
+
+class Drifts:
+    """The poses for each drift of the heading, with the chi-square of the drift, no drift first.
+
+    Poses are computed at their first use.
+    """
+
+    def __init__(self, trace: Trace) -> None:
+        self._trace, self._odometry = trace, trace.odometry or Odometry()
+        self._made: dict[int, ErrorFilter] = {}
+
+    @property
+    def none(self) -> ErrorFilter:
+        """The poses without a drift."""
+        return self._filter(0)
+
+    def _filter(self, number: int) -> ErrorFilter:
+        step = self._odometry.bend / BENDS_A_SIGMA
+        if number not in self._made:
+            self._made[number] = ErrorFilter(self._trace, self._odometry, number * step, step / 2)
+        return self._made[number]
+
+    def __iter__(self) -> Iterator[tuple[ErrorFilter, float]]:
+        numbers = (
+            range(-MOST_BENDS * BENDS_A_SIGMA, MOST_BENDS * BENDS_A_SIGMA + 1)
+            if self._odometry.bend
+            else [0]
+        )
+        for n in sorted(numbers, key=lambda n: (abs(n), n)):
+            look_at_clock()
+            yield self._filter(n), max(abs(n) - 0.5, 0.0) ** 2 / BENDS_A_SIGMA**2
