@@ -356,7 +356,7 @@ def changed(**fields: Any) -> dict[str, Any]:
             "status: expected optimal or feasible, as there is a map",
         ),
         (changed(complete="yes"), "complete: expected true or false"),
-        (changed(count=5), "count: expected 4, as so many maps are listed, got 5"),
+        (changed(count=5), "count: expected 4, the number of maps listed, got 5"),
         (changed(steps=24), r"maps\[0\].labels: expected 24, one a step, got 23"),
         (changed(steps="23"), "steps: expected an integer"),
         (changed(cost={"dstates": 18, "places": 10, "paths": 4}), "cost: expected 19 dstates"),
