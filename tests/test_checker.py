@@ -1,4 +1,4 @@
-"""The checker accepts maps made by hand, names the axiom that a wrong one breaks, and counts the maps of tiny traces."""
+"""Checker: accepts maps made by hand, names broken axioms, and counts the maps of tiny traces."""
 
 from __future__ import annotations
 
@@ -42,7 +42,11 @@ def chart(
     orders: str = "",
     excused: tuple[tuple[int, int], ...] = (),
 ) -> SSHMap:
-    """A map from its labels; a word `place[:path±][^heading]` a dstate; and a word a path with its places, `-` if it lists none."""
+    """A map from its labels, a word for each dstate, and a word for each path.
+
+    The word of a dstate is `place[:path±][^heading]`. The word of a path is its places, or `-` if
+    it lists none.
+    """
     steps = tuple(map(int, labels.split()))
     dstates = []
     for i, word in enumerate(states.split()):
@@ -72,7 +76,7 @@ def names(violations: tuple[Violation, ...]) -> set[str]:
 
 @dataclass(frozen=True)
 class Case:
-    """A map of a trace; `also` names the axioms that are broken together with the one that the case is for."""
+    """A map of a trace. `also` names axioms that break together with that of the case."""
 
     theory: Theory
     trace: Trace
@@ -87,7 +91,8 @@ def case(theory: Theory, trace: Trace, *spec: str, also: str = "") -> Case:
     return Case(theory, trace, chart(trace, *spec), frozenset(also.split()))
 
 
-# A closed notched rectangle: path 0 is the side that leads back to the first corner, for dstate 0 faces along it.
+# A closed notched rectangle: path 0 is the side that leads back to the first corner, for dstate 0
+# faces along it.
 NOTCHED = seen("v0 R v1 T v2 R v3 T " * 2 + "v0")
 NOTCHED_TWICE = seen("v0 R v1 T v2 R v3 T " * 4 + "v0")
 RECTANGLE = ("0:0+ 0:1+ 1:1+ 1:2+ 2:2+ 2:3+ 3:3+ 3:0+", "30 01 12 23")
@@ -362,7 +367,10 @@ def test_the_witness_steps_and_words() -> None:
 @pytest.mark.parametrize("listed", ["021", "201"])
 @pytest.mark.parametrize("order", ["partial", "total"])
 def test_partial_order_is_the_least_one(order: str, listed: str) -> None:
-    """A turn at place 2 leads onto path 0 in direction -. Place 0 is ahead there only if the list, and not a travel, decides."""
+    """A turn at place 2 leads onto path 0 in direction -.
+
+    Place 0 is ahead there only if the list decides, and not a travel.
+    """
     trace = seen("a T b A c T d R e T f A g T h T i A j T e T f A g T h R d")
     states = "0:0+ 1:0+ 1:0- 2:0- 2:1+ 3:1+ 3:1- 2:1- 0:1- 0:1+"
     forked = case(
@@ -566,7 +574,7 @@ GROUNDS = [*CORRECT.values(), *BROKEN.values()]
 
 @st.composite
 def mutants(draw: st.DrawFn) -> tuple[Case, SSHMap]:
-    """A map made by hand with a few of its numbers replaced, its parts dropped, repeated or shuffled."""
+    """A map made by hand with numbers replaced, or parts dropped, repeated or shuffled."""
     original = draw(st.sampled_from(GROUNDS))
     m = original.map
     for _ in range(draw(st.integers(0, 5))):
@@ -649,7 +657,10 @@ def growths(n: int) -> Iterator[tuple[int, ...]]:
 def courses_of(
     supported: list[bool], edges: list[tuple[int, int, int]]
 ) -> Iterator[tuple[tuple[int, int] | None, ...]]:
-    """Courses of dstates: along a path where supported, and agreeing along each edge (dstate, dstate, +1 or -1)."""
+    """Courses of dstates: along a path if supported, and consistent along each edge.
+
+    An edge is a dstate, a dstate, and +1 or -1.
+    """
 
     def grow(
         head: tuple[tuple[int, int] | None, ...],
@@ -675,7 +686,7 @@ def courses_of(
 
 
 def all_maps(trace: Trace) -> Iterator[list[SSHMap]]:
-    """Each equality of steps with places and courses that fit the turns and travels; once with every list of the orders."""
+    """All maps of a trace whose places and courses fit the turns and travels, with every order."""
     kinds = [a.turn or a.kind for a in trace.actions]
     for labels in growths(len(trace)):
         views = [trace.views[labels.index(i)] for i in range(max(labels) + 1)]
@@ -731,7 +742,7 @@ def test_the_notched_rectangle_has_as_many_maps_as_the_theory_says(
 
 
 def test_a_long_trace_is_checked_in_its_stride() -> None:
-    """400 circuits and a corridor of 3,000 places: nothing is walked once for each step or pair of places."""
+    """The checker never walks a corridor of 3,000 places once for each step or pair of places."""
     circuits = 400
     trace = seen("v0 R v1 T v2 R v3 T " * (2 * circuits) + "v0")
     labels = " ".join(map(str, [*range(8)] * circuits + [0]))

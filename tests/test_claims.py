@@ -1,4 +1,4 @@
-"""What a file of maps says of itself: true of all that solve prints, and each lie is named."""
+"""Claims of a file of maps: true for all that `solve` prints, and each lie is named."""
 
 from __future__ import annotations
 
@@ -85,7 +85,10 @@ LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = 
         lambda d: d["maps"].append(d["maps"][1]),
         "maps: expected each map once, got maps 2 and 5, which are the same",
     ),
-    "another trace": ({"steps": 22}, "steps: expected 23, the number of steps of the trace, got 22"),
+    "another trace": (
+        {"steps": 22},
+        "steps: expected 23, the number of steps of the trace, got 22",
+    ),
     "a prefix longer than the trace": ({"prefix": 99}, "prefix: expected 0 to 23"),
     "a smaller cost": (
         lambda d: d["cost"].update(dstates=18),
@@ -133,7 +136,8 @@ LIES: dict[str, tuple[dict[str, Any] | Callable[[dict[str, Any]], Any], str]] = 
     ),
     "no such reason to stop": (
         {"complete": False, "stopped": "lunch"},
-        "stopped: expected one of time limit, memory limit, interrupted, maps limit, no proof, got 'lunch'",
+        "stopped: expected one of time limit, memory limit, interrupted, maps limit, no proof, "
+        "got 'lunch'",
     ),
     "no such status": (
         {"status": "perfect"},
@@ -262,7 +266,7 @@ def test_a_map_under_other_numbers_is_the_same_map(
 
 
 def _renamed(data: dict[str, Any], rng: random.Random) -> dict[str, Any]:
-    """The same map with other numbers, and some paths in the other direction."""
+    """The same map with other numbers, and some paths reversed."""
     data = copy.deepcopy(data)
     dstate, place, path = (
         {x: i for i, x in enumerate(rng.sample(range(n), n))}

@@ -1,4 +1,4 @@
-"""Rival maps compared: against explicit lists, brute force over divisions of questions, and files that are not what they should be."""
+"""Comparisons of rival maps: against explicit lists and brute force, and malformed files."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_deciding_questions_tell_all_apart_and_none_is_superfluous(rows: list[li
 
 
 def is_one(ssh_map: SSHMap, sort: Matter, i: int, j: int) -> bool:
-    """Whether two steps are one, as the map says without a look at arrays."""
+    """Whether two steps are one in a map, without arrays."""
     here, there = (ssh_map.dstates[ssh_map.labels[t]] for t in (i, j))
     if sort == "dstates":
         return here.id == there.id
@@ -144,7 +144,7 @@ def answer(ssh_map: SSHMap, question: Question) -> bool:
 
 
 def holds_of(found: Comparison, maps: Sequence[SSHMap]) -> None:
-    """All that a comparison says is so in the explicit list."""
+    """Check all claims of a comparison against the explicit list."""
     sharing = Sharing()
     for ssh_map in maps:
         sharing.absorb(ssh_map)
@@ -193,7 +193,7 @@ def sorts_differing(found: Comparison) -> dict[str, set[int]]:
 
 
 def naive_differing(maps: Sequence[SSHMap]) -> dict[str, set[int]]:
-    """The steps of which the first step that they are one with is not the same in all maps."""
+    """The steps whose first equal step differs between maps."""
     steps = range(len(maps[0].labels))
     sorts: tuple[Matter, ...] = ("dstates", "places", "paths", "courses")
     found = {
@@ -228,7 +228,7 @@ def test_what_is_said_of_maps_is_so_in_the_explicit_list(data: st.DataObject) ->
 
 
 def regroups(one: SSHMap, other: SSHMap) -> None:
-    """The difference of two maps, applied to the first one, makes the other one."""
+    """Applying the difference of two maps to the first one gives the other one."""
     found = difference(one, other)
     assert (str(found) == "the maps are the same") == found.same == (one == other)
     moved_courses = {
@@ -320,7 +320,10 @@ def of_streets(rng: random.Random, count: int, dstates: int, steps: int) -> list
 
 
 def test_maps_of_all_kinds_are_compared_whatever_they_are_of() -> None:
-    """Arrays say what the absorbing of one map after the other says, also where dstates, places and paths differ in every map."""
+    """Arrays give the same backbone as absorbing one map after the other.
+
+    This also holds if dstates, places and paths differ in every map.
+    """
     maps = of_streets(random.Random(1), 12, 40, 120)
     sharing = Sharing()
     for ssh_map in maps:
@@ -371,7 +374,8 @@ LISTS = """
 import sys
 from benchmarks.instances import maze
 from ssh_abduction import Theory, Trace, solve
-for trace, theory in ((Trace.load("examples/aces3-route.jsonl"), None), (maze(5, 5, steps=60, seed=3).trace, Theory.causal())):
+for trace, theory in ((Trace.load("examples/aces3-route.jsonl"), None), (maze(5, 5, steps=60,
+seed=3).trace, Theory.causal())):
     print([ssh_map.id for ssh_map in solve(trace, theory, max_maps=None).maps])
 """
 
@@ -487,7 +491,8 @@ def test_where_not_all_are_listed_the_backbone_says_what_all_share(
     assert main(["compare", str(cut), str(every)]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith(
-        "at least 2 minimal maps (listing was stopped by the maps limit): the same dstates; the places of steps 15–18 and 21 differ; "
+        "at least 2 minimal maps (listing was stopped by the maps limit): the same dstates; the "
+        "places of steps 15–18 and 21 differ; "
     )
     assert "of the 2 maps listed: " in printed
     assert "only in maps that are not listed: the " in printed
@@ -682,7 +687,7 @@ def test_one_map_has_nothing_to_be_told_apart_from() -> None:
 
 
 def test_dstates_along_no_path_are_no_contradiction() -> None:
-    """Steps that are one dstate in the maps listed only, and along no path: their paths are not one in any map."""
+    """Steps of one dstate in the listed maps, but along no path, are along one path in no map."""
     trace = Trace.from_steps("bbaabaa", ["travel", "left", "left", "left", "around", "around"])
     solution = solve(trace, max_maps=2)
     cut = compare(replace(solution, shared=find_backbone(solution, time_limit=30)))

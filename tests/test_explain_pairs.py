@@ -1,4 +1,4 @@
-"""Why two steps are one dstate or not: verdicts against the brute force, derivations against the theories that they name, and mends against the solver."""
+"""Explanations of pairs: verdicts against the brute force, and mends against the solver."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def only(theory: Theory, names: set[str]) -> Theory:
 def possible(
     derivation: Derivation, trace: Trace, theory: Theory, links: list[tuple[str, int]]
 ) -> bool:
-    """Whether what a derivation rules out is possible where just these axioms hold at just these steps."""
+    """Whether the pair may be otherwise if only these axioms hold at these steps."""
     piece = Piece.of(trace, theory.resolve(trace), derivation.steps)
     pair = piece.steps.index(derivation.first), piece.steps.index(derivation.second)
     active = [facts.active(axiom, piece.steps.index(step)) for axiom, step in links]
@@ -54,7 +54,7 @@ def possible(
 
 
 def check_derivation(derivation: Derivation, trace: Trace, theory: Theory) -> None:
-    """The links suffice, none can be spared, the checker sees each of them broken, and the lines name all of them."""
+    """The links suffice and are minimal, the checker sees each broken, and the lines name all."""
     links = [(link.axiom, link.step) for link in derivation.links]
     assert not possible(derivation, trace, theory, links)
     first, second = (
@@ -88,14 +88,19 @@ def argument() -> PairExplanation:
 
 
 def test_the_argument_of_the_paper() -> None:
-    """x0 is at a place on the path that x1 and x2 define; x4 is at a place to the right of that path; a place on a path is not to its right."""
+    """Steps 0 and 4 differ by the argument of Kuipers & Beeson 2002, section 4.2.
+
+    x0 is at a place on the path that x1 and x2 define. x4 is at a place to the right of that path.
+    No place on a path is to its right.
+    """
     explanation = argument()
     assert (explanation.first, explanation.second, explanation.verdict) == (0, 4, Verdict.DIFFERENT)
     derivation = explanation.derivation
     assert derivation is not None
     assert derivation.steps == (0, 1, 2, 3, 4)
     assert derivation.summary == (
-        "step 0 is at a place on the path that steps 1 and 2 define; step 4 would be at a place to the right of that path; "
+        "step 0 is at a place on the path that steps 1 and 2 define; step 4 would be at a place "
+        "to the right of that path; "
         "no place on a path lies right or left of it"
     )
     assert {"on_path", "branch_side", "side_of_branch", "path_between_sides"} <= set(
@@ -106,7 +111,7 @@ def test_the_argument_of_the_paper() -> None:
 
 
 def test_without_any_one_axiom_the_rectangles_steps_may_be_one() -> None:
-    """By the axioms of the argument alone: the solver finds a map with step 0 = step 4 where one is left out, but none under all of them."""
+    """The solver finds a map with step 0 = step 4 once any axiom of the argument is left out."""
     derivation = argument().derivation
     assert derivation is not None
     for dropped in (None, *derivation.axioms):
@@ -127,7 +132,7 @@ def test_verdicts_are_those_of_the_brute_force(data: st.DataObject) -> None:
 
 
 def compare(trace: Trace, theory: Theory, first: int, second: int) -> PairExplanation:
-    """The verdict, the counts and the costs are those of all maps; a derivation holds."""
+    """Check the verdict, counts and costs against all maps, and the derivation."""
     toys = [toy for toy in TOYS if toy.rules in theory.rules]
 
     def allows(found: Key) -> bool:
@@ -174,7 +179,11 @@ def compare(trace: Trace, theory: Theory, first: int, second: int) -> PairExplan
 
 
 def test_what_planarity_rules_out_is_ruled_out_by_the_links_that_are_named() -> None:
-    """While axioms are left out, a dstate may be at two places, and then nothing says what is drawn: which maps planarity refused hung on what was asked before."""
+    """A derivation names the links that planarity needs.
+
+    While axioms are left out, a dstate may be at two places and there is nothing to draw. Then
+    planarity must not depend on earlier questions.
+    """
     trace = Trace.from_steps("aaaa", ["travel"] * 3, stars=[(1, 1, 1, 1)] * 4)
     (even,) = (toy.rules for toy in TOYS if toy.rules.name == "even.lp")
     theory = Theory(
@@ -191,7 +200,7 @@ def test_what_planarity_rules_out_is_ruled_out_by_the_links_that_are_named() -> 
 
 
 def test_links_that_are_needed_once_more_are_named() -> None:
-    """The axiom at step 5 alone says nothing of steps 0 and 3: it takes the earlier links as well."""
+    """The axiom at step 5 alone implies nothing about steps 0 and 3 without earlier links."""
     trace = Trace.from_steps("baabab", ["left"] * 5)
     derivation = explain_pair(trace, 0, 3, Theory.causal()).derivation
     assert derivation is not None

@@ -1,4 +1,4 @@
-"""Explanations of traces whose odometry contradicts what was seen, and what they say of it in words."""
+"""Explanations of traces whose odometry contradicts what was seen."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ TURNS = Trace.from_steps(
 
 
 def uneven() -> Trace:
-    """Two circuits of a square. Its second side is too long the first time and too short the second time: each corner alone may be the same as before, not two."""
+    """Two circuits of a square, whose second side is too long once and too short once.
+
+    Each corner alone may be the same as before, but two corners may not.
+    """
     trace = circuit(4, 6)
     moved = [step.displacement for step in trace.steps[1:]]
     moved[2], moved[10] = (13.5, 0.0, 0.0), (6.5, 0.0, 0.0)
@@ -40,22 +43,28 @@ def uneven() -> Trace:
 
 
 def test_a_turn_on_the_spot_that_does_not_come_round() -> None:
-    """Four turns right make one dstate of steps 0 and 4; the odometry says that they were of 60 degrees each."""
+    """Four right turns make steps 0 and 4 one dstate, but the odometry says 60 degrees each."""
     explanation = explain(TURNS)
     assert explanation
     assert {"one_pose", "turn_rotates", "one_dstate_per_heading"} <= set(explanation.axioms)
     sigma = math.degrees(math.sqrt(sum(TURNS.covariance(t)[2][2] for t in range(1, 5)) + 1e-6))  # type: ignore[index]
-    expected = f"steps 0 and 4 are not one dstate: by the odometry their headings are 120 ± {sigma:.0f} degrees apart"
+    expected = (
+        f"steps 0 and 4 are not one dstate: by the odometry their headings are 120 ± {sigma:.0f} "
+        "degrees apart"
+    )
     assert explanation.sentences == (expected,)
     assert why_apart(TURNS, 4, 0) == expected
     assert (
         why_apart(TURNS, 0, 2) is None
-    )  # they show different views, and the robot has not moved: displacements need not tell them apart
+    )  # different views, and no movement: displacements need not tell them apart
     assert explain(TURNS, Theory(displacement="none")) is None
 
 
 def test_two_returns_that_cannot_both_be() -> None:
-    """None of the two returns that a person asserts is refused alone. The explanation is found out of a map, as the solver finds no set of two before."""
+    """Two asserted returns are refused together, but not alone.
+
+    The refusal comes from a map, because the solver finds no pair in advance.
+    """
     trace, theory = uneven(), Theory(same=[(1, 9), (3, 11)])
     geometry = Geometry(trace, theory.resolve(trace))
     assert not geometry.refuses(((1, 9, 3),))
@@ -68,14 +77,17 @@ def test_two_returns_that_cannot_both_be() -> None:
         "asserted": (9, 11),
         "one_pose": (11,),
     }
-    said = "steps 1 and 9, and steps 3 and 11 cannot both be returns: the loops of 44 m and 36 m close 3.5 m and 3.5 m off"
+    said = (
+        "steps 1 and 9, and steps 3 and 11 cannot both be returns: the loops of 44 m and 36 m "
+        "close 3.5 m and 3.5 m off"
+    )
     assert explanation.sentences == (said,)
     assert explanation.to_dict()["sentences"] == [said]
     assert explain(trace, theory.replace(joint=1)) is None
 
 
 def test_explanations_are_smallest_where_returns_are_refused_together() -> None:
-    """One return is asserted, and the axioms make it the other one, too: the explanation names both axioms, and not one that is not needed."""
+    """One return is asserted, the axioms imply another, and only both axioms are named."""
     trace, theory = uneven(), Theory.causal().replace(same=[(1, 9)])
     explanation = explain(trace, theory)
     assert explanation
@@ -92,7 +104,10 @@ def test_explanations_are_smallest_where_returns_are_refused_together() -> None:
 
 
 def test_streets_that_would_cross_are_named() -> None:
-    """A street that is travelled back and forth leads back to where it began, or it could not be drawn. That is found out of maps alone, and the explanation names it."""
+    """A street that is travelled back and forth leads back to its start, or it cannot be drawn.
+
+    Only maps show that, and the explanation names it.
+    """
     trace = Trace.from_steps("aaaaa", ["travel", "around", "travel", "around"])
     drawn, crossed = (
         Theory(planar=True, same=[(0, 4)]),
@@ -108,7 +123,7 @@ def test_streets_that_would_cross_are_named() -> None:
 
 
 def test_distances_are_those_of_dead_reckoning() -> None:
-    """Of each pair that displacements tell apart, the sentence has the distance, and its uncertainty along the line between the two steps."""
+    """The sentence of a pair has its distance, and the uncertainty in that direction."""
     trace = circuit(5, 7, 1.0, odometry=Odometry(bend=0.001))
     theory = Theory().resolve(trace)
     pairs = pairs_of(trace, theory)
@@ -121,7 +136,8 @@ def test_distances_are_those_of_dead_reckoning() -> None:
             assert i not in pairs.apart.get(j, ())
             continue
         found = re.search(
-            r"(?:by the odometry|and) (?:they|steps (\d+) and (\d+), where their visits begin,) are ([\d.]+) ± ([\d.]+) m apart",
+            r"(?:by the odometry|and) (?:they|steps (\d+) and (\d+), where their visits begin,) "
+            r"are ([\d.]+) ± ([\d.]+) m apart",
             said,
         )
         if found is None:
@@ -141,7 +157,10 @@ def test_distances_are_those_of_dead_reckoning() -> None:
 
 
 def test_returns_of_a_stretch_are_those_of_the_whole_trace() -> None:
-    """A stretch that begins with a visit: what is refused of it is what is refused of the trace, as the theory has counted the returns of the whole trace."""
+    """What is refused in a stretch that begins with a visit is refused in the whole trace.
+
+    The theory has counted the returns of the whole trace.
+    """
     trace = circuit(4, 9, 1.0)
     theory = Theory().resolve(trace)
     whole = pairs_of(trace, theory)

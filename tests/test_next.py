@@ -1,4 +1,4 @@
-"""The next experiment: the shortest sequence that tells two rivals apart, and a plan for many, against brute force; and what the shell prints."""
+"""The next experiment: shortest sequences and plans against brute force, and the shell."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def machine(
     actions: int = 2,
     rare: bool = False,
 ) -> SSHMap:
-    """A map of one step with random links, of which some are not known. With `rare`, but one dstate looks different."""
+    """A map of one step with random links, some unknown. If `rare`, one dstate looks different."""
     shown = [
         int(s == states - 1) if rare else chance.randrange(views) if s else 0 for s in range(states)
     ]
@@ -47,7 +47,7 @@ def machine(
 
 
 def views_after(ssh_map: SSHMap, words: Sequence[str]) -> list[object] | None:
-    """What a map predicts after each action; None where it does not know a link."""
+    """What a map predicts after each action; None for an unknown link."""
     ends, here, seen = {(s, a): x for s, a, x in ssh_map.links}, ssh_map.labels[-1], []
     for action in words:
         if (here, action) not in ends:
@@ -58,7 +58,10 @@ def views_after(ssh_map: SSHMap, words: Sequence[str]) -> list[object] | None:
 
 
 def shortest(maps: Sequence[SSHMap], longest: int, actions: Sequence[str] = ACTIONS) -> int | None:
-    """How many actions it takes until maps that know all links on the way predict something different: all words are tried, but those that cannot be done."""
+    """The fewest actions after which maps that know all links on the way predict differently.
+
+    All sequences of possible actions are tried.
+    """
     words: list[tuple[str, ...]] = [()]
     for length in range(1, longest + 1):
         longer = [(*word, action) for word in words for action in actions]
@@ -107,7 +110,7 @@ def test_two_rivals_are_told_apart_by_the_fewest_actions() -> None:
 
 
 def walk(plan: Plan, truth: SSHMap) -> Plan:
-    """Where a plan ends, if this map is true."""
+    """The end of a plan if this map is true."""
     words: list[str] = []
     while plan.branches:
         words += plan.actions
@@ -135,7 +138,10 @@ def moved(ssh_map: SSHMap, words: Sequence[str]) -> SSHMap:
 
 
 def least_worst(maps: Sequence[SSHMap]) -> int:
-    """How many rivals the best plan leaves in the worst case: for growing length, the least that is left of rivals at these dstates."""
+    """The number of rivals that the best plan leaves in the worst case.
+
+    It is computed for growing lengths from the rivals at these dstates.
+    """
     ends = [{(s, a): x for s, a, x in m.links} for m in maps]
     known: dict[tuple[frozenset[tuple[int, int]], int], int] = {}
 
@@ -193,7 +199,7 @@ def test_rivals_that_predict_the_same_are_merged() -> None:
 
 
 def with_paths(courses: Sequence[int]) -> SSHMap:
-    """A corridor of three places, of which each is on one of these paths."""
+    """A corridor of three places, each on one of these paths."""
     dstates = tuple(DState(s, "abc"[s], s, courses[s], 1) for s in range(3))
     orders = tuple(
         MapPath(h, tuple(s for s in range(3) if courses[s] == h)) for h in dict.fromkeys(courses)
@@ -206,8 +212,8 @@ def test_rivals_that_differ_in_paths_alone_are_said_to() -> None:
     assert experiment.plan.branches == ()
     assert experiment.worst == 2
     assert (
-        "2 maps predict the same along all links, as they have the same dstates and places and differ only in paths"
-        in experiment.sentence
+        "2 maps predict the same along all links, as they have the same dstates and places and "
+        "differ only in paths" in experiment.sentence
     )
 
 
@@ -296,7 +302,8 @@ def test_a_path_tells_what_comes_next() -> None:
 
 
 def test_the_untried_action_that_tells_most_is_taken() -> None:
-    # Both maps go a from 0 to 1 and back; one has tried b in dstate 1, where it leads to x. None has tried b in dstate 0.
+    # Both maps go a from 0 to 1 and back; one has tried b in dstate 1, where it leads to x. None
+    # has tried b in dstate 0.
     dstates = (DState(0, "v"), DState(1, "w"), DState(2, "x"))
     links = ((0, "a", 1), (1, "a", 0), (2, "a", 0))
     one = SSHMap((0,), dstates, (*links, (1, "b", 2)))
@@ -398,7 +405,7 @@ def test_maps_that_do_not_fit_are_refused(maps: list[SSHMap], message: str) -> N
 
 @pytest.fixture
 def machines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[str, str]:
-    """A trace with rivals that known links tell apart, and its maps as solve --json prints them."""
+    """A trace with rivals that known links tell apart, and its maps as JSON."""
     trace = tmp_path / "trace.jsonl"
     moore(8, 3, steps=40, seed=1).trace.save(trace)
     assert main(["solve", str(trace), "--theory", "causal", "-n", "0", "--json"]) == 0
@@ -442,7 +449,8 @@ def test_errors_of_the_shell_are_one_line(
     for words, message in [
         (
             [maps, ACES],
-            f"{maps}: maps[0]: labels: expected 23, one for each step of the trace, got 41; solve this trace",
+            f"{maps}: maps[0]: labels: expected 23, one for each step of the trace, got 41; solve "
+            "this trace",
         ),
         ([maps, maps], f"{maps}:1: header: expected a trace, got maps"),
         ([trace, trace], f"{trace}: expected maps, got a trace"),

@@ -1,4 +1,4 @@
-"""Planarity: drawings against networkx, numbers of maps against a tree of maps, and minimal maps against the brute force."""
+"""Planarity: against networkx, a tree of maps, and the brute force."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def scrambled(graph: nx.Graph, rng: random.Random) -> dict[object, list[object]]
 
 
 def ends_of(rotation: dict[object, list[object]]) -> dict[object, tuple[int, ...]]:
-    """The same with ends of edges in place of neighbours."""
+    """A rotation system of the ends of edges."""
     number = {
         edge: i
         for i, edge in enumerate(
@@ -158,7 +158,8 @@ def drawn(joined: Joined) -> bool:
     return is_planar(around)
 
 
-# Route, walls, and the number of maps after the last move: of all, of those whose streets pass no place twice, of planar ones, and of those that are both
+# Route, walls, and the number of maps after the last move: of all, of those whose streets pass no
+# place twice, of planar ones, and of those that are both
 TREES: list[tuple[str, Cells | None, tuple[int, int, int, int]]] = [
     ("ESWN", None, (41, 19, 20, 16)),
     ("ESWNESWN", None, (5677, 1623, 631, 444)),
@@ -178,7 +179,7 @@ def test_the_table_of_numbers_of_maps(
 
 
 def route_trace(route: str) -> Trace:
-    """A trace of a robot that begins heading east, sees open gateways everywhere, and turns before it travels."""
+    """A robot that starts heading east, sees open gateways only, and turns before it travels."""
     seen, heading, actions = stars_on(route, None), 1, []
     for way in route:
         quarters, heading = (DIRECTIONS.index(way) - heading) % 4, DIRECTIONS.index(way)
@@ -188,7 +189,7 @@ def route_trace(route: str) -> Trace:
 
 
 def equalities(joined: Joined, route: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Which steps are one dstate by a map of the tree, and which are at one place."""
+    """Which steps are one dstate, and which are at one place, in a map of the tree."""
     heading, faced = 1, (0, 1)
     steps = [faced]
     for way in route:
@@ -209,7 +210,10 @@ def equalities(joined: Joined, route: str) -> tuple[tuple[int, ...], tuple[int, 
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("route", ["ESWN", "EESS", "ESES", "EWE", "EESWN"])
 def test_the_maps_of_the_solver_are_those_of_the_tree(route: str, planar: bool) -> None:
-    """All consistent maps, and not only minimal ones. Two maps of the tree that differ in headings alone are one map here, planar if one of them is."""
+    """The checker accepts the planar maps of the tree, minimal or not.
+
+    Two maps of the tree that differ only in headings are one map, planar if one of them is.
+    """
     allows = [passes_no_place_twice, *([drawn] if planar else [])]
     expected = {equalities(joined, route) for joined in list(levels(route, None, allows))[-1]}
     theory = Theory(star="frame", boundary="none", next_place=True, planar=planar, prefer=())
@@ -224,7 +228,7 @@ def test_the_maps_of_the_solver_are_those_of_the_tree(route: str, planar: bool) 
 
 @st.composite
 def winding(draw: st.DrawFn, steps: int = 6) -> Trace:
-    """A trace of travels and turns that sees nearly the same everywhere: where maps are small, so that streets cross."""
+    """A trace that sees nearly the same everywhere, so that small maps have crossing streets."""
     letters = draw(st.lists(st.sampled_from("TTTRRLA"), min_size=steps - 1, max_size=steps - 1))
     views = draw(st.lists(st.sampled_from("aaaab"), min_size=steps, max_size=steps))
     stars = [(1, 1, 1, 1)] * steps if draw(st.booleans()) else None
@@ -265,7 +269,7 @@ def test_minimal_maps_are_those_of_the_brute_force(data: st.DataObject) -> None:
 
 
 def holds(equality: Equality, ssh_map: SSHMap) -> bool:
-    """Whether a map says what an equality says."""
+    """Whether an equality holds in a map."""
     here, there = (
         ssh_map.dstates[ssh_map.labels[step]] for step in (equality.first, equality.second)
     )
@@ -274,7 +278,10 @@ def holds(equality: Equality, ssh_map: SSHMap) -> bool:
 
 
 def test_what_is_refused_holds_in_no_planar_map_and_the_checker_refuses_the_same() -> None:
-    """Of all consistent maps of a trace, those that the brute force calls planar are accepted, and what the others are refused for is true of none of these."""
+    """Evidence accepts exactly the maps that the brute force calls planar.
+
+    No planar map has all equalities for which another one is refused.
+    """
     rng = random.Random(3)
     refused = accepted = 0
     for _ in range(20):
@@ -347,7 +354,7 @@ TOUR = "12", "E", "LTLTRTRTRTRTLTLTLTT"
 
 @pytest.fixture(scope="module")
 def tour() -> Trace:
-    """What a robot sees on the tour if all places look alike but for their stars; each step with its true dstate."""
+    """The trace of the tour if places look alike except for their stars, with the true dstates."""
     place, heading, actions = TOUR
     seen = drive(GRID, place, heading, actions, stars=True)
     facing = HEADINGS.index(heading)
@@ -408,7 +415,10 @@ def test_the_checker_names_streets_that_cross(tour: Trace, smaller: Solution) ->
 def test_what_is_refused_speaks_of_few_steps_and_tells_their_places_apart(
     tour: Trace, smaller: Solution
 ) -> None:
-    """A place that the map keeps apart from another one may be where streets meet: without that a set would forbid planar maps."""
+    """A place that the map keeps apart from another one may be where streets meet.
+
+    Without this, a refusal would forbid planar maps.
+    """
     ssh_map = smaller.maps[0]
     reason = Planar.of(Theory(planar=True).resolve(tour)).refuse(tour, ssh_map)
     assert reason
@@ -430,7 +440,7 @@ def test_what_is_refused_speaks_of_few_steps_and_tells_their_places_apart(
 def test_the_true_map_of_a_maze_is_not_refused(
     cells: int, steps: int, follow: bool, star: Literal["frame", "none"]
 ) -> None:
-    """However much is open of the order of gateways where places have no frames."""
+    """The true map is drawn, although places without frames leave the order of gateways open."""
     walk = maze(cells, cells, steps=steps, seed=101, stars=True, follow=follow)
     number: dict[tuple[int, ...], int] = {}
     places: dict[tuple[int, ...], int] = {}
@@ -447,7 +457,10 @@ def test_the_true_map_of_a_maze_is_not_refused(
 
 @pytest.mark.parametrize(("planar", "expected"), [(False, {0, 1}), (True, {1})])
 def test_no_travel_passes_a_place_unseen(planar: bool, expected: set[int]) -> None:
-    """After two travels and a turn around, a travel leads to the second place, as a gateway leads to one gateway; else it may lead past it."""
+    """After two travels and a turn around, a travel leads back to the second place.
+
+    A gateway leads to one gateway; without that, the travel may pass the place.
+    """
     trace = Trace.from_steps("aabca", ["travel", "travel", "around", "travel"])
     maps = solve(trace, Theory(planar=planar, prefer=("places",)), max_maps=None).maps
     assert {ssh_map.dstates[ssh_map.labels[4]].place for ssh_map in maps} == expected
@@ -455,14 +468,17 @@ def test_no_travel_passes_a_place_unseen(planar: bool, expected: set[int]) -> No
 
 @pytest.mark.parametrize(("slot", "expected"), [(3, True), (2, False)])
 def test_headings_decide_whether_three_streets_cross(slot: int, expected: bool) -> None:
-    """Three streets between two places: around one place they lie clockwise as they lie counterclockwise around the other."""
+    """Three streets lie clockwise around one place and counterclockwise around the other."""
     joined = Edges([(0, 1), (2, 3), (4, 5)], [], {0: 0, 1: 1, 2: 1, 3: 0, 4: 0, 5: 1})
     headings = {0: 1, 1: 1, 2: 0 if expected else 2, 3: 2, 4: 3, 5: slot}
     assert joined.can_be_drawn_by(headings) == expected
 
 
 def test_streets_without_an_order_are_free() -> None:
-    """Without frames, sides tell less than slots: three streets between two places can be drawn, and a turn right and back right cannot."""
+    """Without frames, three streets between two places can be drawn: sides say less than slots.
+
+    A turn right and back right cannot.
+    """
     free = Edges(
         [(0, 1), (2, 3), (4, 5)],
         [(1, "right", 2), (3, "right", 4)],

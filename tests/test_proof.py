@@ -1,4 +1,4 @@
-"""The certificate of a lower bound: what the solver writes holds, and whatever is changed in it is found."""
+"""Certificates of lower bounds: those of the solver hold, and each change in one is found."""
 
 from __future__ import annotations
 
@@ -49,7 +49,10 @@ def test_what_the_solver_writes_holds(trace: Trace) -> None:
 
 @pytest.mark.parametrize("length", [12, 120])
 def test_a_certificate_is_worked_out_when_asked_for(length: int) -> None:
-    """Of the prefix that clingo was given, once; whether the search, too, had need of steps that are apart, or not."""
+    """The certificate is written once, for the prefix that clingo was given.
+
+    This is so whether or not the search itself needed steps that are apart.
+    """
     trace = wandering(2, rooms=5, length=length, views=3)
     search = Search(trace, Theory.causal(), max_maps=1)
     solution = search.solution(tuple(search))
@@ -99,7 +102,7 @@ def test_a_mapper_gives_a_certificate() -> None:
 
 
 def test_a_short_trace_is_solved_without_numpy() -> None:
-    """It takes longer to load than all the rest."""
+    """numpy takes longer to load than all the rest."""
     program = textwrap.dedent("""
         import sys
         from ssh_abduction import Trace, cli, solve
@@ -127,7 +130,8 @@ def test_a_changed_word_is_a_fault() -> None:
         word = entry[2]
         entry[2] = word[:-1]
         assert check_bound(trace, data).faults == (
-            f"steps {entry[0]} and {entry[1]}: {' '.join(word[:-1]) or 'nothing done'} leads to the same view from both",
+            f"steps {entry[0]} and {entry[1]}: {' '.join(word[:-1]) or 'nothing done'} leads to "
+            "the same view from both",
         )
         entry[2] = [*word[:-1], "fly"]
         assert "'fly' is not what was done at step" in check_bound(trace, data).faults[0]
@@ -203,7 +207,7 @@ def test_check_bound_on_the_command_line(
 def test_a_verdict_on_another_theory_or_trace_is_not_believed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without sides the rectangle has four dstates; what clingo said of a theory with sides does not count there."""
+    """Without sides the rectangle has four dstates, so refutations under sides do not count."""
     trace, maps = tmp_path / "trace.jsonl", tmp_path / "maps.json"
     rectangle(400).save(trace)
     assert main(["solve", str(trace), "--json"]) == 0

@@ -1,4 +1,4 @@
-"""Which returns displacements refuse: the same for a trace that grows as for one that is there at once, and the same with the bounds as without."""
+"""Returns that displacements refuse: in growing and whole traces, with and without bounds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ from ssh_abduction.theory.evidence.together import Together, joint_squares
 
 
 def seen(trace: Trace, truth: tuple[object, ...], dstates: int = 1000) -> SSHMap:
-    """The true map of a walk in a maze, as far as evidence reads it; or one in which there are only so many dstates, and any further one is taken for one of these."""
+    """The true map of a walk in a maze, or one with at most so many dstates.
+
+    In the latter, each further dstate is taken for an earlier one.
+    """
     number: dict[object, int] = {}
     labels = tuple(number.setdefault(state, len(number)) % dstates for state in truth[: len(trace)])
     places: dict[object, int] = {}
@@ -40,7 +43,10 @@ def evidence_of(trace: Trace, **choices: object) -> Displacement:
 @settings(max_examples=8)
 @given(st.data())
 def test_what_is_known_of_a_trace_grows_with_it(data: st.DataObject) -> None:
-    """Pairs and counts; steps without a displacement are among them, and traces that go on from one prefix in two ways."""
+    """Pairs and counts are the same in growing traces.
+
+    Some steps lack a displacement, and traces go on from one prefix in two ways.
+    """
     trace = data.draw(traces(max_steps=10), label="trace")
     level = data.draw(st.sampled_from(["topological", "causal"]), label="level")
     theory = Theory.causal() if level == "causal" else Theory(star="none")
@@ -82,7 +88,10 @@ def test_the_reckoning_of_a_maze_grows_with_it() -> None:
 
 
 def joint_excess(returns: Returns, rows: np.ndarray, thresholds: dict[int, float]) -> np.ndarray:
-    """By how much the chi-square of each set of two rows is above the threshold, m x m, by all sets for all drifts; 0 or less where it is not refused."""
+    """The excess of the chi-square of each pair of rows over the threshold, m x m.
+
+    All pairs and all drifts are tried; 0 or less if a pair is not refused.
+    """
     reckoning, excess = returns.reckoning, np.zeros((len(rows), len(rows)))
     i, j = np.triu_indices(len(rows), 1)
     shared = np.maximum(rows[i, 0], rows[j, 0]) < np.minimum(rows[i, 1], rows[j, 1])
@@ -103,7 +112,11 @@ def joint_excess(returns: Returns, rows: np.ndarray, thresholds: dict[int, float
     ("noise", "bend"), [("usual", 0.0), ("steady drift", 0.006), ("white", 0.0)]
 )
 def test_bounds_change_no_answer(noise: str, bend: float) -> None:
-    """With each return in turn as the only new one, and thresholds so low that many sets are refused of which no return is, though the map is true."""
+    """Each return in turn is the only new one.
+
+    The thresholds are so low that many pairs are refused whose returns are not, though the map is
+    true.
+    """
     refused = only_together = 0
     for seed in (1, 2) if noise == "white" else (1,):
         model = Odometry(
@@ -134,7 +147,7 @@ def test_bounds_change_no_answer(noise: str, bend: float) -> None:
 
 
 def square_alone(returns: Returns, row: np.ndarray) -> float:
-    """The chi-square of a return alone, for the drift for which that is least."""
+    """The chi-square of a single return, for the drift with the least one."""
     closings = (
         returns.reckoning.loops(number).closings(row[:1], row[1:2])
         for number in range(len(returns.reckoning.bends))
@@ -169,7 +182,10 @@ def test_only_returns_that_end_later_are_asked_about_once_a_map_was_accepted() -
 
 @pytest.mark.parametrize("noise", ["usual", "white"])
 def test_bounds_change_nothing_that_the_judge_says(noise: str) -> None:
-    """With shares so large that true maps are refused, too: the judge says the same of all sets as of those that its bound does not pass."""
+    """The checker refuses the same pairs with its bound as without.
+
+    The shares are so large that true maps are refused, too.
+    """
     said = []
     for seed in range(4):
         model = replace(

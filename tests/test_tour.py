@@ -1,4 +1,4 @@
-"""Tours through what is untried: the shortest where nothing is unknown, and what they leave for the way back."""
+"""Tours through what is untried: shortest, and what they leave for the way back."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ THREE = (0, 120, 240)
 def shortest(
     world: Streets, at: tuple[str, int], seen: set[object], actions: tuple[str, ...]
 ) -> int:
-    """How many actions it takes at least to see all dstates and do all travels that are not seen, by breadth first search."""
+    """The fewest actions to see all dstates and do all unseen travels, by breadth-first search."""
     everything = {(place, k) for place in world for k in range(4)} | {
         (place, heading) for place, ways in world.items() for heading in ways
     }
