@@ -210,6 +210,7 @@ class _Claims:
         for i, counts in enumerate(self.counts):
             last = self.counts[max(i - 1, 0)]
             most = self.counts[0][counted] + within if counted else 0
+            # maps are sorted by level, and maps of one level are equally good
             if counted and not last[counted] <= counts[counted] <= most:
                 yield (
                     f"maps: expected {last[counted]} to {most} {counted} in map {i + 1}, as within "
@@ -288,6 +289,7 @@ class _Claims:
                     else "the theory prefers nothing"
                 )
                 yield f"bound: expected none of {name}, as {preferred}, got {value}"
+            # without some axiom, clingo may count more than the map shows
             below = [i for i, counts in enumerate(self.counts) if counts[name] < value]
             if below and not self.theory.without:
                 yield (

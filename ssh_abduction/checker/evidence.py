@@ -37,6 +37,7 @@ def asserted(m: Reading) -> Found:
     for said, (i, j) in (
         (said, pair) for said, pairs in told for pair in pairs if max(pair) < len(labels)
     ):
+        # only steps that the map labels are compared
         here, there = labels[i], labels[j]
         places = {m.states[label].place for label in (here, there) if label in m.states}
         if said == "one dstate" and here != there:

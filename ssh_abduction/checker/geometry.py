@@ -232,6 +232,7 @@ def _refused_together(
             least[left] = np.minimum(
                 least[left], _square_together(filtered, rows, first[left], second[left]) + unlikely
             )
+        # the clearest pair exceeds its threshold most
         excess = least - most
         if len(excess) and excess.max() > (worst[1] - worst[2] if worst else 0.0):
             k = int(excess.argmax())

@@ -43,6 +43,7 @@ class Order:
         }
         for p, q in travels:
             self._next[1][p][q] = self._next[-1][q][p] = None
+        # travels whose places the list does not have in this order
         self.backward = [
             (p, q)
             for p, q in travels

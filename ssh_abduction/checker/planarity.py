@@ -94,6 +94,7 @@ class Edges:
                 headings = [
                     faced for faced in headings if all(_is_turned(faced, turn) for turn in turns)
                 ]
+            # headings that differ by a rotation of the place are one option
             found: dict[tuple[int, ...], Option] = {}
             for faced in headings:
                 if (
@@ -185,6 +186,7 @@ class Edges:
         for s, turn, t in self.turns:
             if turn == "around":
                 join((s, 1), (t, -1))
+        # joining gateways may show that their far ends are one, so repeat
         changed = True
         while changed:
             changed = False

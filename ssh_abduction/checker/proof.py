@@ -69,6 +69,7 @@ def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
             f"certificate: refuted: expected the numbers from {len(steps)} up without a gap, got "
             f"{brief(refuted)}"
         )
+    # the word of each pair of steps for which the certificate has one
     word_of: dict[frozenset[int], list[str]] = {}
     has_words = "words" in certificate
     for entry in words if isinstance(words, list) else [words]:

@@ -283,6 +283,7 @@ class Argument:
             *known,
         ]
         core = self._axioms.core(_active(line.group), given)
+        # the conclusions of earlier links may not suffice; then the links themselves do
         if core is None:
             core = self._axioms.core(
                 _active(line.group), [*given, *((facts.active(*link), True) for link in earlier)]

@@ -369,6 +369,7 @@ class Axioms:
             if pair in clash and pair[0] != displacement.axiom
         ]
         while answer := self._answer(others):
+            # single returns come first: their sentence is simpler
             alone = [
                 e for t in steps for e in returns.refused_alone_at(answer.labels, answer.places, t)
             ]

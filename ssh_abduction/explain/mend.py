@@ -173,6 +173,7 @@ class TraceQuestion(Question[TraceExplanation]):
             for instead, trace, theory in changes:
                 if self._over():
                     return
+                # the stretch is checked first, as it is much faster than the whole trace
                 piece = Piece.of(trace, theory, stretch)
                 if not self._suits(trace, theory) or not Axioms(piece, self._over).consistent():
                     continue

@@ -112,6 +112,7 @@ def explain(
     def has_no_map(first: int, end: int) -> bool:
         return not Axioms(Piece.of(trace, theory, range(first, end)), stop).consistent()
 
+    # drop steps from the end, then from the start
     end = shortest(len(trace), lambda n: has_no_map(0, n))
     if end is None:
         return None

@@ -193,7 +193,7 @@ class PairQuestion(Question[PairExplanation]):
     # Few steps around the pair
 
     def _ask_pieces(self, one: bool, most: int) -> None:
-        """Find a piece of at most so many steps that has no map of a side."""
+        """Find a piece of at most `most` steps that has no map of a side."""
         for steps in self._pieces(most):
             piece = Piece.of(self.trace, self.theory, steps)
             if not self._has_map(piece, one):
@@ -308,6 +308,7 @@ class PairQuestion(Question[PairExplanation]):
         ):
             self._minimal[one] = True
             self._sides[one] = replace(self._sides[one], maps=max(1, self._sides[one].maps))
+        # both best maps are known although minimal maps were not listed in time
         elif self._minimum is None and all(
             side.proven and side.cost for side in self._sides.values()
         ):

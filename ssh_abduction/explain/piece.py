@@ -35,6 +35,7 @@ class Piece:
         kept: list[Step] = []
         for k, t in enumerate(steps):
             step = trace.steps[t]
+            # nothing is known about the action and the displacement across a gap
             if k + 1 == len(steps):
                 step = replace(step, action=None)
             elif steps[k + 1] != t + 1:

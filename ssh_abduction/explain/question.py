@@ -86,7 +86,7 @@ class Question(ABC, Generic[_Answer]):
         return self.stopped is not None
 
     def _solved(self, trace: Trace, theory: Theory, maps: int | None, seconds: float) -> Search:
-        """A search for maps that ends within so many seconds."""
+        """A search for maps that ends within `seconds`."""
 
         def end_with_this(_: Progress) -> None:
             if self._over():

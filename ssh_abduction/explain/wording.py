@@ -125,6 +125,7 @@ class Words:
             return sentence
         if axiom in OF_ACTIONS and t and (action := self._piece.trace.steps[t - 1].action):
             return f"{sentence}, and the action of step {steps[t - 1]} is {action.name!r}"
+        # the pair that the conclusions are about, or the pair of the argument
         pairs = [
             s
             for name, s in said

@@ -274,6 +274,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     if listing_there:
         listing.check_same_trace(listing_there)
     table = Table(listing.maps)
+    # the backbone says more than the listed maps only if the list is not complete
     listed = replace(table.shared(), proven=listing.complete is True)
     shared = listing.backbone if listing.backbone and listing.complete is False else listed
     _check_backbone(shared, listed, listing)

@@ -407,6 +407,7 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
                 f"maps[{i}]: labels: expected {len(trace)}, one for each step of the trace, "
                 f"got {len(labels)}; solve this trace"
             )
+        # a disbelieved view or action may differ from the map
         wrong = {(fault.step, fault.kind) for fault in ssh_map.faults}
         links = set(ssh_map.links)
         for t, step in enumerate(trace.steps):

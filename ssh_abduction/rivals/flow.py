@@ -39,6 +39,7 @@ def shortest_walk(
             (k for k in left if moves[k].source == at),
             key=lambda k: (moves[k].how != "unknown", k not in due, k),
         )
+        # take a move unless the rest of the walk would be cut off
         for k in choices:
             after = {j: n - (j == k) for j, n in left.items() if n > (j == k)}
             if {moves[j].source for j in after} <= reached_from(

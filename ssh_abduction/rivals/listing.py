@@ -122,6 +122,7 @@ class Listing:
                 f"{where}: steps: expected {len(maps[0].labels)}, as map 1 has, got "
                 f"{brief(told['steps'])}; solve the trace again"
             )
+        # each map is listed once
         first_with: dict[str, int] = {}
         for i, ssh_map in enumerate(maps):
             if (known := first_with.setdefault(ssh_map.id, i)) != i:
@@ -141,6 +142,7 @@ class Listing:
                 f"{where}: count: expected how many minimal maps were found, got {brief(count)}; "
                 "solve again"
             )
+        # with levels, only maps of the first level are minimal
         levels = told.get("levels")
         minimal: Any = len(maps)
         if levels is not None:

@@ -155,6 +155,7 @@ def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None)
         return _Reading(
             trace, settled, sorted({t for ssh_map in maps for t in _first_steps(ssh_map).values()})
         )
+    # without a theory, stars are read as frames if each dstate has one star in each map
     if trace.in_quarters:
         reading = _Reading(trace, Theory(star="frame"))
         looks = [reading(t)[0] for t in range(len(trace))]

@@ -136,6 +136,7 @@ def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> 
         together = members_of(heads)
         for c, d, column in table.questions(sort):
             key = _key(column)
+            # equal and opposite answers are one question, which the earliest steps stand for
             if key not in found:
                 sides = [
                     sorted(t for k in together[heads[side]] for t in steps_by_class[k])

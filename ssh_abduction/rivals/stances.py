@@ -121,6 +121,7 @@ class Stances:
                 if degrees is not None:
                     turns[n].append((target, degrees))
                     turns[target].append((n, -degrees))
+        # each connected group of dstates is a room, in which the first one faces 0 degrees
         at: dict[int, tuple[int, float]] = {}
         for n in turns:
             if n in at:
@@ -187,7 +188,7 @@ class Stances:
         return self._turned(n, degrees)
 
     def _turned(self, n: int, degrees: float) -> int:
-        """The stance after a turn by so many degrees clockwise.
+        """The stance after a clockwise turn.
 
         It is a new one if no known stance is within the spread of the star's bearings.
         """
