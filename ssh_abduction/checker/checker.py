@@ -13,9 +13,10 @@
 "Dstate 0 looks like 'a' at step 0 and like 'b' at step 1."
 
 The checker shares nothing with the encodings or the solver, so it catches their mistakes. The
-axioms are those of docs/explanation/theory.md, after Kuipers & Beeson (AAAI 2002) and Remolina & Kuipers (AIJ
-2004). `AXIOMS` maps the name of each axiom to its check. The checks are in `causal`, `topological`,
-`sides`, `stars`, `clashes` and `evidence`; `coherence` checks that the map fits the trace.
+axioms are those of docs/explanation/theory.md, after Kuipers & Beeson (AAAI 2002) and Remolina &
+Kuipers (AIJ 2004). `AXIOMS` maps the name of each axiom to its check. The checks are in `causal`,
+`topological`, `sides`, `stars`, `clashes` and `evidence`; `coherence` checks that the map fits the
+trace.
 
 A map shows the place, course (path and direction) and heading of each dstate, and the order of each
 path. A dstate of a map shows one of each, even if the theory leaves out the axiom that forbids
@@ -90,7 +91,8 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
         MapError: `ssh_map` is no SSHMap.
 
     Reference:
-        Kuipers & Beeson, AAAI 2002; Remolina & Kuipers, AIJ 2004; the axioms are in docs/explanation/theory.md.
+        Kuipers & Beeson, AAAI 2002; Remolina & Kuipers, AIJ 2004; the axioms are in
+        docs/explanation/theory.md.
     """
     theory = checked_theory(theory).resolve(checked_trace(trace))
     if not isinstance(ssh_map, SSHMap):

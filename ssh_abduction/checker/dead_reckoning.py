@@ -26,9 +26,9 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 
 Array: TypeAlias = NDArray[np.float64]
-# The numbers of `one_pose` in docs/explanation/theory.md: errors of the heading that count, in standard
-# deviations; the uncertainty in radians at which a heading is lost; the steps of a drift per
-# standard deviation, and the greatest drift, in standard deviations; and the rounding error in
+# The numbers of `one_pose` in docs/explanation/theory.md: errors of the heading that count, in
+# standard deviations; the uncertainty in radians at which a heading is lost; the steps of a drift
+# per standard deviation, and the greatest drift, in standard deviations; and the rounding error in
 # metres.
 SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
 # The number of steps or returns between two looks at the clock; they take some milliseconds.
