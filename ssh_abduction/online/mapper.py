@@ -18,8 +18,8 @@ is *unknown* to it.
 *Claim.* If some map of M predicts the step and it is unknown to none, then the maps that predict
 it are all minimal maps of the longer trace.
 
-*Proof.* By (1) of the claim in `solver/prefixes.py`, no map of the longer trace costs less than c. A
-map that predicts the step costs c, by (2). Conversely let F be a minimal map of the longer trace.
+*Proof.* By (1) of the claim in `solver/prefixes.py`, no map of the longer trace costs less than c.
+A map that predicts the step costs c, by (2). Conversely let F be a minimal map of the longer trace.
 It costs c and, cut by the last step, is a map R of M, by (3). R does not contradict the step:
 actions are deterministic, and a dstate has one observation, by functional_view and the axioms of
 the stars. (`observation` reads the star as these axioms do, so another rotation of a pattern is no
