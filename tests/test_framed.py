@@ -26,12 +26,12 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import framed
 from ssh_abduction.solver.engines import paths as paths_module
-from ssh_abduction.solver.engines import visits as same
+from ssh_abduction.solver.engines import visit_labels as same
 from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
 from ssh_abduction.solver.engines.sides import FramedSides
-from ssh_abduction.solver.engines.visits import OPEN, VisitLabels
+from ssh_abduction.solver.engines.visit_labels import OPEN, VisitLabels
 from ssh_abduction.solver.guesses import annealing, sampling
 from ssh_abduction.solver.guesses.annealing import Guess, attempts
 from ssh_abduction.solver.guesses.merging import kept, merged_near

@@ -15,7 +15,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.solver import Search
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines import paths as paths_module
-from ssh_abduction.solver.engines import visits as same
+from ssh_abduction.solver.engines import visit_labels as same
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.paths import Paths
 from ssh_abduction.solver.guesses import annealing

@@ -1,7 +1,7 @@
 """An engine for the topological theory where places have frames and fewest dstates come first: dstates first, then places and paths.
 
 Frames tell so much that the dstates are all but settled before any place or path is: a turn rotates by known quarters, so whole visits are
-the same or not (`steps/chart.py`). Which ones are is asked of visits.lp (`engines/visits.py`), which knows the causal axioms and how turns
+the same or not (`steps/chart.py`). Which ones are is asked of visits.lp (`engines/visit_labels.py`), which knows the causal axioms and how turns
 rotate, but not the order of places on a path, or its sides. For what that leaves of the dstates, paths_framed.lp finds the fewest paths and
 places.
 
@@ -43,7 +43,7 @@ from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
 from ssh_abduction.solver.engines.paths import Paths
 from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted_of
 from ssh_abduction.solver.engines.sides import FramedSides
-from ssh_abduction.solver.engines.visits import OPEN, VisitLabels, smaller
+from ssh_abduction.solver.engines.visit_labels import OPEN, VisitLabels, smaller
 from ssh_abduction.solver.guesses.merging import kept
 from ssh_abduction.solver.steps.chart import Chart, FramedChart, numbered
 from ssh_abduction.theory.evidence import Equality

@@ -18,7 +18,7 @@ are allowed one, two, four at a time, as long as that goes well.
 
 The nodes need not be the steps of a trace: where places have frames, they are those of `Chart.framed`, and rotations are links as actions
 are. What is found then need not fit a frame, as names.lp does not know how rotations compose; but the bound holds. Names are poor at
-raising that bound core by core, which is why `engines/visits.py` has none, but good at this.
+raising that bound core by core, which is why `engines/visit_labels.py` has none, but good at this.
 
 In the causal theory clasp searches as its configuration `tweety` does, which proves several times as soon what its default proves; where
 places have frames its default is better, above all to list answers.
