@@ -29,7 +29,7 @@ from ssh_abduction.theory.evidence import displacement
 BEGINS = (
     (displacement.Displacement, "pairs"),
     (displacement.Displacement, "refuse"),
-    (displacement, "count_returns"),
+    (displacement.Displacement, "count_returns"),
     (ssh_abduction.checker.geometry, "refused_returns"),
     (ssh_abduction.solver.fit, "fit"),
 )

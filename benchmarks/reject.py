@@ -18,6 +18,7 @@ from instances import Walk, maze
 from ssh_abduction import SSHMap, Theory
 from ssh_abduction.checker.geometry import refused_returns
 from ssh_abduction.data import DState, Odometry
+from ssh_abduction.theory.settle import settle
 
 REJECTS = (0.5, 0.2, 0.05, 0.01, 0.001)
 MODEL = Odometry()
@@ -44,7 +45,7 @@ def walks(cells: int, steps: int, seed: int) -> Iterator[Walk]:
 
 
 def is_refused(walk: Walk, reject: float) -> bool:
-    theory = Theory(displacement="use", reject=reject).resolve(walk.trace)
+    theory = settle(walk.trace, Theory(displacement="use", reject=reject)).theory
     return any(refused_returns(walk.trace, true_map(walk), theory))
 
 

@@ -27,6 +27,7 @@ from brute_geometry import Geometry
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.star import Gateway, Openings, Star
 from ssh_abduction.data.trace import Action, Step, Trace
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 Labels: TypeAlias = tuple[int, ...]
@@ -134,7 +135,7 @@ def near_minimal_maps(
 
 def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]]:
     """Every map that satisfies the axioms, once, with its counts: excuses are the fewest that make it consistent."""
-    theory = theory.resolve(trace)
+    theory = settle(trace, theory).theory
     on = frozenset(theory.axioms)
     defeasible = theory.boundary == "defeasible"
     stars = tuple(step.openings if theory.star in ("pattern", "frame") else None for step in trace)

@@ -21,6 +21,7 @@ from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.steps.certificate import Certificate
 from ssh_abduction.theory.evidence import Planar
+from ssh_abduction.theory.settle import Problem, settle
 
 TURNED = {"right": -math.pi / 2, "left": math.pi / 2, "around": math.pi}
 
@@ -61,13 +62,13 @@ def sketched(trace: Trace, theory: Theory, homing: bool = True, framed: bool = T
 
 
 DRIVEN = driven(maze(3, 3, steps=80, seed=0).trace)
-USED = Theory.topological().resolve(DRIVEN)
+USED = settle(DRIVEN).theory
 RING = rectangle(2).trace
-PLANAR = Theory.topological().replace(planar=True).resolve(RING)
+PLANAR = settle(RING, Theory.topological().replace(planar=True)).theory
 GATEWAYS = Trace.from_steps(
     "abab", ["travel", "around", "travel"], stars=[[0, 120], [60, 180], [0, 120], [60, 180]]
 )
-IN_TOLERANCE = Theory.topological().resolve(GATEWAYS)
+IN_TOLERANCE = settle(GATEWAYS).theory
 MAP = sketched(DRIVEN, USED)
 
 LONG: dict[str, Callable[[], object]] = {
@@ -76,7 +77,7 @@ LONG: dict[str, Callable[[], object]] = {
         GATEWAYS, sketched(GATEWAYS, IN_TOLERANCE, framed=False), IN_TOLERANCE
     ),
     "displacements of two returns": lambda: Judging(
-        driven(maze(3, 3, steps=80, seed=0).trace), USED
+        Problem.of(driven(maze(3, 3, steps=80, seed=0).trace), USED)
     ).refusal(MAP),
     "crossings": lambda: Planar.of(PLANAR).refuse(RING, solve(RING, max_maps=1).maps[0]),
     "fit": lambda: fit(DRIVEN, MAP),
@@ -127,7 +128,7 @@ def test_there_is_a_map_when_the_time_is_over(steps: int, wrong: int, stars: boo
 
 def test_a_sketch_that_the_checker_refuses_is_not_the_last_one() -> None:
     trace = driven(maze(3, 3, steps=60, seed=1).trace, 4)
-    theory = Theory.topological().resolve(trace)
+    theory = settle(trace).theory
     assert check(trace, sketched(trace, theory), theory)
     with patch.multiple(fallback, OVERTIME=100.0), patch.object(candidates, "SKETCH_SHARE", 1.0):
         assert solve(trace, time_limit=1e-6).maps
@@ -148,7 +149,7 @@ def test_no_sketch_takes_all_the_time() -> None:
         patch.object(candidates.Candidates, "_go_on_to_end", deaf),
     ):
         assert solve(trace, time_limit=1e-6).status is Status.UNKNOWN
-    assert len(tried) == len(Sketch.all_of(trace.steps[0], Theory.topological().resolve(trace)))
+    assert len(tried) == len(Sketch.all_of(trace.steps[0], settle(trace).theory))
 
 
 def test_a_certificate_is_written_without_a_look_at_each_pair() -> None:

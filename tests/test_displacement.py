@@ -25,6 +25,7 @@ from ssh_abduction.solver.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns
 from ssh_abduction.theory.evidence.loops import Loops
+from ssh_abduction.theory.settle import settle
 
 ROOM = 10.0  # metres from corner to corner
 WHITE = Odometry(scale=0.0, bend=0.0)
@@ -83,7 +84,7 @@ def test_sets_of_two_are_those_of_matrices_written_out(
     """Labels that need not be a map's: every second step is at one of few dstates, so that many returns share displacements."""
     odometry = replace(WHITE, bend=bend)
     trace = circuit(corners, 5, noise, seed, odometry)
-    theory = Theory.causal().replace(reject=0.3).resolve(trace)
+    theory = settle(trace, Theory.causal().replace(reject=0.3)).theory
     rng = np.random.default_rng(seed)
     labels = tuple(int(2 * rng.integers(2) + step % 2) for step in range(len(trace)))
     returns, written_out = Returns(Displacement.of(theory), trace), Geometry(trace, theory)
@@ -273,7 +274,7 @@ def test_steps_without_displacements_cut_what_is_known() -> None:
             replace(s, displacement=None) if t == 7 else s for t, s in enumerate(trace.steps)
         ),
     )
-    theory = Theory.topological().resolve(cut)
+    theory = settle(cut).theory
     pairs = pairs_of(cut, theory)
     assert pairs.apart
     assert all((i >= 7) == (j >= 7) for j, others in pairs.apart.items() for i in others)
@@ -301,10 +302,14 @@ def test_displacements_may_be_left_out_or_asked_for() -> None:
 
 def test_places_go_before_paths_where_displacements_are_used() -> None:
     trace = circuit(4, 9, 1.0)
-    assert Theory().resolve(trace).prefer == ("dstates", "places", "paths")
-    assert Theory().resolve(trace.without_displacements()).prefer == ("dstates", "paths", "places")
-    assert Theory.causal().resolve(trace).prefer == ("dstates",)
-    assert Theory.circumscriptive().resolve(trace).prefer == ("paths", "places", "dstates")
+    assert settle(trace, Theory()).theory.prefer == ("dstates", "places", "paths")
+    assert settle(trace.without_displacements(), Theory()).theory.prefer == (
+        "dstates",
+        "paths",
+        "places",
+    )
+    assert settle(trace, Theory.causal()).theory.prefer == ("dstates",)
+    assert settle(trace, Theory.circumscriptive()).theory.prefer == ("paths", "places", "dstates")
 
 
 def test_the_checker_says_which_returns_are_refused() -> None:

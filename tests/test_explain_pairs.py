@@ -24,6 +24,7 @@ from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.solver import Status
 from ssh_abduction.solver.asp import facts
 from ssh_abduction.theory.encodings import axioms
+from ssh_abduction.theory.settle import settle
 
 RECTANGLE = Trace.load(Path(__file__).parent.parent / "examples" / "notched-rectangle.jsonl")
 IMPOSSIBLE = Trace.from_steps(views="abcd", actions=["travel", "around", "around"])
@@ -45,7 +46,7 @@ def possible(
     derivation: Derivation, trace: Trace, theory: Theory, links: list[tuple[str, int]]
 ) -> bool:
     """Whether the pair may be otherwise if only these axioms hold at these steps."""
-    piece = Piece.of(trace, theory.resolve(trace), derivation.steps)
+    piece = Piece.of(settle(trace, theory), derivation.steps)
     pair = piece.steps.index(derivation.first), piece.steps.index(derivation.second)
     active = [facts.active(axiom, piece.steps.index(step)) for axiom, step in links]
     return Axioms(piece, never, relaxed=True).consistent(

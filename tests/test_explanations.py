@@ -21,6 +21,7 @@ from ssh_abduction.explain.no_map import explain, why_apart
 from ssh_abduction.solver import Status
 from ssh_abduction.theory.evidence import evidence_of, pairs_of
 from ssh_abduction.theory.pairs import pairs_in
+from ssh_abduction.theory.settle import settle
 
 TURNS = Trace.from_steps(
     "abcda",
@@ -66,7 +67,7 @@ def test_two_returns_that_cannot_both_be() -> None:
     The refusal comes from a map, because the solver finds no pair in advance.
     """
     trace, theory = uneven(), Theory(same=[(1, 9), (3, 11)])
-    geometry = Geometry(trace, theory.resolve(trace))
+    geometry = Geometry(trace, settle(trace, theory).theory)
     assert not geometry.refuses(((1, 9, 3),))
     assert not geometry.refuses(((3, 11, 3),))
     assert geometry.refuses(((1, 9, 3), (3, 11, 3)))
@@ -125,7 +126,7 @@ def test_streets_that_would_cross_are_named() -> None:
 def test_distances_are_those_of_dead_reckoning() -> None:
     """The sentence of a pair has its distance, and the uncertainty in that direction."""
     trace = circuit(5, 7, 1.0, odometry=Odometry(bend=0.001))
-    theory = Theory().resolve(trace)
+    theory = settle(trace, Theory()).theory
     pairs = pairs_of(trace, theory)
     geometry = Geometry(trace, theory)
     geometry.drift = geometry.odometry.bend
@@ -162,7 +163,7 @@ def test_returns_of_a_stretch_are_those_of_the_whole_trace() -> None:
     The theory has counted the returns of the whole trace.
     """
     trace = circuit(4, 9, 1.0)
-    theory = Theory().resolve(trace)
+    theory = settle(trace, Theory()).theory
     whole = pairs_of(trace, theory)
     for first in (1, 3, 7):
         stretch = Trace(trace.steps[first:], odometry=trace.odometry)
@@ -198,7 +199,7 @@ def test_the_judge_says_it_in_metres() -> None:
     assert found
     (displacement,) = (
         evidence
-        for evidence in evidence_of(theory.resolve(trace))
+        for evidence in evidence_of(settle(trace, theory).theory)
         if evidence.name == "displacement"
     )
     assert displacement.returns_of(trace).closing(int(found[1]), int(found[2])).metres == found[4]  # type: ignore[attr-defined]

@@ -31,6 +31,7 @@ from ssh_abduction.solver.engines.blocks import Blocks
 from ssh_abduction.solver.front import fault_front
 from ssh_abduction.solver.guesses.robust import Explainer
 from ssh_abduction.theory import Speedups
+from ssh_abduction.theory.settle import Problem
 
 Told = tuple[
     tuple[int, ...], frozenset[tuple[int, str, object]]
@@ -238,7 +239,7 @@ def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> N
         misread=data.draw(st.sampled_from([0.4, 1.0])),
         slipped=data.draw(st.sampled_from([0.3, 1.0])),
     )
-    task = Task.of(trace, theory)
+    task = Task.of(Problem.of(trace, theory))
     price = {
         kind: [theory.fault_tenths(kind, step) for step in trace.steps]
         for kind in ("misread", "slipped")

@@ -40,6 +40,7 @@ from ssh_abduction.solver.steps.chart import QUARTERS, Chart, FramedChart, numbe
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory import Speedups, encodings
+from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 PLAIN = Speedups.without(SPEEDUPS)
@@ -729,10 +730,10 @@ def loosened_labels(draw: st.DrawFn, labels: Sequence[int]) -> list[int]:
 
 
 def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:
-    resolved = theory.resolve(trace)
+    resolved = settle(trace, theory).theory
     watch = Watch()
     watch.start()
-    found = FramedEngine(engine.Task.of(trace, resolved, watch))
+    found = FramedEngine(engine.Task.of(Problem.of(trace, resolved), watch))
     found._visits.chart = Chart.framed(trace, found._task.log)
     return found
 

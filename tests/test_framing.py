@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from instances import maze
 from strategies import theories, traces
 
-from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace, solve
+from ssh_abduction import OnlineMapper, SSHMap, Theory, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.solver import Search, Status, candidates, choosing, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
@@ -21,6 +21,7 @@ from ssh_abduction.solver.engines.framing import maps_with_frames
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.theory import Speedups
+from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import SPEEDUPS, row
 
 THEORIES = {
@@ -42,11 +43,11 @@ def started(limit: float | None = None) -> Watch:
 @given(st.data())
 def test_maps_with_frames_are_maps_of_the_theory(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=10), label="trace")
-    theory = data.draw(theories(trace), label="theory").resolve(trace)
+    theory = settle(trace, data.draw(theories(trace), label="theory")).theory
     if not row("framing").holds_for(theory):
         return
     costs = []
-    for ssh_map in maps_with_frames(trace, theory, started(), Speedups()):
+    for ssh_map in maps_with_frames(Problem.of(trace, theory), started(), Speedups()):
         assert check(trace, ssh_map, theory) == ()
         costs.append(len(ssh_map.dstates))
     assert costs == sorted(costs, reverse=True)
@@ -83,7 +84,7 @@ def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
 def test_a_maze_without_stars_has_a_small_map_before_the_proof(theory: Theory) -> None:
     """In the second part of its search it is interrupted at once; the robot was in 32 dstates."""
     walk = maze(3, 3, steps=400, seed=0)
-    stages = 2 if row("ways").holds_for(theory.resolve(walk.trace)) else 1
+    stages = 2 if row("ways").holds_for(settle(walk.trace, theory).theory) else 1
     with patch.object(
         Prefixes, "find_minimum", side_effect=[*[StageTimeError] * stages, KeyboardInterrupt]
     ):
@@ -136,11 +137,11 @@ def test_a_sketch_with_frames_is_smaller(theory: Theory) -> None:
     trace = maze(3, 3, steps=400, seed=0).trace
     first, *rest = trace.steps
     sizes = []
-    for sketch in Sketch.all_of(first, theory.resolve(trace)):
+    for sketch in Sketch.all_of(first, settle(trace, theory).theory):
         assert all(
             sketch.extend(action, step) for action, step in zip(trace.actions, rest, strict=True)
         )
-        assert check(trace, sketch.map(), theory.resolve(trace)) == ()
+        assert check(trace, sketch.map(), settle(trace, theory).theory) == ()
         sizes.append(len(sketch.map().dstates))
     framed, homing = sizes[0], sizes[2]
     assert framed < homing / 2
@@ -173,8 +174,8 @@ def test_what_ends_it_leaves_its_last_map_and_no_thread(stop: BaseException) -> 
     search = Search(walk.trace, time_limit=60)
     found = framing.maps_with_frames
 
-    def stopped(trace: Trace, theory: Theory, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
-        yield next(found(trace, theory, watch, speedups))
+    def stopped(problem: Problem, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
+        yield next(found(problem, watch, speedups))
         if str(stop) == "interrupted":
             search.interrupt()
         raise stop
@@ -206,9 +207,9 @@ def test_until_there_is_a_map_it_may_take_twice_as_long() -> None:
     found = framing.maps_with_frames
     left: list[float] = []
 
-    def timed(trace: Trace, theory: Theory, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
+    def timed(problem: Problem, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
         left.append(watch.left())
-        yield next(found(trace, theory, watch, speedups))
+        yield next(found(problem, watch, speedups))
         left.append(watch.left())
         raise KeyboardInterrupt
 

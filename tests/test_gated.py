@@ -18,6 +18,7 @@ from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.solver.guesses.gated import gated_map
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.settle import Problem, settle
 
 WORLDS: dict[str, nx.Graph] = {
     "triangle": planar.triangle(),
@@ -44,7 +45,7 @@ def drive(world: str, seed: int, steps: int = 24) -> Trace:
 def test_a_greedy_map_satisfies_all_axioms(world: str, homing: bool) -> None:
     for seed in range(2):
         trace = drive(world, seed)
-        theory = Theory.topological().resolve(trace)
+        theory = settle(trace).theory
         assert theory.star == "gateways"
         ssh_map = gated_map(trace, theory, homing=homing)
         assert ssh_map is not None
@@ -66,7 +67,7 @@ def test_evidence_keeps_two_places_apart() -> None:
     back = Trace.from_steps(
         "abaa", ["travel", "around", "travel"], stars=[[0, 120], [180], [0], [180, 300]]
     )
-    theory = Theory.topological().resolve(back)
+    theory = settle(back).theory
     there = gated_map(back, theory, homing=True)
     assert there is not None
     assert there.dstates[there.labels[3]].place == there.dstates[there.labels[0]].place
@@ -138,15 +139,17 @@ def test_own_rules_hold_in_the_maps_that_clingo_lists(body: str, level: str) -> 
     def maps_of(asked: Theory) -> set[SSHMap]:
         return set(solve(SMALL, asked, max_maps=None).maps)
 
-    resolved = theory.resolve(SMALL)
+    resolved = settle(SMALL, theory).theory
     assert can_be_asked(resolved)
     assert {
-        ssh_map for ssh_map in maps_of(plain) if keeps_own_rules(SMALL, ssh_map, resolved)
+        ssh_map
+        for ssh_map in maps_of(plain)
+        if keeps_own_rules(Problem.of(SMALL, resolved), ssh_map)
     } == maps_of(theory)
 
 
 @pytest.mark.parametrize("body", ["founded(S,t)", "used(H,t)", "violation(deterministic,t)"])
 def test_rules_about_atoms_that_maps_lack_cannot_be_asked(body: str) -> None:
     assert not can_be_asked(
-        ruled(f"#program step(t).\n:- {body}.", Theory.topological()).resolve(SMALL)
+        settle(SMALL, ruled(f"#program step(t).\n:- {body}.", Theory.topological())).theory
     )

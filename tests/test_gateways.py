@@ -27,6 +27,7 @@ from ssh_abduction.data.star import Frame, Gateway, Star
 from ssh_abduction.data.trace import Action, Step
 from ssh_abduction.solver import Status, prefixes
 from ssh_abduction.solver.steps import frames
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import Speedups
 
 GATEWAYS = Theory(star="gateways")
@@ -84,14 +85,14 @@ def test_what_is_in_quarters() -> None:
 def test_what_the_trace_tells_settles_the_star() -> None:
     square, bend = (Trace.from_steps("a", [], stars=[star]) for star in ((0, 90), (0, 120)))
     for star in ("auto", "frame"):
-        assert Theory(star=star).resolve(square).star == "frame"
-        assert Theory(star=star).resolve(bend).star == "gateways"
-    assert Theory(star="gateways").resolve(square).star == "gateways"
+        assert settle(square, Theory(star=star)).theory.star == "frame"
+        assert settle(bend, Theory(star=star)).theory.star == "gateways"
+    assert settle(square, Theory(star="gateways")).theory.star == "gateways"
     with pytest.raises(
         TraceError,
         match=r"step 0: star: expected bearings that fall into different quarters.*take star=gateways",
     ):
-        Theory(star="pattern").resolve(bend)
+        settle(bend, Theory(star="pattern"))
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from ssh_abduction.explain.no_map import explain
 from ssh_abduction.solver.front import fault_front
 from ssh_abduction.solver.guesses.outliers import wrong_displacements
 from ssh_abduction.theory import Speedups
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 AHEAD, LEFT, AWAY = (10.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2), (25.0, 7.0, 0.9)
@@ -63,7 +64,7 @@ def test_minimal_maps_are_the_best_of_all_ways_to_leave_displacements_out(
     theory = (Theory.causal() if causal else Theory(boundary="none")).replace(
         displacement="use", jumped=price, prefer=("dstates",)
     )
-    theory = theory.resolve(trace)
+    theory = settle(trace, theory).theory
     moved = [t for t, step in enumerate(trace.steps) if step.displacement is not None]
     expected: dict[float, set[tuple[tuple[int, ...], tuple[int, ...]]]] = {}
     for jumps in chain.from_iterable(combinations(moved, size) for size in range(len(moved) + 1)):

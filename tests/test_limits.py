@@ -28,6 +28,7 @@ from ssh_abduction.solver.asp.limits import LimitError, Watch, peak_memory
 from ssh_abduction.solver.candidates import Candidates
 from ssh_abduction.solver.steps import certificate
 from ssh_abduction.solver.steps.noise import noise_in
+from ssh_abduction.theory.settle import settle
 
 # Seconds in which what has to end soon has ended also on a slow machine that has much else to do. What does not heed its limit takes longer than that. How many
 # seconds an end takes beyond the limit is measured by benchmarks/limits.py.
@@ -277,7 +278,7 @@ def test_an_explanation_can_be_stopped_while_it_grounds() -> None:
     asked = iter([False, False, True])
     with pytest.raises(Interrupted):
         Axioms(
-            Piece.of(trace, Theory.topological().resolve(trace), range(len(trace))),
+            Piece.of(settle(trace), range(len(trace))),
             lambda: next(asked),
         )
 

@@ -32,6 +32,7 @@ from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import Speedups
+from ssh_abduction.theory.settle import Problem
 
 CAUSAL = Theory.causal()
 
@@ -359,7 +360,7 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
     trace = maze(3, 3, steps=1600, seed=0).trace
     watch = Watch(100.0)
     watch.start()
-    long = CausalEngine(engine.Task.of(trace, CAUSAL, watch))._named
+    long = CausalEngine(engine.Task.of(Problem.of(trace, CAUSAL), watch))._named
     long.grow(len(trace))
     with patch.multiple(named, AT_ONCE=first, GUESSED=guessed):
         found = list(long._from_beginning(watch.check))
@@ -395,7 +396,7 @@ def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
 def test_of_a_long_trace_as_much_is_taken_as_adds_to_the_clique() -> None:
     trace = maze(3, 3, steps=3000, seed=0).trace
     log = Log(trace, CAUSAL)
-    long = CausalEngine(engine.Task.of(trace, CAUSAL, Watch(100.0)))
+    long = CausalEngine(engine.Task.of(Problem.of(trace, CAUSAL), Watch(100.0)))
     long._named.size = 32
     with patch.object(engine, "AT_ONCE", 50), patch.object(named, "AT_ONCE", 50):
         size = long.next_size(32)

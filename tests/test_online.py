@@ -32,6 +32,7 @@ from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import Speedups
 
 NO_TIME = 1e-9  # seconds: every search is stopped before it begins
@@ -93,7 +94,7 @@ def sketched(mapper: OnlineMapper) -> SSHMap:
 
 def agree(trace: Trace, theory: Theory) -> None:
     """After every step the answer is what solving the prefix anew gives."""
-    theory = theory.resolve(trace)
+    theory = settle(trace, theory).theory
     _, answers = follow(trace, theory)
     for i, answer in enumerate(answers):
         anew = solve(trace.prefix(i + 1), theory.of_steps(0, i + 1), max_maps=None)
@@ -124,7 +125,7 @@ def test_a_theory_without_an_axiom_is_solved_anew(name: str) -> None:
 @given(st.data())
 def test_no_more_maps_than_asked_for(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
-    theory = data.draw(theories(trace), label="theory").resolve(trace)
+    theory = settle(trace, data.draw(theories(trace), label="theory")).theory
     _, answers = follow(
         trace,
         theory,
@@ -191,9 +192,9 @@ def test_sketches_are_consistent(data: st.DataObject) -> None:
     trace = data.draw(
         traces(max_steps=14), label="trace"
     ).without_displacements()  # what evidence says, a sketch does not know
-    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory").resolve(
-        trace
-    )
+    theory = settle(
+        trace, data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory")
+    ).theory
     sketch = data.draw(st.sampled_from(Sketch.all_of(trace.steps[0], theory)), label="sketch")
     for i, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True)):
         assert check(trace.prefix(i + 1), sketch.map(), theory) == ()
@@ -232,9 +233,9 @@ def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> 
     trace = data.draw(
         traces(max_steps=10), label="trace"
     ).without_displacements()  # what evidence says, a sketch does not know
-    theory = data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory").resolve(
-        trace
-    )
+    theory = settle(
+        trace, data.draw(theories(trace, fixed=(*FOREIGN, *PAIRS, "planar")), label="theory")
+    ).theory
     draft(
         trace,
         theory,
@@ -246,7 +247,7 @@ def test_a_map_that_goes_on_like_a_sketch_is_consistent(data: st.DataObject) -> 
 def test_a_map_whose_turns_lead_back_is_not_sure_to_go_on() -> None:
     """Two turns to the right lead back, so a new place ahead would be on both sides of a path."""
     trace = Trace.from_steps("aaaa", ["right", "right", "travel"])
-    theory = Theory(star="none", path_order="partial", all_on_paths=True).resolve(trace)
+    theory = settle(trace, Theory(star="none", path_order="partial", all_on_paths=True)).theory
     assert draft(trace, theory, 3, 0) == [True]
 
 
@@ -258,9 +259,7 @@ def test_a_map_goes_on_through_a_maze(stars: bool) -> None:
         trace = (
             trace if stars else Trace.from_steps([step.view or "" for step in trace], trace.actions)
         )
-        doubts += draft(
-            trace, Theory.topological().resolve(trace), 12 + 4 * seed if stars else 6 + seed, seed
-        )
+        doubts += draft(trace, settle(trace).theory, 12 + 4 * seed if stars else 6 + seed, seed)
     assert {*doubts} == {True, False}
 
 
@@ -268,7 +267,7 @@ def test_a_map_goes_on_through_a_maze(stars: bool) -> None:
 @given(st.data())
 def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) -> None:
     trace = data.draw(traces(max_steps=9), label="trace")
-    theory = data.draw(theories(trace), label="theory").resolve(trace)
+    theory = settle(trace, data.draw(theories(trace), label="theory")).theory
     mapper, answers = follow(trace, theory, limit=NO_TIME)
     for i, answer in enumerate(answers):
         assert answer.status in (Status.FEASIBLE, Status.UNKNOWN)
@@ -291,7 +290,7 @@ def test_without_time_there_is_a_map_and_later_the_proof(data: st.DataObject) ->
 def test_a_limit_leaves_feasible_maps_and_sound_bounds() -> None:
     """The tour is solved for its first half; then there is no time."""
     trace = drive(*TOURS["plus"])
-    theory = Theory.topological().resolve(trace)
+    theory = settle(trace).theory
     half = len(trace) // 2
     mapper, _ = follow(trace.prefix(half), theory)
     limit_steps(mapper, NO_TIME)
@@ -353,7 +352,7 @@ def test_a_map_that_is_contradicted_is_mended() -> None:
     without = contradicted = 0
     for seed in range(6):
         trace = maze(3, 3, steps=120, seed=seed, stars=True).trace
-        theory = Theory.topological().resolve(trace)
+        theory = settle(trace).theory
         first = 25 + 5 * seed
         known = solve(trace.prefix(first), theory, max_maps=1).maps[0]
         predicted = Log(trace, theory).replay(known.labels).labels
@@ -561,9 +560,9 @@ def test_displacements_may_be_asked_for_before_the_first_one_comes() -> None:
     trace = maze(2, 2, steps=12, seed=0, odometry=Odometry()).trace
     theory = Theory(displacement="use", star="none")
     mapper, answers = follow(trace, theory)
-    assert answers[0].theory == theory.replace(returns=1).resolve(trace.prefix(1))
+    assert answers[0].theory == settle(trace.prefix(1), theory.replace(returns=1)).theory
     assert set(answers[-1].maps) == set(solve(trace, theory, max_maps=None).maps)
-    assert mapper.theory == theory.resolve(trace)
+    assert mapper.theory == settle(trace, theory).theory
     assert follow(trace, Theory(displacement="none"))[0].theory.displacement == "none"
 
 
@@ -577,7 +576,7 @@ def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
 
     def guessed_map(trace: Trace, *others: Any) -> SSHMap | None:
         given.append(trace)
-        return guessing.FramedEngine(Task.of(trace, others[0])).map_of_guess().map  # type: ignore[union-attr]
+        return guessing.FramedEngine(Task.of(Problem.of(trace, others[0]))).map_of_guess().map  # type: ignore[union-attr]
 
     def at_once(function: Callable[..., SSHMap | None], *args: Any, watch: object) -> SSHMap | None:
         return (guessed_map if function is guessing.guessed_map else function)(*args)

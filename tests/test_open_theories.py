@@ -34,6 +34,7 @@ from ssh_abduction.solver.judging import InternalError
 from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs
 from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import SPEEDUPS, TABLE, row
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -276,7 +277,7 @@ def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.
     def allows(found: Key) -> bool:
         return all(found[0].count(label) <= 2 for label in found[0])
 
-    counts, expected = minimal_maps(trace, theory.resolve(trace), allows)
+    counts, expected = minimal_maps(trace, settle(trace, theory).theory, allows)
     with (
         patch.object(judging, "evidence_of", lambda _: (NoLongReturns(),)),
         patch.object(

@@ -24,6 +24,7 @@ from ssh_abduction.data.maps import DState
 from ssh_abduction.solver import Status, choosing, prefixes
 from ssh_abduction.theory.evidence import Equality, Planar
 from ssh_abduction.theory.planarity import can_be_drawn, is_planar
+from ssh_abduction.theory.settle import settle
 
 # Drawings, against networkx
 
@@ -291,7 +292,7 @@ def test_what_is_refused_holds_in_no_planar_map_and_the_checker_refuses_the_same
             [ACTIONS[letter] for letter in letters],
             stars=[(1, 1, 1, 1)] * 7 if rng.random() < 0.5 else None,
         )
-        theory = Theory(boundary="none", path_order="partial", prefer=()).resolve(trace)
+        theory = settle(trace, Theory(boundary="none", path_order="partial", prefer=())).theory
         planar = theory.replace(planar=True)
         drawable = {found for found, _ in consistent_maps(trace, planar)}
         maps = solve(trace, theory, max_maps=None).maps
@@ -318,7 +319,7 @@ def test_a_map_cut_to_first_steps_stays_planar() -> None:
         letters = [rng.choice("TTRRLA") for _ in range(9)]
         stars = [(1, 1, 1, 1)] * 10 if rng.random() < 0.5 else None
         trace = Trace.from_steps("a" * 10, [ACTIONS[letter] for letter in letters], stars=stars)
-        theory = Theory(boundary="none", planar=True).resolve(trace)
+        theory = settle(trace, Theory(boundary="none", planar=True)).theory
         for ssh_map in solve(trace, theory, max_maps=20).maps:
             for steps in range(1, len(trace)):
                 labels = ssh_map.labels[:steps]
@@ -420,7 +421,7 @@ def test_what_is_refused_speaks_of_few_steps_and_tells_their_places_apart(
     Without this, a refusal would forbid planar maps.
     """
     ssh_map = smaller.maps[0]
-    reason = Planar.of(Theory(planar=True).resolve(tour)).refuse(tour, ssh_map)
+    reason = Planar.of(settle(tour, Theory(planar=True)).theory).refuse(tour, ssh_map)
     assert reason
     place = {
         step: ssh_map.dstates[ssh_map.labels[step]].place

@@ -16,7 +16,6 @@ from ssh_abduction import SSHMap, Theory, Trace
 from ssh_abduction.checker import geometry
 from ssh_abduction.checker.geometry import refused_returns
 from ssh_abduction.data import DState, Odometry
-from ssh_abduction.theory.evidence import displacement as module
 from ssh_abduction.theory.evidence.displacement import Displacement, Returns
 from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares
 from ssh_abduction.theory.evidence.together import Together, joint_squares
@@ -51,11 +50,10 @@ def test_what_is_known_of_a_trace_grows_with_it(data: st.DataObject) -> None:
     level = data.draw(st.sampled_from(["topological", "causal"]), label="level")
     theory = Theory.causal() if level == "causal" else Theory(star="none")
     evidence = Displacement.of(theory.replace(displacement="use", returns=2, reject=0.3))
-    module._KEPT.clear()
     sizes = data.draw(st.lists(st.integers(1, len(trace)), min_size=1, max_size=6), label="sizes")
     for size in [*sizes, len(trace)]:
         prefix = trace.prefix(size)
-        grown, anew = module._returns(evidence, prefix), Returns(evidence, prefix)
+        grown, anew = evidence.returns_of(prefix), Returns(evidence, prefix)
         assert (grown.pairs, grown.count()) == (anew.pairs, anew.count())
 
 
@@ -166,7 +164,6 @@ def test_only_returns_that_end_later_are_asked_about_once_a_map_was_accepted() -
     trace = walk.trace
     evidence = evidence_of(trace, reject=0.3)
     wrong = seen(trace, walk.truth, 14)
-    module._KEPT.clear()
     size = next(
         n
         for n in range(2, len(trace))

@@ -43,6 +43,7 @@ from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.steps.log import Log, Outcome
 from ssh_abduction.theory import Speedups
+from ssh_abduction.theory.settle import Problem, settle
 
 TRACE = rectangle(8)
 MAP = solve(TRACE).maps[0]
@@ -447,7 +448,7 @@ def maps_of_all_tours() -> Iterator[tuple[Trace, Theory, SSHMap]]:
 
 def test_a_map_predicts_the_trace_it_was_made_for() -> None:
     for trace, theory, ssh_map in maps_of_all_tours():
-        replayed = Log(trace, theory.resolve(trace)).replay(ssh_map.labels)
+        replayed = Log(trace, settle(trace, theory).theory).replay(ssh_map.labels)
         assert (replayed.labels, replayed.outcome) == (ssh_map.labels, Outcome.PREDICTED)
         assert links_of(ssh_map.labels, trace) == ssh_map.links
 
@@ -502,7 +503,7 @@ def test_nothing_that_infers_reads_the_truth() -> None:
 def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
     """A limit that stops the growth leaves no old horizon behind: growing on gives what growing at once gives."""
     trace = drive(*TOURS["comb"])
-    theory = Theory.topological().resolve(trace)
+    theory = settle(trace).theory
 
     class Impatient(Watch):
         left = 100
@@ -513,7 +514,7 @@ def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
                 raise LimitError("time limit")
 
     watch = Impatient(None, None, lambda: None)
-    engine = StepEngine(Task.of(trace, theory, watch), paths=10)
+    engine = StepEngine(Task.of(Problem.of(trace, theory), watch), paths=10)
     engine.grow(4)
     watch.left = 2
     with pytest.raises(LimitError):

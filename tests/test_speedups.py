@@ -36,6 +36,7 @@ from ssh_abduction.solver.steps.apart import Continuations, clique
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.theory import Speedups
+from ssh_abduction.theory.settle import settle
 
 NAMES = [f.name for f in fields(Speedups)]
 PLAIN = Speedups.without(NAMES)
@@ -271,7 +272,7 @@ def test_unknown_speedups_are_an_error() -> None:
 @given(traces(max_steps=12))
 def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     """So they do where each step was a dstate, and these are merged while they can be."""
-    theory = Theory.causal().replace(joint=1).resolve(trace)  # merging knows of pairs alone
+    theory = settle(trace, Theory.causal().replace(joint=1)).theory  # merging knows of pairs alone
     log = Log(trace, theory)
     chart = Chart.of_steps(log, len(trace))
     apart, links = chart.apart(), chart.links

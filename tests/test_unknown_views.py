@@ -20,6 +20,7 @@ from ssh_abduction.data.errors import TraceError
 from ssh_abduction.output import to_dot, to_graphml, to_svg
 from ssh_abduction.rivals.comparison import compare
 from ssh_abduction.rivals.explore import next_experiment
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import TABLE
 
 CORRIDOR = ["end", "hall", "end", "end", "hall", "end", "end"]
@@ -141,7 +142,7 @@ def test_there_is_a_map_when_the_time_is_over(theory: Theory) -> None:
 
 
 def test_no_speedup_that_reads_views_is_on() -> None:
-    theory = Theory.topological().resolve(Trace.from_steps(["a", None], ["travel"]))
+    theory = settle(Trace.from_steps(["a", None], ["travel"])).theory
     kept = {
         "path_names",
         "sides",

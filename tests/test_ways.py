@@ -26,6 +26,7 @@ from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.theory import Speedups
 from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.settle import Problem, settle
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -71,7 +72,7 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
         patch.object(ways, "CONTRARY", contrary),
     ):
         known = data.draw(st.sampled_from([None, expected.maps[0].labels]), label="known")
-        engine = FramelessEngine(Task.of(trace, theory), known or ())
+        engine = FramelessEngine(Task.of(Problem.of(trace, theory)), known or ())
         engine.grow(len(trace))
         *_, best = engine.improving_maps()
         found = [found.map for found in engine.maps_of_cost(best.cost, 0)]
@@ -86,7 +87,7 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
 def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.DataObject) -> None:
     """Two returns of a minimal map, to dstates or to places, are forbidden: the maps that are left are those of the readable encodings, which are told the same."""
     trace = data.draw(traces(max_steps=9), label="trace").without_stars()
-    task = Task.of(trace, data.draw(bare_theories(), label="theory").resolve(trace))
+    task = Task.of(settle(trace, data.draw(bare_theories(), label="theory")))
     plain, engine = (
         StepEngine(task, most_paths(trace, task.theory, len(trace))),
         FramelessEngine(task),
@@ -125,10 +126,10 @@ def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.Da
 def test_a_limit_while_labels_are_listed_is_a_limit() -> None:
     """Labels with the fewest dstates are listed after a map with so few is known: that it is known ends the search for it, and not the list."""
     trace = maze(3, 3, steps=30, seed=0).trace
-    theory = Theory.topological().resolve(trace)
+    theory = settle(trace).theory
     known = solve(trace, theory).maps[0].labels
     with patch.object(named, "SPARES", 0):
-        engine = FramelessEngine(Task.of(trace, theory), known)
+        engine = FramelessEngine(Task.of(Problem.of(trace, theory)), known)
         engine.grow(len(trace))
         maps = engine.improving_maps()
         next(maps)

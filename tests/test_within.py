@@ -22,6 +22,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Cost, Status, prefixes
 from ssh_abduction.solver.search import Search
 from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory.settle import settle
 
 ACES3, EXAMPLE = "examples/aces3-route.jsonl", "examples/notched-rectangle.jsonl"
 LIMIT = 100  # seconds: a search that does not end is a failure, not a hang
@@ -208,7 +209,7 @@ def test_a_file_of_near_minimal_maps_is_not_taken_at_its_word(
     answer = near | change | {"maps": [near["maps"][i] for i in chosen], "count": len(chosen)}
     maps = [SSHMap.from_dict(ssh_map) for ssh_map in answer["maps"]]
     trace = Trace.load(ACES3)
-    false = false_claims(answer, maps, len(trace), Theory.topological().resolve(trace), 19)
+    false = false_claims(answer, maps, len(trace), settle(trace).theory, 19)
     assert (fault in "; ".join(false)) if fault else not false
 
 
@@ -216,9 +217,7 @@ def test_a_map_that_does_not_cost_what_it_is_said_to_cost_is_found(near: dict[st
     maps = [SSHMap.from_dict(ssh_map) for ssh_map in near["maps"]]
     wrong = [ssh_map | {"cost": near["cost"]} for ssh_map in near["maps"]]
     trace = Trace.load(ACES3)
-    false = false_claims(
-        near | {"maps": wrong}, maps, len(trace), Theory.topological().resolve(trace), 19
-    )
+    false = false_claims(near | {"maps": wrong}, maps, len(trace), settle(trace).theory, 19)
     assert len(false) == 7
     assert (
         false[0]

@@ -41,9 +41,10 @@ from ssh_abduction.checker import (
 from ssh_abduction.checker.reading import Check, Reading
 from ssh_abduction.data.errors import MapError, brief
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.theory import Theory
 
 COHERENCE = "map_explains_trace"
 
@@ -94,7 +95,7 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
         Kuipers & Beeson, AAAI 2002; Remolina & Kuipers, AIJ 2004; the axioms are in
         docs/explanation/theory.md.
     """
-    theory = checked_theory(theory).resolve(checked_trace(trace))
+    theory = settle(trace, theory).theory
     if not isinstance(ssh_map, SSHMap):
         raise MapError(
             f"map: expected an SSHMap, got {brief(ssh_map)}; take one of a solution, or SSHMap.load"

@@ -17,6 +17,7 @@ from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import SSHMap, maps_of
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import RESTS_ON, Ranking, Sharing, Solution, summary_of
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 EXIT_VIOLATED = 20
@@ -59,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
                 else ""
             )
             print(f"map {i + 1}: {v.axiom}: {steps}{printable(v.message)}")
-    resolved = theory.resolve(trace)
+    resolved = settle(trace, theory).theory
     not_checked = unchecked(resolved)
     checked = sum(name not in not_checked for name in resolved.axioms)
     print(f"{len(maps) - broken} of {len(maps)} maps satisfy the {checked} axioms")
@@ -80,10 +81,10 @@ def run(options: argparse.Namespace) -> int:
         doubt = "some maps break axioms"
     elif solved is None:
         doubt = "the file does not say of which theory"
-    elif theory.resolve(trace).replace(prefer=()) != solved.resolve(trace).replace(prefer=()):
+    elif resolved.replace(prefer=()) != settle(trace, solved).theory.replace(prefer=()):
         doubt = "the file is of another theory"
     proven = _bound(
-        trace, data, theory, maps, doubt, (solved or theory).resolve(trace), bool(broken)
+        trace, data, theory, maps, doubt, settle(trace, solved or theory).theory, bool(broken)
     )
     return EXIT_VIOLATED if broken or not proven else 0
 

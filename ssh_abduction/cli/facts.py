@@ -9,6 +9,7 @@ from ssh_abduction.cli.options import Verbs, add_theory, theory_of
 from ssh_abduction.data.errors import printable
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import facts as encoding
+from ssh_abduction.theory.settle import settle
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -21,7 +22,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def run(options: argparse.Namespace) -> int:
     trace = Trace.load(options.trace)
-    text = encoding.program(trace, theory_of(options).resolve(trace))
+    text = encoding.program(settle(trace, theory_of(options)))
     if sys.stdout.isatty():  # clingo takes a name as it is; a terminal would obey some characters
         text = "".join(f"{printable(line)}\n" for line in text.rstrip("\n").split("\n"))
     print(text, end="")

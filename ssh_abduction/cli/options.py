@@ -16,6 +16,7 @@ from ssh_abduction.cli.parsing import Parser, true_or_false
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import (
     ASSERTIONS,
     CHOICES,
@@ -246,7 +247,7 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
         with suppress(
             AbductionError
         ):  # the theory was made for a trace that has what the default asks for; this one may be another
-            default = default.resolve(trace)
+            default = settle(trace, default).theory
     for field in fields(Theory):
         value = getattr(theory, field.name)
         if value == getattr(default, field.name) or field.name in ("level", *SETTLED):

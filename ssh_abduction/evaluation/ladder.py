@@ -25,6 +25,7 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.evaluation import Evaluation, evaluate, tells_names
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Search, Solution, check_limit
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 
@@ -185,7 +186,7 @@ def _solved(
     for name, chosen in rungs(trace, theory, stars):
         solution = (
             known
-            if known and known.theory == chosen.resolve(trace)
+            if known and known.theory == settle(trace, chosen).theory
             else under_way.solve(trace, chosen, time_limit=limit, max_maps=maps)
         )
         is_judged = has_truth and solution.maps and not under_way.interrupted

@@ -2,10 +2,11 @@
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.explain.piece import Piece
+>>> from ssh_abduction.theory.settle import settle
 >>> actions = ["right", "travel", "right", "travel"]
 >>> trace = Trace.from_steps(views=["v0", "v1", "v2", "v3", "v0"], actions=actions)
->>> theory = Theory.topological().resolve(trace)
->>> argument = derive(Piece.of(trace, theory, range(5)), trace, 0, 4, one=False)
+>>> problem = settle(trace)
+>>> argument = derive(Piece.of(problem, range(5)), trace, 0, 4, one=False)
 >>> for part in argument.summary.split("; "):
 ...     print(part)
 step 0 is at a place on the path that steps 1 and 2 define

@@ -8,10 +8,11 @@ from typing import NamedTuple, TypeAlias
 import clingo
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.explain.piece import Piece, displacement_of
+from ssh_abduction.explain.piece import Piece
 from ssh_abduction.solver import facts
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.evidence import Displacement, Equality, Planar, evidence_of
+from ssh_abduction.theory.evidence import Displacement, Equality, Planar
+from ssh_abduction.theory.settle import displacement_of
 
 # Seconds between two calls of `stop` while clingo solves.
 POLL = 0.05
@@ -91,7 +92,8 @@ class Axioms:
         """
         trace, theory = piece.trace, piece.theory
         self._trace, self._theory, self._first = trace, theory, piece.steps[0]
-        self._evidence = evidence_of(theory)
+        self._problem = piece.problem
+        self._evidence = piece.problem.evidence
         self._stop = stop
         self._refusals = 0  # constraints that were added since
         self._conclusions: list[clingo.Symbol] = []
@@ -110,7 +112,7 @@ class Axioms:
             facts.theory_facts(
                 theory, len(trace) if relaxed else facts.most_paths(trace, theory, len(trace))
             )
-            + facts.trace_facts(trace, theory, 0, len(trace)),
+            + facts.trace_facts(piece.problem, 0, len(trace)),
         )
         self._control.add("base", [], facts.own_rules(theory))
         self._control.add("base", [], piece.facts)
@@ -357,7 +359,7 @@ class Axioms:
         The other axioms of the clash have models, and each of them has a return that is refused.
         The clearest refused return is forbidden until no model is left.
         """
-        displacement = displacement_of(self._theory)
+        displacement = displacement_of(self._problem)
         steps = [t for axiom, t in clash if displacement and axiom == displacement.axiom]
         if not displacement or not steps:
             return ()

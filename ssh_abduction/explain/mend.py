@@ -14,6 +14,7 @@ from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.question import Question
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Status, Stop
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import ASSERTIONS, Theory, checked_theory
 
 NEW_VIEW = "a view never seen"
@@ -174,8 +175,10 @@ class TraceQuestion(Question[TraceExplanation]):
                 if self._over():
                     return
                 # the stretch is checked first, as it is much faster than the whole trace
-                piece = Piece.of(trace, theory, stretch)
-                if not self._suits(trace, theory) or not Axioms(piece, self._over).consistent():
+                if not self._suits(trace, theory):
+                    continue
+                piece = Piece.of(self.problem.changed(trace, theory), stretch)
+                if not Axioms(piece, self._over).consistent():
                     continue
                 found = self._has_map(trace, theory)
                 if found is not False:
@@ -186,7 +189,7 @@ class TraceQuestion(Question[TraceExplanation]):
     def _suits(self, trace: Trace, theory: Theory) -> bool:
         """Whether the changed trace still has what the theory reads."""
         try:
-            theory.resolve(trace)
+            settle(trace, theory)
         except AbductionError:
             return False
         return True

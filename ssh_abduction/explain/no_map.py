@@ -17,11 +17,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_whole
-from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Axioms
-from ssh_abduction.explain.piece import Piece, displacement_of
+from ssh_abduction.explain.piece import Piece
 from ssh_abduction.solver import check_rules
-from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.theory.settle import displacement_of, settle
+from ssh_abduction.theory.theory import Theory
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,8 @@ def explain(
         TraceError, TheoryError: As `solve` does, and if the theory has `jumped`.
         Interrupted: `stop` returned True.
     """
-    theory = checked_theory(theory).resolve(checked_trace(trace))
+    problem = settle(trace, theory)
+    theory = problem.theory
     if theory.jumped:
         raise TheoryError(
             "jumped: expected displacements that hold where a trace is explained; "
@@ -110,7 +112,7 @@ def explain(
     check_rules(theory)
 
     def has_no_map(first: int, end: int) -> bool:
-        return not Axioms(Piece.of(trace, theory, range(first, end)), stop).consistent()
+        return not Axioms(Piece.of(problem, range(first, end)), stop).consistent()
 
     # drop steps from the end, then from the start
     end = shortest(len(trace), lambda n: has_no_map(0, n))
@@ -119,7 +121,7 @@ def explain(
     length = shortest(end, lambda n: has_no_map(end - n, end)) or end
     first, last = end - length, end - 1
     clashes: dict[str, list[int]] = {}
-    axioms = Axioms(Piece.of(trace, theory, range(first, last + 1)), stop, relaxed=True)
+    axioms = Axioms(Piece.of(problem, range(first, last + 1)), stop, relaxed=True)
     clash = axioms.smallest_clash()
     for axiom, step in clash:
         clashes.setdefault(axiom, []).append(first + step)
@@ -145,7 +147,7 @@ def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = Non
     Raises:
         TraceError: The trace has no such step, or both steps are the same.
     """
-    theory = checked_theory(theory).resolve(checked_trace(trace))
+    problem = settle(trace, theory)
     for step in (first, second):
         if not is_whole(step) or not 0 <= step < len(trace):
             raise TraceError(
@@ -154,7 +156,7 @@ def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = Non
             )
     if first == second:
         raise TraceError(f"step: expected two steps, got {first} twice; take another one")
-    displacement = displacement_of(theory)
+    displacement = displacement_of(problem)
     return (
         displacement.returns_of(trace).why_apart(min(first, second), max(first, second))
         if displacement

@@ -195,7 +195,7 @@ class PairQuestion(Question[PairExplanation]):
     def _ask_pieces(self, one: bool, most: int) -> None:
         """Find a piece of at most `most` steps that has no map of a side."""
         for steps in self._pieces(most):
-            piece = Piece.of(self.trace, self.theory, steps)
+            piece = Piece.of(self.problem, steps)
             if not self._has_map(piece, one):
                 self._sides[one] = replace(self._sides[one], possible=False)
                 self._ruling_out[one] = piece
@@ -244,7 +244,7 @@ class PairQuestion(Question[PairExplanation]):
             ends = [k for k in piece.steps if k - 1 not in piece.steps or k + 1 not in piece.steps]
             if t not in ends:
                 continue
-            fewer = Piece.of(self.trace, self.theory, [k for k in piece.steps if k != t])
+            fewer = Piece.of(self.problem, [k for k in piece.steps if k != t])
             if not self._has_map(fewer, one):
                 piece = fewer
         return piece

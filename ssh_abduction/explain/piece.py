@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from ssh_abduction.data.trace import Action, Step, Trace
-from ssh_abduction.theory.evidence import Displacement, evidence_of
+from ssh_abduction.theory.settle import Problem, displacement_of
 from ssh_abduction.theory.theory import ASSERTIONS, Theory
 
 
@@ -18,20 +18,30 @@ class Piece:
     has no map, the trace has none.
 
     Attributes:
-        trace: The steps, numbered from 0. Across a gap the action and displacement are unknown.
-        theory: The theory, with asserted pairs in the numbers of the piece.
+        problem: The steps, numbered from 0, and the theory, with asserted pairs in these numbers.
+            Across a gap the action and displacement are unknown.
         steps: The steps of the whole trace, ascending.
         facts: Clingo facts: what displacements say about pairs of steps across gaps.
     """
 
-    trace: Trace
-    theory: Theory
+    problem: Problem
     steps: tuple[int, ...]
     facts: str = ""
 
+    @property
+    def trace(self) -> Trace:
+        """The steps of the piece."""
+        return self.problem.trace
+
+    @property
+    def theory(self) -> Theory:
+        """The theory of the piece."""
+        return self.problem.theory
+
     @staticmethod
-    def of(trace: Trace, theory: Theory, steps: Sequence[int]) -> Piece:
-        """The piece with these steps of a trace, ascending, under a resolved theory."""
+    def of(problem: Problem, steps: Sequence[int]) -> Piece:
+        """The piece with these steps of a trace, ascending."""
+        trace, theory = problem.trace, problem.theory
         kept: list[Step] = []
         for k, t in enumerate(steps):
             step = trace.steps[t]
@@ -53,25 +63,27 @@ class Piece:
             for name in ASSERTIONS
         }
         gap = steps[-1] - steps[0] + 1 > len(steps)
-        facts_across = _said_across(trace, theory, number) if gap else ""
+        facts_across = _said_across(problem, number) if gap else ""
         return Piece(
-            replace(trace, steps=tuple(kept)), theory.replace(**pairs), tuple(steps), facts_across
+            problem.changed(replace(trace, steps=tuple(kept)), theory.replace(**pairs)),
+            tuple(steps),
+            facts_across,
         )
 
 
-def _said_across(trace: Trace, theory: Theory, number: Mapping[int, int]) -> str:
+def _said_across(problem: Problem, number: Mapping[int, int]) -> str:
     """What displacements say about pairs of these steps, as facts.
 
     They are computed from the whole trace: the piece lacks the displacements across its gaps.
     """
-    displacement = displacement_of(theory)
+    displacement = displacement_of(problem)
     if displacement is None:
         return ""
-    pairs = displacement.pairs(trace)
+    pairs = displacement.pairs(problem.trace)
     told = []
     for name, earlier in (
         ("excluded", pairs.apart),
-        ("elsewhere", pairs.elsewhere if theory.level == "topological" else {}),
+        ("elsewhere", pairs.elsewhere if problem.theory.level == "topological" else {}),
     ):
         told += [
             f"{name}({displacement.axiom},{number[i]},{number[t]})."
@@ -81,10 +93,3 @@ def _said_across(trace: Trace, theory: Theory, number: Mapping[int, int]) -> str
             if i in number
         ]
     return "\n".join(told)
-
-
-def displacement_of(theory: Theory) -> Displacement | None:
-    """The evidence of displacements, if the theory uses it."""
-    return next(
-        (evidence for evidence in evidence_of(theory) if isinstance(evidence, Displacement)), None
-    )

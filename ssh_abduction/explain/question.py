@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from contextlib import suppress
 from typing import Generic, TypeVar
 
-from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.solver import (
     LimitError,
@@ -17,7 +17,8 @@ from ssh_abduction.solver import (
     check_limit,
     check_rules,
 )
-from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.theory import Theory
 
 _Answer = TypeVar("_Answer")
 SHORTEST = 0.05  # seconds that a search has at least
@@ -38,8 +39,8 @@ class Question(ABC, Generic[_Answer]):
     ) -> None:
         check_limit("time_limit (--time-limit)", "seconds", time_limit)
         check_limit("memory_limit (--memory-limit)", "MiB", memory_limit)
-        self.trace = checked_trace(trace)
-        self.theory = checked_theory(theory).resolve(trace)
+        self.problem = settle(trace, theory)
+        self.trace, self.theory = trace, self.problem.theory
         self.theory.check_steps(trace)
         check_rules(self.theory)
         self.limit, self.memory = time_limit, memory_limit

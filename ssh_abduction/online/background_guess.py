@@ -16,13 +16,14 @@ from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.online.background import BackgroundTask
 from ssh_abduction.solver import FramedEngine, Task, Watch, has_processors, in_process
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
 
 def guessed_map(trace: Trace, theory: Theory, speedups: Speedups, watch: Watch) -> SSHMap | None:
     """A map made of a guess, if one is found soon."""
-    found = FramedEngine(Task.of(trace, theory, watch, speedups)).map_of_guess()
+    found = FramedEngine(Task.of(Problem.of(trace, theory), watch, speedups)).map_of_guess()
     return found.map if found else None
 
 
@@ -35,7 +36,9 @@ def mended_map(
         A map of the trace with new dstates for whatever does not fit; None if there is none.
     """
     watch = watch or Watch()
-    found = FramedEngine(Task.of(trace, theory, watch, speedups)).map_mended_from(known.labels)
+    found = FramedEngine(Task.of(Problem.of(trace, theory), watch, speedups)).map_mended_from(
+        known.labels
+    )
     return found.map if found else None
 
 

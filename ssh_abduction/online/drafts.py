@@ -13,10 +13,9 @@ from ssh_abduction.checker.checker import check, unchecked
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.solver import Cost, Judging, Sketch
-from ssh_abduction.theory.evidence import evidence_of
 from ssh_abduction.theory.pairs import Pairs
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
-from ssh_abduction.theory.theory import Theory
 
 # At most this many drafts are kept. Each takes time at every step, and mostly one of the first
 # goes on for long.
@@ -35,14 +34,13 @@ class Drafts:
     """Drafts and sketches of the steps so far.
 
     Args:
-        trace: The steps so far.
-        theory: The settled theory.
+        problem: The steps so far, and the settled theory.
         judging: Evidence and the checker, for this theory.
     """
 
-    def __init__(self, trace: Trace, theory: Theory, judging: Judging) -> None:
+    def __init__(self, problem: Problem, judging: Judging) -> None:
+        trace, theory, evidence = problem.trace, problem.theory, problem.evidence
         self._theory, self._judging = theory, judging
-        evidence = evidence_of(theory)
         self._has_evidence = bool(evidence)
         # Evidence is asked as a sketch grows. The other axioms hold by construction, or the
         # checker is asked about them.

@@ -12,7 +12,8 @@ from ssh_abduction.online.incremental import IncrementalSolver
 from ssh_abduction.online.options import StepOptions
 from ssh_abduction.online.replay import MinimalMaps
 from ssh_abduction.solver import Cost, Effort, Judging, Seconds, Solution, Status
-from ssh_abduction.theory.evidence import evidence_of, pairs_of, said_by
+from ssh_abduction.theory.evidence import said_by
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 
 
@@ -20,8 +21,7 @@ class MapKeeper:
     """Keeps the minimal maps current, or else the best map that can be had in time.
 
     Args:
-        trace: The steps so far.
-        theory: The settled theory, without faults.
+        problem: The steps so far, and the settled theory, without faults.
         options: What a step may use.
         before: The keeper that this one follows. Its theory was settled for fewer steps.
     """
@@ -30,16 +30,15 @@ class MapKeeper:
 
     def __init__(
         self,
-        trace: Trace,
-        theory: Theory,
+        problem: Problem,
         options: StepOptions,
         before: MapKeeper | None = None,
     ) -> None:
-        self.trace, self.theory, self._options = trace, theory, options
-        self._judging = Judging(trace, theory)
-        self._pairs = pairs_of(trace, theory)
+        trace, theory = problem.trace, problem.theory
+        self._problem, self._options = problem, options
+        self._judging = Judging(problem)
         self.minimal = MinimalMaps(trace, theory, self._judging)
-        self.drafts = Drafts(trace, theory, self._judging)
+        self.drafts = Drafts(problem, self._judging)
         self.solver: IncrementalSolver = IncrementalSolver(
             options, before.solver.searches if before else 0
         )
@@ -48,17 +47,28 @@ class MapKeeper:
         self._spent = 0.0  # seconds that all steps took
 
     @property
+    def trace(self) -> Trace:
+        """The steps so far."""
+        return self._problem.trace
+
+    @property
+    def theory(self) -> Theory:
+        """The settled theory."""
+        return self._problem.theory
+
+    @property
     def searches(self) -> int:
         """How often clingo was asked."""
         return self.solver.searches
 
-    def restarted(self, trace: Trace, theory: Theory) -> MapKeeper:
+    def restarted(self, problem: Problem) -> MapKeeper:
         """A keeper for the theory as one more step settles it.
 
         Minimal maps of fewer steps need not be minimal by that theory. They go on as drafts, if
         they were judged by displacements, too.
         """
-        keeper = MapKeeper(trace, theory, self._options, before=self)
+        trace = problem.trace
+        keeper = MapKeeper(problem, self._options, before=self)
         keeper.guesser.follow(trace)
         keeper._previous = self._best_known()
         if self.theory.displacement == "use":
@@ -68,18 +78,17 @@ class MapKeeper:
             keeper.guesser.guess = None
         return keeper
 
-    def take(self, trace: Trace) -> None:
+    def take(self, problem: Problem) -> None:
         """Take in the last step of a trace: keep the maps that predict it."""
         self._previous = self._best_known()
-        self.trace = trace
+        self._problem, trace = problem, problem.trace
         self.guesser.follow(trace)
         action = trace.steps[-2].action
         assert action
         if self.minimal.is_impossible:
             return
-        self._pairs = pairs_of(trace, self.theory)
         was_proven = self.minimal.status is Status.OPTIMAL
-        untried = self.minimal.follow(action, trace, self._pairs)
+        untried = self.minimal.follow(action, trace, problem.pairs)
         self.drafts.follow(action, trace.steps[-1])
         if was_proven and self.minimal.status is Status.UNKNOWN:
             self.solver.make_due()
@@ -137,7 +146,7 @@ class MapKeeper:
         minimal, steps = self.minimal, len(self.trace)
         status, cost = minimal.status, minimal.cost
         maps = tuple(m.map() for m in minimal.maps)
-        if status is Status.UNKNOWN and (best := self.drafts.best(self.trace, self._pairs)):
+        if status is Status.UNKNOWN and (best := self.drafts.best(self.trace, self._problem.pairs)):
             maps, status, cost = (best,), Status.FEASIBLE, Cost.of(best)
         self._spent += time.perf_counter() - began
         if maps and self._judging.has_time_for(steps, self._spent):
@@ -159,7 +168,7 @@ class MapKeeper:
                     asked.seconds.solve if was_asked else 0.0,
                 ),
                 evidence=said_by(
-                    evidence_of(self.theory),
+                    self._problem.evidence,
                     self.trace,
                     {name: said["refused"] for name, said in asked.evidence.items()},
                 ),

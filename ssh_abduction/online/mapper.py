@@ -131,19 +131,24 @@ class OnlineMapper:
         self._actions: dict[str, Action] = {}
         self.trace = Trace((first,), odometry=self._odometry)
         self._settler = TheorySettler(theory, self.trace)
-        self.theory = self._settler.settled(self.trace)
+        self._problem = self._settler.settled(self.trace)
         options = StepOptions(time_limit, max_maps, speedups)
         self._keeper: MapKeeper | Recovery
         if theory.has_faults:
             from ssh_abduction.online.recovery import Recovery  # loads numpy
 
             began = time.perf_counter()
-            self._keeper = Recovery(self.trace, self.theory, options)
+            self._keeper = Recovery(self._problem, options)
         else:
             _preload_engine(self.theory)
             began = time.perf_counter()
-            self._keeper = MapKeeper(self.trace, self.theory, options)
+            self._keeper = MapKeeper(self._problem, options)
         self.solution = self._keeper.answer(began)
+
+    @property
+    def theory(self) -> Theory:
+        """The theory, settled for the steps so far."""
+        return self._problem.theory
 
     @property
     def searches(self) -> int:
@@ -206,11 +211,12 @@ class OnlineMapper:
         )
         self._append(done, replace(step, confidence=confidence))
         # A longer trace may settle the theory anew; then the maps are sought anew.
-        if self._settler.is_settled(self.theory, self.trace):
-            self._keeper.take(self.trace)
+        if self._settler.is_settled(self._problem, self.trace):
+            self._problem = self._problem.changed(self.trace)
+            self._keeper.take(self._problem)
         else:
-            self.theory = self._settler.settled(self.trace)
-            self._keeper = self._keeper.restarted(self.trace, self.theory)
+            self._problem = self._settler.settled(self.trace, self._problem)
+            self._keeper = self._keeper.restarted(self._problem)
         self.solution = self._keeper.answer(began)
         return self.solution
 

@@ -38,13 +38,12 @@ from __future__ import annotations
 
 import time
 
-from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.background_solve import FaultSolver
 from ssh_abduction.online.options import StepOptions
 from ssh_abduction.online.rival_maps import RivalMaps
 from ssh_abduction.online.standing import Confidence, Standing
 from ssh_abduction.solver import Effort, Judging, Seconds, Solution, Status, cost_as_counted
-from ssh_abduction.theory.theory import Theory
+from ssh_abduction.theory.settle import Problem
 
 
 class Recovery:
@@ -62,16 +61,15 @@ class Recovery:
 
     def __init__(
         self,
-        trace: Trace,
-        theory: Theory,
+        problem: Problem,
         options: StepOptions,
         before: Recovery | None = None,
     ) -> None:
-        self._trace, self._theory, self._options = trace, theory, options
-        self._judging = Judging(trace, theory)
-        self._maps = RivalMaps(trace, theory, options.max_maps, self._judging)
+        self._trace, self._theory, self._options = problem.trace, problem.theory, options
+        self._judging = Judging(problem)
+        self._maps = RivalMaps(problem, options.max_maps, self._judging)
         self.solver: FaultSolver = FaultSolver(options, before.solver.searches if before else 0)
-        self._confidence: Confidence = before._confidence if before else Confidence(theory)
+        self._confidence: Confidence = before._confidence if before else Confidence(problem.theory)
         self._spent = 0.0  # seconds that all steps took
         self.standing: Standing | None = None
 
@@ -80,16 +78,17 @@ class Recovery:
         """How often the trace was solved anew, in a step."""
         return self.solver.searches
 
-    def restarted(self, trace: Trace, theory: Theory) -> Recovery:
+    def restarted(self, problem: Problem) -> Recovery:
         """A keeper for the theory as one more step settles it, with nothing proven."""
-        return Recovery(trace, theory, self._options, before=self)
+        return Recovery(problem, self._options, before=self)
 
-    def take(self, trace: Trace) -> None:
+    def take(self, problem: Problem) -> None:
         """Take in the last step of a trace: let the rivals go on with it."""
+        trace = problem.trace
         self._trace, lead = trace, self._maps.lead
         if lead and self._confidence.known is None:
             self._confidence.known = lead.explained()
-        change = self._maps.follow(trace)
+        change = self._maps.follow(problem)
         if change.lost_proof:
             self.solver.make_due()
         self._confidence.note(len(trace) - 1, change.broke)

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault
-from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.background_solve import Solved
 from ssh_abduction.online.chances import Chances
 from ssh_abduction.online.hypotheses import Rival, Scale, Seen
 from ssh_abduction.solver import Bound, Judging, Status, observation
-from ssh_abduction.theory.evidence import evidence_of, pairs_of
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
-from ssh_abduction.theory.theory import Theory
 
 # Probability of a fault of the cheapest kind, at each step.
 RARE = Chances().misread
@@ -55,18 +53,18 @@ class RivalMaps:
         is_impossible: Whether no map satisfies the axioms.
     """
 
-    def __init__(
-        self, trace: Trace, theory: Theory, max_maps: int | None, judging: Judging
-    ) -> None:
+    def __init__(self, problem: Problem, max_maps: int | None, judging: Judging) -> None:
+        trace, theory = problem.trace, problem.theory
         self.rivals: list[Rival] = []
         self.solved: Solved | None = None
         self.bound = Bound()
         self.is_proven = self.is_complete = self.is_impossible = False
-        self._trace, self._theory, self._max_maps, self._judging = trace, theory, max_maps, judging
+        self._problem, self._trace, self._theory = problem, trace, theory
+        self._max_maps, self._judging = max_maps, judging
         self._views = {step.view for step in trace.steps}
         self._least: tuple[int, ...] = ()  # what a minimal map costs, while proven
         self._replays = row("prefixes").holds_for(theory.replace(misread=0, slipped=0))
-        self._has_evidence = bool(evidence_of(theory))
+        self._has_evidence = bool(problem.evidence)
         # Under the two causal axioms alone, `Rival.ways_on` lists all links that can be assumed.
         self._lists_links = (
             theory.level == "causal"
@@ -98,9 +96,10 @@ class RivalMaps:
         """Whether a rival costs what a minimal map costs."""
         return rival.cost == self._least
 
-    def follow(self, trace: Trace) -> Change:
+    def follow(self, problem: Problem) -> Change:
         """Let the rivals go on with the last step of a trace, which is one step longer."""
-        self._trace, t = trace, len(trace) - 1
+        self._problem, self._trace = problem, problem.trace
+        trace, t = self._trace, len(self._trace) - 1
         self._views.add(trace.steps[t].view)
         if self.is_impossible and self._replays:
             return Change()
@@ -196,7 +195,7 @@ class RivalMaps:
         # Evidence is asked of the new step only: it refuses no more of the earlier ones.
         if self._has_evidence:
             trace = self._trace.prefix(t + 1)
-            pairs = pairs_of(trace, self._theory.of_steps(0, t + 1))
+            pairs = self._problem.changed(trace, self._theory.of_steps(0, t + 1)).pairs
             new = [
                 rival
                 for rival in new

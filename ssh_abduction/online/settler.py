@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from ssh_abduction.data.errors import TraceError
 from ssh_abduction.data.trace import Step, Trace
-from ssh_abduction.theory.evidence.displacement import count_returns
+from ssh_abduction.theory.evidence import evidence_of
+from ssh_abduction.theory.settle import Problem, count_returns, settle
 from ssh_abduction.theory.theory import Theory
 
 
@@ -22,24 +23,29 @@ class TheorySettler:
 
     def __init__(self, theory: Theory, first: Trace) -> None:
         # The first step has no displacement, so its star is settled without displacements.
-        settled = theory.replace(displacement="none").resolve(first)
+        settled = settle(first, theory.replace(displacement="none")).theory
         self._refuses_stars = theory.star == "auto" and settled.star == "none"
         self._theory = theory.replace(star=settled.star)
 
-    def settled(self, trace: Trace) -> Theory:
-        """The theory settled for the steps so far."""
+    def settled(self, trace: Trace, known: Problem | None = None) -> Problem:
+        """The theory settled for the steps so far, with what is known about fewer steps."""
         theory = self._theory
         if theory.displacement == "auto":
             theory = theory.replace(displacement="use" if trace.has_displacements else "none")
         if theory.displacement == "use" and not theory.returns:
-            theory = theory.replace(returns=count_returns(trace, theory))
-        return theory.resolve(trace.prefix(1))
+            theory = theory.replace(returns=self._count(trace, theory, known))
+        return settle(trace.prefix(1), theory, known).changed(trace)
 
-    def is_settled(self, theory: Theory, trace: Trace) -> bool:
-        """Whether `theory`, which was settled for the steps but the last, is settled for all."""
+    def is_settled(self, problem: Problem, trace: Trace) -> bool:
+        """Whether a theory that was settled for the steps but the last is settled for all."""
+        theory = problem.theory
         if theory.displacement == "none":
             return self._theory.displacement == "none" or trace.steps[-1].displacement is None
-        return bool(self._theory.returns) or theory.returns == count_returns(trace, theory)
+        return bool(self._theory.returns) or theory.returns == self._count(trace, theory, problem)
+
+    def _count(self, trace: Trace, theory: Theory, known: Problem | None) -> int:
+        evidence = evidence_of(theory, known.evidence if known else ())
+        return count_returns(Problem(trace, theory, evidence))
 
     def check_star(self, step: Step, number: int) -> None:
         """Raise TraceError for a star after a first step that had none."""

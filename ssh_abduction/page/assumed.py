@@ -20,6 +20,7 @@ from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.verdict import PairExplanation, Side, Verdict
 from ssh_abduction.rivals.listing import Listing
 from ssh_abduction.solver import Cost, Status, facts, solve
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 Pair = tuple[int, int]
@@ -40,7 +41,8 @@ def assumptions(
         For each pair what "same" and "different" cost, in words, as `PairExplanation.assuming`.
     """
     end = time.monotonic() + seconds
-    theory = theory.resolve(trace)
+    problem = settle(trace, theory)
+    theory = problem.theory
     axioms_survive_cuts = not (theory.rules or theory.has_faults)
     if not listing.minimal or theory.without or (len(trace) > UNCUT and not axioms_survive_cuts):
         return {}
@@ -59,7 +61,7 @@ def assumptions(
         known[pair] = told.assuming
 
     # First find out which pairs can be otherwise at all. One grounding serves all of them.
-    piece = Piece.of(trace, theory, range(len(trace) if len(trace) <= UNCUT else SMALL))
+    piece = Piece.of(problem, range(len(trace) if len(trace) <= UNCUT else SMALL))
     try:
         axioms = Axioms(piece, lambda: time.monotonic() > end)
         for pair, one in _agreed([ssh_map.labels for ssh_map in minimal], len(piece.steps)):

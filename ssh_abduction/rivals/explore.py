@@ -74,6 +74,7 @@ from ssh_abduction.rivals.machines import (
 )
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import LimitError, Solution, Stop, Watch, check_limit
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 
@@ -166,7 +167,7 @@ class Laboratory:
         implied: bool,
         watch: Watch,
     ) -> None:
-        settled = theory if theory is None or trace is None else theory.resolve(trace)
+        settled = theory if theory is None or trace is None else settle(trace, theory).theory
         self._can, self._watch = can, watch
         self._sights = Sights(rivals, trace, theory)
         self._links = [

@@ -22,6 +22,7 @@ from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.solver import observation
 from ssh_abduction.theory.evidence.alike import are_alike
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import IN_TOLERANCE, Theory
 
 Array: TypeAlias = NDArray[np.int32]
@@ -149,7 +150,7 @@ def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None)
     if trace is None or not trace.has_stars:
         return None
     if theory is not None:
-        settled = theory.resolve(trace)
+        settled = settle(trace, theory).theory
         if settled.star == "none":
             return None
         return _Reading(

@@ -34,6 +34,7 @@ from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.rivals.flow import followed_from, nearest_of, reached_from, shortest_walk
 from ssh_abduction.rivals.machines import Can
 from ssh_abduction.rivals.stances import Stances
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 # A place, and 0 or the step of a return to it that is not believed.
@@ -72,7 +73,7 @@ def next_tour(
     stances = Stances(
         ssh_map,
         trace,
-        (theory or Theory.topological()).resolve(trace),
+        settle(trace, theory).theory,
         [*map(Action.of, actions)],
         can,
     )

@@ -18,7 +18,7 @@ from ssh_abduction.solver.values import (
     Seconds,
     cost_as_counted,
 )
-from ssh_abduction.theory.evidence import evidence_of, said_by
+from ssh_abduction.theory.evidence import said_by
 from ssh_abduction.theory.speedups import row
 
 
@@ -76,7 +76,7 @@ class Answer:
                 parts.engine.size,
                 seconds,
                 asker.grounding if grounding is None else grounding,
-                said_by(evidence_of(task.theory), task.trace, known.refused),
+                said_by(task.problem.evidence, task.trace, known.refused),
             ),
             stopped=known.stopped,
             partial=None if known.best else known.partial,

@@ -153,9 +153,7 @@ class Candidates:
         part = watch.part(UNMAPPED * seconds)
         try:
             with heeding(part.check):
-                for ssh_map in maps_with_frames(
-                    self._task.trace, self._task.theory, part, speedups
-                ):
+                for ssh_map in maps_with_frames(self._task.problem, part, speedups):
                     part.shorten(seconds)
                     self.offer(ssh_map)
                     self._report()
@@ -195,4 +193,5 @@ def _with_all_views(task: Task) -> Task:
         [new if view is None else view for view in task.trace.views],
         [s.confidence for s in task.trace.steps],
     )
-    return Task.of(trace, replace(task.theory, unknown_views=False), task.watch, task.speedups)
+    theory = replace(task.theory, unknown_views=False)
+    return Task.of(task.problem.changed(trace, theory), task.watch, task.speedups)

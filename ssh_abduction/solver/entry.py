@@ -28,6 +28,7 @@ from ssh_abduction.solver.result import Solution
 from ssh_abduction.solver.search import Search
 from ssh_abduction.solver.sharing import Backbone, Sharing
 from ssh_abduction.solver.values import Progress
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import ALL, Speedups, row
 from ssh_abduction.theory.theory import Theory, checked_theory
 
@@ -136,11 +137,11 @@ def find_backbone(
     watch.start()
     cost, proven = solution.costs[0].preferred_by(solution.theory), False
     with suppress(LimitError, KeyboardInterrupt), heeding(watch.check):
-        task = Task.of(trace, solution.theory, watch)
+        task = Task.of(Problem.of(trace, solution.theory), watch)
         if _is_known_by_mending_alone(task):
             return known
         engine = _labelling_engine(task, solution)
-        judging = Judging(trace, solution.theory)
+        judging = Judging(task.problem)
         try:
             proven = prove_backbone(task, judging, cost, sharing, engine)
         finally:

@@ -22,6 +22,7 @@ from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver.asp.limits import LimitError, Watch, check_limit
 from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 # Both kinds of faults are allowed where the theory names none. What they cost plays no part in a front.
@@ -114,10 +115,10 @@ def fault_front(
     if not is_whole(most) or not 0 <= most <= 1000:
         raise TheoryError(f"front: expected a number of faults from 0 to 1000, got {brief(most)}")
     theory.check_steps(checked_trace(trace))
-    theory = (theory if theory.has_faults else theory.replace(**KINDS)).resolve(trace)
+    problem = settle(trace, theory if theory.has_faults else theory.replace(**KINDS))
     watch = Watch(time_limit)
     watch.start()
-    points = tuple(_points(Task.of(trace, theory, watch), most))
+    points = tuple(_points(Task.of(problem, watch), most))
     return Front(points, stopped=any(not point.proven for point in points))
 
 

@@ -15,8 +15,8 @@ from ssh_abduction.data.errors import AbductionError
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
-from ssh_abduction.theory.evidence import Equality, evidence_of
-from ssh_abduction.theory.theory import Theory
+from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.settle import Problem
 
 # At most such a share of the time of the search, and so many seconds more, are spent on checking what is not checked always.
 SHARE = 0.1
@@ -42,10 +42,11 @@ class Judging:
     theory  with star settled
     """
 
-    def __init__(self, trace: Trace, theory: Theory) -> None:
-        self._trace = trace
-        self._theory = theory
-        self._evidence = evidence_of(theory)
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self._trace = problem.trace
+        theory = self._theory = problem.theory
+        self._evidence = problem.evidence
         self._accepted: SSHMap | None = (
             None  # the last map that passed the checker before it was kept
         )
@@ -94,7 +95,7 @@ class Judging:
             self.can_accept
             and next(violations(self._trace, ssh_map, self._theory), None) is None
             and not self.why_refused(ssh_map)
-            and keeps_own_rules(self._trace, ssh_map, self._theory)
+            and keeps_own_rules(self._problem, ssh_map)
         )
         self._accepted = ssh_map if accepted else self._accepted
         return accepted

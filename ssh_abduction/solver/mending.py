@@ -28,7 +28,7 @@ from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.guesses.outliers import wrong_displacements
 from ssh_abduction.solver.guesses.voting import Merging
 from ssh_abduction.solver.judging import Judging
-from ssh_abduction.theory.evidence import pairs_of
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
 
@@ -62,7 +62,7 @@ class Mending:
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
         self._causal_labels: tuple[int, ...] = ()  # of the last causal map
         # The log is that of the theory: so stars tell dstates apart, and so do pairs of steps that are not at one place.
-        self._causal = FaultyEngine(replace(task, theory=causal))
+        self._causal = FaultyEngine(replace(task, problem=task.problem.changed(theory=causal)))
 
     @property
     def bound(self) -> int | None:
@@ -128,18 +128,19 @@ class Mending:
         if theory.star != "frame" or not (theory.misread or theory.jumped):
             return
         before: Found | None = None
-        pairs = pairs_of(trace, self._without_faults)
+        pairs = self._problem(trace).pairs
         for _ in range(ROUNDS):
             merging = Merging(trace, theory, pairs, self._task.watch.check)
             if before is not None:
                 merging.start_from(_places(before.map))
             merging.merge()
             mended = merging.mended()
-            task = Task.of(mended, self._without_faults, self._task.watch, self._task.speedups)
+            problem = self._problem(mended)
+            task = Task.of(problem, self._task.watch, self._task.speedups)
             near = (
                 FramedEngine(task).map_mended_from(merging.labels()) if _has_frames(task) else None
             )
-            if near is not None and not Judging(mended, self._without_faults).why_refused(near.map):
+            if near is not None and not Judging(problem).why_refused(near.map):
                 yield from self._improving(self._as_found(near.map, mended), mended)
             yield from self._improving(self._minimal(mended, MERGED)[0], mended)
             if self._best is before:
@@ -225,6 +226,10 @@ class Mending:
             steps[t] = replace(steps[t], action=Action.that_slipped(t))
         return replace(self._task.trace, steps=tuple(steps))
 
+    def _problem(self, mended: Trace) -> Problem:
+        """A mended trace, without faults."""
+        return self._task.problem.changed(mended, self._without_faults)
+
     def _minimal(self, mended: Trace, seconds: float = math.inf) -> tuple[Found | None, bool]:
         """A minimal map of a mended trace, as one of the trace itself, and whether it is known to be minimal. None where it has no map, or none was found in time.
 
@@ -252,12 +257,11 @@ class Mending:
             steps = list(mended.steps)
             steps[t] = replace(other, displacement=step.displacement, covariance=step.covariance)
             again = replace(mended, steps=tuple(steps))
-            pairs = pairs_of(again, self._without_faults)
+            problem = self._problem(again)
+            pairs = problem.pairs
             place_of = [s.place for s in ssh_map.dstates]
             fits = all(pairs.allow(k, ssh_map.labels, place_of) for k in range(len(again)))
-            if fits and not Judging(again, self._without_faults).why_refused(
-                replace(ssh_map, faults=())
-            ):
+            if fits and not Judging(problem).why_refused(replace(ssh_map, faults=())):
                 mended = again
         return mended
 

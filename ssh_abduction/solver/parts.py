@@ -6,7 +6,6 @@ import logging
 import math
 from collections.abc import Callable
 
-from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.logs import PROGRESS
 from ssh_abduction.solver import prefixes
 from ssh_abduction.solver.asp.limits import Watch
@@ -21,8 +20,8 @@ from ssh_abduction.solver.near import NearMinimal
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.start import Limits, Start
 from ssh_abduction.solver.values import Bound, Cost, Progress, Status
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups
-from ssh_abduction.theory.theory import Theory
 
 
 class Parts:
@@ -43,8 +42,7 @@ class Parts:
 
     def __init__(
         self,
-        trace: Trace,
-        theory: Theory,
+        problem: Problem,
         limits: Limits,
         speedups: Speedups,
         on_progress: Callable[[Progress], None] | None,
@@ -55,9 +53,9 @@ class Parts:
         self._on_progress = on_progress
         self._news: tuple[Cost | None, Bound] = (None, Bound())  # what the last report said
         self.watch.start()  # comparing all pairs of steps may take long
-        self.task = Task.of(trace, theory, self.watch, speedups)
-        self.known = Known(theory)
-        self.judging = Judging(trace, theory)
+        self.task = Task.of(problem, self.watch, speedups)
+        self.known = Known(problem.theory)
+        self.judging = Judging(problem)
         self.rivals = Rivals(self.task, self.judging)
         self.candidates = Candidates(self.task, self.known, self.judging, self.report)
         self.near: NearMinimal | None = None

@@ -34,8 +34,9 @@ from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.solver.stages import Stages
 from ssh_abduction.solver.start import ANEW, Limits, Start
 from ssh_abduction.solver.values import Bound, Cost, Grounding, Progress, Status
+from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups
-from ssh_abduction.theory.theory import Theory, checked_theory
+from ssh_abduction.theory.theory import Theory
 
 # The search for the maps of a mended trace has at least this many seconds.
 SHORTEST = 0.05
@@ -81,7 +82,9 @@ class Search:
             raise SolverError(
                 f"on_progress: expected a function of one Progress, got {brief(on_progress)}"
             )
-        self.theory = checked_theory(theory).resolve(trace)
+        before = _start.after.task.problem if _start.after else None
+        problem = settle(trace, theory, before)
+        self.theory = problem.theory
         if within and self.theory.has_faults:
             raise TheoryError(
                 "within: expected 0 where faults are allowed; leave it out, or see what each "
@@ -91,9 +94,7 @@ class Search:
         self.trace = trace
         self._begun = False
         self._reasons = _start.reasons
-        self._parts = Parts(
-            trace, self.theory, self.limits, checked_speedups(speedups), on_progress, _start
-        )
+        self._parts = Parts(problem, self.limits, checked_speedups(speedups), on_progress, _start)
         self._stages = Stages(self._parts, self._solve_mended, goes_on=_start.after is not None)
         self._answer = Answer(self._parts)
 

@@ -193,7 +193,7 @@ class Theory:
             self._check_faults()
         if "excuses" in self.prefer and self.boundary != "defeasible":
             raise TheoryError(
-                f"prefer: expected no excuses with boundary={self.boundary}; take {_choice('boundary', 'defeasible')}"
+                f"prefer: expected no excuses with boundary={self.boundary}; take {choice('boundary', 'defeasible')}"
             )
 
     def __repr__(self) -> str:
@@ -206,15 +206,15 @@ class Theory:
             )
         if self.star == "gateways":
             raise TheoryError(
-                f"star: expected no stars of any gateways where faults are allowed, got gateways; take {_choice('star', 'alike')}"
+                f"star: expected no stars of any gateways where faults are allowed, got gateways; take {choice('star', 'alike')}"
             )
         if self.boundary == "defeasible":
             raise TheoryError(
-                f"boundary: expected no excuses where faults are allowed, got defeasible; take {_choice('boundary', 'strict')}"
+                f"boundary: expected no excuses where faults are allowed, got defeasible; take {choice('boundary', 'strict')}"
             )
         if self.jumped and self.displacement == "none":
             raise TheoryError(
-                f"jumped: expected displacements to be used, which may be wrong, got displacement=none; leave it out, or take {_choice('displacement', 'auto')}"
+                f"jumped: expected displacements to be used, which may be wrong, got displacement=none; leave it out, or take {choice('displacement', 'auto')}"
             )
         if self.planar:
             raise TheoryError(
@@ -407,60 +407,6 @@ class Theory:
             star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest)
         )
 
-    def resolve(self, trace: Trace) -> Theory:
-        """This theory with `star`, `displacement` and `prefer` settled for a trace, after checking that the trace has what the axioms need.
-
-        A step whose view is unknown may be at any dstate. A trace without any view has to be clustered first.
-
-        Raises TraceError where all views, the kind of an action, or a star is missing, TheoryError where stars are asked for but
-        the trace has none.
-        """
-        checked_trace(trace)
-        star = self.star
-        if star == "auto":
-            star = "frame" if trace.has_stars else "none"
-        if star != "none" and not trace.has_stars:
-            mend = f"add them to the steps, or take {_choice('star', 'none')}"
-            raise TheoryError(
-                f"star: expected a trace with stars for star={star}, got none; {mend}"
-            )
-        if star == "frame" and not trace.in_quarters:
-            star = "gateways"
-        displacement = self.displacement
-        if displacement == "auto":
-            displacement = "use" if trace.has_displacements else "none"
-        if (
-            displacement == "use" and not trace.has_displacements and not self.returns
-        ):  # once they are counted, this may be a part of a trace
-            mend = f"add them to the steps, or take {_choice('displacement', 'none')}"
-            raise TheoryError(
-                f"displacement: expected a trace with displacements for displacement=use, got none; {mend}"
-            )
-        views = set(trace.views)
-        if views == {None}:
-            raise TraceError(
-                f"{trace.at(0)}: view: expected one, got only an image; cluster the images into views first (ssh-abduction cluster)"
-            )
-        theory = replace(self, star=star, displacement=displacement, unknown_views=None in views)
-        counts: list[Count] = [
-            "dstates" if count == "tenths" else count for count in theory.priorities
-        ]
-        theory = replace(
-            theory,
-            prefer=tuple(count for count in counts if count in self.prefer or count != "excuses"),
-        )
-        for i, step in enumerate(trace.steps):
-            theory.require(step, trace.at(i))
-        return (
-            theory._with_returns_of(trace) if displacement == "use" and not self.returns else theory
-        )
-
-    def _with_returns_of(self, trace: Trace) -> Theory:
-        """This theory with the returns counted that may be true in a trace."""
-        from ssh_abduction.theory.evidence.displacement import count_returns  # loads numpy
-
-        return replace(self, returns=count_returns(trace, self))
-
     def require(self, step: Step, where: str) -> None:
         """Raises TraceError, which says where, if a step lacks what the axioms need. Star has to be settled."""
         a_text("where", where, TraceError)
@@ -479,7 +425,7 @@ class Theory:
             return
         if step.star is None:
             raise TraceError(
-                f"{where}: star: expected one, as other steps have stars; add it, or take {_choice('star', 'none')}"
+                f"{where}: star: expected one, as other steps have stars; add it, or take {choice('star', 'none')}"
             )
         if self.star == "alike":
             return
@@ -493,7 +439,7 @@ class Theory:
         try:
             _ = step.openings
         except TraceError as error:
-            raise TraceError(f"{where}: {error}, or take {_choice('star', 'none')}") from None
+            raise TraceError(f"{where}: {error}, or take {choice('star', 'none')}") from None
 
     def check_steps(self, trace: Trace) -> None:
         """Raises TheoryError where a pair names a step that the trace does not have."""
@@ -618,7 +564,7 @@ def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
     return _Checked(found)
 
 
-def _choice(name: str, value: str) -> str:
+def choice(name: str, value: str) -> str:
     """A choice as an error message names it: in Python, and in the shell."""
     flag = f"--{name} {value}" if name == "star" else f"--set {name}={value}"
     return f"{name}={value} ({flag})"

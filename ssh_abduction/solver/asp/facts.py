@@ -21,7 +21,8 @@ from ssh_abduction.data.trace import Action, Trace, View
 from ssh_abduction.solver.steps import frames
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.evidence import Equality, Pairs, evidence_of
+from ssh_abduction.theory.evidence import Equality, Pairs
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import TRAVELS_AND_TURNS
 from ssh_abduction.theory.theory import EXCUSED, Count, Theory
 
@@ -74,8 +75,9 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
     )
 
 
-def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
+def trace_facts(problem: Problem, start: int, stop: int) -> str:
     """What happened in steps `start` to `stop - 1`, and the links between them and from the step before, as facts."""
+    trace, theory = problem.trace, problem.theory
     facts = []
     for t in range(start, stop):
         step = trace.steps[t]
@@ -110,7 +112,7 @@ def trace_facts(trace: Trace, theory: Theory, start: int, stop: int) -> str:
         ]
     if theory.star == "gateways":
         facts += _gateway_facts(trace, start, stop)
-    return "\n".join([*facts, *_evidence_facts(trace, theory, start, stop)])
+    return "\n".join([*facts, *_evidence_facts(problem, start, stop)])
 
 
 def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
@@ -157,9 +159,10 @@ def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
             yield from (f"rotates({_constant(action.name)},{x},{y},{shift})." for shift in fitting)
 
 
-def _evidence_facts(trace: Trace, theory: Theory, start: int, stop: int) -> Iterator[str]:
+def _evidence_facts(problem: Problem, start: int, stop: int) -> Iterator[str]:
     """What evidence says of these steps, and of pairs of them with earlier ones."""
-    for evidence in evidence_of(theory):
+    trace, theory = problem.trace, problem.theory
+    for evidence in problem.evidence:
         pairs = evidence.pairs(trace)
         for t in range(start, stop) if pairs else ():
             yield from (f"excluded({evidence.axiom},{i},{t})." for i in pairs.apart.get(t, ()))
@@ -171,15 +174,16 @@ def _evidence_facts(trace: Trace, theory: Theory, start: int, stop: int) -> Iter
         yield evidence.facts(trace, start, stop)
 
 
-def program(trace: Trace, theory: Theory) -> str:
-    """A trace and a resolved theory as the facts that `encodings/run.py` solves."""
+def program(problem: Problem) -> str:
+    """A trace and its settled theory as the facts that `encodings/run.py` solves."""
+    trace, theory = problem.trace, problem.theory
     files = " ".join(f"{name}.lp" for name in encoding_names(theory))
     return "\n".join(
         [
             f"% {len(trace)} steps{f' of {trace.name!r}' if trace.name else ''}. In {encodings.folder()}, run",
             f"%   python run.py --project=project --opt-mode=optN -n 0 THIS_FILE {files}",
             theory_facts(theory, most_paths(trace, theory, len(trace))),
-            trace_facts(trace, theory, 0, len(trace)),
+            trace_facts(problem, 0, len(trace)),
             own_rules(theory),
             "",
         ]

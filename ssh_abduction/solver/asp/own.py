@@ -5,11 +5,13 @@ takes hardly longer than to ground them.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.solver.asp.own import keeps_own_rules
+>>> from ssh_abduction.theory.settle import settle
 >>> from ssh_abduction.theory.rules import Rules
 >>> trace = Trace.from_steps("aba", ["go", "go"])
 >>> ssh_map = solve(trace, Theory.causal())[0]
 >>> rules = [Rules("own.lp", f"#program step(t). :- same(I,t), t-I > {n}.") for n in (1, 2)]
->>> [keeps_own_rules(trace, ssh_map, Theory.causal().replace(rules=rule)) for rule in rules]
+>>> theories = [Theory.causal().replace(rules=rule) for rule in rules]
+>>> [keeps_own_rules(settle(trace, theory), ssh_map) for theory in theories]
 [False, True]
 """
 
@@ -24,6 +26,7 @@ from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Control
 from ssh_abduction.solver.asp.limits import POLL
 from ssh_abduction.solver.asp.rules import read_by
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 
 # What rules may read of a map and of a trace, if a map alone is to say whether they hold.
@@ -64,20 +67,20 @@ def can_be_asked(theory: Theory) -> bool:
     )
 
 
-def keeps_own_rules(trace: Trace, ssh_map: SSHMap, theory: Theory) -> bool:
+def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
     """Whether a map of a whole trace keeps the user's own rules, which `can_be_asked`.
 
     Args:
-        trace: The trace.
-        ssh_map: A map of all of its steps that satisfies all other axioms.
-        theory: Resolved for the trace.
+        problem: The trace and its settled theory.
+        ssh_map: A map of all steps that satisfies all other axioms.
     """
+    trace, theory = problem.trace, problem.theory
     if not theory.rules:
         return True
     control = Control(check=look_at_clock)
     steps = range(len(trace))
     control.add("base", [], facts.theory_facts(theory, len(ssh_map.paths)))
-    control.add("base", [], facts.trace_facts(trace, theory, 0, len(trace)))
+    control.add("base", [], facts.trace_facts(problem, 0, len(trace)))
     control.add("base", [], "\n".join(f"{fact}." for fact in _shown(trace, ssh_map)))
     control.add("base", [], f"query({len(trace) - 1}).\n{FRAME}")
     control.add("base", [], facts.own_rules(theory))

@@ -14,6 +14,7 @@ from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.steps.log import Log
 from ssh_abduction.solver.values import Cost
 from ssh_abduction.theory.evidence import Equality
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
@@ -47,23 +48,35 @@ class Task:
     speedups  those that hold for the theory
     """
 
-    trace: Trace
-    theory: Theory
+    problem: Problem
     log: Log
     watch: Watch
     speedups: Speedups
 
+    @property
+    def trace(self) -> Trace:
+        """The whole trace."""
+        return self.problem.trace
+
+    @property
+    def theory(self) -> Theory:
+        """The settled theory."""
+        return self.problem.theory
+
     @staticmethod
-    def of(
-        trace: Trace, theory: Theory, watch: Watch | None = None, speedups: Speedups | None = None
-    ) -> Task:
+    def of(problem: Problem, watch: Watch | None = None, speedups: Speedups | None = None) -> Task:
         """A task for all speed-ups that hold for a theory, or for these of them."""
-        speedups = (speedups or Speedups()).that_hold_for(theory)
+        speedups = (speedups or Speedups()).that_hold_for(problem.theory)
         if speedups.sides and any(
-            action.slipped for action in trace.actions
+            action.slipped for action in problem.trace.actions
         ):  # `sides` takes all that links two visits for a travel
             speedups = replace(speedups, sides=False)
-        return Task(trace, theory, Log(trace, theory), watch or Watch(), speedups)
+        return Task(
+            problem,
+            Log(problem.trace, problem.theory, problem.pairs),
+            watch or Watch(),
+            speedups,
+        )
 
     @property
     def has_processors(self) -> bool:

@@ -19,17 +19,16 @@ from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.solver.steps.log import Log
+from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups
-from ssh_abduction.theory.theory import Theory
 
 
-def maps_with_frames(
-    trace: Trace, theory: Theory, watch: Watch, speedups: Speedups
-) -> Iterator[SSHMap]:
+def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
     """Maps of a trace, each with fewer dstates than the one before, or as many and better paths, and the last one the best in which places have frames.
 
     theory  what it asks for, with star settled; none where it has no theory with frames
     """
+    trace, theory = problem.trace, problem.theory
     around: Mapping[int, Sequence[int]] | None = None
     framed = theory.with_frames()
     if framed is None:
@@ -37,7 +36,7 @@ def maps_with_frames(
     if theory.star == "none":
         trace = trace.without_stars()
         around = _around(trace, Log(trace, theory))
-    task = Task.of(trace, framed, watch, speedups)
+    task = Task.of(problem.changed(trace, framed), watch, speedups)
     engine = FramedEngine(task, around, soon=0.0)
     try:
         engine.grow(len(trace))

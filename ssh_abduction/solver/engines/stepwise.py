@@ -88,7 +88,7 @@ class StepEngine:
         self.asker.watch.check(*self._last_step)
         control, start = self.asker.control, self.size
         part = f"steps_from_{start}"
-        control.add(part, [], facts.trace_facts(self._task.trace, self._task.theory, start, stop))
+        control.add(part, [], facts.trace_facts(self._task.problem, start, stop))
         before = control.seconds, control.mebibytes
         base: list[tuple[str, list[clingo.Symbol]]] = [] if start else [("base", [])]
         control.ground(

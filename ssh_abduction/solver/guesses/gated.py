@@ -2,12 +2,13 @@
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.solver.guesses.gated import gated_map
+>>> from ssh_abduction.theory.settle import settle
 >>> stars = [[0, 120], [180, 300], [0, 240], [180, 300]]
 >>> trace = Trace.from_steps("abcb", ["travel", "right", "travel"], stars=stars)
->>> gated_map(trace, Theory.topological().resolve(trace), homing=True)
+>>> gated_map(trace, settle(trace).theory, homing=True)
 >>> stars = [[0], [180], [0], [180]]
 >>> straight = Trace.from_steps("abab", ["travel", "around", "travel"], stars=stars)
->>> gated_map(straight, Theory.topological().resolve(straight), homing=True).labels
+>>> gated_map(straight, settle(straight).theory, homing=True).labels
 (0, 1, 2, 3)
 
 Stars tell which steps can be at a place: there has to be one frame, and a shift for each star, that

@@ -14,6 +14,7 @@ from enum import Enum
 
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.theory.evidence import pairs_of
+from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.theory import Theory
 
 # The most dstates to try as the end of an unknown action, first ones first. So a view that is seen
@@ -69,8 +70,8 @@ class Log:
         pairs: Evidence about pairs of steps.
     """
 
-    def __init__(self, trace: Trace, theory: Theory) -> None:
-        self.pairs = pairs_of(trace, theory)
+    def __init__(self, trace: Trace, theory: Theory, pairs: Pairs | None = None) -> None:
+        self.pairs = pairs_of(trace, theory) if pairs is None else pairs
         actions: dict[str, int] = {}
         seen: dict[object, int] = {}
         self.actions = [actions.setdefault(a.name, len(actions)) for a in trace.actions]

@@ -44,9 +44,16 @@ __all__ = [
 ]
 
 
-def evidence_of(theory: Theory) -> tuple[Evidence, ...]:
-    """The kinds of evidence that take part in a theory, made for it."""
-    return tuple(kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms)
+def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidence, ...]:
+    """Make the kinds of evidence that take part in a theory.
+
+    Args:
+        theory: The settled theory.
+        known: Evidence that was made before. What it remembers about traces is taken over.
+    """
+    made = [kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms]
+    before = {type(evidence): evidence for evidence in known}
+    return tuple(e.remembering(before[type(e)]) if type(e) in before else e for e in made)
 
 
 def said_by(

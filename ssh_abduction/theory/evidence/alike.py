@@ -30,6 +30,9 @@ class Alike:
     def of(cls, theory: Theory) -> Alike:
         return cls("functional_view" in theory.hard and not theory.unknown_views)
 
+    def remembering(self, known: Alike) -> Alike:
+        return self
+
     def pairs(self, trace: Trace) -> Pairs:
         return _pairs(
             tuple(

@@ -26,6 +26,9 @@ class Asserted:
     def of(cls, theory: Theory) -> Asserted:
         return cls(theory.asserted)
 
+    def remembering(self, known: Asserted) -> Asserted:
+        return self
+
     def pairs(self, trace: Trace) -> Pairs:
         return self.said
 

@@ -19,10 +19,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import is_
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
@@ -46,6 +46,8 @@ AT_A_TIME = 200_000
 # So many maps of one trace that were accepted are remembered, as they may be asked about again, or go on as the trace grows; and so many sets that were refused,
 # as the next maps mostly have them, too.
 REMEMBERED = 64
+# The traces whose returns a kind of evidence remembers.
+KEPT = 8
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class Displacement:
     has_places: bool
     turns_stay: bool
     has_one_view: bool
+    known: list[Returns] = field(default_factory=list, compare=False, repr=False)
 
     @classmethod
     def of(cls, theory: Theory) -> Displacement:
@@ -88,41 +91,43 @@ class Displacement:
             ssh_map, since
         )
 
+    def remembering(self, known: Displacement) -> Displacement:
+        return replace(self, known=known.known)
+
+    def count_returns(self, trace: Trace) -> int:
+        """How many returns of a trace may be true, rounded up to a power of two.
+
+        The length of the trace does not limit the number.
+        """
+        return replace(self, returns=0).returns_of(trace).count()
+
     def returns_of(self, trace: Trace) -> Returns:
-        """The returns that a trace may have."""
-        return _returns(self, trace)
+        """The returns that a trace may have, made when they are first asked for.
+
+        The last few traces are remembered, as several parts of a search ask for them. If a trace
+        has grown, the returns of its first steps are taken over.
+        """
+        kept = list(self.known)
+        for known in kept:
+            if known.trace is trace and known.evidence == self:
+                return known
+        before = next(
+            (k for k in reversed(kept) if k.evidence == self and _has_grown(k.trace, trace)), None
+        )
+        reckoning = next((known.reckoning for known in kept if known.trace is trace), None)
+        found = Returns(self, trace, before, reckoning)
+        with suppress(ValueError):  # another thread was faster
+            if before is not None:
+                self.known.remove(before)
+            elif len(kept) >= KEPT:
+                self.known.remove(kept[0])
+        self.known.append(found)
+        return found
 
 
 def jumped(ssh_map: SSHMap) -> tuple[int, ...]:
     """The steps whose displacements a map disbelieves."""
     return tuple(fault.step for fault in ssh_map.faults if fault.kind == "jumped")
-
-
-# The returns that were asked for last: several parts of a search ask for them, and as a trace grows they are those of fewer steps, and some more.
-_KEPT: deque[Returns] = deque(maxlen=8)
-
-
-def _returns(evidence: Displacement, trace: Trace) -> Returns:
-    """The returns of a trace, made when they are first asked for."""
-    kept = list(_KEPT)
-    for known in kept:
-        if known.trace is trace and known.evidence == evidence:
-            return known
-    before = next(
-        (
-            known
-            for known in reversed(kept)
-            if known.evidence == evidence and _has_grown(known.trace, trace)
-        ),
-        None,
-    )
-    reckoning = next((known.reckoning for known in kept if known.trace is trace), None)
-    found = Returns(evidence, trace, before, reckoning)
-    if before:
-        with suppress(ValueError):  # another thread was faster
-            _KEPT.remove(before)
-    _KEPT.append(found)
-    return found
 
 
 def _has_grown(before: Trace, trace: Trace) -> bool:
@@ -134,11 +139,6 @@ def _has_grown(before: Trace, trace: Trace) -> bool:
     if (old.view, old.displacement, old.covariance) != (new.view, new.displacement, new.covariance):
         return False
     return all(map(is_, before.steps[:last], trace.steps[:last]))
-
-
-def count_returns(trace: Trace, theory: Theory) -> int:
-    """How many returns of a trace may be true, rounded up to a power of two. A trace may be as long as it likes, and have as few."""
-    return _returns(replace(Displacement.of(theory), returns=0), trace).count()
 
 
 class Returns:

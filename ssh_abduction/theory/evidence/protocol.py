@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
@@ -33,6 +33,10 @@ class Evidence(Protocol):
     def of(cls, theory: Theory) -> Evidence:
         """What takes part in a theory."""
         ...
+
+    def remembering(self, known: Any) -> Evidence:
+        """This evidence with what `known`, of the same kind, worked out about traces."""
+        return self
 
     def pairs(self, trace: Trace) -> Pairs:
         """What is known of pairs of steps before the search. A map of the trace, cut down to some first steps, keeps what is said of these."""

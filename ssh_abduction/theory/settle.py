@@ -1,0 +1,127 @@
+"""A theory, settled for one trace.
+
+>>> from ssh_abduction import Theory, Trace
+>>> from ssh_abduction.theory.settle import settle
+>>> problem = settle(Trace.from_steps("aba", ["travel", "around"]), Theory())
+>>> problem.theory.star, problem.theory.prefer
+('none', ('dstates', 'paths', 'places'))
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, TypeAlias
+
+from ssh_abduction.data.errors import TheoryError, TraceError
+from ssh_abduction.data.trace import Trace, checked_trace
+from ssh_abduction.theory.evidence import Displacement, Evidence, evidence_of
+from ssh_abduction.theory.pairs import Pairs
+from ssh_abduction.theory.theory import Theory, checked_theory, choice
+
+Star: TypeAlias = Literal["auto", "none", "alike", "pattern", "frame", "gateways"]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A trace and the theory that was settled for it. Whoever works on a trace is given this value.
+
+    Attributes:
+        trace: The trace.
+        theory: The theory, with `star`, `displacement`, `prefer` and `returns` settled.
+        evidence: The kinds of evidence that take part, made for this theory. They remember what they
+            worked out about the trace.
+    """
+
+    trace: Trace
+    theory: Theory
+    evidence: tuple[Evidence, ...] = field(compare=False, repr=False)
+
+    @classmethod
+    def of(cls, trace: Trace, theory: Theory) -> Problem:
+        """The problem of a theory that is settled for a trace already."""
+        return cls(trace, theory, evidence_of(theory))
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """What the evidence that nothing excuses says of pairs of steps."""
+        hard = self.theory.hard
+        return Pairs.joined([e.pairs(self.trace) for e in self.evidence if e.axiom in hard])
+
+    def changed(self, trace: Trace | None = None, theory: Theory | None = None) -> Problem:
+        """Another trace or settled theory, with what is known about this one.
+
+        Args:
+            trace: Another trace, such as this one with more steps, or a part of it.
+            theory: Another theory, which is settled for that trace.
+        """
+        theory = theory or self.theory
+        return Problem(trace or self.trace, theory, evidence_of(theory, self.evidence))
+
+
+def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = None) -> Problem:
+    """Settle a theory for a trace, and check that the trace has what the axioms need.
+
+    A step whose view is unknown may be at any dstate.
+
+    Args:
+        trace: The trace.
+        theory: The theory; Theory.topological() by default.
+        known: A problem about the same trace, or about its first steps, to take knowledge from.
+
+    Raises:
+        TraceError: All views, the kind of an action, or a star is missing.
+        TheoryError: The theory needs stars or displacements, and the trace has none.
+    """
+    checked_trace(trace)
+    theory = checked_theory(theory)
+    star = _star_of(trace, theory)
+    displacement = theory.displacement
+    if displacement == "auto":
+        displacement = "use" if trace.has_displacements else "none"
+    # Once returns are counted, this may be a part of a trace, which need not have displacements.
+    if displacement == "use" and not trace.has_displacements and not theory.returns:
+        mend = f"add them to the steps, or take {choice('displacement', 'none')}"
+        raise TheoryError(
+            "displacement: expected a trace with displacements for displacement=use, got none; "
+            f"{mend}"
+        )
+    views = set(trace.views)
+    if views == {None}:
+        raise TraceError(
+            f"{trace.at(0)}: view: expected one, got only an image; cluster the images into views "
+            "first (ssh-abduction cluster)"
+        )
+    settled = replace(theory, star=star, displacement=displacement, unknown_views=None in views)
+    counts = ["dstates" if count == "tenths" else count for count in settled.priorities]
+    prefer = tuple(c for c in counts if c in theory.prefer or c != "excuses")
+    settled = replace(settled, prefer=prefer)
+    for i, step in enumerate(trace.steps):
+        settled.require(step, trace.at(i))
+    evidence = evidence_of(settled, known.evidence if known else ())
+    problem = Problem(trace, settled, evidence)
+    if displacement == "use" and not settled.returns:
+        problem = problem.changed(theory=replace(settled, returns=count_returns(problem)))
+    return problem
+
+
+def count_returns(problem: Problem) -> int:
+    """How many returns of a trace may be true, rounded up to a power of two; 0 if none are used."""
+    displacement = displacement_of(problem)
+    return displacement.count_returns(problem.trace) if displacement else 0
+
+
+def displacement_of(problem: Problem) -> Displacement | None:
+    """The evidence of displacements, if the theory uses it."""
+    return next((e for e in problem.evidence if isinstance(e, Displacement)), None)
+
+
+def _star_of(trace: Trace, theory: Theory) -> Star:
+    """How stars are read in a trace."""
+    star = theory.star
+    if star == "auto":
+        star = "frame" if trace.has_stars else "none"
+    if star != "none" and not trace.has_stars:
+        mend = f"add them to the steps, or take {choice('star', 'none')}"
+        raise TheoryError(f"star: expected a trace with stars for star={star}, got none; {mend}")
+    return "gateways" if star == "frame" and not trace.in_quarters else star
