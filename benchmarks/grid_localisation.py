@@ -3,7 +3,7 @@
     python benchmarks/grid_localisation.py [--part aliasing|clutter|growing] [--seeds 10] [--first 600] [--save JSON] [--plot PNG] [--maps]
     python benchmarks/grid_localisation.py --from JSON [--plot PNG]
 
-prints tables for docs/explanation/localisation.md and draws its picture, which takes all parts; or prints and draws what was saved. A robot of the simulator drives at random for 30 steps; then it is carried to another dstate, and drives for 30 more.
+prints tables for docs/measurements/localisation.md and draws its picture, which takes all parts; or prints and draws what was saved. A robot of the simulator drives at random for 30 steps; then it is carried to another dstate, and drives for 30 more.
 
 dstates by image, by view  the bootstrap loop has mapped the world from one exploration run, which tries each action at each dstate twice, and Localiser follows the robot in that map by its images
                            or by the views that they are clustered to. It reads neither odometry nor stars. Never nowhere: like the peers it is told that the robot is in the map, which

@@ -2,7 +2,7 @@
 
     python benchmarks/localisation.py [--part kidnapped|nowhere|images|speed] [--seeds 20] [--first 200] [--plot PNG]
 
-prints tables for docs/explanation/localisation.md, and draws its picture: the first robot in a maze of 5 x 5 that is put into another maze and back. Maps are the true ones of walks, so what is measured is localisation alone. Robots walk at random along the links of the map:
+prints tables for docs/measurements/localisation.md, and draws its picture: the first robot in a maze of 5 x 5 that is put into another maze and back. Maps are the true ones of walks, so what is measured is localisation alone. Robots walk at random along the links of the map:
 
 kidnapped  at step 40 of 80 the robot is at some other dstate, and its action is not what brought it there. Some views are wrong, each another one at random
 nowhere    from step 40 to step 69 of 110 the robot is in another world; then it is put back. In the other world there are the same views, or a third of its

@@ -54,8 +54,8 @@ def test_lists_of_fields_and_examples_keep_their_lines() -> None:
     ],
 )
 def test_links_out_of_the_pages_lead_to_github(link: str, shown: str) -> None:
-    assert hooks.to_github(f"See [there]({link}).", "usage.md") == f"See [there]({shown})."
-    assert hooks.to_github("[up](../usage.md)", "tutorials/logs.md") == "[up](../usage.md)"
+    assert hooks.to_github(f"See [there]({link}).", "contributing.md") == f"See [there]({shown})."
+    assert hooks.to_github("[up](../index.md)", "tutorials/logs.md") == "[up](../index.md)"
 
 
 def test_all_names_that_pages_import_have_a_page() -> None:
