@@ -3,7 +3,7 @@
     python benchmarks/ablation.py [--limit S] [--memory MIB] [--only PATTERN] [--out benchmarks/results/ablation.json]
 
 The table is in the form of bench.py, with the solver without a speed-up in place of a peer; "without all" is the plain encoding of the
-axioms, whole trace at once. `python benchmarks/readme.py benchmarks/results/ablation.json ablation` writes it into docs/measurements/performance.md.
+axioms, whole trace at once.
 """
 
 from __future__ import annotations

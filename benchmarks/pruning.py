@@ -1,11 +1,12 @@
 """Which speed-ups earn their lines: each is switched off by itself, on several families of instances and seeds, with and without in turns.
 
-    python benchmarks/pruning.py [--only SWITCHES] [--seeds N] [--resume] [--out RESULTS.json] [--page PAGE.md]
+    python benchmarks/pruning.py [--only SWITCHES] [--seeds N] [--resume] [--out RESULTS.json]
 
 A speed-up stays if on two families the median over the seeds is at least GAIN times as many seconds without it, or as many dstates where a
 limit ends the search. Seconds are those that the processors worked, unless TRIALS says otherwise: so other work on the machine
 counts little. A search that its limit ends counts as if it had ended then, so the true ratio is at least as far from 1. `following` is no switch: cell.py
-says what is left out. Each run is a process of its own, and one runs at a time. What came of it is stored as JSON, run by run; --resume goes on with that.
+says what is left out. Each run is a process of its own, and one runs at a time. The results are stored as JSON, run by run; --resume goes on with them.
+readme.py writes the table into docs/measurements/performance.md.
 """
 
 from __future__ import annotations
@@ -210,33 +211,6 @@ def _spread(found: list[float]) -> str:
     )
 
 
-def page(results: dict[str, Any], stored: Path) -> str:
-    """What docs/measurements/pruning.md says."""
-    on, versions = (
-        results["machine"],
-        ", ".join(f"{package} {number}" for package, number in results["packages"].items()),
-    )
-    limits = sorted({cell["limit"] for cell in results["cells"]})
-    return f"""# Which speed-ups earn their lines
-
-Each speed-up was switched off by itself on three families of instances or more, {results["seeds"]} seeds each where nothing else is said, with and without in turns; compared are CPU seconds until one
-minimal map is proven, or the dstates of the best map at a limit of {limits[0]:g} to {limits[-1]:g} s, and a speed-up stays where two families show {GAIN} times. Measured on
-{results["date"]} by `benchmarks/pruning.py` on {on["cpu"]}, {on["cores"]} cores, Python {on["python"]}, {versions}, while other work ran there.
-
-Families were not all chosen beforehand: `apart`, `watched`, `one_by_one`, `following`, `sides`, `path_names`, `annealed` and `core_guided` got more of them, or a longer limit,
-after the first ones were seen, so what stays by such a family is less certain. Left out are `sides` on 8 x 8 cells at 4 s, where most searches did not end, and
-`following` on 7 x 7 cells with corridors followed, one seed, no gain.
-
-A search that its limit ended counts as if it had ended then. ∞ stands for no map at all. The names of families are explained in `benchmarks/suite.py`: "full" is the topological
-theory, with stars where nothing else is said; other families are of the causal theory. `threads` and `processes` are about a second processor, so they are measured by
-the clock on the wall, on a machine that does nothing else.
-
-{table(results)}
-
-From [`{stored.relative_to(ROOT).as_posix()}`](../../{stored.relative_to(ROOT).as_posix()}).
-"""
-
-
 def measure(results: dict[str, Any], trials: Iterable[Trial], seeds: int, out: Path) -> None:
     """Run what is not stored yet."""
     done = {
@@ -285,9 +259,6 @@ def main() -> None:
         default=ROOT / "benchmarks" / "results" / "pruning.json",
         metavar="RESULTS.json",
     )
-    parser.add_argument(
-        "--page", type=Path, metavar="PAGE.md", help="write the page with the table there"
-    )
     options = parser.parse_args()
     results: dict[str, Any] = {
         "date": datetime.date.today().isoformat(),
@@ -306,8 +277,6 @@ def main() -> None:
     only = options.only.split(",")
     measure(results, [trial for trial in TRIALS if trial.switch in only], options.seeds, out)
     print(table(results))
-    if options.page:
-        options.page.write_text(page(results, out), encoding="utf-8")
 
 
 if __name__ == "__main__":

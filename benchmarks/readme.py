@@ -1,7 +1,7 @@
 """Writes the tables of a stored run into docs/measurements/performance.md.
 
     python benchmarks/readme.py RESULTS.json             # of bench.py
-    python benchmarks/readme.py RESULTS.json ablation    # of ablation.py
+    python benchmarks/readme.py RESULTS.json pruning     # of pruning.py
 
 Each table stands between two comments that name it. The text around them stays.
 """
@@ -15,12 +15,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pruning
 from table import times
 
 ROOT = Path(__file__).parent.parent
 PAGES = {
     "peers": ROOT / "docs" / "measurements" / "performance.md",
-    "ablation": ROOT / "docs" / "measurements" / "performance.md",
+    "pruning": ROOT / "docs" / "measurements" / "performance.md",
 }
 
 
@@ -31,16 +32,19 @@ def block(name: str, results: dict[str, Any], path: Path) -> str:
         ", ".join(f"{package} {number}" for package, number in results["packages"].items()),
     )
     measured = f"{results['date']}, {machine['cpu']}, {machine['cores']} cores"
+    source = os.path.relpath(path, PAGES[name].parent).replace(os.sep, "/")
+    stored = f"From [`{path.relative_to(ROOT).as_posix()}`]({source}).\n"
+    if name == "pruning":
+        return f"{pruning.table(results)}\n\n{measured}, {results['seeds']} seeds where no other number is named. {stored}"
     limits = f"{results['limit']:g} s and {results['memory']:,} MiB a cell"
     seeds = (
         "one trace of each kind"
         if results["seeds"] == 1
         else f"medians over {results['seeds']} traces of each random kind"
     )
-    source = os.path.relpath(path, PAGES[name].parent).replace(os.sep, "/")
     return (
         f"{_narrow(times(results))}\n\n"
-        f"{measured}, Python {machine['python']}, {versions}; {limits}, {seeds}. From [`{path.relative_to(ROOT).as_posix()}`]({source}).\n"
+        f"{measured}, Python {machine['python']}, {versions}; {limits}, {seeds}. {stored}"
     )
 
 
