@@ -37,7 +37,7 @@ from instances import Walk
 from ssh_abduction import OnlineMapper, SSHMap, Theory, Trace
 from ssh_abduction.online.hypotheses import Rival
 from ssh_abduction.solver import Cost
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.facts import answer_maps
 
 COLUMNS = (
     "noticed",
@@ -203,7 +203,7 @@ def true_map(case: Case, theory: Theory, steps: int) -> SSHMap:
     """The true map of so many first steps, and its faults."""
     trace = case.walk.trace
     faults = [(t, kind) for t, kind in case.faults if t + (kind == "slipped") < steps]
-    return facts.faulty_map(case.walk.truth[:steps], trace.prefix(steps), faults, theory)
+    return answer_maps.faulty_map(case.walk.truth[:steps], trace.prefix(steps), faults, theory)
 
 
 def cells(records: Sequence[Record]) -> list[str]:

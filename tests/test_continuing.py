@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from benchmarks.instances import maze
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.guesses import continuing
 from ssh_abduction.solver.guesses.continuing import followed
 from ssh_abduction.solver.guesses.merging import thinned
@@ -40,7 +40,7 @@ def test_the_result_is_a_map(trace: Trace, data: st.DataObject) -> None:
     ):
         labels = followed(Log(trace, CAUSAL), solve(beginning, CAUSAL).maps[0].labels)
     if labels is not None:
-        assert check(trace, facts.causal_map(labels, trace), CAUSAL) == ()
+        assert check(trace, answer_maps.causal_map(labels, trace), CAUSAL) == ()
 
 
 @pytest.mark.parametrize(("steps", "kept"), [(500, False), (800, True), (1200, True)])
@@ -52,9 +52,9 @@ def test_a_map_that_lacks_links_leads_to_a_map_of_all_steps(steps: int, kept: bo
     labels = followed(log, known)
     assert labels is not None
     assert (labels[:steps] == known) == kept
-    assert check(walk.trace, facts.causal_map(labels, walk.trace), CAUSAL) == ()
+    assert check(walk.trace, answer_maps.causal_map(labels, walk.trace), CAUSAL) == ()
     thin = thinned(Chart.of_steps(log, len(walk.trace)), labels)
-    assert check(walk.trace, facts.causal_map(thin, walk.trace), CAUSAL) == ()
+    assert check(walk.trace, answer_maps.causal_map(thin, walk.trace), CAUSAL) == ()
     assert len(set(thin)) <= len(set(walk.truth))
 
 

@@ -19,7 +19,7 @@ from test_property import agree
 from ssh_abduction import SSHMap, Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import DState, Odometry, TheoryError
-from ssh_abduction.solver.asp.facts import causal_map
+from ssh_abduction.solver.asp.facts.answer_maps import causal_map
 from ssh_abduction.solver.fit import _Problem, fit
 from ssh_abduction.solver.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of

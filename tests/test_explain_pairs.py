@@ -22,7 +22,7 @@ from ssh_abduction.explain.pairs import explain_pair
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.verdict import PairExplanation, Verdict
 from ssh_abduction.solver import Status
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.facts import derivation_lp, questions
 from ssh_abduction.theory.encodings import axioms
 from ssh_abduction.theory.settle import settle
 
@@ -48,9 +48,9 @@ def possible(
     """Whether the pair may be otherwise if only these axioms hold at these steps."""
     piece = Piece.of(settle(trace, theory), derivation.steps)
     pair = piece.steps.index(derivation.first), piece.steps.index(derivation.second)
-    active = [facts.active(axiom, piece.steps.index(step)) for axiom, step in links]
+    active = [derivation_lp.active(axiom, piece.steps.index(step)) for axiom, step in links]
     return Axioms(piece, never, relaxed=True).consistent(
-        active, [(facts.are_one(*pair), not derivation.one)]
+        active, [(questions.are_one(*pair), not derivation.one)]
     )
 
 

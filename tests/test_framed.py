@@ -21,7 +21,8 @@ from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.online.keeper import MapKeeper
 from ssh_abduction.solver import Search, Start, Status, choosing
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.facts import paths_lp, sides_lp, visits_lp
+from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import framed
@@ -470,9 +471,11 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
         assert labels
         chart = engine._chart
         control = engine._paths.control(chart)
-        control.add("base", [], facts.settled_labels(enumerate(labels)))
+        control.add("base", [], paths_lp.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("contrary", [])])
-        contrary, _ = next(engine.asker.answers(facts.read_contrary, "ignore", 1, control=control))
+        contrary, _ = next(
+            engine.asker.answers(paths_lp.read_contrary, "ignore", 1, control=control)
+        )
         contradicted += len(contrary)
 
         def atoms(name: str, arity: int, control: clingo.Control = control) -> set[tuple[int, ...]]:
@@ -500,21 +503,21 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
             control.load(encodings.path("sides_framed"))
             given = [(node, visit, slot) for node, _, visit, slot in nodes]
             leaves = [(visit, *how) for visit, how in chart.leaves.items()]
-            control.add("visits", [], facts.visit_facts(0, given, leaves, pairs))
+            control.add("visits", [], visits_lp.visit_facts(0, given, leaves, pairs))
             control.add(
                 "visits",
                 [],
-                facts.turn_facts(0, chart, range(len(chart.stars)), chart.turns(trace)),
+                sides_lp.turn_facts(0, chart, range(len(chart.stars)), chart.turns(trace)),
             )
-            control.add("visits", [], facts.sides_framed_facts(theory))
+            control.add("visits", [], sides_lp.sides_framed_facts(theory))
             control.add("visits", [], "\n".join(f":- not same({i},{j},{r})." for i, j, r in pairs))
-            street = ("path", facts.numbers(*chart.facing[labels.index(dstate)], 0))
+            street = ("path", numbers(*chart.facing[labels.index(dstate)], 0))
             control.ground(
                 [
                     ("visits", []),
-                    ("more", facts.numbers(0)),
+                    ("more", numbers(0)),
                     ("sides", []),
-                    ("paths", facts.numbers(0)),
+                    ("paths", numbers(0)),
                     street,
                 ]
             )

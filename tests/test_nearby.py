@@ -18,7 +18,7 @@ from test_speedups import PLAIN, machines
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.solver import Search, Status, choosing, fallback
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import naming as named
@@ -74,7 +74,7 @@ def test_from_any_guess_to_a_minimal_map(trace: Trace, data: st.DataObject) -> N
     fewest = solve(trace, CAUSAL, speedups=PLAIN).cost
     assert fewest
     for labels in found:
-        assert check(trace, facts.causal_map(labels, trace), CAUSAL) == ()
+        assert check(trace, answer_maps.causal_map(labels, trace), CAUSAL) == ()
     counts = [len(set(labels)) for labels in found]
     assert counts == sorted(set(counts), reverse=True)
     assert counts
@@ -189,7 +189,7 @@ def test_a_causal_maze_is_guessed_by_its_turns() -> None:
     fewest = solve(walk.trace, CAUSAL, speedups=Speedups.without("annealed")).cost
     assert fewest
     assert len(set(found[-1])) == searched.bound == fewest.dstates
-    assert check(walk.trace, facts.causal_map(found[-1], walk.trace), CAUSAL) == ()
+    assert check(walk.trace, answer_maps.causal_map(found[-1], walk.trace), CAUSAL) == ()
 
 
 @pytest.mark.parametrize("beside", [True, False])
@@ -367,7 +367,7 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
     assert bool(found) == goes_on
     fewest = fewest_dstates(trace)
     for labels in found:
-        assert check(trace, facts.causal_map(labels, trace), CAUSAL) == ()
+        assert check(trace, answer_maps.causal_map(labels, trace), CAUSAL) == ()
     assert min(len(set(labels)) for labels in found or [range(fewest)]) == fewest
 
 

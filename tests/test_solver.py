@@ -33,7 +33,7 @@ from ssh_abduction.explain.axioms import Interrupted
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.solver import Progress, Search, Status, fallback, map_list, prefixes
-from ssh_abduction.solver.asp.facts import links_of
+from ssh_abduction.solver.asp.facts.answer_maps import links_of
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine_module
 from ssh_abduction.solver.engines import stepwise

@@ -23,7 +23,7 @@ from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data import SolverError
 from ssh_abduction.solver import Search, Status, choosing
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.facts import answer_maps, names_lp
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.engines import base as engine
 from ssh_abduction.solver.engines import framed
@@ -101,16 +101,16 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(
 @pytest.mark.parametrize("seed", [0, 3])
 def test_names_read_from_where_actions_lead_are_those_read_whole(seed: int) -> None:
     """Though there are no spare names at first, so that some have to be added."""
-    read, answers = facts.NameReader.read, []
+    read, answers = names_lp.NameReader.read, []
 
-    def compared(reader: facts.NameReader, model: clingo.Model) -> dict[int, int]:
-        names = facts.read_names(model)
+    def compared(reader: names_lp.NameReader, model: clingo.Model) -> dict[int, int]:
+        names = names_lp.read_names(model)
         assert read(reader, model) == names
         answers.append(names)
         return names
 
     few = patch.multiple(named, PATIENCE=0, CORES=0, SPARES=0)
-    with few, patch.object(facts.NameReader, "read", compared):
+    with few, patch.object(names_lp.NameReader, "read", compared):
         speedups = Speedups.without(("annealed", "threads"))
         assert solve(
             moore(8, 2, steps=60, seed=seed).trace, Theory.causal(), max_maps=20, speedups=speedups
@@ -280,7 +280,7 @@ def test_steps_merged_by_evidence_make_a_map(trace: Trace) -> None:
     assert fewest
     known = merged(apart, links, chart.continuations.clique())
     for labels in known, thinned(chart, range(len(trace))), thinned(chart, known):
-        found = facts.causal_map(labels, trace)
+        found = answer_maps.causal_map(labels, trace)
         assert check(trace, found, theory) == ()
         assert fewest.dstates <= len(found.dstates) <= len(trace)
         if labels is not known:

@@ -16,7 +16,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.checker.proof import check_bound
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Search, Start, Status, choosing
-from ssh_abduction.solver.asp.facts import most_paths
+from ssh_abduction.solver.asp.facts.readable import most_paths
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import frameless as ways
 from ssh_abduction.solver.engines import naming as named

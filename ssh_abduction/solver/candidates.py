@@ -12,7 +12,7 @@ from functools import partial
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import each_looking, heeding
 from ssh_abduction.runtime.logs import log_of
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.guesses.gated import gated_map
@@ -51,7 +51,7 @@ class Candidates:
     def merge(self) -> None:
         """Make a causal map by merging steps greedily: at once, and not minimal."""
         if self._task.speedups.greedy and self._task.theory.level == "causal":
-            self.offer(facts.causal_map(self._task.log.merged(), self._task.trace))
+            self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
 
     def sketch(self, seconds: float = math.inf) -> None:
         """Where no map of the whole trace is known yet, make one without a search: from the best map of a prefix on, or of all steps.
@@ -163,7 +163,7 @@ class Candidates:
     def offer(self, ssh_map: SSHMap) -> None:
         """Keep a map of the whole trace if it is better than the best one known, and satisfies all axioms."""
         if self._task.trace is not self._trace:
-            views = facts.views_of(dict(enumerate(ssh_map.labels)), self._trace)
+            views = answer_maps.views_of(dict(enumerate(ssh_map.labels)), self._trace)
             ssh_map = replace(
                 ssh_map, dstates=tuple(replace(s, view=views[s.id]) for s in ssh_map.dstates)
             )

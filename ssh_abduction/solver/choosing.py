@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ssh_abduction.solver import prefixes
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.facts import readable
 from ssh_abduction.solver.engines.base import AT_ONCE, Engine, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.theory.speedups import row
@@ -49,6 +49,6 @@ def new_engine(task: Task) -> Engine:
 
 def step_engine(task: Task) -> StepEngine:
     """The engine that takes any theory. It begins with few names for paths, if that is allowed."""
-    most = facts.most_paths(task.trace, task.theory, len(task.trace))
+    most = readable.most_paths(task.trace, task.theory, len(task.trace))
     names = min(prefixes.FIRST_PATHS, most) if task.speedups.path_names else most
     return StepEngine(task, names)

@@ -21,7 +21,7 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Action, Step, Trace, View
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.faulty import FaultyEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
@@ -305,8 +305,11 @@ def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) ->
             faults.append((t, "slipped"))
         if step.displacement != other.displacement:
             faults.append((t, "jumped"))
-    told = facts.faults_of(faults, dict(enumerate(ssh_map.labels)), shows, trace, theory)
+    told = answer_maps.faults_of(faults, dict(enumerate(ssh_map.labels)), shows, trace, theory)
     dstates = tuple(replace(s, view=shows[s.id]) for s in ssh_map.dstates)
     return replace(
-        ssh_map, dstates=dstates, links=facts.links_of(ssh_map.labels, trace, faults), faults=told
+        ssh_map,
+        dstates=dstates,
+        links=answer_maps.links_of(ssh_map.labels, trace, faults),
+        faults=told,
     )

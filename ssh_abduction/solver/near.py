@@ -14,8 +14,8 @@ from dataclasses import replace
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import prefixes
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.asp.facts import readable
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import Judging
@@ -43,7 +43,7 @@ class NearMinimal:
         """
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report
-        names = facts.most_paths(task.trace, task.theory, len(task.trace))
+        names = readable.most_paths(task.trace, task.theory, len(task.trace))
         self.engine = StepEngine(
             self._task, min(prefixes.FIRST_PATHS, names) if task.speedups.path_names else names
         )

@@ -44,7 +44,7 @@ from dataclasses import replace
 from ssh_abduction.data.gateways import turned
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.logs import log_of
-from ssh_abduction.solver.asp import facts
+from ssh_abduction.solver.asp.facts import readable
 from ssh_abduction.solver.asp.limits import LAST, LimitError, StageTimeError
 from ssh_abduction.solver.engines.base import Engine, Found, Task
 from ssh_abduction.solver.engines.refusing import first_accepted
@@ -154,7 +154,7 @@ class Prefixes:
         self.engine.settle()
         size, theory = self.engine.size, self._task.theory
         self.engine = StepEngine(
-            self._task, facts.most_paths(self._task.trace, theory, len(self._task.trace))
+            self._task, readable.most_paths(self._task.trace, theory, len(self._task.trace))
         )
         self.engine.grow(size)
         self.engine.forbid(equalities)

@@ -22,8 +22,9 @@ from collections.abc import Iterator
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Control
+from ssh_abduction.solver.asp.facts import readable
+from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import POLL
 from ssh_abduction.solver.asp.rules import read_by
 from ssh_abduction.theory.settle import Problem
@@ -79,16 +80,16 @@ def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
         return True
     control = Control(check=look_at_clock)
     steps = range(len(trace))
-    control.add("base", [], facts.theory_facts(theory, len(ssh_map.paths)))
-    control.add("base", [], facts.trace_facts(problem, 0, len(trace)))
+    control.add("base", [], readable.theory_facts(theory, len(ssh_map.paths)))
+    control.add("base", [], readable.trace_facts(problem, 0, len(trace)))
     control.add("base", [], "\n".join(f"{fact}." for fact in _shown(trace, ssh_map)))
     control.add("base", [], f"query({len(trace) - 1}).\n{FRAME}")
-    control.add("base", [], facts.own_rules(theory))
+    control.add("base", [], readable.own_rules(theory))
     control.ground([("base", [])])
     for t in steps:
         look_at_clock()
-        control.ground([("step", facts.numbers(t))])
-    control.ground([("check", facts.numbers(len(trace) - 1))])
+        control.ground([("step", numbers(t))])
+    control.ground([("check", numbers(len(trace) - 1))])
     with control.solve(async_=True) as handle:
         while not handle.wait(POLL):
             look_at_clock()

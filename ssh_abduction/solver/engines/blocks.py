@@ -16,8 +16,9 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, Control
+from ssh_abduction.solver.asp.facts import faulty_lp
+from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.theory.evidence import Pairs
@@ -165,13 +166,19 @@ class Blocks:
                 for t in found
                 for near in (-1, 0, 1)
             }
-            told = facts.faulty_batch(0, seen, actions, range(len(seen)), (), Pairs(), price, full)
-            base = facts.faulty_base(actions, dict.fromkeys(sorted(set(seen)), most), self.price)
+            told = faulty_lp.faulty_batch(
+                0, seen, actions, range(len(seen)), (), Pairs(), price, full
+            )
+            base = faulty_lp.faulty_base(
+                actions, dict.fromkeys(sorted(set(seen)), most), self.price
+            )
             asker.control.add(
-                "base", [], "\n".join([base, told, facts.dstates_and_faults_up_to(most, tenths)])
+                "base",
+                [],
+                "\n".join([base, told, faulty_lp.dstates_and_faults_up_to(most, tenths)]),
             )
             asker.control.ground([("base", [])])
-            asker.control.ground([("more", facts.numbers(0))])
+            asker.control.ground([("more", numbers(0))])
             answer, core = asker.verdict(lambda _: True, [], CONFLICTS)
             if answer or core is None:
                 return False

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
 from ssh_abduction.solver.engines.naming import NamedLabels
 from ssh_abduction.theory.evidence import Equality
@@ -65,4 +65,4 @@ class CausalEngine:
         self._named.settle()
 
     def _found(self, labels: Sequence[int]) -> Found:
-        return Found.of(facts.causal_map(labels, self._task.trace), self._task.theory)
+        return Found.of(answer_maps.causal_map(labels, self._task.trace), self._task.theory)

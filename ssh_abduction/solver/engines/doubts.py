@@ -13,8 +13,8 @@ from typing import TypeAlias, TypeVar
 import clingo
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.asp.facts import path_reader, questions
 from ssh_abduction.solver.sharing import Sort
 
 Answer = TypeVar("Answer")
@@ -48,9 +48,9 @@ class Doubts:
             return None
         self._tell([doubt for doubt in doubts if doubt not in self._told])
         for doubt in self._open ^ doubts:
-            self._control.assign_external(facts.open_doubt(self._told[doubt]), doubt in doubts)
+            self._control.assign_external(questions.open_doubt(self._told[doubt]), doubt in doubts)
         self._open = doubts
-        assumed = [(facts.some_doubt(self._parts), True)]
+        assumed = [(questions.some_doubt(self._parts), True)]
         with closing(
             self._asker.answers(read, mode, 1, assumptions=assumed, control=self._control)
         ) as answers:
@@ -60,10 +60,10 @@ class Doubts:
         if not doubts:
             return
         self._parts += 1
-        rules = [facts.doubts_before(self._parts)]
+        rules = [questions.doubts_before(self._parts)]
         for sort, i, j, one in doubts:
             number = self._told[sort, i, j, one] = len(self._told)
-            rules.append(facts.doubt(number, self._parts, self._condition(sort, i, j), one=one))
+            rules.append(questions.doubt(number, self._parts, self._condition(sort, i, j), one=one))
         part = f"doubts_{self._parts}"
         with self._asker.grounding_timed():
             self._control.add(part, [], "\n".join(rules))
@@ -83,8 +83,8 @@ class Settled:
         asker: Asker,
         control: clingo.Control,
         mode: str,
-        reader: facts.PathReader,
-        map_of: Callable[[facts.PathAnswer], SSHMap],
+        reader: path_reader.PathReader,
+        map_of: Callable[[path_reader.PathAnswer], SSHMap],
     ) -> None:
         self._asker, self._control, self._mode, self._reader, self._map_of = (
             asker,

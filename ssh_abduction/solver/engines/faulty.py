@@ -24,8 +24,9 @@ from itertools import chain
 import clingo
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, Control
+from ssh_abduction.solver.asp.facts import answer_maps, faulty_lp
+from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.blocks import Blocks
 from ssh_abduction.solver.guesses.robust import Explained, Explainer, Machine, robust_maps
@@ -233,7 +234,7 @@ class FaultyEngine:
         """Give the views more names whose rest is used, and also those all of whose names are."""
         used = Counter(
             view
-            for name, view in facts.faulty_names(self._names)
+            for name, view in faulty_lp.faulty_names(self._names)
             if name in set(answer.where.values())
         )
         for view in self._names:
@@ -250,7 +251,7 @@ class FaultyEngine:
                 self.asker.control = Control(OPTIONS, self.asker.watch.check)
                 self.asker.control.load_encodings("faulty")
                 self.asker.control.add(
-                    "base", [], facts.faulty_base(self._actions, self._names, self._price)
+                    "base", [], faulty_lp.faulty_base(self._actions, self._names, self._price)
                 )
                 self.asker.control.ground([("base", [])])
             control = self.asker.control
@@ -261,7 +262,7 @@ class FaultyEngine:
                     if self._most_faults is None
                     else {kind: [0] * len(self._seen) for kind in self._price}
                 )
-                told = facts.faulty_batch(
+                told = faulty_lp.faulty_batch(
                     batch,
                     self._seen,
                     self._actions,
@@ -272,14 +273,16 @@ class FaultyEngine:
                     self._full,
                 )
                 control.add(f"batch_{batch}", [], told)
-                control.ground([(f"batch_{batch}", []), ("more", facts.numbers(batch))])
+                control.ground([(f"batch_{batch}", []), ("more", numbers(batch))])
                 if self._most_faults is not None:
-                    control.add(f"most_{batch}", [], facts.at_most_faults(self._most_faults))
+                    control.add(f"most_{batch}", [], faulty_lp.at_most_faults(self._most_faults))
                     control.ground([(f"most_{batch}", [])])
                 self._told += new
                 self._batches += 1
             for number in range(self._ruled, len(self._forbidden)):
-                control.add(f"forbidden_{number}", [], facts.not_all_one(self._forbidden[number]))
+                control.add(
+                    f"forbidden_{number}", [], faulty_lp.not_all_one(self._forbidden[number])
+                )
                 control.ground([(f"forbidden_{number}", [])])
             self._ruled = len(self._forbidden)
 
@@ -310,9 +313,11 @@ class FaultyEngine:
                     return
 
     def _read(self, model: clingo.Model) -> _Answer:
-        where, slips, lost = facts.read_faulty(model)
+        where, slips, lost = faulty_lp.read_faulty(model)
         used = set(where.values())
-        rests = frozenset(view for name, view in facts.faulty_rests(self._names) if name in used)
+        rests = frozenset(
+            view for name, view in faulty_lp.faulty_rests(self._names) if name in used
+        )
         return _Answer(model.cost[0] if model.cost else 0, where, slips, lost, rests)
 
     def _machine(self, answer: _Answer) -> tuple[dict[int, int], Machine]:
@@ -320,7 +325,7 @@ class FaultyEngine:
         number: dict[int, int] = {}
         for t in sorted(answer.where):
             number.setdefault(answer.where[t], len(number))
-        view_of = dict(facts.faulty_names(self._names))
+        view_of = dict(faulty_lp.faulty_names(self._names))
         goes = {
             (number[answer.where[t]], self._actions[t]): number[answer.where[t + 1]]
             for t in answer.where
@@ -393,12 +398,13 @@ class FaultyEngine:
         shows: Sequence[int] | None = None,
     ) -> Found:
         """A map of the whole trace, and what it costs."""
-        view_of = dict(facts.faulty_names(self._names))
+        view_of = dict(faulty_lp.faulty_names(self._names))
         shown = self._shown_somewhere(labels, shows or [view_of[name] for name in number])
         misread = [t for t in range(self.size) if shown[labels[t]] != self._seen[t]]
         faults = [*((t, "misread") for t in misread), *((t, "slipped") for t in slips)]
         return Found.of(
-            facts.faulty_map(labels, self._task.trace, faults, self._task.theory), self._task.theory
+            answer_maps.faulty_map(labels, self._task.trace, faults, self._task.theory),
+            self._task.theory,
         )
 
     def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:

@@ -33,8 +33,8 @@ from itertools import chain, islice
 
 import clingo
 
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, give_threads, mapped
+from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.asp.process import in_process
 from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
@@ -403,7 +403,7 @@ class FramedEngine:
             self._best[1] if self._best and self._best[0] == cost else self._all_with_paths(cost[0])
         ):
             control = naming.control or self._path_control(naming.labels)
-            reader = facts.PathReader(
+            reader = path_reader.PathReader(
                 control, self._task.trace, self._task.theory, self._chart, naming.labels
             )
             settled = Settled(self.asker, control, mode, reader, reader.map_of)
@@ -485,7 +485,7 @@ class FramedEngine:
             and self._task.has_processors
         )
         give_threads(control, two=alone)  # which keep all that they list
-        reader = facts.PathReader(
+        reader = path_reader.PathReader(
             control, self._task.trace, self._task.theory, chart or self._chart, naming.labels
         )
         answers = self.asker.answers(
@@ -564,7 +564,7 @@ class FramedEngine:
         control = self._paths.clashing(self._chart, labels)
         clashes = list(
             self.asker.answers(
-                lambda model: sorted(facts.read_names(model)), "ignore", CLASHES, control=control
+                lambda model: sorted(names_lp.read_names(model)), "ignore", CLASHES, control=control
             )
         )
         return clashes or [self._clash(labels)]
@@ -593,5 +593,5 @@ class FramedEngine:
         nodes = range(len(chart.seen))
         control = self._paths.telling(chart, nodes, nodes)
         self.asker.watch.check()
-        _, elsewhere, _ = next(self.asker.answers(facts.read_told, "ignore", 1, control=control))
+        _, elsewhere, _ = next(self.asker.answers(paths_lp.read_told, "ignore", 1, control=control))
         return chart.with_elsewhere(elsewhere)

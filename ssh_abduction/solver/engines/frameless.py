@@ -28,8 +28,9 @@ import clingo
 import networkx as nx
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, Control, mapped
+from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp, sides_lp
+from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
@@ -284,10 +285,10 @@ class PlacesAndPaths:
             if not self._told:
                 control.load(encodings.path("sides_frameless"))
                 control.add(
-                    "sides", [], facts.sides_frameless_facts(self._task.theory, self._actions)
+                    "sides", [], sides_lp.sides_frameless_facts(self._task.theory, self._actions)
                 )
                 parts.append(("sides", []))
-            parts += [("path", facts.numbers(names[dstate])) for dstate in dstates]
+            parts += [("path", numbers(names[dstate])) for dstate in dstates]
             control.ground(parts)  # in one go: that takes half as long, and searching, too
             self._told.update(dstates)
 
@@ -309,7 +310,7 @@ class PlacesAndPaths:
             control = self._control_for(
                 self._links_of(labels), labels, far=self._far_away(labels), parts=TOLD
             )
-            told = facts.Segments.read(control)
+            told = paths_lp.Segments.read(control)
             homes = homes_of(told)
             if homes is not None:
                 _go_on_at_home(control, homes, (*PARTS, *EACH))
@@ -330,7 +331,7 @@ class PlacesAndPaths:
             next(count for count in self._task.theory.priorities if count in ("places", "paths"))
             == "places"
         )
-        reader = facts.PathReader(
+        reader = path_reader.PathReader(
             control, self._task.trace, self._task.theory, self.named.chart, labels
         )
         answers = mapped(
@@ -358,7 +359,7 @@ class PlacesAndPaths:
     def forbid(self, labels: Sequence[int]) -> None:
         links = self._links_of(labels)
         control = self._control_for(links, parts=("base",))
-        contrary = next(self._asker.answers(facts.read_contraries, "ignore", 1, control=control))
+        contrary = next(self._asker.answers(paths_lp.read_contraries, "ignore", 1, control=control))
         dstate_of = {name: dstate for dstate, name in self.named.names().items()}
         new = [
             dstate
@@ -376,7 +377,7 @@ class PlacesAndPaths:
             self.named.add_links_at({step for step, _ in placed})
             self._forbidden += 1
             self.named.tell(
-                f"forbidden_{self._forbidden}", facts.forbidden_links(members.links, placed)
+                f"forbidden_{self._forbidden}", names_lp.forbidden_links(members.links, placed)
             )
 
     def _turned_together(self, links: Iterable[Link], far: Iterable[_Far]) -> list[_Members]:
@@ -441,7 +442,7 @@ class PlacesAndPaths:
         control.add(
             "base",
             [],
-            facts.paths_frameless_facts(
+            paths_lp.paths_frameless_facts(
                 self._task.theory, dstates, links, self._actions, apart, single=single
             ),
         )
@@ -475,7 +476,7 @@ class PlacesAndPaths:
     def settled(self, labels: Sequence[int], mode: str) -> Settled:
         """The maps with these dstates."""
         control = self._path_control(labels)
-        reader = facts.PathReader(
+        reader = path_reader.PathReader(
             control, self._task.trace, self._task.theory, self.named.chart, labels
         )
         return Settled(
@@ -505,7 +506,7 @@ class PlacesAndPaths:
     ) -> Generator[Found, None, bool]:
         """Maps with these dstates: without EACH one for each choice of places. Returns whether clingo came to an end, and not to the limit of conflicts."""
         control = self._path_control(labels, options, parts)
-        reader = facts.PathReader(
+        reader = path_reader.PathReader(
             control, self._task.trace, self._task.theory, self.named.chart, labels
         )
         answers = self._asker.answers(
@@ -528,7 +529,7 @@ class PlacesAndPaths:
 
 def _go_on_at_home(control: Control, homes: Mapping[int, list[int]], parts: Iterable[str]) -> None:
     """Ground the other parts of a control that has what segments tell, where each place is at one of its homes."""
-    control.add("homes", [], facts.tight_facts(homes))
+    control.add("homes", [], paths_lp.tight_facts(homes))
     control.ground(
         [(part, []) for part in ("homes", *(part for part in parts if part not in TOLD))]
     )

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssh_abduction.runtime.clock import look_at_clock
-from ssh_abduction.solver.asp.facts import Segments
+from ssh_abduction.solver.asp.facts.paths_lp import Segments
 from ssh_abduction.solver.engines.paths import pairwise_distinct
 
 

@@ -45,8 +45,9 @@ from typing import Protocol, TypeAlias
 import clingo
 import numpy as np
 
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, give_threads, new_control
+from ssh_abduction.solver.asp.facts import names_lp
+from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch
 from ssh_abduction.solver.engines.base import AT_ONCE, Task
 from ssh_abduction.solver.engines.nearby import (
@@ -308,7 +309,7 @@ class NamedLabels:
         """The best answer that clingo finds with so many conflicts, and whether it is proven to be the best."""
         answer = None
         answers = self._asker.answers(
-            facts.read_names,
+            names_lp.read_names,
             "opt",
             0,
             conflicts=conflicts,
@@ -343,7 +344,7 @@ class NamedLabels:
         pairs = self._forbidden[number]
         steps = {step for pair in pairs for step in pair}
         self.add_links_at(steps)
-        self.tell(f"not_together_{number}", facts.not_together(number, pairs))
+        self.tell(f"not_together_{number}", names_lp.not_together(number, pairs))
 
     def add_links_at(self, steps: Collection[int]) -> None:
         """Give clingo the links to and from these steps, and so the steps, where it does not know them."""
@@ -521,13 +522,13 @@ class NamedLabels:
 
     def _answers_of(self, spares: int) -> Iterator[dict[int, int]]:
         """All answers that cost so many spare names and use no rest."""
-        read = self._reader().read if self.has_all_links else facts.read_names
+        read = self._reader().read if self.has_all_links else names_lp.read_names
         return self._asker.answers(
             read, f"enum,{spares},0", 0, assumptions=[self._resting(False)], ahead=True
         )
 
-    def _reader(self) -> facts.NameReader:
-        return facts.NameReader(self._task.log.actions[: self.size - 1], self._choices)
+    def _reader(self) -> names_lp.NameReader:
+        return names_lp.NameReader(self._task.log.actions[: self.size - 1], self._choices)
 
     @property
     def has_all_links(self) -> bool:
@@ -593,7 +594,7 @@ class NamedLabels:
         """Take more spare names, if some answer of this cost uses a rest. Says whether it was so."""
         answer = next(
             self._asker.answers(
-                facts.read_names, f"enum,{spares},{spares}", 1, assumptions=[self._resting(True)]
+                names_lp.read_names, f"enum,{spares},{spares}", 1, assumptions=[self._resting(True)]
             ),
             None,
         )
@@ -604,7 +605,7 @@ class NamedLabels:
 
     def _resting(self, value: bool) -> tuple[clingo.Symbol, bool]:
         """The assumption that some node is at a rest, or that none is."""
-        return facts.resting(self._batches - 1), value
+        return names_lp.resting(self._batches - 1), value
 
     def _raise_bound(self, costs: Sequence[int]) -> None:
         self.bound = max(self.bound or 0, len(self.clique) + costs[0])
@@ -637,7 +638,7 @@ class NamedLabels:
             for t, options in enumerate(self._may_be)
         ]
         cores = ["--opt-strategy=usc"] if self._task.speedups.core_guided else []
-        base = facts.name_facts(names, spares.values(), self.chart.links, self._choices)
+        base = names_lp.name_facts(names, spares.values(), self.chart.links, self._choices)
         self._check_ahead(SECONDS_A_CHARACTER * len(base))
         self._asker.control = new_control("names", base, ["--eq=1", *cores])
         self._configure()
@@ -687,9 +688,9 @@ class NamedLabels:
                     self._open[t] = True
         self._links.update(dict.fromkeys(added))
         part, batch = f"batch_{self._batches}", self._batches
-        self._asker.control.add(part, [], facts.batch_facts(batch, given, added, far))
+        self._asker.control.add(part, [], names_lp.batch_facts(batch, given, added, far))
         self._asker.control.ground([(part, [])])
-        self._asker.control.ground([("more", facts.numbers(batch))])
+        self._asker.control.ground([("more", numbers(batch))])
         self._batches += 1
 
     def _name_more(self, views: Collection[int]) -> None:

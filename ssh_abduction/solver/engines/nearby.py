@@ -37,8 +37,9 @@ from typing import Any, Literal, TypeAlias
 import clingo
 import numpy as np
 
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, give_threads, has_processors, new_control
+from ssh_abduction.solver.asp.facts import names_lp
+from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart, numbered
@@ -153,7 +154,7 @@ class NearbySearch:
             give_threads(self._asker.control, two=has_processors(self._speedups))
             with closing(
                 self._asker.answers(
-                    facts.read_names, f"enum,{spares},{spares}", 0, assumptions=[self._ordered]
+                    names_lp.read_names, f"enum,{spares},{spares}", 0, assumptions=[self._ordered]
                 )
             ) as answers:
                 for answer in answers:
@@ -180,20 +181,20 @@ class NearbySearch:
             for t, options in enumerate(map(list, self._may_be))
         ]
         links = self._chart.links
-        base = facts.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
+        base = names_lp.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
         self._asker.watch.check(SECONDS_A_CHARACTER * len(base))
         self._asker.control = new_control("names", base, ["--eq=1"])
         if self._configuration:
             configuration: Any = self._asker.control.configuration
             configuration.configuration, configuration.sat_prepro = self._configuration, "no"
         self._used = {
-            name: self._literal(facts.used(name))
+            name: self._literal(names_lp.used(name))
             for spare in self._spare.values()
             for name in spare
         }
         given: set[int] = set()
         last: dict[int, int] = {}  # by view, the last step that has a choice
-        self._ordered = self._literal(facts.ordered())
+        self._ordered = self._literal(names_lp.ordered())
         for batch, start in enumerate(range(0, len(links), AT_A_TIME)):
             self._asker.watch.check()
             part, added = f"batch_{batch}", links[start : start + AT_A_TIME]
@@ -209,8 +210,8 @@ class NearbySearch:
                 if self._far is not None
                 else []
             )
-            self._asker.control.add(part, [], facts.batch_facts(batch, nodes, added, far))
-            self._asker.control.ground([(part, []), ("more", facts.numbers(batch))])
+            self._asker.control.add(part, [], names_lp.batch_facts(batch, nodes, added, far))
+            self._asker.control.ground([(part, []), ("more", numbers(batch))])
         self._asker.watch.check(PREPARING * (time.perf_counter() - began))
 
     def _literal(self, symbol: clingo.Symbol) -> int:
@@ -241,7 +242,7 @@ class NearbySearch:
                 if literal and name not in free
             }
             answer, core = self._asker.verdict(
-                facts.read_names, [-self._ordered, *assumed, *stay], conflicts
+                names_lp.read_names, [-self._ordered, *assumed, *stay], conflicts
             )
             if answer is not None:
                 self._keep(answer)
@@ -261,7 +262,7 @@ class NearbySearch:
         return [
             0
             if name < 0 or len(self._choices[t]) == 1 or name not in self._choices[t]
-            else self._literal(facts.named(t, name))
+            else self._literal(names_lp.named(t, name))
             for t, name in enumerate(self._labels)
         ]
 
@@ -392,7 +393,7 @@ class NearbySearch:
         cost = len(set(self._labels)) - 1 - len(self.clique)
         if cost < 0:
             return None, []
-        return self._asker.verdict(facts.read_names, assumed, conflicts, f"enum,{cost},{cost}")
+        return self._asker.verdict(names_lp.read_names, assumed, conflicts, f"enum,{cost},{cost}")
 
     def _name_more(self, resting: Collection[int]) -> None:
         """Take a control with more names for the views of these rests."""

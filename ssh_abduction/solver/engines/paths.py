@@ -31,8 +31,8 @@ import clingo
 import numpy as np
 
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Control
+from ssh_abduction.solver.asp.facts import paths_lp
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.guesses.annealing import MORE, SECONDS, attempts
 from ssh_abduction.solver.guesses.merging import (
@@ -104,21 +104,23 @@ class Paths:
         control = Control(options, self._check, PREPARING)
         control.load_encodings("paths_framed")
         control.add(
-            "base", [], facts.paths_framed_facts(self._trace, self._theory, chart, self._forbidden)
+            "base",
+            [],
+            paths_lp.paths_framed_facts(self._trace, self._theory, chart, self._forbidden),
         )
         return control
 
     def contrary(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
         """A control that says which single paths these labels contradict."""
         control = self.control(chart)
-        control.add("base", [], facts.settled_labels(enumerate(labels)))
+        control.add("base", [], paths_lp.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("again", []), ("contrary", [])])
         return control
 
     def clashing(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
         """A control whose answers are the minimal sets of nodes whose labels no paths fit, as far as that takes no choice of paths."""
         control = self.control(chart, SMALLEST)
-        control.add("base", [], facts.open_labels(labels))
+        control.add("base", [], paths_lp.open_labels(labels))
         control.ground([("base", [])])
         return control
 
@@ -136,14 +138,16 @@ class Paths:
         control.load_encodings("preference")
         nodes = range(len(labels)) if nodes is None else nodes
         control.add(
-            "base", [], facts.settled_facts(self._theory, chart, labels, nodes, single=single)
+            "base", [], paths_lp.settled_facts(self._theory, chart, labels, nodes, single=single)
         )
         control.ground(
             [("base", []), *([("again", [])] if single else []), ("segments", []), ("least", [])]
         )
         if self._pinned and not single:
             control.add(
-                "pinned", [], facts.pinned_facts(pairwise_distinct(*facts.read_rivals(control)))
+                "pinned",
+                [],
+                paths_lp.pinned_facts(pairwise_distinct(*paths_lp.read_rivals(control))),
             )
         control.ground([("pinned", []), ("paths", []), ("each", [])])
         return control
@@ -153,7 +157,9 @@ class Paths:
     ) -> clingo.Control:
         """A control for what holds wherever the nodes are at these dstates, though loose ones may turn out to be others."""
         control = self.control(chart)
-        control.add("base", [], f"{facts.settled_labels(enumerate(labels))}\n{facts.loose(loose)}")
+        control.add(
+            "base", [], f"{paths_lp.settled_labels(enumerate(labels))}\n{paths_lp.loose(loose)}"
+        )
         control.ground([("base", []), ("again", []), ("apart", [])])
         return control
 
@@ -163,7 +169,7 @@ class Paths:
         with control.solve(yield_=True) as handle:
             model = handle.model()
             assert model
-            violated, elsewhere, one = facts.read_told(model)
+            violated, elsewhere, one = paths_lp.read_told(model)
         if violated:
             return None
         first = {label: node for node, label in reversed(list(enumerate(labels)))}
@@ -172,9 +178,9 @@ class Paths:
     def may_fit(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
         """Whether these labels, which hold of all nodes but some, may be those of a map, as far as separate paths tell."""
         control = self.control(chart)
-        control.add("base", [], facts.settled_labels(enumerate(labels)))
+        control.add("base", [], paths_lp.settled_labels(enumerate(labels)))
         control.ground([("base", [])])
-        return not facts.is_violated(control) and self._may_have_separate(chart, labels, loose)
+        return not paths_lp.is_violated(control) and self._may_have_separate(chart, labels, loose)
 
     def has_separate(
         self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None

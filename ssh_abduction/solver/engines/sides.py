@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.asp.facts import paths_lp, sides_lp
+from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.engines.paths import Paths
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory import encodings
@@ -35,11 +36,11 @@ class FramedSides:
         self._batch = batch
         if self._said:
             paths = [
-                (part, facts.numbers(*arguments, batch))
+                (part, numbers(*arguments, batch))
                 for part, arguments in self._said
                 if part == "path"
             ]
-            self._asker.control.ground([("paths", facts.numbers(batch)), *paths])
+            self._asker.control.ground([("paths", numbers(batch)), *paths])
 
     def say_of_path(
         self,
@@ -54,7 +55,7 @@ class FramedSides:
         """
         contrary, twice = next(
             self._asker.answers(
-                facts.read_contrary, "ignore", 1, control=paths.contrary(chart, labels)
+                paths_lp.read_contrary, "ignore", 1, control=paths.contrary(chart, labels)
             )
         )
         if any(self._say_once("path", *standing[dstate]) for dstate in contrary):
@@ -77,13 +78,11 @@ class FramedSides:
         with self._asker.grounding_timed():
             if not self._said:
                 control.load(encodings.path("sides_framed"))
-                control.add("sides", [], facts.sides_framed_facts(self._theory))
-                control.ground(
-                    [("sides", []), *(("paths", facts.numbers(batch)) for batch in batches)]
-                )
+                control.add("sides", [], sides_lp.sides_framed_facts(self._theory))
+                control.ground([("sides", []), *(("paths", numbers(batch)) for batch in batches)])
             self._said[part, arguments] = None
             if part == "path":
-                control.ground([(part, facts.numbers(*arguments, batch)) for batch in batches])
+                control.ground([(part, numbers(*arguments, batch)) for batch in batches])
             else:
-                control.ground([(part, facts.numbers(*arguments))])
+                control.ground([(part, numbers(*arguments))])
         return True

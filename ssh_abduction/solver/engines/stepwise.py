@@ -8,8 +8,9 @@ from typing import Any
 import clingo
 
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker
+from ssh_abduction.solver.asp.facts import answer_maps, questions, readable
+from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.doubts import Doubt, Doubts
 from ssh_abduction.theory import encodings
@@ -43,11 +44,11 @@ class StepEngine:
         # Seconds and MiB that it took to ground the last step: the next one takes about as much, and cannot be stopped.
         self._last_step = 0.0, 0.0
         control = self.asker.control
-        self._doubts = Doubts(self.asker, control, facts.steps_are_one)
-        for name in facts.encoding_names(task.theory):
+        self._doubts = Doubts(self.asker, control, questions.steps_are_one)
+        for name in readable.encoding_names(task.theory):
             control.load(encodings.path(name))
-        control.add("base", [], facts.theory_facts(task.theory, paths))
-        control.add("base", [], facts.own_rules(task.theory))
+        control.add("base", [], readable.theory_facts(task.theory, paths))
+        control.add("base", [], readable.own_rules(task.theory))
 
     def with_paths(self, paths: int) -> StepEngine:
         engine = StepEngine(self._task, paths)
@@ -88,14 +89,12 @@ class StepEngine:
         self.asker.watch.check(*self._last_step)
         control, start = self.asker.control, self.size
         part = f"steps_from_{start}"
-        control.add(part, [], facts.trace_facts(self._task.problem, start, stop))
+        control.add(part, [], readable.trace_facts(self._task.problem, start, stop))
         before = control.seconds, control.mebibytes
         base: list[tuple[str, list[clingo.Symbol]]] = [] if start else [("base", [])]
-        control.ground(
-            [*base, (part, []), *(("step", facts.numbers(t)) for t in range(start, stop))]
-        )
+        control.ground([*base, (part, []), *(("step", numbers(t)) for t in range(start, stop))])
         if base:
-            control.assign_external(facts.run_by_steps(), True)
+            control.assign_external(readable.run_by_steps(), True)
         self._last_step = control.seconds - before[0], control.mebibytes - before[1]
         self.size = stop
 
@@ -104,10 +103,10 @@ class StepEngine:
         if self._asked == last:
             return
         control = self.asker.control
-        control.ground([("check", facts.numbers(last))])
+        control.ground([("check", numbers(last))])
         if self._asked is not None:
-            control.release_external(facts.query(self._asked))
-        control.assign_external(facts.query(last), True)
+            control.release_external(readable.query(self._asked))
+        control.assign_external(readable.query(last), True)
         self._asked = last
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
@@ -142,7 +141,7 @@ class StepEngine:
     def ask_for(self, number: int, count: Count) -> None:
         """From now on maps have just so many dstates, places or paths, and the prefix does not grow any more."""
         if self._number is not None:
-            self.asker.control.release_external(facts.of_number(*self._number))
+            self.asker.control.release_external(questions.of_number(*self._number))
         self._number = number, count
         self._tell_number()
 
@@ -150,9 +149,9 @@ class StepEngine:
         if self._number is None:
             return
         part = f"number_{self._number[0]}"
-        self.asker.control.add(part, [], facts.exactly(*self._number))
+        self.asker.control.add(part, [], questions.exactly(*self._number))
         self.asker.control.ground([(part, [])])
-        self.asker.control.assign_external(facts.of_number(*self._number), True)
+        self.asker.control.assign_external(questions.of_number(*self._number), True)
 
     def settle(self) -> None:
         """Nothing goes on in clingo beyond an answer."""
@@ -162,20 +161,22 @@ class StepEngine:
         self.asker.control.add(
             part,
             [],
-            facts.forbidden_equalities(
+            questions.forbidden_equalities(
                 self._forbidden[number], excusable=self._task.theory.jumped > 0
             ),
         )
         self.asker.control.ground([(part, [])])
 
     def _read(self, model: clingo.Model) -> Found:
-        return Found(facts.read_map(model, self._task.trace, self._task.theory), tuple(model.cost))
+        return Found(
+            answer_maps.read_map(model, self._task.trace, self._task.theory), tuple(model.cost)
+        )
 
 
 def paths_needed(task: Task, size: int, cost: tuple[int, ...] | None) -> int:
     """How many names for paths it takes to be sure that no map of the prefix has another cost, or is missed at this one."""
     theory = task.theory
-    segments = facts.most_paths(task.trace, theory, size)
+    segments = readable.most_paths(task.trace, theory, size)
     first = theory.priorities[0] if theory.priorities else None
     if theory.level == "causal":
         return 0

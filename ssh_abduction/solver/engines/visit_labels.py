@@ -36,8 +36,9 @@ from typing import Final, Protocol, TypeAlias, TypeVar
 import clingo
 import numpy as np
 
-from ssh_abduction.solver.asp import facts
 from ssh_abduction.solver.asp.control import Asker, new_control
+from ssh_abduction.solver.asp.facts import sides_lp, visits_lp
+from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.refusing import first_accepted
 from ssh_abduction.solver.steps.apart import clique
@@ -237,7 +238,7 @@ class VisitLabels:
         if anew:
             self._begin(chart)
         else:
-            self._asker.control.release_external(facts.listed(self.batch))
+            self._asker.control.release_external(visits_lp.listed(self.batch))
         self.chart = chart
         self.batch += 1
         added = sorted(visits - self._visits)
@@ -262,13 +263,15 @@ class VisitLabels:
         new, unfit = sorted(fits - self._fits), sorted(self._fits - fits)
         self._fits = fits
         part = f"visits_{self.batch}"
-        self._asker.control.add(part, [], facts.visit_facts(self.batch, nodes, leaves, new, unfit))
-        self._asker.control.add(part, [], facts.turn_facts(self.batch, chart, added, turns))
-        self._asker.control.ground([(part, []), ("more", facts.numbers(self.batch))])
-        self._asker.control.assign_external(facts.listed(self.batch), True)
+        self._asker.control.add(
+            part, [], visits_lp.visit_facts(self.batch, nodes, leaves, new, unfit)
+        )
+        self._asker.control.add(part, [], sides_lp.turn_facts(self.batch, chart, added, turns))
+        self._asker.control.ground([(part, []), ("more", numbers(self.batch))])
+        self._asker.control.assign_external(visits_lp.listed(self.batch), True)
         atoms = self._asker.control.symbolic_atoms
         for place, *_ in nodes:
-            atom = atoms[facts.first(place)]
+            atom = atoms[visits_lp.first(place)]
             if atom and (atom.is_fact or not self._task.speedups.core_guided):
                 self.least += atom.is_fact
             elif atom:
@@ -355,7 +358,7 @@ class VisitLabels:
         """Look up the literals that two visits are one: that takes seconds where there are many, and is seldom needed."""
         atoms = self._asker.control.symbolic_atoms
         for pair in self._unread:
-            if atom := atoms[facts.same(pair)]:
+            if atom := atoms[visits_lp.same(pair)]:
                 self._transitive.literals[pair] = atom.literal
         self._unread = []
 
@@ -365,19 +368,19 @@ class VisitLabels:
         self.least += 1
         self._raise_bound()
         for member in members:
-            if (over := facts.read_over(member)) is not None:
+            if (over := visits_lp.read_over(member)) is not None:
                 self._limit(over[0], over[1] + 1)
         if len(members) > 1:
             number = len(self._core_sizes)
             self._core_sizes.append(len(members))
-            self._tell(facts.core_facts(number, members), "core", number)
+            self._tell(visits_lp.core_facts(number, members), "core", number)
             self._limit(number, 2)
 
     def _limit(self, core: int, count: int) -> None:
         """Ask that fewer than so many members of a core are there."""
         if count <= self._core_sizes[core]:
-            self._asker.control.ground([("over", facts.numbers(core, count))])
-            if atom := self._asker.control.symbolic_atoms[facts.over(core, count)]:
+            self._asker.control.ground([("over", numbers(core, count))])
+            if atom := self._asker.control.symbolic_atoms[visits_lp.over(core, count)]:
                 self._avoided[-atom.literal] = atom.symbol
 
     def _tell(self, told: str, part: str | None = None, number: int = 0) -> None:
@@ -388,11 +391,11 @@ class VisitLabels:
             self._asker.control.add(name, [], told)
             self._asker.control.ground([(name, [])])
             if part is not None:
-                self._asker.control.ground([(part, facts.numbers(number))])
+                self._asker.control.ground([(part, numbers(number))])
 
     def _close(self, threes: Iterable[Three]) -> None:
         """Tell clingo that to be the same is transitive, of these visits."""
-        self._tell(facts.three_facts(self._parts, threes), "closed", self._parts)
+        self._tell(visits_lp.three_facts(self._parts, threes), "closed", self._parts)
 
     def near(self, guess: Sequence[int]) -> Iterator[tuple[int, ...] | None]:
         """First the guess itself, then improved labels of all nodes; yields None between queries so that the caller can do other work.
@@ -469,7 +472,7 @@ class VisitLabels:
                 self._spanning(found, self._place_of) for found in self._found[self._excluded :]
             ]
             self._tell(
-                "\n".join(facts.forbidden_pairs(pairs, listed=self.batch) for pairs in known)
+                "\n".join(visits_lp.forbidden_pairs(pairs, listed=self.batch) for pairs in known)
             )
             self._excluded = len(self._found)
             labels = self._other(dstates)
@@ -556,7 +559,7 @@ class VisitLabels:
             if self._fits.issuperset(
                 together := self._spanning(labels, clash)
             ):  # else clingo knows by now
-                rules.append(facts.forbidden_pairs(together, different))
+                rules.append(visits_lp.forbidden_pairs(together, different))
         self._tell("\n".join(rules))
 
     def forbid_together(
@@ -577,7 +580,7 @@ class VisitLabels:
             (i, _), (j, _) = sorted((facing[a], facing[b]))
             choices.append([(i, j, turned) for turned in range(4) if (i, j, turned) in self._fits])
         if len(choices) == len(apart) + len(away):  # else they are apart by now
-            self._tell(facts.forbidden_places(choices))
+            self._tell(visits_lp.forbidden_places(choices))
         if away:
             return
 
@@ -681,7 +684,7 @@ class _PairOf(dict[clingo.Symbol, Pair]):
     """The visits that atoms say are one, each atom read once."""
 
     def __missing__(self, symbol: clingo.Symbol) -> Pair:
-        pair = self[symbol] = facts.read_same(symbol)
+        pair = self[symbol] = visits_lp.read_same(symbol)
         return pair
 
 

@@ -1,0 +1,224 @@
+"""Maps made of answer sets and of labels, whichever encoding gave them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+
+from clingo import Model
+
+from ssh_abduction.data.maps import FAULTS, DState, Fault, MapPath, SSHMap
+from ssh_abduction.data.odometry import in_words
+from ssh_abduction.data.trace import Trace, View
+from ssh_abduction.solver.asp.facts.atoms import read_atom
+from ssh_abduction.solver.steps import frames
+from ssh_abduction.theory.theory import Theory
+
+
+def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
+    """The map that an answer set describes, for the steps it speaks of."""
+    is_at: dict[int, int] = {}
+    place: dict[int, int] = {}
+    course: dict[int, tuple[int, int]] = {}
+    heading: dict[int, int] = {}
+    shape: dict[int, int] = {}
+    before: list[tuple[int, int, int]] = []
+    excused: list[tuple[int, int]] = []
+    faults: list[tuple[int, str]] = []
+    for name, args in map(read_atom, model.symbols(shown=True)):
+        if name == "is":
+            is_at[args[0]] = args[1]
+        elif name == "at":
+            place[args[0]] = args[1]
+        elif name == "along":
+            course[args[0]] = (args[1], args[2])
+        elif name == "before":
+            before.append((args[0], args[1], args[2]))
+        elif name == "heading":
+            heading[args[0]] = args[1]
+        elif name == "shape":
+            shape[args[0]] = args[1]
+        elif name == "excused":
+            excused.append((args[0], args[1]))
+        elif name in FAULTS:
+            faults.append((args[0], name))
+    if theory.star == "gateways":
+        found = frames.Frames(trace, len(is_at)).frames
+        heading = {
+            t: frames.heading(found[shape[p]], found[shape[t]], heading[t])
+            for t, p in place.items()
+        }
+    return _map(trace, is_at, place, course, heading, before, excused, faults, theory)
+
+
+def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
+    """The dstate and the place of each step in an answer set, which may break axioms; in a causal theory no step has a place."""
+    found: dict[str, dict[int, int]] = {"is": {}, "at": {}}
+    for name, args in map(read_atom, model.symbols(shown=True)):
+        if name in found:
+            found[name][args[0]] = args[1]
+    steps = range(len(found["is"]))
+    return tuple(found["is"][t] for t in steps), tuple(found["at"].get(t) for t in steps)
+
+
+def _map(
+    trace: Trace,
+    is_at: Mapping[int, int],
+    place: Mapping[int, int],
+    course: Mapping[int, tuple[int, int]],
+    heading: Mapping[int, int],
+    before: Iterable[tuple[int, int, int]],
+    excused: Iterable[tuple[int, int]] = (),
+    faults: Sequence[tuple[int, str]] = (),
+    theory: Theory | None = None,
+) -> SSHMap:
+    """The map of these dstates, places, courses and headings of steps; dstates and places are named by the first step at them."""
+    views = views_of(is_at, trace, faults)
+    names = sorted(set(is_at.values()))
+    dstate_of = {name: i for i, name in enumerate(names)}
+    place_of = {name: i for i, name in enumerate(sorted({place[s] for s in names if s in place}))}
+    path_of = {
+        name: i for i, name in enumerate(sorted({course[s][0] for s in names if s in course}))
+    }
+    dstates = tuple(
+        DState(
+            id=dstate_of[s],
+            view=views[s],
+            place=place_of[place[s]] if s in place else None,
+            path=path_of[course[s][0]] if s in course else None,
+            direction=course[s][1] if s in course else None,
+            heading=heading.get(s),
+        )
+        for s in names
+    )
+    labels = tuple(dstate_of[is_at[t]] for t in range(len(is_at)))
+    pairs = [
+        (path_of[h], place_of[p], place_of[q])
+        for h, p, q in before
+        if h in path_of and p in place_of and q in place_of
+    ]
+    return SSHMap(
+        labels=labels,
+        dstates=dstates,
+        links=links_of(labels, trace, faults),
+        places=tuple(place_of.values()),
+        paths=_paths(len(path_of), dstates, pairs),
+        excused=tuple(
+            sorted((path_of[h], path_of[g]) for h, g in excused if h in path_of and g in path_of)
+        ),
+        faults=() if theory is None else faults_of(faults, is_at, views, trace, theory),
+    )
+
+
+def views_of(
+    labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
+) -> dict[int, View | None]:
+    """The view of each dstate: that of its first step at which it is known and not misread; None where there is no such step.
+
+    labels  the dstate of each step
+    faults  steps and kinds of faults
+    """
+    misread = {t for t, kind in faults if kind == "misread"}
+    views: dict[int, View | None] = dict.fromkeys(labels.values())
+    for t in sorted(labels):
+        if t not in misread and views[labels[t]] is None:
+            views[labels[t]] = trace.steps[t].view
+    return views
+
+
+def faults_of(
+    faults: Iterable[tuple[int, str]],
+    labels: Mapping[int, int],
+    views: Mapping[int, View | None],
+    trace: Trace,
+    theory: Theory,
+) -> tuple[Fault, ...]:
+    """The faults as a map tells them."""
+    found = []
+    for t, kind in sorted(faults):
+        cost = theory.fault_tenths(kind, trace.steps[t]) / 10
+        if kind == "misread":
+            found.append(Fault(t, "misread", view_at(trace, t), views[labels[t]], cost))
+        elif kind == "slipped":
+            found.append(Fault(t, "slipped", trace.actions[t].name, cost=cost))
+        elif kind == "jumped":
+            found.append(
+                Fault(
+                    t, "jumped", in_words(trace.steps[t].displacement or (0.0, 0.0, 0.0)), cost=cost
+                )
+            )
+        else:
+            found.append(Fault(t, "misseen", cost=cost))
+    return tuple(found)
+
+
+def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
+    """The map of the causal level that these labels of the first steps make, dstates numbered by first visit."""
+    number: dict[int, int] = {}
+    first: list[int] = []
+    for t, label in enumerate(labels):
+        if number.setdefault(label, len(number)) == len(first):
+            first.append(t)
+    found = tuple(number[label] for label in labels)
+    return SSHMap(
+        found,
+        tuple(DState(i, view_at(trace, t)) for i, t in enumerate(first)),
+        links_of(found, trace),
+    )
+
+
+def faulty_map(
+    labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]], theory: Theory
+) -> SSHMap:
+    """The map of the causal level that these labels make, where some steps are disbelieved; dstates are numbered by first visit."""
+    number: dict[int, int] = {}
+    found = tuple(number.setdefault(label, len(number)) for label in labels)
+    is_at = dict(enumerate(found))
+    views = views_of(is_at, trace, faults)
+    dstates = tuple(DState(i, views[i]) for i in range(len(number)))
+    return SSHMap(
+        found,
+        dstates,
+        links_of(found, trace, faults),
+        faults=faults_of(faults, is_at, views, trace, theory),
+    )
+
+
+def links_of(
+    labels: Sequence[int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
+) -> tuple[tuple[int, str, int], ...]:
+    """The distinct links that a labelling of the trace's first steps makes, sorted; without those of actions that slipped."""
+    slipped = {t for t, kind in faults if kind == "slipped"}
+    links = enumerate(zip(pairwise(labels), trace.actions, strict=False))
+    return tuple(sorted({(s, action.name, x) for t, ((s, x), action) in links if t not in slipped}))
+
+
+def view_at(trace: Trace, step: int) -> str | int:
+    view = trace.steps[step].view
+    assert view is not None
+    return view
+
+
+def _paths(
+    count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]
+) -> tuple[MapPath, ...]:
+    """Paths with their places in order."""
+    on: list[set[int]] = [set() for _ in range(count)]
+    for s in dstates:
+        if s.path is not None and s.place is not None:
+            on[s.path].add(s.place)
+    pairs: list[list[tuple[int, int]]] = [[] for _ in range(count)]
+    for path, p, q in before:
+        if p in on[path] and q in on[path]:
+            pairs[path].append((p, q))
+    return tuple(
+        MapPath(path, tuple(in_order(found, pairs[path]))) for path, found in enumerate(on)
+    )
+
+
+def in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:
+    """Places in an order in which each comes behind all that are before it. In a strict order, a place has more places before it than each of these has."""
+    behind = dict.fromkeys(places, 0)
+    for _, q in before:
+        behind[q] += 1
+    return sorted(behind, key=lambda p: (behind[p], p))

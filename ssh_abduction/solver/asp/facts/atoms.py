@@ -1,0 +1,30 @@
+"""Numbers, constants and atoms as clingo has them."""
+
+from __future__ import annotations
+
+from functools import cache, lru_cache
+
+from clingo import Number, String, Symbol, SymbolType
+
+COURSE = {"pos": 1, "neg": -1}
+
+
+def constant(value: str | int) -> str:
+    return str(Number(value) if isinstance(value, int) else String(value))
+
+
+@lru_cache(maxsize=2**14)
+def read_atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
+    """The name and the arguments of an atom of a map. They are cached, as maps have most atoms in common and each part takes a call to clingo."""
+    return symbol.name, tuple(
+        arg.number if arg.type is SymbolType.Number else COURSE[arg.name]
+        for arg in symbol.arguments
+    )
+
+
+_number = cache(Number)  # takes half the time of making a number anew, where there are many
+
+
+def numbers(*arguments: int) -> list[Symbol]:
+    """Numbers as the arguments of a program part, or of an atom."""
+    return [_number(argument) for argument in arguments]

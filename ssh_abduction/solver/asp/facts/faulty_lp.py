@@ -1,0 +1,115 @@
+"""Facts for `fast/faulty.lp`, where views may be misread and actions may slip, and its answers."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import groupby, pairwise
+from operator import itemgetter
+
+from clingo import Model
+
+from ssh_abduction.solver.asp.facts.atoms import read_atom
+from ssh_abduction.theory.evidence import Equality, Pairs
+
+
+def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
+    """The names of dstates for faulty.lp, and the view of each: for each view so many, and one more, which is the rest of the view."""
+    first = 0
+    for view, count in names.items():
+        yield from ((name, view) for name in range(first, first + count + 1))
+        first += count + 1
+
+
+def faulty_rests(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
+    """The rest of each view, and the view."""
+    named = dict(names)
+    last = {view: name for name, view in faulty_names(named)}
+    return ((name, view) for view, name in last.items())
+
+
+def at_most_faults(most: int) -> str:
+    """That the steps given so far have so many faults at most, as a rule for faulty.lp."""
+    return f":- #count {{ T,misread : misreads(T); T,slipped : slips(T) }} > {most}."
+
+
+def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
+    """That there are so many dstates at most, and that their faults cost no more than this, as rules for faulty.lp."""
+    faults = (
+        "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
+    )
+    return f"#program more(b).\n:- #sum {{ {faults} }} > {tenths}.\n:- #count {{ S : used(S) }} > {dstates}."
+
+
+def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
+    """The names of dstates, the actions, and the kinds of faults that may be, as facts for faulty.lp.
+
+    names  how many names each view has, beside the rest
+    """
+    found = [f"action({action})." for action in sorted(set(actions))]
+    found += [f"allowed({kind})." for kind in kinds]
+    for view, some in groupby(faulty_names(names), key=itemgetter(1)):
+        of_view = [name for name, _ in some]
+        found += [f"view({name},{view})." for name in of_view]
+        found += [f"after({before},{name})." for before, name in pairwise(of_view)]
+        found.append(f"rest({of_view[-1]}).")
+    return "\n".join(found)
+
+
+def faulty_batch(
+    batch: int,
+    seen: Sequence[int],
+    actions: Sequence[int],
+    steps: Sequence[int],
+    known: Sequence[int],
+    pairs: Pairs,
+    price: Mapping[str, Sequence[int]],
+    full: Collection[int] = (),
+) -> str:
+    """These steps of a trace as a batch of facts for faulty.lp.
+
+    full   steps of which it is asked where they are, also where their views are misread
+    price  tenths of dstates for each kind of fault that may be, at each step
+    steps  in the order in which they are given
+    known  those that were given before, in that order
+    """
+    given = {*known, *steps}
+    new = set(steps)
+    found = [f"node({batch},{t},{seen[t]})." for t in steps]
+    found += [f"full({t})." for t in steps if t in full]
+    found += [f"next({batch},{t},{u})." for t, u in pairwise([*known[-1:], *steps])]
+    links = sorted({t for step in steps for t in (step - 1, step) if t in given and t + 1 in given})
+    found += [f"link({batch},{t},{actions[t]},{t + 1})." for t in links]
+    found += [
+        f"price({kind},{t},{tenths[t]})."
+        for kind, tenths in price.items()
+        for t in (steps if kind == "misread" else links)
+    ]
+    for t in given:
+        found += [
+            f"excluded({batch},{i},{t})."
+            for i in pairs.apart.get(t, ())
+            if i in given and (i in new or t in new)
+        ]
+        found += [
+            f"one({batch},{i},{t})."
+            for i in pairs.one.get(t, ())
+            if i in given and (i in new or t in new)
+        ]
+    return "\n".join(found)
+
+
+def not_all_one(equalities: Collection[Equality]) -> str:
+    """That these equalities of given steps do not all hold, as a rule for faulty.lp."""
+    return f":- {', '.join(f'is({e.first},S{k}), is({e.second},S{k})' for k, e in enumerate(equalities))}."
+
+
+def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int], frozenset[int]]:
+    """Where each given step is, by the names of faulty.lp; the steps whose actions slipped; and those that are lost, as nobody asks where they are."""
+    where: dict[int, int] = {}
+    steps: dict[str, set[int]] = {"slips": set(), "lost": set()}
+    for name, args in map(read_atom, model.symbols(shown=True)):
+        if name == "is":
+            where[args[0]] = args[1]
+        else:
+            steps[name].add(args[0])
+    return where, frozenset(steps["slips"]), frozenset(steps["lost"])

@@ -1,0 +1,229 @@
+"""Reads maps from answers of `fast/paths_framed.lp` and `fast/paths_frameless.lp`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+from typing import TypeAlias
+
+from clingo import Control, Function, Model
+
+from ssh_abduction.data.maps import DState, MapPath, SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.solver.asp.facts.answer_maps import in_order, links_of, view_at
+from ssh_abduction.solver.asp.facts.atoms import numbers, read_atom
+from ssh_abduction.solver.steps.chart import Chart
+from ssh_abduction.theory.theory import Theory
+
+_Ahead: TypeAlias = tuple[
+    int, int, int
+]  # a path, and two places of which the first comes before the second on it
+
+
+@dataclass(frozen=True, slots=True)
+class PathAnswer:
+    """An answer of paths_framed.lp or paths_frameless.lp.
+
+    at     for each place that the turns tell, the place that it is at, and how it is turned to it
+    part   for each segment, the path that it is part of, and in which direction
+    order  for each path, its places in order
+    """
+
+    at: dict[int, tuple[int, int]]
+    part: dict[int, tuple[int, int]]
+    order: dict[int, list[int]]
+
+
+class PathReader:
+    """Reads maps from answers of paths_framed.lp or paths_frameless.lp, for one labelling of the nodes. What the labels alone tell is worked out once.
+
+    Instead of reading all atoms of an answer, this asks it for the atoms that can be in it, beginning with those of the answer before. That takes a third of
+    the time.
+    """
+
+    def __init__(
+        self, control: Control, trace: Trace, theory: Theory, chart: Chart, labels: Sequence[int]
+    ) -> None:
+        stands, runs = (
+            {a: (b, c) for a, b, c in _literals(control, name)} for name in ("stands", "runs")
+        )
+        first: dict[int, int] = {}  # for each label, the first step at its dstate
+        for t, node in enumerate(chart.node_of):
+            first.setdefault(labels[node], t)
+        number = {label: i for i, label in enumerate(first)}
+        self._labels = tuple(number[labels[node]] for node in chart.node_of)
+        self._links = links_of(self._labels, trace)
+        self._dstates = [(view_at(trace, t), *stands[label]) for label, t in first.items()]
+        self._runs: dict[
+            int, list[tuple[int, int]]
+        ] = {}  # for each segment, the dstates on it, and whether they face its direction
+        for i, label in enumerate(first):
+            if label in runs:
+                segment, direction = runs[label]
+                self._runs.setdefault(segment, []).append((i, direction))
+        self._passes = {
+            (segment, self._dstates[i][1]): None
+            for segment, members in self._runs.items()
+            for i, _ in members
+        }
+        self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
+        self._total = theory.path_order == "total"
+        self._before: dict[_Ahead, int] = {}  # the literal that says so, 0 for what is never so
+        self._order: dict[
+            int, list[int]
+        ] = {}  # for each path, its places in the answer that was read last
+        self._placed: _Placed | None = (
+            None  # what the places of the last map tell, as they are mostly the same in the next
+        )
+        self._made: dict[
+            tuple[object, ...], DState
+        ] = {}  # dstates made so far, as most of them are in most maps
+
+    def condition(self, sort: str, i: int, j: int) -> str | None:
+        """The condition that two dstates of a map are one in the answer: as to place, path or course. None where they never are."""
+        if sort == "places":
+            return f"at({self._dstates[i][1]},P,_), at({self._dstates[j][1]},P,_)"
+        runs = {
+            dstate: (segment, direction)
+            for segment, members in self._runs.items()
+            for dstate, direction in members
+        }
+        if i not in runs or j not in runs:
+            return None
+        (g, d), (h, e) = runs[i], runs[j]
+        same_way = f", {d} * D == {e} * E" if sort == "courses" else ""
+        return f"course({g},H,D), course({h},H,E){same_way}"
+
+    def read(self, model: Model) -> PathAnswer:
+        """The values that map_of needs of an answer."""
+        at, part = self._at.made_in(model), self._part.made_in(model)
+        on: dict[int, dict[int, None]] = {}  # for each path, the places on it
+        for segment, component in self._passes:
+            on.setdefault(part[segment][0], {})[at[component][0]] = None
+        return PathAnswer(
+            at, part, {path: self._ordered(model, path, places) for path, places in on.items()}
+        )
+
+    def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
+        """The places of a path in order. This begins with their order in the last answer, which is mostly nearly the same."""
+        order = list(
+            dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places])
+        )
+        if self._total:
+            for i, place in enumerate(
+                order
+            ):  # insertion sort takes few questions where places are nearly in order
+                to = i
+                while to and not self._is_before(model, (path, order[to - 1], place)):
+                    to -= 1
+                order.insert(to, order.pop(i))
+        else:
+            order = in_order(
+                places,
+                (pair for pair in permutations(places, 2) if self._is_before(model, (path, *pair))),
+            )
+        self._order[path] = order
+        return order
+
+    def _is_before(self, model: Model, ahead: _Ahead) -> bool:
+        literal = self._before.get(ahead)
+        if literal is None:
+            atom = model.context.symbolic_atoms[Function("before", numbers(*ahead))]
+            literal = self._before[ahead] = atom.literal if atom else 0
+        return literal != 0 and model.is_true(literal)
+
+    def map_of(self, answer: PathAnswer) -> SSHMap:
+        """The map that an answer describes."""
+        placed = self._placed
+        if placed is None or placed.at != answer.at:
+            placed = self._placed = self._placed_at(answer.at)
+        faced: dict[
+            int, tuple[int, int]
+        ] = {}  # for each path, its number in the map, and the direction that is faced first
+        dstates = list(placed.dstates)
+        for segment, members in self._runs.items():
+            h, ahead = answer.part[segment]
+            path, first = faced.setdefault(h, (len(faced), ahead * members[0][1]))
+            key = segment, path, ahead * first
+            along = placed.along.get(key)
+            if along is None:
+                along = placed.along[key] = [
+                    (i, self._dstate(dstates[i], path, key[2] * direction))
+                    for i, direction in members
+                ]
+            for i, dstate in along:
+                dstates[i] = dstate
+        orders = (
+            (path, [placed.number[p] for p in answer.order[h][::first]])
+            for h, (path, first) in faced.items()
+        )
+        paths = tuple(MapPath(path, tuple(order)) for path, order in orders)
+        return SSHMap(
+            self._labels, tuple(dstates), self._links, tuple(range(len(placed.number))), paths
+        )
+
+    def _placed_at(self, at: dict[int, tuple[int, int]]) -> _Placed:
+        """What the places of an answer tell of a map."""
+        arrived: dict[
+            int, tuple[int, int]
+        ] = {}  # for each place, its number in the map, and the slot that is faced first
+        dstates: list[DState] = []
+        for view, component, slot in self._dstates:
+            p, turned = at[component]
+            place, facing = arrived.setdefault(p, (len(arrived), (slot + turned) % 4))
+            dstates.append(DState(len(dstates), view, place, heading=(slot + turned - facing) % 4))
+        return _Placed(at, {p: number for p, (number, _) in arrived.items()}, dstates, {})
+
+    def _dstate(self, placed: DState, path: int, direction: int) -> DState:
+        """A dstate, with its path and direction."""
+        key = placed.id, placed.place, placed.heading, path, direction
+        if key not in self._made:
+            self._made[key] = replace(placed, path=path, direction=direction)
+        return self._made[key]
+
+
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """What the places of an answer tell of a map.
+
+    at       as in PathAnswer
+    number   for each place, its number in the map
+    dstates  the dstates of the map, without paths
+    along    the dstates of a segment with their paths, by the segment, the path that it is part of, and in which direction
+    """
+
+    at: dict[int, tuple[int, int]]
+    number: dict[int, int]
+    dstates: list[DState]
+    along: dict[tuple[int, int, int], list[tuple[int, DState]]]
+
+
+class _Choices:
+    """The atoms of a predicate with three arguments of which an answer has exactly one for each first argument."""
+
+    def __init__(self, control: Control, name: str) -> None:
+        self._among: dict[
+            int, list[tuple[int, tuple[int, int]]]
+        ] = {}  # for each first argument, the literals of its atoms, and their other arguments
+        for (a, b, c), literal in _literals(control, name).items():
+            self._among.setdefault(a, []).append((literal, (b, c)))
+
+    def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
+        """The other two arguments that an answer chooses for each first argument."""
+        made = {}
+        for a, among in self._among.items():  # what the last answer chose is asked for first
+            if len(among) > 1 and not model.is_true(among[0][0]):
+                taken = next(i for i, (literal, _) in enumerate(among) if model.is_true(literal))
+                among.insert(0, among.pop(taken))
+            made[a] = among[0][1]
+        return made
+
+
+def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
+    """The literals of the atoms of a predicate with three arguments, by these."""
+    found = {}
+    for atom in control.symbolic_atoms.by_signature(name, 3):
+        a, b, c = read_atom(atom.symbol)[1]
+        found[a, b, c] = atom.literal
+    return found

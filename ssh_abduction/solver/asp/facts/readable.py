@@ -1,0 +1,184 @@
+"""Facts for the readable encodings (`encodings/*.lp`): a theory, and the steps of a trace."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+from clingo import Function, Symbol
+
+from ssh_abduction.data.trace import Action, Trace
+from ssh_abduction.solver.asp.facts.atoms import constant, numbers
+from ssh_abduction.solver.steps import frames
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.settle import Problem
+from ssh_abduction.theory.speedups import TRAVELS_AND_TURNS
+from ssh_abduction.theory.theory import EXCUSED, Theory
+
+
+def encoding_names(theory: Theory) -> tuple[str, ...]:
+    """The encodings that a theory needs, in the order to load them."""
+    return (*encodings.needed_by(vars(theory)), "preference", "show")
+
+
+def theory_facts(theory: Theory, paths: int) -> str:
+    """The axioms and the preference of a theory, and names for so many paths, as facts."""
+    facts = [f"axiom({name})." for name in theory.axioms]
+    facts += [f"path(1..{paths})."] if theory.level == "topological" else []
+    facts += preferred(theory)
+    facts += ["defeasible."] if theory.boundary == "defeasible" else []
+    facts += [f"allowed({kind})." for kind in EXCUSED if getattr(theory, kind)]
+    return "\n".join(facts)
+
+
+def preferred(theory: Theory) -> list[str]:
+    """Which counts a theory prefers to be small, the first one at the highest level."""
+    return [
+        f"prefer({count},{len(theory.priorities) - i})."
+        for i, count in enumerate(theory.priorities)
+    ]
+
+
+def own_rules(theory: Theory) -> str:
+    """The user's own rules. Their axioms hold like those of the encodings."""
+    return "\n".join(rules.text for rules in theory.rules)
+
+
+def run_by_steps() -> Symbol:
+    """The external atom that says that the program parts of steps are grounded: without it the encodings have no answer."""
+    return Function("run_by_steps")
+
+
+def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
+    """The most paths that a map of the first steps can have: a path begins at the start, or where a turn right or left ends."""
+    if TRAVELS_AND_TURNS & theory.given_up:
+        return steps
+    return 1 + sum(
+        action.turn in ("right", "left") or action.slipped for action in trace.actions[: steps - 1]
+    )
+
+
+def trace_facts(problem: Problem, start: int, stop: int) -> str:
+    """What happened in steps `start` to `stop - 1`, and the links between them and from the step before, as facts."""
+    trace, theory = problem.trace, problem.theory
+    facts = []
+    for t in range(start, stop):
+        step = trace.steps[t]
+        facts.append(f"unknown({t})." if step.view is None else f"view({t},{constant(step.view)}).")
+        if theory.star in ("pattern", "frame"):
+            facts += [
+                f"open({t},{slot})." for slot, is_open in enumerate(step.openings or ()) if is_open
+            ]
+    done = {t: trace.actions[t] for t in range(max(start - 1, 0), stop - 1)}
+    facts += [f"act({t},{constant(action.name)})." for t, action in done.items()]
+    facts += [f"unlinked({t})." for t, action in done.items() if action.slipped]
+    if theory.misread:
+        facts += [
+            f"price(misread,{t},{theory.fault_tenths('misread', trace.steps[t])})."
+            for t in range(start, stop)
+        ]
+    if theory.jumped:
+        moved = [t for t in range(max(start, 1), stop) if trace.steps[t].displacement is not None]
+        facts += [
+            f"moved({t}). price(jumped,{t},{theory.fault_tenths('jumped', trace.steps[t])})."
+            for t in moved
+        ]
+    if theory.slipped:
+        facts += [
+            f"price(slipped,{t},{theory.fault_tenths('slipped', trace.steps[t])})." for t in done
+        ]
+    if theory.level == "topological":
+        facts += [
+            _kind_fact(action) for action in dict.fromkeys(done.values()) if action.kind is not None
+        ]
+    if theory.star == "gateways":
+        facts += _gateway_facts(trace, start, stop)
+    return "\n".join([*facts, *_evidence_facts(problem, start, stop)])
+
+
+def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
+    """What these steps see of gateways, and how that fits what earlier steps see, as facts for gateways.lp."""
+    found = frames.Frames(trace, stop)
+    known = len(frames.Frames(trace, start).frames)
+    yield from (f"star({t},{found.stars[t]})." for t in range(start, stop))
+    yield from (
+        f"looks({star},{x})."
+        for star in dict.fromkeys(found.stars[start:])
+        for x in found.looks[star]
+    )
+    yield from (
+        f"slots({x},{max(frame.slots, 1)})." for x, frame in enumerate(found.frames) if x >= known
+    )
+    yield from (
+        f"ends({x},{way})."
+        for x, frame in enumerate(found.frames)
+        if x >= known
+        for way in frames.ends(frame)
+    )
+    for x, y in product(range(len(found.frames)), repeat=2):
+        for shift in found.fits(x, y) if max(x, y) >= known else ():
+            yield f"fits({x},{y},{shift})."
+            yield from (
+                f"may({x},{y},{shift},{way})."
+                for way in frames.may_face(found.frames[x], found.frames[y], shift)
+            )
+            yield from (
+                f"must({x},{y},{shift},{way})."
+                for way in frames.must_face(found.frames[x], found.frames[y], shift)
+            )
+    turns = {
+        (trace.actions[t - 1], found.stars[t - 1], found.stars[t]): None
+        for t in range(max(start, 1), stop)
+    }
+    for action, a, b in turns:
+        for x, y in product(found.looks[a], found.looks[b]) if action.turn else ():
+            fitting = (
+                c
+                for c in found.fits(x, y)
+                if frames.may_turn(action, found.frames[x], found.frames[y], c)
+            )
+            yield from (f"rotates({constant(action.name)},{x},{y},{shift})." for shift in fitting)
+
+
+def _evidence_facts(problem: Problem, start: int, stop: int) -> Iterator[str]:
+    """What evidence says of these steps, and of pairs of them with earlier ones."""
+    trace, theory = problem.trace, problem.theory
+    for evidence in problem.evidence:
+        pairs = evidence.pairs(trace)
+        for t in range(start, stop) if pairs else ():
+            yield from (f"excluded({evidence.axiom},{i},{t})." for i in pairs.apart.get(t, ()))
+            if theory.level == "topological":
+                yield from (
+                    f"elsewhere({evidence.axiom},{i},{t})." for i in pairs.elsewhere.get(t, ())
+                )
+            yield from (f"one({i},{t})." for i in pairs.one.get(t, ()))
+        yield evidence.facts(trace, start, stop)
+
+
+def program(problem: Problem) -> str:
+    """A trace and its settled theory as the facts that `encodings/run.py` solves."""
+    trace, theory = problem.trace, problem.theory
+    files = " ".join(f"{name}.lp" for name in encoding_names(theory))
+    return "\n".join(
+        [
+            f"% {len(trace)} steps{f' of {trace.name!r}' if trace.name else ''}. In {encodings.folder()}, run",
+            f"%   python run.py --project=project --opt-mode=optN -n 0 THIS_FILE {files}",
+            theory_facts(theory, most_paths(trace, theory, len(trace))),
+            trace_facts(problem, 0, len(trace)),
+            own_rules(theory),
+            "",
+        ]
+    )
+
+
+def query(t: int) -> Symbol:
+    """The external atom that makes t the last step."""
+    return Function("query", numbers(t))
+
+
+def _kind_fact(action: Action) -> str:
+    return (
+        f"kind({constant(action.name)},travel)."
+        if action.kind == "travel"
+        else f"turns({constant(action.name)},{action.turn})."
+    )
