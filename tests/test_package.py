@@ -151,6 +151,6 @@ def test_the_citation_and_the_changelog_have_the_version_of_the_package() -> Non
     assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text()
     changelog = (ROOT / "CHANGELOG.md").read_text()
     assert f"\n## [{project['version']}]" in changelog
-    assert "\n## [Unreleased]\n" in changelog
+    assert re.search(r"^## \[[\d.]+\] \(unreleased\)$", changelog, re.MULTILINE)
     assert all(url.startswith(project["urls"]["Source"]) for url in project["urls"].values())
     assert f'repository-code: "{project["urls"]["Source"]}"' in (ROOT / "CITATION.cff").read_text()
