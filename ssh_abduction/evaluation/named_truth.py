@@ -15,8 +15,9 @@ right label.
 
 Only steps with truth are counted; for places, only steps whose true place is known. A value is None
 if it cannot be said: a share of nothing, or a sort of thing (dstates, places, paths) that the truth
-or the map does not have. Maps of causal theories have no places, for example. docs/reference/formats.md says
-in which forms a trace has its truth. Nothing that infers maps may import this module.
+or the map does not have. Maps of causal theories have no places, for example.
+docs/reference/formats.md says in which forms a trace has its truth. Nothing that infers maps may
+import this module.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ another map, as closed as the minimal one, that predicts the same for ever: a sy
 such maps. Then the exploration ends as `inseparable`, and not as `done`.
 
 This does not prove that the map is true. A world may hide more than `margin` dstates, and of the
-rivals without a return only the best is looked at. docs/how-to/exploring.md measures how often the map is
-true.
+rivals without a return only the best is looked at. docs/how-to/exploring.md measures how often the
+map is true.
 """
 
 from __future__ import annotations

@@ -50,8 +50,7 @@ class Recovery:
     """Keeps the maps with faults current, and says how sure they are.
 
     Args:
-        trace: The steps so far.
-        theory: The settled theory, with faults.
+        problem: The steps so far, and the settled theory, with faults.
         options: What a step may use.
         before: The keeper that this one follows. Its theory was settled for fewer steps.
 

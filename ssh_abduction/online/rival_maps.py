@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.maps import Fault
+from ssh_abduction.data.trace import Trace
 from ssh_abduction.online.background_solve import Solved
 from ssh_abduction.online.chances import Chances
 from ssh_abduction.online.hypotheses import Rival, Scale, Seen
 from ssh_abduction.solver import Bound, Judging, Status, observation
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
+from ssh_abduction.theory.theory import Theory
 
 # Probability of a fault of the cheapest kind, at each step.
 RARE = Chances().misread
@@ -39,8 +41,7 @@ class RivalMaps:
     """The rivals of the steps so far, the best one first.
 
     Args:
-        trace: The steps so far.
-        theory: The settled theory, with faults.
+        problem: The steps so far, and the settled theory, with faults.
         max_maps: Keep at most this many minimal maps; None keeps all.
         judging: Evidence and the checker, for this theory.
 
@@ -59,8 +60,7 @@ class RivalMaps:
         self.solved: Solved | None = None
         self.bound = Bound()
         self.is_proven = self.is_complete = self.is_impossible = False
-        self._problem, self._trace, self._theory = problem, trace, theory
-        self._max_maps, self._judging = max_maps, judging
+        self._problem, self._max_maps, self._judging = problem, max_maps, judging
         self._views = {step.view for step in trace.steps}
         self._least: tuple[int, ...] = ()  # what a minimal map costs, while proven
         self._replays = row("prefixes").holds_for(theory.replace(misread=0, slipped=0))
@@ -72,6 +72,14 @@ class RivalMaps:
             and not theory.rules
             and not theory.without
         )
+
+    @property
+    def _trace(self) -> Trace:
+        return self._problem.trace
+
+    @property
+    def _theory(self) -> Theory:
+        return self._problem.theory
 
     @property
     def lead(self) -> Rival | None:
@@ -98,8 +106,8 @@ class RivalMaps:
 
     def follow(self, problem: Problem) -> Change:
         """Let the rivals go on with the last step of a trace, which is one step longer."""
-        self._problem, self._trace = problem, problem.trace
-        trace, t = self._trace, len(self._trace) - 1
+        self._problem, trace = problem, problem.trace
+        t = len(trace) - 1
         self._views.add(trace.steps[t].view)
         if self.is_impossible and self._replays:
             return Change()
