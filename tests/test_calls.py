@@ -125,6 +125,8 @@ RIGHT: dict[str, set[str]] = {
     "Plan.rooms": EMPTY,
     "Plan.doors": EMPTY,
     "Plan.told_apart.degrees": {"3.5"},
+    "Search.continuing.after": {"None"},
+    "Search.continuing.theory": {"None"},
     "Speedups.that_hold_for.theory": {"None"},
     "Speedups.without.names": {"empty text", "dict", *EMPTY},
     "Step.image": {"list", "array", "huge", "[1, 2]"},
@@ -343,11 +345,15 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "Plan.rooms": made["plan"].rooms,
         "SSHMap.from_dict.data": ssh_map.to_dict(),
         "SSHMap.load.path": "map.json",
+        "Search.continuing.after": made["search"],
+        "Search.continuing.max_maps": 1,
+        "Search.continuing.time_limit": None,
         "Search.solution.maps": solution.maps,
         "Solution.from_dict.data": solution.to_dict(),
         "Solution.load.path": "solution.json",
         "Speedups.without.names": "names",
         "Theory.from_dict.data": {},
+        "Theory.from_toml.path": "theory.toml",
         "Theory.require.step": replace(trace.steps[1], star=(1, 0, 1, 0)),
         "Trace.from_steps.actions": ["travel"],
         "Trace.from_steps.views": ["a", "b"],
@@ -373,6 +379,7 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
         "compare.maps": solution,
         "next_experiment.maps": solution,
         "route.maps": solution,
+        "find_backbone.solution": solution,
         "view_page.source": solution,
     }
     by_name: dict[str, Any] = {
@@ -453,7 +460,8 @@ def parameters(function: Any) -> list[inspect.Parameter]:
     return [
         p
         for p in found
-        if p.name != "self"
+        if not p.name.startswith("_")
+        and p.name != "self"
         and p not in anything
         and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
     ]
@@ -480,6 +488,7 @@ def _in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made["trace"].save("trace.jsonl")
     made["map"].save("map.json")
     made["solution"].save("solution.json")
+    Path("theory.toml").write_text('star = "none"')
 
 
 SWEPT = [(call, function) for call, function in calls() if parameters(function)]

@@ -18,7 +18,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from ssh_abduction.data.checks import a_text, a_whole_number, an_instance, one_of
+from ssh_abduction.data.checks import a_path, a_text, a_whole_number, an_instance, one_of
 from ssh_abduction.data.errors import TheoryError, TraceError, brief, is_finite, is_whole, named
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.trace import Step, Trace, checked_trace
@@ -495,6 +495,7 @@ class Theory:
         Raises:
             TheoryError: The file cannot be read, or a field is wrong.
         """
+        a_path("path", path, TheoryError)
         data = _read_toml(path)
         preset = data.pop("preset", "causal" if data.get("level") == "causal" else "topological")
         if not isinstance(preset, str) or preset not in PRESETS:
