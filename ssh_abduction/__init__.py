@@ -1,7 +1,8 @@
 """From what a robot saw and did, find the map: every minimal topological map of distinctive states, places and paths.
 
-Each name is loaded when it is first used. The command line therefore starts at once and hears Ctrl-C from then on.
-This module imports nothing, not even `__future__`, before `__main__` has put the current folder behind Python's own modules.
+Each name is loaded when it is first used. The command line therefore starts at once and hears
+Ctrl-C from then on. This module imports nothing, not even `__future__`, before `__main__` has put
+the current folder behind Python's own modules.
 """
 
 TYPE_CHECKING = False  # as in typing, which takes longer to load than this whole module
@@ -41,7 +42,8 @@ _HOMES = {  # package: the names that are exported from it
     "theory": ("Theory",),
 }
 
-# Names of version 0.1.0: each still works in this version, with a warning that says where it is now.
+# Names of version 0.1.0: each still works in this version, with a warning that says where it is
+# now.
 _MOVED = {
     "Action": "data.Action",
     "Backbone": "solver.Backbone",

@@ -48,7 +48,8 @@ def run() -> "NoReturn":
 def _interrupt(number: int, frame: "FrameType | None") -> None:
     """Ctrl-C is a KeyboardInterrupt, but while a module is loaded it ends the program at once.
 
-    Nothing is lost by that; and what is written in C, such as numpy, prints a traceback or makes another error of a KeyboardInterrupt.
+    Nothing is lost by that; and what is written in C, such as numpy, prints a traceback or makes
+    another error of a KeyboardInterrupt.
     """
     program.heard.append(number)
     while frame is not None:

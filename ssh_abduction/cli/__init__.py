@@ -1,7 +1,8 @@
 """The command line: one module a verb. Maps outcomes to exit codes.
 
-0 done, a minimal map was proven | 1 a known error, one line on stderr | 2 wrong usage | 10 a map without proof | 20 no map satisfies
-the axioms, or a checked map breaks one | 30 nothing in time | 130 interrupted | 143 ended by SIGTERM
+0 done, a minimal map was proven | 1 a known error, one line on stderr | 2 wrong usage | 10 a map
+without proof | 20 no map satisfies the axioms, or a checked map breaks one | 30 nothing in time |
+130 interrupted | 143 ended by SIGTERM
 """
 
 from __future__ import annotations
@@ -90,7 +91,8 @@ def parser() -> Parser:
     top = Parser(
         prog="ssh-abduction",
         description="From what a robot saw and did, find the map.",
-        epilog="Exit codes: 0 minimal map proven; 1 error; 2 usage; 10 map without proof; 20 no map, or a map that breaks an axiom; "
+        epilog="Exit codes: 0 minimal map proven; 1 error; 2 usage; 10 map without proof; 20 no "
+        "map, or a map that breaks an axiom; "
         "30 nothing in time; 130 interrupted; 143 ended by SIGTERM.",
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
@@ -158,7 +160,8 @@ def _main(arguments: Sequence[str] | None) -> int:
     try:
         if sys.stdout is None:
             raise AbductionError(
-                "standard output: expected a place to print to, got a closed stream; open it, or send it to a file"
+                "standard output: expected a place to print to, got a closed stream; open it, or "
+                "send it to a file"
             )
         with telling(options, for_programs), warnings.catch_warnings(record=True) as caught:
             try:
@@ -177,12 +180,14 @@ def _main(arguments: Sequence[str] | None) -> int:
         print(f"ssh-abduction: {error}", file=sys.stderr)
         return EXIT_ERROR
     except BrokenPipeError:
-        # Whoever read the output has seen enough; what Python still holds back must not raise again at exit.
+        # Whoever read the output has seen enough; what Python still holds back must not raise again
+        # at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
         print(
-            f"ssh-abduction: {unwritten(error, getattr(options, 'output', None) or 'standard output')}",
+            "ssh-abduction: "
+            f"{unwritten(error, getattr(options, 'output', None) or 'standard output')}",
             file=sys.stderr,
         )
         with contextlib.suppress(OSError, ValueError):

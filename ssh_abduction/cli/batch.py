@@ -1,6 +1,7 @@
 """ssh-abduction solve TRACE TRACE …: many traces, here or on a Dask cluster, one result a line.
 
-Results come as they are ready and are printed in the order of the traces. An error is the result of its trace, and the others go on.
+Results come as they are ready and are printed in the order of the traces. An error is the result of
+its trace, and the others go on.
 """
 
 from __future__ import annotations
@@ -54,14 +55,25 @@ if TYPE_CHECKING:
 Task: TypeAlias = tuple[int, str]  # the number of a trace, and its path
 
 PATIENCE = 10  # seconds for a Dask scheduler, and for its first worker, to answer
-KILLED = "process: expected an answer, got killed, as happens when memory runs out; set --memory-limit, or solve fewer traces at a time"
+KILLED = (
+    "process: expected an answer, got killed, as happens when memory runs out; set "
+    "--memory-limit, or solve fewer traces at a time"
+)
 LOOK = 1.0  # seconds between two looks at whether the cluster still has a worker
+# times the time limit, and seconds beyond that, or after Ctrl-C, after which a process has no
+# answer: its own guard ends it before
 GUARDED, OVERDUE = (
     1.2,
     3.0,
-)  # times the time limit, and seconds beyond that, or after Ctrl-C, after which a process has no answer: its own guard ends it before
-LATE = "process: expected an answer in time, got none, as happens when memory is swapped; set --memory-limit, or solve fewer traces at a time"
-LOST = "scheduler: expected an answer, got disconnected; see whether it still runs, and solve this trace again"
+)
+LATE = (
+    "process: expected an answer in time, got none, as happens when memory is swapped; set "
+    "--memory-limit, or solve fewer traces at a time"
+)
+LOST = (
+    "scheduler: expected an answer, got disconnected; see whether it still runs, and solve this "
+    "trace again"
+)
 
 
 class Answer(NamedTuple):
@@ -74,7 +86,10 @@ class Answer(NamedTuple):
 
 
 class Stop:
-    """Whether all is to stop. A handler of signals may say so at any time, which an Event of `threading` does not allow."""
+    """Whether all is to stop.
+
+    A handler of signals may say so at any time, which an Event of `threading` does not allow.
+    """
 
     def __init__(self) -> None:
         self._is_set = False
@@ -100,7 +115,11 @@ def in_a_line(error: Exception) -> str:
 
 
 class Asked(Protocol):
-    """What is asked about each of many files. Plain data, as it travels to other processes and machines; so are its answers, which have the number of their file."""
+    """What is asked about each of many files.
+
+    Plain data, as it travels to other processes and machines; so are its answers, which have the
+    number of their file.
+    """
 
     @property
     def overdue(self) -> float | None:
@@ -133,7 +152,10 @@ class Asked(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked about each trace: limit, maps, within, memory and speedups as of Search. Plain data, as it travels to other processes and machines."""
+    """What is asked about each trace: limit, maps, within, memory and speedups as of Search.
+
+    Plain data, as it travels to other processes and machines.
+    """
 
     theory: Theory
     limit: float | None
@@ -159,7 +181,10 @@ class Question:
         trace: Trace | None = None,
         given_up: Callable[[], bool] = lambda: False,
     ) -> Answer:
-        """Solve a trace, read from its file if it did not come along. Whatever goes wrong is the answer. Stops when it is given up."""
+        """Solve a trace, read from its file if it did not come along.
+
+        Whatever goes wrong is the answer. Stops when it is given up.
+        """
         try:
             return self._solved(number, path, trace or Trace.load(path), given_up)
         except (
@@ -280,11 +305,13 @@ def run(options: argparse.Namespace) -> int:
     paths: list[str] = options.traces
     if "-" in paths:
         raise AbductionError(
-            "-: expected files where there are several traces, --jobs or --scheduler, got standard input; save it to a file"
+            "-: expected files where there are several traces, --jobs or --scheduler, got "
+            "standard input; save it to a file"
         )
     if options.jobs == 0:
         raise AbductionError(
-            "--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; leave it out for 1"
+            "--jobs: expected how many traces to solve at a time, or -1 for one a core, got 0; "
+            "leave it out for 1"
         )
     speedups = Speedups.without(options.without_speedups)
     if options.scheduler or options.jobs not in (None, 1):
@@ -321,7 +348,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _printed(answers: Generator[Answer], total: int, stop: Stop) -> list[int]:
-    """Print the lines of all answers in the order of the traces. Returns the codes of those that came."""
+    """Print the lines of all answers in the order of the traces.
+
+    Returns the codes of those that came.
+    """
     lines: dict[int, str] = {}  # of answers whose turn has not come
     codes: list[int] = []
     turn = 0
@@ -350,9 +380,12 @@ def _solved_in_worker(number: int, path: str, question: Asked, given_up: Callabl
 
 
 def here(question: Asked, paths: Sequence[str], jobs: int, stop: Stop) -> Generator[Any]:
-    """Answers from processes of this machine. Once it is to stop, those of traces under way, as far as these are.
+    """Answers from processes of this machine.
 
-    A process that is killed loses its trace alone. These processes do not hear Ctrl-C themselves: they are told of it.
+    Once it is to stop, those of traces under way, as far as these are.
+
+    A process that is killed loses its trace alone. These processes do not hear Ctrl-C themselves:
+    they are told of it.
     """
 
     def end() -> None:
@@ -382,11 +415,13 @@ def on_cluster(
         from distributed import Client
     except ImportError:
         raise AbductionError(
-            "--scheduler: expected the package distributed, got none; pip install 'ssh-abduction[cluster]'"
+            "--scheduler: expected the package distributed, got none; pip install "
+            "'ssh-abduction[cluster]'"
         ) from None
     if not re.search(r"^inproc:|:\d+$", address):
         raise AbductionError(
-            f"--scheduler: expected an address with a port, such as tcp://host:8786, got {brief(address)}"
+            "--scheduler: expected an address with a port, such as tcp://host:8786, got "
+            f"{brief(address)}"
         )
     logging.getLogger("distributed.client").setLevel(
         logging.CRITICAL
@@ -398,14 +433,16 @@ def on_cluster(
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except Exception as error:  # whatever else listens there may answer anything
         raise AbductionError(
-            f"--scheduler: expected a Dask scheduler at {address}, got none ({error}); start one with: dask scheduler"
+            f"--scheduler: expected a Dask scheduler at {address}, got none ({error}); start one "
+            "with: dask scheduler"
         ) from None
     with client:
         try:
             client.wait_for_workers(1, timeout=PATIENCE)
         except TimeoutError:
             raise AbductionError(
-                f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask worker {address}"
+                f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask "
+                f"worker {address}"
             ) from None
         most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
         absence = Absence(lambda: len(client.ncores()), question.limit, address)
@@ -424,8 +461,9 @@ def _answers(
 ) -> Iterator[Any]:
     """Answers as they are ready, in any order.
 
-    `attempt` yields the answers for some traces, and puts those under way while a process was killed into its second list. Which of them was
-    to blame is not known, so each is solved again, alone: it is the one whose process is killed again.
+    `attempt` yields the answers for some traces, and puts those under way while a process was
+    killed into its second list. Which of them was to blame is not known, so each is solved again,
+    alone: it is the one whose process is killed again.
     """
     suspects: list[Task] = []
     yield from attempt([*enumerate(paths)], suspects)
@@ -439,7 +477,8 @@ def _answers(
 class Absence:
     """How long a cluster has had no worker. Dask itself waits without a word.
 
-    After PATIENCE seconds a warning says so. Where there is a time limit, the wait is too long after so many seconds, or PATIENCE, if that is more.
+    After PATIENCE seconds a warning says so. Where there is a time limit, the wait is too long
+    after so many seconds, or PATIENCE, if that is more.
 
     Args:
         workers: Tells how many workers there are.
@@ -463,10 +502,16 @@ class Absence:
     def sentence(self) -> str:
         """What is said of it."""
         seconds = self._clock() - self._last_seen
-        return f"scheduler: expected a worker, got none for {seconds:.0f} s; start one with: dask worker {self._address}"
+        return (
+            f"scheduler: expected a worker, got none for {seconds:.0f} s; start one with: dask "
+            f"worker {self._address}"
+        )
 
     def is_too_long(self) -> bool:
-        """Look, now and then, whether there is a worker, and warn once if there is none. Returns whether nobody should wait any longer."""
+        """Look, now and then, whether there is a worker, and warn once if there is none.
+
+        Returns whether nobody should wait any longer.
+        """
         now = self._clock()
         if now >= self._looks_at:
             self._looks_at = now + LOOK
@@ -488,9 +533,12 @@ def _on_workers(
     tasks: list[Task],
     killed: list[Task],
 ) -> Iterator[Any]:
-    """An attempt on Dask, with so many traces at most sent at a time. They are read here: workers need not share the disk.
+    """An attempt on Dask, with so many traces at most sent at a time.
 
-    This is Dask's own interface, as joblib's backend for Dask waits for ever when a worker is killed.
+    They are read here: workers need not share the disk.
+
+    This is Dask's own interface, as joblib's backend for Dask waits for ever when a worker is
+    killed.
     """
     from distributed import KilledWorker, as_completed
 
@@ -549,7 +597,10 @@ def _on_workers(
 
 
 def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
-    """The answer, on a Dask worker. A worker runs on when its client has gone, so the search looks now and then whether it has."""
+    """The answer, on a Dask worker.
+
+    A worker runs on when its client has gone, so the search looks now and then whether it has.
+    """
     from distributed import get_worker
 
     worker = get_worker()
@@ -560,7 +611,8 @@ def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
 
     if not question.has_limits:
         return question.answer(number, path, content, given_up)
-    # Other traces may be under way in this process, which cannot be ended with one that does not heed its limits.
+    # Other traces may be under way in this process, which cannot be ended with one that does not
+    # heed its limits.
     work = [(number, path, question, content)]
     answer: Any = next(
         workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, question.patience)
@@ -575,7 +627,10 @@ def _solved_for_cluster(
 
 
 def _forget_memory() -> None:
-    """Count the peak of memory anew, after what earlier traces left is given back. Where this is not Linux, the peak stays."""
+    """Count the peak of memory anew, after what earlier traces left is given back.
+
+    Where this is not Linux, the peak stays.
+    """
     gc.collect()
     with contextlib.suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -24,7 +24,10 @@ EXIT_VIOLATED = 20
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Check maps against a trace and the axioms, without clingo. Which named axiom fails, and at which steps?"
+    text = (
+        "Check maps against a trace and the axioms, without clingo. Which named axiom fails, and "
+        "at which steps?"
+    )
     parser = verbs.add_parser("check", help="do these maps satisfy the axioms?", description=text)
     parser.add_argument("maps", help="what solve --json printed, or one saved map")
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
@@ -33,7 +36,10 @@ def add_parser(verbs: Verbs) -> None:
     )
     add_theory(parser, default="the theory of the maps, or topological")
     parser.set_defaults(run=run)
-    parser.epilog = "Without --theory, the theory is the one that the file of maps was solved under; other flags are laid over it."
+    parser.epilog = (
+        "Without --theory, the theory is the one that the file of maps was solved under; other "
+        "flags are laid over it."
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -47,7 +53,8 @@ def run(options: argparse.Namespace) -> int:
     maps = maps_of(data, str(options.maps))
     if not maps and not options.bound:
         raise MapError(
-            f"{options.maps}: maps: expected one to check, got none; see the status that solve printed, or check its bound (--bound)"
+            f"{options.maps}: maps: expected one to check, got none; see the status that solve "
+            "printed, or check its bound (--bound)"
         )
     broken = 0
     for i, ssh_map in enumerate(maps):
@@ -70,11 +77,13 @@ def run(options: argparse.Namespace) -> int:
         return EXIT_VIOLATED if broken else 0
     if resolved.has_faults or (solved is not None and solved.has_faults):
         raise MapError(
-            "bound: expected a theory without faults (misread, slipped), as where steps may be disbelieved no clique of them proves anything"
+            "bound: expected a theory without faults (misread, slipped), as where steps may be "
+            "disbelieved no clique of them proves anything"
         )
     if resolved.unknown_views:
         raise MapError(
-            "bound: expected a trace whose views are all known, as a step whose view is unknown may be any dstate; leave out --bound"
+            "bound: expected a trace whose views are all known, as a step whose view is unknown "
+            "may be any dstate; leave out --bound"
         )
     doubt = None
     if broken:
@@ -98,7 +107,9 @@ def _bound(
     solved: Theory,
     broken: bool,
 ) -> bool:
-    """Print what the certificate of the file proves, and what the file says wrongly of itself. Says whether all of it holds.
+    """Print what the certificate of the file proves, and what the file says wrongly of itself.
+
+    Says whether all of it holds.
 
     doubt   why clingo's verdict cannot be taken for one on this trace and theory, if so
     solved  the theory that the file is of
@@ -107,7 +118,8 @@ def _bound(
     fewest = min((len(m.dstates) for m in maps), default=None)
     if RESTS_ON - set(theory.axioms):
         raise MapError(
-            "bound: expected a theory with the axioms functional_view and deterministic, which the proof rests on"
+            "bound: expected a theory with the axioms functional_view and deterministic, which "
+            "the proof rests on"
         )
     if not isinstance(data, dict) or "certificate" not in data:
         raise MapError(
@@ -129,12 +141,14 @@ def _bound(
     pairs = bound.dstates * (bound.dstates - 1) // 2
     states = counted(bound.dstates, "dstates")
     print(
-        f"at least {states}: as many steps, of which no two can be one dstate ({counted(pairs, 'pairs')} checked)"
+        f"at least {states}: as many steps, of which no two can be one dstate "
+        f"({counted(pairs, 'pairs')} checked)"
     )
     total = bound.dstates + (0 if doubt else len(bound.refuted))
     if bound.refuted and doubt:
         print(
-            f"clingo's verdict on {counted(bound.refuted[0], 'dstates')} and more is left out: {doubt}"
+            f"clingo's verdict on {counted(bound.refuted[0], 'dstates')} and more is left out: "
+            f"{doubt}"
         )
     elif bound.refuted:
         sizes = (
@@ -143,7 +157,8 @@ def _bound(
             else str(bound.refuted[0])
         )
         print(
-            f"at least {counted(total, 'dstates')}, if clingo is right that there is no map of {sizes}"
+            f"at least {counted(total, 'dstates')}, if clingo is right that there is no map of "
+            f"{sizes}"
         )
     if fewest is not None:
         beyond = (
@@ -162,20 +177,32 @@ def _false_of_maps(data: Mapping[str, Any], maps: Sequence[SSHMap], trace: Trace
     ranking = Ranking(trace)
     for i, (said, ssh_map) in enumerate(zip(data.get("maps", ()), maps, strict=False)):
         if "id" in said and said["id"] != ssh_map.id:
-            yield f"maps[{i}].id: expected {ssh_map.id}, the digest of the map, got {brief(said['id'])}"
+            yield (
+                f"maps[{i}].id: expected {ssh_map.id}, the digest of the map, got "
+                f"{brief(said['id'])}"
+            )
         if ssh_map.fit is None and not {"fit", "poses", "spreads"} & set(said):
             continue
         if not trace.has_displacements:
-            yield f"maps[{i}].fit: expected none, as the trace has no displacements, got {brief(said.get('fit'))}"
+            yield (
+                f"maps[{i}].fit: expected none, as the trace has no displacements, got "
+                f"{brief(said.get('fit'))}"
+            )
             continue
         right = ranking.fitted(ssh_map).to_dict()
         for name in ("fit", "poses", "spreads"):
             if not _is_near(said.get(name), right[name]):
-                yield f"maps[{i}].{name}: expected {brief(right[name])}, by the displacements of the trace, got {brief(said.get(name))}"
+                yield (
+                    f"maps[{i}].{name}: expected {brief(right[name])}, by the displacements of "
+                    f"the trace, got {brief(said.get(name))}"
+                )
 
 
 def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
-    """What the file says wrongly of what its maps share. Its other claims hold, so that it can be read as a solution."""
+    """What the file says wrongly of what its maps share.
+
+    Its other claims hold, so that it can be read as a solution.
+    """
     try:
         solution = Solution.from_dict(data, "the file", trace)
     except MapError as error:
@@ -190,7 +217,10 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
             sharing.absorb(ssh_map)
         right = sharing.backbone(proven=True)
         if backbone.to_dict() != right.to_dict():
-            yield f"backbone: expected {right.sentence or 'the one map'}, as the maps show, got {backbone.sentence or 'something else'}"
+            yield (
+                f"backbone: expected {right.sentence or 'the one map'}, as the maps show, got "
+                f"{backbone.sentence or 'something else'}"
+            )
         backbone = right
     summary = summary_of(solution, solution.count, backbone)
     if data.get("summary", summary) != summary:

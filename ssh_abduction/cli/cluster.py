@@ -20,8 +20,14 @@ from ssh_abduction.theory.theory import Theory
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Cluster the images of a trace into views, as many as separate best (k by M), and write the trace with its views. Where another number "
-    text += "of views is about as good, its views are kept beside them, and it is said whether they give another map."
+    text = (
+        "Cluster the images of a trace into views, as many as separate best (k by M), and write "
+        "the trace with its views. Where another number "
+    )
+    text += (
+        "of views is about as good, its views are kept beside them, and it is said whether they "
+        "give another map."
+    )
     parser = verbs.add_parser("cluster", help="cluster images into views", description=text)
     parser.add_argument("trace", help="trace file with images, or - for standard input")
     add_output(parser)

@@ -21,24 +21,39 @@ UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Compare the minimal maps of a trace: what do all of them share, where do they differ, and which steps decide between them?"
+    text = (
+        "Compare the minimal maps of a trace: what do all of them share, where do they differ, "
+        "and which steps decide between them?"
+    )
     parser = verbs.add_parser(
         "compare", help="what do rival maps share, and where do they differ?", description=text
     )
     parser.add_argument(
         "maps",
-        help="what solve --json printed, one saved map, or the folder of a run of map; - for standard input",
+        help=(
+            "what solve --json printed, one saved map, or the folder of a run of map; - for "
+            "standard input"
+        ),
     )
     parser.add_argument(
         "other",
         nargs="?",
-        help="maps of the same trace to compare with: which maps are in both, and how do the first ones differ?",
+        help=(
+            "maps of the same trace to compare with: which maps are in both, and how do the first "
+            "ones differ?"
+        ),
     )
-    diff = "instead, tell two maps apart in words, each by its number, from 1, or its id; with OTHER, the second one is of that file"
+    diff = (
+        "instead, tell two maps apart in words, each by its number, from 1, or its id; with "
+        "OTHER, the second one is of that file"
+    )
     parser.add_argument("--diff", nargs=2, metavar=("I", "J"), help=diff)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
-    parser.epilog = "Questions that decide are chosen greedily: none can be left out, but there may be fewer. docs/reference/formats.md says what the JSON has."
+    parser.epilog = (
+        "Questions that decide are chosen greedily: none can be left out, but there may be fewer. "
+        "docs/reference/formats.md says what the JSON has."
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -126,7 +141,8 @@ def _lines(found: Comparison) -> Iterator[str]:
         yield from compared(found)
     if len(found.sizes) > 1:
         yield from (
-            f"  {counted(count, 'maps')} with {counted(dstates, 'dstates')}, {counted(places, 'places')}, {counted(paths, 'paths')}"
+            f"  {counted(count, 'maps')} with {counted(dstates, 'dstates')}, "
+            f"{counted(places, 'places')}, {counted(paths, 'paths')}"
             for (dstates, places, paths), count in found.sizes
         )
     if found.fits and found.fits[0] != found.fits[1]:

@@ -12,12 +12,16 @@ SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Print the completion of verbs, options and files for a shell. Needs the package shtab: pip install 'ssh-abduction[completion]'."
+    text = (
+        "Print the completion of verbs, options and files for a shell. Needs the package shtab: "
+        "pip install 'ssh-abduction[completion]'."
+    )
     parser = verbs.add_parser("completion", help="print completions for a shell", description=text)
     parser.add_argument("shell", choices=SHELLS, help="the shell that completes")
     parser.set_defaults(run=run)
     parser.epilog = (
-        'bash: eval "$(ssh-abduction completion bash)" in ~/.bashrc; zsh: write it to a file _ssh-abduction in a folder of $fpath; '
+        'bash: eval "$(ssh-abduction completion bash)" in ~/.bashrc; zsh: write it to a file '
+        "_ssh-abduction in a folder of $fpath; "
         "fish: write it to ~/.config/fish/completions/ssh-abduction.fish"
     )
 
@@ -27,11 +31,13 @@ def run(options: argparse.Namespace) -> int:
         import shtab
     except ImportError:
         raise AbductionError(
-            "completion: expected the package shtab, got none; pip install 'ssh-abduction[completion]'"
+            "completion: expected the package shtab, got none; pip install "
+            "'ssh-abduction[completion]'"
         ) from None
     if options.shell not in shtab.SUPPORTED_SHELLS:
         raise AbductionError(
-            f"completion: expected a shtab that knows {options.shell}, got {shtab.__version__}; pip install -U shtab"
+            f"completion: expected a shtab that knows {options.shell}, got {shtab.__version__}; "
+            "pip install -U shtab"
         )
     from ssh_abduction.cli import parser
 

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, MapPairs, VisitsEvaluation
 
 UNKNOWN = "–"
-# Poses and relations of one log judge at least such a share of the pairs alike: else they are of different logs, or one of them is wrong.
+# Poses and relations of one log judge at least such a share of the pairs alike: else they are of
+# different logs, or one of them is wrong.
 ALIKE = 0.9
 PAIRS = (
     "map",
@@ -46,7 +47,10 @@ HEAD = (
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Compare maps with the truth that the steps of the trace tell: which map is the true one, and how right are the others?"
+    text = (
+        "Compare maps with the truth that the steps of the trace tell: which map is the true one, "
+        "and how right are the others?"
+    )
     parser = verbs.add_parser("evaluate", help="how right are these maps?", description=text)
     parser.add_argument(
         "maps",
@@ -67,13 +71,18 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "--truth",
         metavar="FILE",
-        help="judge by the robot's true trajectory, in TUM format: lines of timestamp tx ty tz qx qy qz qw",
+        help=(
+            "judge by the robot's true trajectory, in TUM format: lines of timestamp tx ty tz qx "
+            "qy qz qw"
+        ),
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "Of pairs at the same place, edges and links, the two shares are precision and recall. Where steps tell poses and no names, as those "
-        "of an imported log do, visits near each other are judged. docs/reference/formats.md says what is counted."
+        "Of pairs at the same place, edges and links, the two shares are precision and recall. "
+        "Where steps tell poses and no names, as those "
+        "of an imported log do, visits near each other are judged. docs/reference/formats.md says "
+        "what is counted."
     )
 
 
@@ -92,7 +101,8 @@ def run(options: argparse.Namespace) -> int:
     maps = maps_of(data, str(options.maps))
     if not maps:
         raise MapError(
-            f"{options.maps}: maps: expected one to evaluate, got none; see the status that solve printed"
+            f"{options.maps}: maps: expected one to evaluate, got none; see the status that solve "
+            "printed"
         )
     trace = Trace.load(options.trace)
     if options.truth is not None:
@@ -119,7 +129,8 @@ def run(options: argparse.Namespace) -> int:
             print(f"ssh-abduction: warning: {_nothing_judged(visits)}", file=sys.stderr)
         if visits.by_both is not None and visits.by_both[1] < ALIKE * visits.by_both[0]:
             print(
-                f"ssh-abduction: warning: relations and the poses of the trace judge {visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits alike: "
+                "ssh-abduction: warning: relations and the poses of the trace judge "
+                f"{visits.by_both[1]} of {counted(visits.by_both[0], 'pairs')} of visits alike: "
                 f"are {named(options.relations)} relations of this log?",
                 file=sys.stderr,
             )
@@ -150,10 +161,19 @@ def _nothing_judged(found: VisitsEvaluation) -> str:
     """Why no pair of visits was judged, so that no figure says anything."""
     why = f"the trace has {counted(found.visits, 'visits')}"
     if found.places.stayed:
-        why += f"; of {counted(found.places.stayed, 'pairs')} within {found.near:g} m the robot was at no visit farther away in between"
+        why += (
+            f"; of {counted(found.places.stayed, 'pairs')} within {found.near:g} m the robot was "
+            "at no visit farther away in between"
+        )
     if found.places.unknown:
-        why += f"; of {counted(found.places.unknown, 'pairs')} {found.judge} do not tell how far apart they are"
-    return f"judged by {found.judge}: expected pairs of visits to judge, got none: {why}; evaluate a longer drive, or with truth at more steps"
+        why += (
+            f"; of {counted(found.places.unknown, 'pairs')} {found.judge} do not tell how far "
+            "apart they are"
+        )
+    return (
+        f"judged by {found.judge}: expected pairs of visits to judge, got none: {why}; evaluate a "
+        "longer drive, or with truth at more steps"
+    )
 
 
 def _told_of_visits(found: VisitsEvaluation) -> str:
@@ -168,12 +188,15 @@ def _told_of_visits(found: VisitsEvaluation) -> str:
         else "",
     ]
     return (
-        f"judged by {found.judge}: of {counted(places.judged, 'pairs')} of different visits {places.returns} are returns to one place: within "
-        f"{found.near:g} m, and the robot was farther away in between; of {counted(dstates.judged, 'pairs')} of their steps {dstates.returns} are returns "
+        f"judged by {found.judge}: of {counted(places.judged, 'pairs')} of different visits "
+        f"{places.returns} are returns to one place: within "
+        f"{found.near:g} m, and the robot was farther away in between; of "
+        f"{counted(dstates.judged, 'pairs')} of their steps {dstates.returns} are returns "
         f"to one dstate: headings differ by at most {found.turned:g} degrees, too"
         + "".join(f"\nleft out: {text}" for text in left_out if text)
         + (
-            f"\nposes judge {found.by_both[1]} of {counted(found.by_both[0], 'pairs')} of visits alike"
+            f"\nposes judge {found.by_both[1]} of {counted(found.by_both[0], 'pairs')} of visits "
+            "alike"
             if found.by_both
             else ""
         )

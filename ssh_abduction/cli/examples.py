@@ -12,7 +12,10 @@ from ssh_abduction.data.files import shipped, write_file
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Copy the examples that ship with the package into a folder: traces, programs, and a notebook. A file that is there already, and is another one, is left as it is."
+    text = (
+        "Copy the examples that ship with the package into a folder: traces, programs, and a "
+        "notebook. A file that is there already, and is another one, is left as it is."
+    )
     parser = verbs.add_parser("examples", help="copy the examples into a folder", description=text)
     parser.add_argument(
         "-o",
@@ -39,13 +42,15 @@ def run(options: argparse.Namespace) -> int:
     ]
     if changed:
         raise AbductionError(
-            f"{named(changed[0])}: expected no file, or the example of this name, got another one; nothing was copied: "
+            f"{named(changed[0])}: expected no file, or the example of this name, got another "
+            "one; nothing was copied: "
             "move it away, or take another folder (-o FOLDER)"
         )
     folder.mkdir(parents=True, exist_ok=True)
     for path, data in examples.items():
         write_file(path, data)
     print(
-        f"{counted(len(examples), 'examples')} in {named(folder)}: {', '.join(path.name for path in examples)}"
+        f"{counted(len(examples), 'examples')} in {named(folder)}: "
+        f"{', '.join(path.name for path in examples)}"
     )
     return 0

@@ -1,4 +1,7 @@
-"""ssh-abduction explain TRACE [FIRST SECOND]: why are two steps different dstates, or one? Without steps: why has the trace no map?"""
+"""ssh-abduction explain TRACE [FIRST SECOND]: why are two steps different dstates, or one?
+
+Without steps: why has the trace no map?
+"""
 
 from __future__ import annotations
 
@@ -21,8 +24,10 @@ EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Explain why two steps of a trace are different dstates in every map, or one, with the axioms that it takes; or else in which maps they are, and what maps of "
-        "the other kind cost. Without steps, explain why the trace has no map, and which one observation, if it were wrong, would mend it."
+        "Explain why two steps of a trace are different dstates in every map, or one, with the "
+        "axioms that it takes; or else in which maps they are, and what maps of "
+        "the other kind cost. Without steps, explain why the trace has no map, and which one "
+        "observation, if it were wrong, would mend it."
     )
     parser = verbs.add_parser(
         "explain",
@@ -60,14 +65,18 @@ def add_parser(verbs: Verbs) -> None:
         help="stop when the process has used so much memory",
     )
     add_theory(parser)
-    parser.epilog = "Exit codes: 0 explained; 20 the trace has no map; 30 not found out in time; 1, 2, 130 and 143 as for the other verbs."
+    parser.epilog = (
+        "Exit codes: 0 explained; 20 the trace has no map; 30 not found out in time; 1, 2, 130 "
+        "and 143 as for the other verbs."
+    )
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     if len(options.steps) not in (0, 2):
         raise AbductionError(
-            f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are to be explained"
+            f"steps: expected two, or none, got {len(options.steps)}; name the two steps that are "
+            "to be explained"
         )
     trace = Trace.load(options.trace)
     theory = theory_of(options)

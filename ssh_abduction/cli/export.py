@@ -14,7 +14,11 @@ FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Write a map as a file of another program: a route graph of Nav2 (GeoJSON), a topological map of LCAS's topological_navigation (tmap2, YAML), GraphML, Graphviz DOT, or JSON of networkx."
+    text = (
+        "Write a map as a file of another program: a route graph of Nav2 (GeoJSON), a topological "
+        "map of LCAS's topological_navigation (tmap2, YAML), GraphML, Graphviz DOT, or JSON of "
+        "networkx."
+    )
     parser = verbs.add_parser(
         "export", help="write a map for Nav2, tmap2, GraphML, DOT or networkx", description=text
     )
@@ -31,12 +35,18 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "--level",
         choices=("places", "dstates"),
-        help="what nodes are (default: places for nav2 and tmap2, where the map has any, else dstates)",
+        help=(
+            "what nodes are (default: places for nav2 and tmap2, where the map has any, else "
+            "dstates)"
+        ),
     )
     parser.add_argument(
         "--trace",
         metavar="TRACE",
-        help="the trace that was mapped, which says how actions turn: for the layout of a map without poses",
+        help=(
+            "the trace that was mapped, which says how actions turn: for the layout of a map "
+            "without poses"
+        ),
     )
     parser.add_argument(
         "-o",
@@ -48,7 +58,10 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_setting("name", "the name of the map (default: ssh-abduction)", "ssh-abduction")
     parser.add_setting("frame", "the coordinate frame of the positions (default: map)", "map")
     parser.set_defaults(run=run)
-    parser.epilog = "Positions are metres, seen from the first dstate, where the map has poses; else they are of a layout, and this is said. docs/reference/formats.md says what each file has."
+    parser.epilog = (
+        "Positions are metres, seen from the first dstate, where the map has poses; else they are "
+        "of a layout, and this is said. docs/reference/formats.md says what each file has."
+    )
 
 
 def run(options: argparse.Namespace) -> int:

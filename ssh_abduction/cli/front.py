@@ -15,10 +15,15 @@ from ssh_abduction.theory.theory import Theory
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the front. Exit code 0 if all of it is proven, 20 if it is proven that there is no map, and else 10, as for solve."""
+    """Print the front.
+
+    Exit code 0 if all of it is proven, 20 if it is proven that there is no map, and else 10, as for
+    solve.
+    """
     if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
         raise AbductionError(
-            "--front: expected one trace, got several, or --jobs or --scheduler; ask for each trace by itself"
+            "--front: expected one trace, got several, or --jobs or --scheduler; ask for each "
+            "trace by itself"
         )
     front = fault_front(
         Trace.load(options.traces[0]),
@@ -33,7 +38,8 @@ def run(options: argparse.Namespace) -> int:
 def _as_text(front: Front, most: int) -> str:
     if not front.points:
         return (
-            f"no map has at most {counted(most, 'faults')}: what is asserted (--same, --different, --elsewhere) contradicts what was seen and done; "
+            f"no map has at most {counted(most, 'faults')}: what is asserted (--same, "
+            "--different, --elsewhere) contradicts what was seen and done; "
             f"allow more faults (--front), or assert less"
         )
     rows = []
@@ -46,7 +52,8 @@ def _as_text(front: Front, most: int) -> str:
     lines = [table(["faults", "dstates", "", "of the map found"], rows)]
     if front.prices:
         lines.append(
-            f"a fault that costs more than {front.prices[0]:g} and less than {front.prices[1]:g} dstates makes the map at the knee minimal among these"
+            f"a fault that costs more than {front.prices[0]:g} and less than {front.prices[1]:g} "
+            "dstates makes the map at the knee minimal among these"
         )
     elif not front.stopped:
         lines.append("no knee: each further fault saves about as many dstates")

@@ -1,7 +1,9 @@
 """The last net under the limits: what is known is printed in time, even while the main thread sits in a call of clingo's that nothing can stop.
 
-Python runs handlers of signals in the main thread alone, and not before a call of clingo's has returned. So a thread of its own looks at the clock and at
-the memory, and the system tells it of signals through a socket. Where a promise is about to be broken, this thread prints what is known, and ends the process.
+Python runs handlers of signals in the main thread alone, and not before a call of clingo's has
+returned. So a thread of its own looks at the clock and at the memory, and the system tells it of
+signals through a socket. Where a promise is about to be broken, this thread prints what is known,
+and ends the process.
 """
 
 from __future__ import annotations
@@ -155,7 +157,10 @@ class Guard:
         )
 
     def _end(self, why: Stop) -> None:
-        """Print the last words, and end the process with its helpers. What Python and clingo hold is left to the system."""
+        """Print the last words, and end the process with its helpers.
+
+        What Python and clingo hold is left to the system.
+        """
         self._interrupt()
         code = 1
         try:
@@ -164,7 +169,8 @@ class Guard:
         except BaseException as error:
             with suppress(OSError, ValueError):
                 print(
-                    f"ssh-abduction: {why}: expected to print what is known, got {type(error).__name__}: {error}",
+                    f"ssh-abduction: {why}: expected to print what is known, got "
+                    f"{type(error).__name__}: {error}",
                     file=sys.stderr,
                     flush=True,
                 )

@@ -30,13 +30,18 @@ MEANINGS = ("free", "unknown")
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Read a robot's log of laser scans and odometry, find the distinctive places that it passed, and write a trace: views, stars, displacements, and the "
-        "actions between. Corrected poses in a log become truth for evaluation; nothing that infers reads them."
+        "Read a robot's log of laser scans and odometry, find the distinctive places that it "
+        "passed, and write a trace: views, stars, displacements, and the "
+        "actions between. Corrected poses in a log become truth for evaluation; nothing that "
+        "infers reads them."
     )
     parser = verbs.add_parser("import", help="make a trace of a robot's log", description=text)
     parser.add_argument(
         "log",
-        help="CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by gzip, bzip2, xz or zstd, too",
+        help=(
+            "CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by "
+            "gzip, bzip2, xz or zstd, too"
+        ),
     )
     add_output(parser)
     add_reading(parser)
@@ -151,7 +156,8 @@ def run(options: argparse.Namespace) -> int:
         raise AbductionError("-: expected the file of a log, got standard input; save it to a file")
     if options.output != "-" and not Path(options.output).absolute().parent.is_dir():
         raise AbductionError(
-            f"{named(options.output)}: cannot write the trace: its folder is not there; make it first"
+            f"{named(options.output)}: cannot write the trace: its folder is not there; make it "
+            "first"
         )
     doors = doors_of(options)
     log = read(options.log, options)
@@ -162,22 +168,32 @@ def run(options: argparse.Namespace) -> int:
     places = (
         "doors"
         if scale.doors
-        else f"distinctive places at a radius of {scale.radius:g} m, gateways from {scale.gateway:g} m"
+        else (
+            f"distinctive places at a radius of {scale.radius:g} m, gateways from "
+            f"{scale.gateway:g} m"
+        )
     )
-    said = f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: {counted(len(done.visits), 'visits')} to {places}; {counted(len(done.trace), 'steps')}"
+    said = (
+        f"{counted(len(log), 'scans')}, {done.track.way[-1]:.0f} m: "
+        f"{counted(len(done.visits), 'visits')} to {places}; {counted(len(done.trace), 'steps')}"
+    )
     write(done.trace, options.output, said)
     return 0
 
 
 def doors_of(options: argparse.Namespace) -> bool | None:
-    """Whether doors are the places, as asked; None where the log is to tell. Raises AbductionError for a scale of junctions where doors are asked for."""
+    """Whether doors are the places, as asked; None where the log is to tell.
+
+    Raises AbductionError for a scale of junctions where doors are asked for.
+    """
     if options.places is None:
         return None
     doors = bool(options.places == "doors")
     for name, given in (("gateway", options.gateway), ("radius", options.radius)):
         if doors and given is not None:
             raise AbductionError(
-                f"{name}: expected none with --places doors, got {given:g}; it is about ways that part, so leave it out, or ask for junctions"
+                f"{name}: expected none with --places doors, got {given:g}; it is about ways that "
+                "part, so leave it out, or ask for junctions"
             )
     return doors
 

@@ -25,8 +25,10 @@ HEAD = ("", "minimal maps", "dstates", "places", "paths", "the true one", "accur
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Solve a trace by its views alone, and then with one kind of evidence more on each rung: stars, pairs of steps that displacements tell apart, "
-        "sets of two returns, planarity. Says how many minimal maps there are, how large they are, and which of them is the true one, where the trace has truth."
+        "Solve a trace by its views alone, and then with one kind of evidence more on each rung: "
+        "stars, pairs of steps that displacements tell apart, "
+        "sets of two returns, planarity. Says how many minimal maps there are, how large they "
+        "are, and which of them is the true one, where the trace has truth."
     )
     parser = verbs.add_parser(
         "ladder", help="what is each kind of evidence worth?", description=text

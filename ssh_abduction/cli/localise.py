@@ -28,8 +28,10 @@ NOWHERE = "–"
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Where in a known map was the robot at each step of another trace? Markov localisation: a belief over dstates after each step, from a prior that knows nothing. "
-        "A robot that is kidnapped is found again, and one that is nowhere that the map knows is said to be nowhere."
+        "Where in a known map was the robot at each step of another trace? Markov localisation: a "
+        "belief over dstates after each step, from a prior that knows nothing. "
+        "A robot that is kidnapped is found again, and one that is nowhere that the map knows is "
+        "said to be nowhere."
     )
     parser = verbs.add_parser(
         "localise", help="where in a known map is the robot?", description=text
@@ -39,7 +41,10 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument(
         "other",
-        help="trace of a robot in the mapped world, with the same names of views and actions; - for standard input",
+        help=(
+            "trace of a robot in the mapped world, with the same names of views and actions; - "
+            "for standard input"
+        ),
     )
     parser.add_argument(
         "--map", type=int, metavar="I", help="take the I-th map, from 1 (default: the first)"
@@ -111,14 +116,18 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _localiser(options: argparse.Namespace) -> Localiser:
-    """The localiser that the options ask for. Raises AbductionError that names the file that is wrong."""
+    """The localiser that the options ask for.
+
+    Raises AbductionError that names the file that is wrong.
+    """
     from ssh_abduction.online.chances import Chances
     from ssh_abduction.online.localiser import Localiser
 
     maps = maps_of(read_maps(options.maps), str(options.maps))
     if not maps:
         raise MapError(
-            f"{named(options.maps)}: maps: expected one to localise in, got none; see the status that solve printed"
+            f"{named(options.maps)}: maps: expected one to localise in, got none; see the status "
+            "that solve printed"
         )
     check_number(options.map, maps, options.maps)
     if len(maps) > 1 and options.map is None:

@@ -11,7 +11,8 @@ from ssh_abduction.cli.parsing import true_or_false
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "From a robot's log to the minimal maps of the building: trace.jsonl, maps.json, page.html, report.html and run.json in a folder. Of several logs each has a folder "
+        "From a robot's log to the minimal maps of the building: trace.jsonl, maps.json, "
+        "page.html, report.html and run.json in a folder. Of several logs each has a folder "
         "of its own, and its result is a line; what is done already is not done again."
     )
     parser = verbs.add_parser("map", help="map a building from a robot's log", description=text)
@@ -19,7 +20,10 @@ def add_parser(verbs: Verbs) -> None:
         "logs",
         nargs="+",
         metavar="log",
-        help="CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by gzip, bzip2, xz or zstd, too",
+        help=(
+            "CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by "
+            "gzip, bzip2, xz or zstd, too"
+        ),
     )
     parser.add_argument(
         "-o",
@@ -41,7 +45,10 @@ def add_parser(verbs: Verbs) -> None:
         "--time-limit",
         type=float,
         metavar="S",
-        help="seconds for the minimal maps (default: what is left of a twentieth of the time that the robot drove, and 5 at least)",
+        help=(
+            "seconds for the minimal maps (default: what is left of a twentieth of the time that "
+            "the robot drove, and 5 at least)"
+        ),
     )
     parser.add_setting(
         "ladder",
@@ -66,7 +73,10 @@ def add_parser(verbs: Verbs) -> None:
     add_reading(parser)
     add_theory(
         parser,
-        default="topological; without stars and sides where doors are the places, where walls do not meet at right angles, and where no map fits the stars",
+        default=(
+            "topological; without stars and sides where doors are the places, where walls do not "
+            "meet at right angles, and where no map fits the stars"
+        ),
     )
     parser.set_defaults(run=run)
 

@@ -1,7 +1,7 @@
 """Maps of many logs, here or on a Dask cluster: a folder each, and a line on each.
 
-A run is done once its run.json is there and says nothing of an interruption. What is done with the same settings is not done again, so a call that was
-stopped is simply made once more.
+A run is done once its run.json is there and says nothing of an interruption. What is done with the
+same settings is not done again, so a call that was stopped is simply made once more.
 """
 
 from __future__ import annotations
@@ -38,12 +38,16 @@ if TYPE_CHECKING:
     from perception.readers.scans import RobotLog
     from ssh_abduction.robot_logs.log_maps import LogMap, LogMapping
 
-KILLED = "process: expected an answer, got killed, as happens when memory runs out; map fewer logs at a time (--jobs)"
+KILLED = (
+    "process: expected an answer, got killed, as happens when memory runs out; map fewer logs at "
+    "a time (--jobs)"
+)
 GIVEN_UP = "expected time to map this log, got an interruption; map it again"
 # The files of a run, and the one that says that it is there.
 RUN = "run.json"
 FILES = ("trace.jsonl", "maps.json", "page.html", "report.html", RUN)
-# Bytes that the name of a folder may have, and hexadecimal digits of a digest that tell logs of one name apart.
+# Bytes that the name of a folder may have, and hexadecimal digits of a digest that tell logs of one
+# name apart.
 LONGEST, DIGITS = 255, 8
 # Seconds that a worker has to write down what is known once all is to stop.
 PATIENCE = 10.0
@@ -64,7 +68,10 @@ class MapAnswer:
 
 @dataclass(frozen=True, slots=True)
 class MapQuestion:
-    """What is asked about each log. Plain data, as it travels to other processes and machines; an answer brings its files along."""
+    """What is asked about each log.
+
+    Plain data, as it travels to other processes and machines; an answer brings its files along.
+    """
 
     theory: Theory | None
     choices: dict[str, Any]
@@ -134,7 +141,11 @@ class MapQuestion:
         given_up: Callable[[], bool],
         answer_last: Callable[[MapAnswer], None],
     ) -> MapAnswer:
-        """Map the log in the file `here`. The digest of its content was made before: if the log changes meanwhile, the next call sees another digest, and maps it again."""
+        """Map the log in the file `here`.
+
+        The digest of its content was made before: if the log changes meanwhile, the next call sees
+        another digest, and maps it again.
+        """
         begun: list[tuple[RobotLog, LogMapping]] = []  # the mapping, once the log is read
 
         def interrupt() -> None:
@@ -193,11 +204,20 @@ class MapQuestion:
         found = (
             "no map"
             if cost is None
-            else f"{counted(cost.places, 'places')}, {counted(cost.paths, 'paths')}, {counted(cost.dstates, 'dstates')}"
+            else (
+                f"{counted(cost.places, 'places')}, {counted(cost.paths, 'paths')}, "
+                f"{counted(cost.dstates, 'dstates')}"
+            )
         )
-        how = f"{solution.status.value}, {counted(solution.count, 'minimal maps')}{'' if solution.complete else ' or more'}"
+        how = (
+            f"{solution.status.value}, "
+            f"{counted(solution.count, 'minimal maps')}{'' if solution.complete else ' or more'}"
+        )
         total = sum(done.seconds.values())
-        line = f"{named(path)}: {found}; {how}; {counted(len(done.imported.visits), 'visits')} in {counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m; {total:.1f} s"
+        line = (
+            f"{named(path)}: {found}; {how}; {counted(len(done.imported.visits), 'visits')} in "
+            f"{counted(len(log), 'scans')}, {done.imported.track.way[-1]:.0f} m; {total:.1f} s"
+        )
         code = interrupted_code() if done.interrupted else exit_code(solution)
         return MapAnswer(
             number,
@@ -241,7 +261,8 @@ class MapQuestion:
 def run(options: argparse.Namespace) -> int:
     if options.jobs == 0:
         raise AbductionError(
-            "--jobs: expected how many logs to map at a time, or -1 for one a core, got 0; leave it out for 1"
+            "--jobs: expected how many logs to map at a time, or -1 for one a core, got 0; leave "
+            "it out for 1"
         )
     if "-" in options.logs:
         raise AbductionError("-: expected the files of logs, got standard input; save it to a file")
@@ -302,7 +323,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _alone(question: MapQuestion, left: list[str], folders: dict[str, Path]) -> int:
-    """Map the only log in this process, if it is not done already. Returns the exit code. Raises AbductionError."""
+    """Map the only log in this process, if it is not done already.
+
+    Returns the exit code. Raises AbductionError.
+    """
 
     def keep(answer: MapAnswer) -> None:
         if answer.code == EXIT_ERROR:
@@ -370,20 +394,24 @@ def _check_folder(folder: Path) -> None:
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not there.is_dir():
         raise AbductionError(
-            f"{named(str(folder))}: expected a folder to write, got a file: {named(str(there))}; name another one"
+            f"{named(str(folder))}: expected a folder to write, got a file: {named(str(there))}; "
+            "name another one"
         )
     if not os.access(there, os.W_OK):
         raise AbductionError(
-            f"{named(str(folder))}: expected a folder that can be written, got no permission in {named(str(there))}; name another one"
+            f"{named(str(folder))}: expected a folder that can be written, got no permission in "
+            f"{named(str(there))}; name another one"
         )
 
 
 def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict[str, str]]:
     """The folder of each log, and which logs are the same as another one.
 
-    A log that has a run in `folder` keeps that run's folder, whatever it is called now. Else one log alone has `folder`, and each of several logs
-    a folder in it, named after the log. Where that folder has the run of another log, or several logs have one name, the name ends in a part of the
-    digest of the log. So the order of the logs does not matter. A log that cannot be read, or only once, leaves the names to the others.
+    A log that has a run in `folder` keeps that run's folder, whatever it is called now. Else one
+    log alone has `folder`, and each of several logs a folder in it, named after the log. Where that
+    folder has the run of another log, or several logs have one name, the name ends in a part of the
+    digest of the log. So the order of the logs does not matter. A log that cannot be read, or only
+    once, leaves the names to the others.
     """
     contents = {path: _content(path) for path in dict.fromkeys(logs)}
     runs = _runs_in(folder)
@@ -419,7 +447,8 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
                 )
                 warn(
                     [
-                        f"{named(path)}: its folder is {named(str(place))}, as {named(str(wished))} {why}"
+                        f"{named(path)}: its folder is {named(str(place))}, as "
+                        f"{named(str(wished))} {why}"
                     ]
                 )
         other = next((one for one, taken in found.items() if _key(taken) == _key(place)), None)
@@ -471,7 +500,10 @@ def _cut(name: str) -> str:
 
 
 def _theory(options: argparse.Namespace) -> tuple[Theory | None, dict[str, Any]]:
-    """The theory that is named, and what is laid over it. Where none is named, it is None, as it then depends on the log. Raises TheoryError."""
+    """The theory that is named, and what is laid over it.
+
+    Where none is named, it is None, as it then depends on the log. Raises TheoryError.
+    """
     asked = theory_of(options)
     choices = {name: getattr(asked, name) for name in choices_of(options)}
     return (asked, {}) if options.theory or asked.level == "causal" else (None, choices)
@@ -490,7 +522,10 @@ def is_done(folder: Path, path: str, question: MapQuestion) -> bool:
 
 
 def digest(path: str) -> str | None:
-    """A digest of a log: of its content, or, of a folder, of the names and contents of its files. None of a pipe, which can be read only once. Raises LogError."""
+    """A digest of a log: of its content, or, of a folder, of the names and contents of its files.
+
+    None of a pipe, which can be read only once. Raises LogError.
+    """
     from perception.readers.lines import opened
 
     whole = hashlib.sha256()

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.consequences import Consequence
     from ssh_abduction.rivals.experiment import Experiment, Plan, Untried
 
-# So many columns of a table, and lines of a plan, are shown at most, as more cannot be taken in on a terminal; --json has all.
+# So many columns of a table, and lines of a plan, are shown at most, as more cannot be taken in on
+# a terminal; --json has all.
 SHOWN_COLUMNS, SHOWN_LINES = 6, 40
 # What the shell is told where a limit ended the search: a plan that may be better, or none at all.
 EXIT_CUT_SHORT, EXIT_NOTHING = 10, 30
@@ -32,8 +33,10 @@ HOW = {"link": "known", "implied": "implied", "expected": "expected", "open": "o
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "What to do next, to find out which of these maps is true: from where the robot is now, the fewest actions after which they predict something different; of many maps a plan. "
-        "Where the links that all maps know do not tell them apart, the untried action that tells most, and the way to it."
+        "What to do next, to find out which of these maps is true: from where the robot is now, "
+        "the fewest actions after which they predict something different; of many maps a plan. "
+        "Where the links that all maps know do not tell them apart, the untried action that tells "
+        "most, and the way to it."
     )
     parser = verbs.add_parser(
         "next", help="what should the robot do to tell these maps apart?", description=text
@@ -56,8 +59,10 @@ def add_parser(verbs: Verbs) -> None:
     add_theory(parser, default="the theory of the maps, or how the maps read stars")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "The plan for two maps is the shortest one. That for more is greedy, as the best one is hard to find (PSPACE-complete: Lee & Yannakakis 1994). "
-        "Exit codes: 0 done; 10 a limit ended the search, and there may be a better plan; 30 no plan in time. docs/reference/formats.md says what --json prints."
+        "The plan for two maps is the shortest one. That for more is greedy, as the best one is "
+        "hard to find (PSPACE-complete: Lee & Yannakakis 1994). "
+        "Exit codes: 0 done; 10 a limit ended the search, and there may be a better plan; 30 no "
+        "plan in time. docs/reference/formats.md says what --json prints."
     )
 
 
@@ -72,7 +77,8 @@ def run(options: argparse.Namespace) -> int:
     maps = maps_of(data, str(options.maps))
     if not maps:
         raise MapError(
-            f"{named(options.maps)}: maps: expected one to seek an experiment for, got none; see the status that solve printed"
+            f"{named(options.maps)}: maps: expected one to seek an experiment for, got none; see "
+            "the status that solve printed"
         )
     found = data.get("theory") if isinstance(data, dict) else None
     theory: Theory | None = theory_of(options, None if found is None else Theory.from_dict(found))
@@ -156,7 +162,10 @@ def _untried(plan: Plan) -> str:
         return ""
     if plan.untried is None:
         return "; nothing tells them apart"
-    return f"; known links tell no more, try {printable(', '.join((*plan.untried.way, plan.untried.action)))}"
+    return (
+        "; known links tell no more, try "
+        f"{printable(', '.join((*plan.untried.way, plan.untried.action)))}"
+    )
 
 
 def _expected(untried: Untried) -> Iterator[str]:

@@ -137,7 +137,10 @@ def picture_file(text: str) -> str:
 
 
 def check_picture(file: str | None) -> None:
-    """Whether a picture that is asked for could be drawn, before hours of work. Raises AbductionError."""
+    """Whether a picture that is asked for could be drawn, before hours of work.
+
+    Raises AbductionError.
+    """
     if file is None:
         return
     from ssh_abduction.evaluation.paper.figures import require_matplotlib
@@ -218,7 +221,8 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
     data = read_json(named_theory)
     if not isinstance(data, dict) or data.get("theory") is None:
         raise MapError(
-            f"{named(named_theory)}: theory: expected the theory that the maps were made with, got none; "
+            f"{named(named_theory)}: theory: expected the theory that the maps were made with, "
+            "got none; "
             "take what solve --json printed"
         )
     return Theory.from_dict(data["theory"]).replace(**chosen)
@@ -244,9 +248,9 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
     default = Theory.causal() if theory.level == "causal" else Theory.topological()
     flags = ["--theory", "causal"] if theory.level == "causal" else []
     if trace is not None:
-        with suppress(
-            AbductionError
-        ):  # the theory was made for a trace that has what the default asks for; this one may be another
+        # the theory was made for a trace that has what the default asks for; this one may be
+        # another
+        with suppress(AbductionError):
             default = settle(trace, default).theory
     for field in fields(Theory):
         value = getattr(theory, field.name)

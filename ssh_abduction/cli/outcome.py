@@ -28,7 +28,8 @@ from ssh_abduction.solver import (
 from ssh_abduction.solver import ending as written_ending
 from ssh_abduction.solver import opening as written_opening
 
-SOON = 10_000  # steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds
+# steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds
+SOON = 10_000
 
 Given: TypeAlias = tuple[SSHMap, Cost | None]
 
@@ -138,7 +139,8 @@ def dump(value: dict[str, Any]) -> str:
 def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
     """Ctrl-C and SIGTERM do this, rather than stop the program wherever it is: what was found is still printed. None: nothing, nor in processes that begin.
 
-    The guard of the whole program hears nothing meanwhile: who takes signals into his own hands needs a guard of his own if he may be deaf.
+    The guard of the whole program hears nothing meanwhile: who takes signals into his own hands
+    needs a guard of his own if he may be deaf.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may handle signals

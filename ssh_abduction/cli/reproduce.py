@@ -13,11 +13,16 @@ from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import AbductionError, brief, named
 
-MOST_SEEDS = 10_000  # a seed takes seconds: more are surely a slip of the hand, and would fill the memory before the first is run
+# a seed takes seconds: more are surely a slip of the hand, and would fill the memory before the
+# first is run
+MOST_SEEDS = 10_000
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Reproduce an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn. Writes figures, data and a page into a folder."
+    text = (
+        "Reproduce an experiment of Kuipers & Beeson (2002): simulate, cluster, abduce, learn. "
+        "Writes figures, data and a page into a folder."
+    )
     parser = verbs.add_parser(
         "reproduce", help="the paper's experiments, end to end", description=text
     )
@@ -121,6 +126,7 @@ def _seeds(text: str) -> list[int]:
             found += numbers
     except (ValueError, OverflowError):
         raise AbductionError(
-            f"--seeds: expected numbers as 0-19 or 1,5,7, at most {MOST_SEEDS:,} and below {2**32:,}, got {brief(text)}"
+            f"--seeds: expected numbers as 0-19 or 1,5,7, at most {MOST_SEEDS:,} and below "
+            f"{2**32:,}, got {brief(text)}"
         ) from None
     return found

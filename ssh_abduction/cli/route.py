@@ -11,7 +11,10 @@ from ssh_abduction.data.files import json_line
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "The shortest route through a map: the actions from one dstate or place to another, and the views to expect on the way."
+    text = (
+        "The shortest route through a map: the actions from one dstate or place to another, and "
+        "the views to expect on the way."
+    )
     parser = verbs.add_parser("route", help="which actions lead there?", description=text)
     parser.add_argument(
         "maps", help="what solve --json printed, or one saved map; - for standard input"
@@ -20,7 +23,10 @@ def add_parser(verbs: Verbs) -> None:
         "--from",
         dest="start",
         metavar="A",
-        help="a dstate by its number, or a place as p3 (default: where the robot was at its last step)",
+        help=(
+            "a dstate by its number, or a place as p3 (default: where the robot was at its last "
+            "step)"
+        ),
     )
     parser.add_argument(
         "--to",
@@ -36,7 +42,10 @@ def add_parser(verbs: Verbs) -> None:
         metavar="X",
         help="dstates, and places as p3, that the route may not touch",
     )
-    by = "what the route has the fewest of: actions or metres, through links that were driven before, or places, along the paths of the map, driven that way or not (default: actions)"
+    by = (
+        "what the route has the fewest of: actions or metres, through links that were driven "
+        "before, or places, along the paths of the map, driven that way or not (default: actions)"
+    )
     parser.add_argument("--by", choices=("actions", "places", "metres"), default="actions", help=by)
     parser.add_argument(
         "--map",
@@ -46,7 +55,10 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
-    parser.epilog = "ssh-abduction show lists the dstates and places of a map. docs/reference/formats.md says what the JSON has."
+    parser.epilog = (
+        "ssh-abduction show lists the dstates and places of a map. docs/reference/formats.md says "
+        "what the JSON has."
+    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -38,13 +38,18 @@ SHARE: dict[str, Any] = {"type": float, "metavar": "SHARE"}
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Drive tours through a world, and log an image, an action and the odometry at each dstate; views are left to cluster. "
-        "Or, with --format, log scans and odometry all along, as real robots do, and write the truth about places beside the log."
+        "Drive tours through a world, and log an image, an action and the odometry at each "
+        "dstate; views are left to cluster. "
+        "Or, with --format, log scans and odometry all along, as real robots do, and write the "
+        "truth about places beside the log."
     )
     parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
     parser.add_argument(
         "world",
-        help=f"{', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or a floor plan (.xml)",
+        help=(
+            f"{', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or a floor "
+            "plan (.xml)"
+        ),
     )
     parser.add_argument(
         "--format",
@@ -134,7 +139,8 @@ def run(options: argparse.Namespace) -> int:
         return _write_log(options, _drive(options))
     if options.world.endswith(".xml"):
         raise AbductionError(
-            f"{named(options.world)}: expected --format carmen or --format bag beside a floor plan, as it has no route of actions; add that"
+            f"{named(options.world)}: expected --format carmen or --format bag beside a floor "
+            "plan, as it has no route of actions; add that"
         )
     noise = Body.odometry if options.odometry_noise is None else options.odometry_noise
     body = Body(odometry=noise, scale=options.scale_error, bend=math.radians(options.bend_error))
@@ -176,7 +182,8 @@ def _drive(options: argparse.Namespace) -> Drive:
     ):
         if given:
             raise AbductionError(
-                f"{name}: expected none beside --format, as a robot's log is a file of scans; leave it out"
+                f"{name}: expected none beside --format, as a robot's log is a file of scans; "
+                "leave it out"
             )
     odometer = Odometer(scale=options.scale_error, bend=math.radians(options.bend_error))
     if options.odometry_noise is not None:
@@ -188,7 +195,8 @@ def _drive(options: argparse.Namespace) -> Drive:
     for name in ("start", "route", "reach"):
         if getattr(options, name) is not None:
             raise AbductionError(
-                f"--{name}: expected none beside a floor plan, whose rounds are drawn by --seed; leave it out"
+                f"--{name}: expected none beside a floor plan, whose rounds are drawn by --seed; "
+                "leave it out"
             )
     return record_plan(
         Plan.load(options.world), options.tours, options.seed, odometer=odometer, every=every
@@ -223,7 +231,8 @@ def _write_log(options: argparse.Namespace, drive: Drive) -> int:
             f"{named(truth)}: cannot write the truth: {error.strerror or error}; check the folder"
         ) from None
     print(
-        f"{counted(len(drive), 'scans')} along {drive.metres:.0f} m of {printable(drive.name)} in {named(target)}, and the truth in {named(truth)}"
+        f"{counted(len(drive), 'scans')} along {drive.metres:.0f} m of {printable(drive.name)} in "
+        f"{named(target)}, and the truth in {named(truth)}"
     )
     return 0
 
@@ -253,7 +262,8 @@ def _camera(options: argparse.Namespace) -> Camera | None:
         for name in ("textures", "paint_seed", "hours"):
             if getattr(options, name) is not None:
                 raise AbductionError(
-                    f"--{name.replace('_', '-')}: expected --images panoramas beside it, as ranges show no light; add that"
+                    f"--{name.replace('_', '-')}: expected --images panoramas beside it, as "
+                    "ranges show no light; add that"
                 )
         return None
     paint = Paint(options.paint_seed or 0, repeated=options.textures == "repeated")
@@ -263,7 +273,8 @@ def _camera(options: argparse.Namespace) -> Camera | None:
         begin, end = (float(hour) for hour in options.hours.split(","))
     except ValueError:
         raise AbductionError(
-            f"hours: expected two hours with a comma between them, as 7,19, got {options.hours!r}; write two"
+            "hours: expected two hours with a comma between them, as 7,19, got "
+            f"{options.hours!r}; write two"
         ) from None
     return Camera(paint=paint, hours=(begin, end))
 

@@ -44,7 +44,8 @@ from ssh_abduction.solver import (
 )
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
-# So many maps are compared on the terminal, at most, and so many are put in order in JSON: of more the first ones found are compared, and all are printed as found.
+# So many maps are compared on the terminal, at most, and so many are put in order in JSON: of more
+# the first ones found are compared, and all are printed as found.
 HELD = 1000
 # And maps of so many dstates together, so that they take some 100 MB at most.
 HELD_DSTATES = 500_000
@@ -69,14 +70,20 @@ def add_parser(verbs: Verbs) -> None:
         metavar="K",
         help="stop after K maps; 0 for all (default: 100)",
     )
-    more = "list maps with up to K dstates more than the least, too: for each number of dstates the best (default: 0)"
+    more = (
+        "list maps with up to K dstates more than the least, too: for each number of dstates the "
+        "best (default: 0)"
+    )
     parser.add_argument("--within", type=int, default=0, metavar="K", help=more)
     parser.add_argument(
         "--json",
         action="store_true",
         help="print the solution as JSON, map by map as they are found; of many traces, a line each",
     )
-    front = "instead, the fewest dstates for 0, 1, … K faults, and the knee, by the causal theory (--misread, --slipped: only these kinds)"
+    front = (
+        "instead, the fewest dstates for 0, 1, … K faults, and the knee, by the causal theory "
+        "(--misread, --slipped: only these kinds)"
+    )
     parser.add_argument("--front", type=int, metavar="K", help=front)
     parser.add_argument(
         "--time-limit",
@@ -92,11 +99,17 @@ def add_parser(verbs: Verbs) -> None:
     )
     many = parser.add_argument_group(
         "many traces",
-        "With several traces, or one of these, each result is a line, in the order of the traces. What goes wrong with a trace is on its line, "
-        "and the others go on. The exit code is 1 if anything went wrong, else the highest of the traces' codes. Limits are for each trace, but "
-        "memory is that of the process: what other threads of a Dask worker use counts too, and, except on Linux, what traces before used.",
+        "With several traces, or one of these, each result is a line, in the order of the traces. "
+        "What goes wrong with a trace is on its line, "
+        "and the others go on. The exit code is 1 if anything went wrong, else the highest of the "
+        "traces' codes. Limits are for each trace, but "
+        "memory is that of the process: what other threads of a Dask worker use counts too, and, "
+        "except on Linux, what traces before used.",
     )
-    jobs = "solve N traces at a time, each in a process; -1 for one a core (default: 1; with --scheduler, as many as its workers can)"
+    jobs = (
+        "solve N traces at a time, each in a process; -1 for one a core (default: 1; with "
+        "--scheduler, as many as its workers can)"
+    )
     many.add_argument("--jobs", type=int, metavar="N", help=jobs)
     many.add_argument(
         "--scheduler",
@@ -189,7 +202,11 @@ class _Text:
 
 
 class _Json:
-    """What is printed of a search for programs: the maps, one a line. They are held until they can be put in order; where they are too many, all are printed as they come."""
+    """What is printed of a search for programs: the maps, one a line.
+
+    They are held until they can be put in order; where they are too many, all are printed as they
+    come.
+    """
 
     def __init__(self, search: Search) -> None:
         self._search = search
@@ -268,11 +285,17 @@ def _lines(
         if explanation:
             yield from explanation.sentences
             first, last = search.trace.at(explanation.first), search.trace.at(explanation.last)
-            yield f"look at what was seen and done from {first} to {last}, or leave one of these axioms out: --set without=NAME"
+            yield (
+                f"look at what was seen and done from {first} to {last}, or leave one of these "
+                "axioms out: --set without=NAME"
+            )
         return
     if solution.cost is None:
         if solution.partial:
-            yield f"\nbest map of the first {len(solution.partial.labels)} steps\n{describe(solution.partial)}"
+            yield (
+                f"\nbest map of the first {len(solution.partial.labels)} "
+                f"steps\n{describe(solution.partial)}"
+            )
         return
     yield f"\n{'map 1' if search.count > 1 else 'map'}\n{describe(solution.maps[0])}"
     if backbone and (search.count > 1 or not solution.complete):
@@ -307,7 +330,8 @@ def _progress(prints_meanwhile: bool) -> Iterator[Any]:
     from rich.spinner import Spinner
 
     status = Spinner("dots", "solving")
-    # Unless told otherwise, rich takes over what is printed to stdout, too: it would go to stderr, fitted to the terminal's width.
+    # Unless told otherwise, rich takes over what is printed to stdout, too: it would go to stderr,
+    # fitted to the terminal's width.
     with Live(
         status,
         console=Console(stderr=True),

@@ -33,33 +33,54 @@ NOUNS: dict[Matter, tuple[str, str]] = {
 
 
 def headline(solution: Solution, count: int, explanation: Explanation | None) -> str:
-    """How a search ended, on one line. `count` is how many maps it found, of which the solution need not hold any."""
+    """How a search ended, on one line.
+
+    `count` is how many maps it found, of which the solution need not hold any.
+    """
     if explanation:
         return f"{solution.status.value}: {explanation}"
     if solution.status is Status.UNSATISFIABLE and not solution.stopped:
         kinds = ", ".join(evidence.name for evidence in evidence_of(solution.theory))
-        return f"unsatisfiable: no map satisfies the axioms: those that clingo found are refused as wholes, by evidence ({kinds})"
+        return (
+            "unsatisfiable: no map satisfies the axioms: those that clingo found are refused as "
+            f"wholes, by evidence ({kinds})"
+        )
     if solution.status is Status.UNSATISFIABLE:
-        return f"unsatisfiable: no map satisfies the axioms; why was not found out in time ({solution.stopped})"
+        return (
+            "unsatisfiable: no map satisfies the axioms; why was not found out in time "
+            f"({solution.stopped})"
+        )
     why = f" ({solution.stopped})" if solution.stopped else ""
-    seconds = f"{solution.seconds.total:.2f} s, {solution.prefix} of {solution.steps} steps given to clingo"
+    seconds = (
+        f"{solution.seconds.total:.2f} s, {solution.prefix} of {solution.steps} steps given to "
+        "clingo"
+    )
     bound = ", ".join(
         f"at least {counted(v, k)}" if k != "cost" else f"a cost of at least {v:g} dstates"
         for k, v in solution.bound.to_dict().items()
     )
     if solution.cost is None:
-        return f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any has {bound or 'no proven bound'}; {seconds}"
+        return (
+            f"{solution.status.value}{why}: no map of all {solution.steps} steps yet; any has "
+            f"{bound or 'no proven bound'}; {seconds}"
+        )
     counts = ", ".join(
         counted(v, k) if k != "faults" else f"faults that cost {v:g} dstates"
         for k, v in solution.cost.to_dict().items()
     )
     if solution.status is Status.FEASIBLE:
-        return f"feasible{why}: {counts}, not proven minimal; any map has {bound or 'no proven bound'}; {seconds}"
+        return (
+            f"feasible{why}: {counts}, not proven minimal; any map has "
+            f"{bound or 'no proven bound'}; {seconds}"
+        )
     found = counted(
         solution.levels[0].count if solution.levels else count, "minimal maps"
     ) + _levels_above(solution)
     beyond = f" that cost up to {solution.within} more" if solution.minimal_listed else ""
-    return f"optimal: {counts}; {found}{'' if solution.complete else f', and there may be more{beyond}{why}'}; {seconds}"
+    return (
+        f"optimal: {counts}; "
+        f"{found}{'' if solution.complete else f', and there may be more{beyond}{why}'}; {seconds}"
+    )
 
 
 def _levels_above(solution: Solution) -> str:
@@ -80,13 +101,22 @@ def by_displacements(solution: Solution) -> Iterator[str]:
     best = solution.maps[0].fit if solution.maps else None
     if best is not None:
         which = "the map closes" if solution.count == 1 else "map 1, which closes best, does so"
-        text += f"; {which} with a chi-square of {best.chi2:.1f} for {best.dof} degrees of freedom (p = {best.p:.2g})"
+        text += (
+            f"; {which} with a chi-square of {best.chi2:.1f} for {best.dof} degrees of freedom (p "
+            f"= {best.p:.2g})"
+        )
         if best.scale or best.bend:
-            text += f", scale off by {100 * best.scale:+z.1f} %, headings drift by {math.degrees(best.bend):+z.3f} degrees a metre"
+            text += (
+                f", scale off by {100 * best.scale:+z.1f} %, headings drift by "
+                f"{math.degrees(best.bend):+z.3f} degrees a metre"
+            )
     yield text
     weights = solution.weights
     if len(weights) > 1:
-        yield f"weights of the maps by displacements alone: {', '.join(f'{weight:.2g}' for weight in weights)}"
+        yield (
+            "weights of the maps by displacements alone: "
+            f"{', '.join(f'{weight:.2g}' for weight in weights)}"
+        )
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -105,7 +135,8 @@ def describe(ssh_map: SSHMap) -> str:
     parts = []
     if ssh_map.faults:
         parts.append(
-            f"  {counted(len(ssh_map.dstates), 'dstates')}, and {'; '.join(printable(str(fault)) for fault in ssh_map.faults)}"
+            f"  {counted(len(ssh_map.dstates), 'dstates')}, and "
+            f"{'; '.join(printable(str(fault)) for fault in ssh_map.faults)}"
         )
     if ssh_map.paths:
         parts += [f"  path {p.id}: places {' – '.join(map(str, p.order))}" for p in ssh_map.paths]
@@ -166,7 +197,10 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
 
 
 def compared(found: Comparison) -> Iterator[str]:
-    """What maps differ in, choice by choice, and which questions decide. Nothing where they do not differ."""
+    """What maps differ in, choice by choice, and which questions decide.
+
+    Nothing where they do not differ.
+    """
     number = {question: i for i, question in enumerate(found.deciding, 1)}
     if found.product:
         yield f"  {found.product}: each combination of these choices is a map"
@@ -182,7 +216,10 @@ def compared(found: Comparison) -> Iterator[str]:
             ]
             yield f"    {number[question]}. {question}: in {_numbered(sorted(yes), len(found.ids))}"
         if len(asked) > SHOWN_QUESTIONS:
-            yield f"    and {counted(len(asked) - SHOWN_QUESTIONS, 'more questions')}; --json has them"
+            yield (
+                f"    and {counted(len(asked) - SHOWN_QUESTIONS, 'more questions')}; --json has "
+                "them"
+            )
         if 1 < len(asked) <= SHOWN_QUESTIONS and len(choice.options) <= SHOWN_OPTIONS:
             order = [choice.questions.index(question) for question in asked]
             rows = [

@@ -11,14 +11,18 @@ from ssh_abduction.theory.theory import PRESETS
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "List every axiom: name, sentence, source, and which presets have it, without and with stars in the trace."
+    text = (
+        "List every axiom: name, sentence, source, and which presets have it, without and with "
+        "stars in the trace."
+    )
     parser = verbs.add_parser("theory", help="list the axioms", description=text)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     print(
-        "presets: on, or stars (on where the trace has stars that fit right angles), or gateways (on where it has other stars), or –"
+        "presets: on, or stars (on where the trace has stars that fit right angles), or gateways "
+        "(on where it has other stars), or –"
     )
     for level in encodings.levels():
         print(f"\n{level}")

@@ -24,13 +24,19 @@ from ssh_abduction.data.trace import Trace
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Train a nearest-neighbour recogniser on the labels that a map gives to the images of a trace."
+    text = (
+        "Train a nearest-neighbour recogniser on the labels that a map gives to the images of a "
+        "trace."
+    )
     train = verbs.add_parser("train", help="train a recogniser on a map's labels", description=text)
     train.add_argument(
         "-o", "--output", type=output, required=True, metavar="FILE.skops", help="file to write"
     )
     train.set_defaults(run=run_train)
-    text = "Recognition rate by 10-fold cross-validation, against the number of images, on the labels that a map gives."
+    text = (
+        "Recognition rate by 10-fold cross-validation, against the number of images, on the "
+        "labels that a map gives."
+    )
     curve = verbs.add_parser(
         "learning-curve",
         help="how well a recogniser does with few and many images",
@@ -43,7 +49,10 @@ def add_parser(verbs: Verbs) -> None:
     curve.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the learning curve")
     curve.add_argument("--json", action="store_true", help="print JSON")
     curve.set_defaults(run=run_learning_curve)
-    text = "Say by which beams two dstates differ that look alike: by default, each pair of dstates that share a view."
+    text = (
+        "Say by which beams two dstates differ that look alike: by default, each pair of dstates "
+        "that share a view."
+    )
     apart = verbs.add_parser(
         "tell-apart", help="which beams tell dstates apart that share a view", description=text
     )
@@ -71,7 +80,10 @@ def add_parser(verbs: Verbs) -> None:
             metavar="I",
             help="take the I-th map, from 1 (default: the labels all maps agree on)",
         )
-    text = "Say of each image of a trace at which dstate it was taken, or that it was taken nowhere that the recogniser knows."
+    text = (
+        "Say of each image of a trace at which dstate it was taken, or that it was taken nowhere "
+        "that the recogniser knows."
+    )
     recognise = verbs.add_parser(
         "recognise", help="recognise dstates from images", description=text
     )
@@ -120,7 +132,8 @@ def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
     )
     if len(labels) != len(trace):
         raise MapError(
-            f"{options.maps}: expected labels for the {len(trace)} steps of {options.trace}, got {len(labels)}; solve this trace"
+            f"{options.maps}: expected labels for the {len(trace)} steps of {options.trace}, got "
+            f"{len(labels)}; solve this trace"
         )
     sure = labels >= 0
     return images_of(trace)[sure], labels[sure], maps[(options.map or 1) - 1], features_of(trace)
@@ -132,7 +145,8 @@ def run_train(options: argparse.Namespace) -> int:
     images, labels, recogniser = _labelled(options)
     save(recogniser.fit(images, labels), options.output)
     print(
-        f"{counted(len(set(labels.tolist())), 'dstates')} learnt from {counted(len(images), 'images')} in {named(options.output)}"
+        f"{counted(len(set(labels.tolist())), 'dstates')} learnt from "
+        f"{counted(len(images), 'images')} in {named(options.output)}"
     )
     return 0
 
@@ -208,7 +222,8 @@ def run_tell_apart(options: argparse.Namespace) -> int:
     ranges, labels, ssh_map, features = _mapped(options)
     if not isinstance(features, ReciprocalTransformer):
         raise MapError(
-            f"{options.trace}: expected a trace with ranges, as beams are told of, got panoramas; take a trace of a laser"
+            f"{options.trace}: expected a trace with ranges, as beams are told of, got panoramas; "
+            "take a trace of a laser"
         )
     images = ReciprocalTransformer().fit_transform(ranges)
     views = {s.id: s.view for s in ssh_map.dstates if s.view is not None}
@@ -217,7 +232,8 @@ def run_tell_apart(options: argparse.Namespace) -> int:
     pairs = [options.dstates] if options.dstates else [p for p in alike if seen.issuperset(p)]
     if not pairs:
         raise MapError(
-            f"{options.maps}: expected dstates that share a view, with two images each, got none; name two with --dstates I,J"
+            f"{options.maps}: expected dstates that share a view, with two images each, got none; "
+            "name two with --dstates I,J"
         )
     found = {p: telling_features(images, labels, *p) for p in pairs}
     if options.json:

@@ -13,7 +13,9 @@ from collections.abc import Iterator
 from ssh_abduction.data.errors import printable
 from ssh_abduction.runtime.logs import PACKAGE, PROGRESS
 
-EVERY = 10.0  # Seconds between two lines of progress, and before the first one: a log is to be read, and most commands are done by then.
+# Seconds between two lines of progress, and before the first one: a log is to be read, and most
+# commands are done by then.
+EVERY = 10.0
 LEVELS = {1: logging.INFO, 2: logging.DEBUG}
 
 
@@ -41,7 +43,8 @@ def add_verbosity(parser: argparse.ArgumentParser) -> None:
 def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
     """Tell as much as the options ask for, while a command runs.
 
-    for_programs  whether what it prints is read by programs: then nothing is told now and then where stdout and stderr go to one file
+    for_programs  whether what it prints is read by programs: then nothing is told now and then
+    where stdout and stderr go to one file
     """
     verbose = getattr(options, "verbose", 0)
     if getattr(options, "quiet", False):

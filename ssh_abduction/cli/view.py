@@ -25,7 +25,10 @@ ASSUMING = (
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Show maps in the browser, on one page: what all share, where they differ, each map, two side by side, and what happened at each step."
+    text = (
+        "Show maps in the browser, on one page: what all share, where they differ, each map, two "
+        "side by side, and what happened at each step."
+    )
     parser = verbs.add_parser("view", help="see rival maps in the browser", description=text)
     parser.add_argument(
         "maps", help="what solve --json printed, or one saved map; - for standard input"
@@ -39,7 +42,8 @@ def add_parser(verbs: Verbs) -> None:
         "-o", "--output", metavar="FILE", help="write the page to this file, and do not open it"
     )
     localised = (
-        "also replay this run of a robot, with the belief where it may be at each step, in each rival. It may be TRACE itself. It is localised by its views, or as "
+        "also replay this run of a robot, with the belief where it may be at each step, in each "
+        "rival. It may be TRACE itself. It is localised by its views, or as "
         "--belief says"
     )
     parser.add_argument("--run", dest="followed", metavar="RUN", help=localised)
@@ -48,7 +52,10 @@ def add_parser(verbs: Verbs) -> None:
         metavar="FILE",
         help="what localise --json printed of the run of --run, or of TRACE",
     )
-    serve = "serve the page on this computer alone, so that it can explain, and solve again under what is assumed; needs TRACE. Ctrl-C ends it"
+    serve = (
+        "serve the page on this computer alone, so that it can explain, and solve again under "
+        "what is assumed; needs TRACE. Ctrl-C ends it"
+    )
     parser.add_argument("--serve", action="store_true", help=serve)
     parser.add_argument(
         "--time-limit",
@@ -72,7 +79,10 @@ def add_parser(verbs: Verbs) -> None:
         metavar="true|false",
     )
     parser.set_defaults(run=run)
-    parser.epilog = "The page is one file that loads nothing from elsewhere. Without --serve it says which commands answer its questions."
+    parser.epilog = (
+        "The page is one file that loads nothing from elsewhere. Without --serve it says which "
+        "commands answer its questions."
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -157,7 +167,8 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
     followed = Trace.load(options.followed) if options.followed is not None else trace
     if followed is None:
         raise AbductionError(
-            "--belief: expected the run that it is of, got none; name it with --run, or give the trace that was mapped"
+            "--belief: expected the run that it is of, got none; name it with --run, or give the "
+            "trace that was mapped"
         )
     if options.belief is None:
         from ssh_abduction.online.localiser import Localiser
@@ -176,20 +187,24 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
     beliefs = told.get("beliefs") if isinstance(told, dict) else None
     if not isinstance(beliefs, list) or not all(isinstance(belief, dict) for belief in beliefs):
         raise MapError(
-            f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write them with localise --json"
+            f"{named(file)}: beliefs: expected a list of objects, got {brief(beliefs)}; write "
+            "them with localise --json"
         )
     maps, number = maps_of(data, "maps"), told.get("map", 1)
     if not is_whole(number) or not 1 <= number <= len(maps):
         raise MapError(
-            f"{named(file)}: map: expected 1 to {len(maps)}, got {brief(number)}; localise in these maps"
+            f"{named(file)}: map: expected 1 to {len(maps)}, got {brief(number)}; localise in "
+            "these maps"
         )
     if told.get("dstates", count := len(maps[number - 1].dstates)) != count:
         raise MapError(
-            f"{named(file)}: dstates: expected {count}, as map {number} has, got {brief(told['dstates'])}; localise in these maps, and not in others"
+            f"{named(file)}: dstates: expected {count}, as map {number} has, got "
+            f"{brief(told['dstates'])}; localise in these maps, and not in others"
         )
     if len(beliefs) != len(followed):
         raise MapError(
-            f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, got {len(beliefs)}; name that run with --run"
+            f"{named(file)}: beliefs: expected {len(followed)}, one for each step of the run, got "
+            f"{len(beliefs)}; name that run with --run"
         )
     chosen, labels = maps[number - 1], maps[number - 1].renumbered().labels
     visited = dict.fromkeys([*chosen.labels, *range(len(chosen.dstates))])
@@ -201,7 +216,8 @@ def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
         ]
     except (KeyError, TypeError, ValueError):
         raise MapError(
-            f"{named(file)}: probabilities: expected pairs [dstate, probability], got something else; localise again"
+            f"{named(file)}: probabilities: expected pairs [dstate, probability], got something "
+            "else; localise again"
         ) from None
     return Run(followed, lambda ssh_map: renumbered if ssh_map.labels == labels else None)
 

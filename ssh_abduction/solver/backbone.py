@@ -1,17 +1,22 @@
 """What all minimal maps of a trace share, without listing them.
 
-Some minimal maps are known. What they share is in doubt: two steps that are one in all of them need not be one in all minimal maps, and two steps that are
-one in none of them may be one in another. So clingo is asked for a minimal map in which any of these doubts holds. If there is one, it is taken in, and fewer
-doubts are left; if there is none, what is shared is proven. This is brave and cautious reasoning in one, and each answer is a map that can be looked at.
+Some minimal maps are known. What they share is in doubt: two steps that are one in all of them need
+not be one in all minimal maps, and two steps that are one in none of them may be one in another. So
+clingo is asked for a minimal map in which any of these doubts holds. If there is one, it is taken
+in, and fewer doubts are left; if there is none, what is shared is proven. This is brave and
+cautious reasoning in one, and each answer is a map that can be looked at.
 
-*Prefixes.* It is asked for maps of a prefix that cost at most as much as minimal maps of the trace. The cut of a minimal map is among these
-(`solver/prefixes.py`). So a map that is found and replays to the end is minimal; where one does not, the prefix grows. Where none is left in which a doubt about
-steps of the prefix holds, the classes of steps that are one in all known maps are one in all minimal maps. As actions are deterministic, these classes
-replay like a map: where they replay to the end, each further step is in the class of a step of the prefix in every minimal map, and so nothing about it is in
-doubt. Where they do not, the prefix grows.
+*Prefixes.* It is asked for maps of a prefix that cost at most as much as minimal maps of the trace.
+The cut of a minimal map is among these (`solver/prefixes.py`). So a map that is found and replays
+to the end is minimal; where one does not, the prefix grows. Where none is left in which a doubt
+about steps of the prefix holds, the classes of steps that are one in all known maps are one in all
+minimal maps. As actions are deterministic, these classes replay like a map: where they replay to
+the end, each further step is in the class of a step of the prefix in every minimal map, and so
+nothing about it is in doubt. Where they do not, the prefix grows.
 
-*Labels.* An engine that settles dstates before places and paths has all labels of minimal maps, which are few, even where there are thousands of maps. Then
-dstates are not in doubt, and what is in doubt about places and paths is asked for each labels in turn.
+*Labels.* An engine that settles dstates before places and paths has all labels of minimal maps,
+which are few, even where there are thousands of maps. Then dstates are not in doubt, and what is in
+doubt about places and paths is asked for each labels in turn.
 """
 
 from __future__ import annotations
@@ -34,7 +39,8 @@ from ssh_abduction.theory.evidence import Equality
 
 _log = log_of(__name__)
 
-# Without these axioms a dstate may be at several places, or along several courses, of which a map shows one.
+# Without these axioms a dstate may be at several places, or along several courses, of which a map
+# shows one.
 SHOWN_ONCE = frozenset({"one_place", "one_course"})
 
 
@@ -132,7 +138,10 @@ class _Reasoning:
         self._task, self._judging, self._cost, self._sharing = task, judging, cost, sharing
 
     def settle_labels(self, engine: Engine) -> bool:
-        """Take in maps, for each labels of minimal maps, until nothing is in doubt. Returns False where that cannot be done with this engine."""
+        """Take in maps, for each labels of minimal maps, until nothing is in doubt.
+
+        Returns False where that cannot be done with this engine.
+        """
         forbidden = set[frozenset[Equality]]()
         while (labellings := engine.labellings(self._cost)) is not None:
             failed, refused = 0, None
@@ -200,7 +209,10 @@ class _Reasoning:
         return size
 
     def _settle_prefix(self, engine: StepEngine, size: int) -> int:
-        """Settle what is in doubt about a prefix. Returns the size to go on with; 0 where nothing is in doubt any more."""
+        """Settle what is in doubt about a prefix.
+
+        Returns the size to go on with; 0 where nothing is in doubt any more.
+        """
         engine.grow(size)
         while (found := engine.map_with(list(self._doubts(size)), self._cost)) is not None:
             replayed = self._replay(found)

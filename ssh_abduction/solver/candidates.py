@@ -23,14 +23,20 @@ from ssh_abduction.theory.speedups import Speedups, row
 
 _log = log_of(__name__)
 
-FRAMING = 30.0  # Maps with frames are sought for so many seconds at most: what they are good for is mostly found by then.
-FRAMING_SHARE = 0.4  # Or for such a share of the time that is left, if that is less, so that clingo has the larger part.
+# Maps with frames are sought for so many seconds at most: what they are good for is mostly found by
+# then.
+FRAMING = 30.0
+# Or for such a share of the time that is left, if that is less, so that clingo has the larger part.
+FRAMING_SHARE = 0.4
 SKETCH_SHARE = (
     0.4  # A sketch and its check may take such a share of the time that is left for all of them.
 )
-# The surest sketch may take this many seconds even if less time is left. Else a slow machine would leave no map at all.
+# The surest sketch may take this many seconds even if less time is left. Else a slow machine would
+# leave no map at all.
 SUREST = 1.5
-UNMAPPED = 2.0  # Until there is any map that may take so many times as long, as any map is worth more than a better one.
+# Until there is any map that may take so many times as long, as any map is worth more than a better
+# one.
+UNMAPPED = 2.0
 
 
 class Candidates:
@@ -46,7 +52,9 @@ class Candidates:
             judging,
             report,
         )
-        self._sketching = threading.Lock()  # so that who asks for a snapshot waits for a sketch that is nearly done, rather than make another one
+        # so that who asks for a snapshot waits for a sketch that is nearly done, rather than make
+        # another one
+        self._sketching = threading.Lock()
 
     def merge(self) -> None:
         """Make a causal map by merging steps greedily: at once, and not minimal."""
@@ -56,8 +64,9 @@ class Candidates:
     def sketch(self, seconds: float = math.inf) -> None:
         """Where no map of the whole trace is known yet, make one without a search: from the best map of a prefix on, or of all steps.
 
-        The map that takes nothing for seen before is large, but it is accepted most often and fastest. So it comes first. Then a smaller one is sought: those
-        that become smallest are tried first. Where time is short, the first one that the checker accepts will do.
+        The map that takes nothing for seen before is large, but it is accepted most often and
+        fastest. So it comes first. Then a smaller one is sought: those that become smallest are
+        tried first. Where time is short, the first one that the checker accepts will do.
 
         Args:
             seconds: What it may take. Each sketch may use a share of what is left.
@@ -89,7 +98,8 @@ class Candidates:
     def sketch_least(self) -> bool:
         """Offer a sketch that has as few dstates as steps of the trace are pairwise apart, so that no map has fewer. Says whether there is one.
 
-        Where the robot drives there and back, and most views are different, that is so. Then only places and paths remain to be found.
+        Where the robot drives there and back, and most views are different, that is so. Then only
+        places and paths remain to be found.
         """
         from ssh_abduction.solver.steps.apart import Continuations  # loads numpy
 
@@ -144,7 +154,8 @@ class Candidates:
     def frame(self, speedups: Speedups) -> None:
         """Make maps in which places have frames, though the theory does not ask for any.
 
-        speedups  those that the caller of the search has on: other ones than here may hold where places have frames
+        speedups  those that the caller of the search has on: other ones than here may hold where
+        places have frames
         """
         from ssh_abduction.solver.engines.framing import maps_with_frames  # loads numpy
 

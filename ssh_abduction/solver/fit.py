@@ -9,9 +9,11 @@
 >>> len(found.poses) == len(ssh_map.dstates)
 True
 
-Unknown are the position of each place (of each dstate, where the map has no places), the heading of each dstate, and what is wrong with all displacements: their
-scale, and a steady drift of heading, which have a prior. Each displacement of the trace, divided by its standard deviations, says what they should be. The best poses are
-those with the least sum of squares (Lu & Milios 1997, "Globally consistent range scan alignment"). That sum is chi-square distributed if the map is true and the
+Unknown are the position of each place (of each dstate, where the map has no places), the heading of
+each dstate, and what is wrong with all displacements: their scale, and a steady drift of heading,
+which have a prior. Each displacement of the trace, divided by its standard deviations, says what
+they should be. The best poses are those with the least sum of squares (Lu & Milios 1997, "Globally
+consistent range scan alignment"). That sum is chi-square distributed if the map is true and the
 odometry is as good as it says. It ranks maps that are equally minimal, and warns; it refuses none.
 """
 
@@ -39,7 +41,8 @@ Array: TypeAlias = NDArray[np.float64]
 
 # With a standard deviation below this, in metres or radians, a displacement counts as exact.
 EXACT = 2e-3
-# The power method takes so many sweeps, and holds each rotation with so much weight to where it was: little, as a metre is worth some hundreds.
+# The power method takes so many sweeps, and holds each rotation with so much weight to where it
+# was: little, as a metre is worth some hundreds.
 SWEEPS, HELD = 20, 1e-2
 
 
@@ -55,7 +58,8 @@ def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
 class _Problem:
     """Least squares over the places and headings of one map.
 
-    The unknowns are x and y of each position, then the heading of each dstate, then the scale and the drift, as multiples of their standard deviations.
+    The unknowns are x and y of each position, then the heading of each dstate, then the scale and
+    the drift, as multiples of their standard deviations.
     """
 
     def __init__(self, trace: Trace, ssh_map: SSHMap) -> None:
@@ -68,7 +72,8 @@ class _Problem:
             -1, 3
         )
         noise = np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
-        # Each dstate has one pose here, so how far off it is taken to be at a visit counts as an error of the displacements to it and from it.
+        # Each dstate has one pose here, so how far off it is taken to be at a visit counts as an
+        # error of the displacements to it and from it.
         travelled = np.array(
             [trace.actions[t - 1].kind != "turn" for t in steps], dtype=float
         ).reshape(-1, 1, 1)
@@ -84,7 +89,8 @@ class _Problem:
         self._place = np.array([number[place] for place in places], dtype=int)
         self._positions, self._headings = len(number), len(places)
         self._size = 2 * self._positions + self._headings + 2
-        # The group of each dstate: displacements connect the headings of one group, and of one part of the map the positions.
+        # The group of each dstate: displacements connect the headings of one group, and of one part
+        # of the map the positions.
         self._group = connected_components(
             self._graph(self._from, self._to, self._headings), directed=False
         )[1]
@@ -115,7 +121,8 @@ class _Problem:
             unknown[: 2 * self._positions].reshape(-1, 2),
             unknown[2 * self._positions : -2],
         )
-        # Headings first, which are linear but for whole turns, and then positions, which are linear where headings are known (Carlone et al. 2014).
+        # Headings first, which are linear but for whole turns, and then positions, which are linear
+        # where headings are known (Carlone et al. 2014).
         reckoned = self._reckoned()
         off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
         off -= math.tau * np.round(off / math.tau)
@@ -150,8 +157,9 @@ class _Problem:
     def _rotations(self, onward: Array) -> Array:
         """By how much the headings of each group are to be turned, in radians, so that positions agree.
 
-        What is least is a quadratic form of the rotations, as complex numbers on the unit circle. They are sought by the power method for its inverse, from
-        anywhere (Boumal 2016, "Nonconvex phase synchronization"). What positions do not tell stays as it begins.
+        What is least is a quadratic form of the rotations, as complex numbers on the unit circle.
+        They are sought by the power method for its inverse, from anywhere (Boumal 2016, "Nonconvex
+        phase synchronization"). What positions do not tell stays as it begins.
 
         onward  the displacements, as headings are now
         """
@@ -286,10 +294,13 @@ class _Problem:
         return part
 
     def _freedom(self, unknown: Array) -> int:
-        """The degrees of freedom: what displacements say, without what the poses take up. Each part of the map may be moved as a whole, and turned, as may each group of
-        headings in it that positions leave open.
+        """The degrees of freedom: what displacements say, without what the poses take up.
 
-        What is known to the millimetre has no noise that would count: it settles as many unknowns as it is about, and says no more.
+        Each part of the map may be moved as a whole, and turned, as may each group of headings in
+        it that positions leave open.
+
+        What is known to the millimetre has no noise that would count: it settles as many unknowns
+        as it is about, and says no more.
         """
         said = np.unique(np.concatenate([self._from, self._to]))
         used = np.unique(self._place[said])

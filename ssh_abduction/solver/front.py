@@ -1,7 +1,8 @@
 """The front of faults: the fewest dstates that explain a trace, for each number of faults.
 
-Without faults the causal theory always has a map, however wrong the trace is, and with many faults a map of few dstates: what is true is where the number of dstates stops
-falling fast, the *knee*. One number that counts both hides it.
+Without faults the causal theory always has a map, however wrong the trace is, and with many faults
+a map of few dstates: what is true is where the number of dstates stops falling fast, the *knee*.
+One number that counts both hides it.
 
 >>> from ssh_abduction import Trace
 >>> from ssh_abduction.solver.front import fault_front
@@ -25,7 +26,8 @@ from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-# Both kinds of faults are allowed where the theory names none. What they cost plays no part in a front.
+# Both kinds of faults are allowed where the theory names none. What they cost plays no part in a
+# front.
 KINDS = {"misread": 1.5, "slipped": 1.5}
 
 
@@ -47,7 +49,9 @@ class Point:
 
 @dataclass(frozen=True)
 class Front:
-    """The points for 0, 1, 2, … faults, as far as time allowed. There is none for numbers of faults that what somebody asserts rules out.
+    """The points for 0, 1, 2, … faults, as far as time allowed.
+
+    There is none for numbers of faults that what somebody asserts rules out.
 
     points   what so many faults are worth
     stopped  whether the time limit ended the search
@@ -96,21 +100,25 @@ def fault_front(
     theory  Theory.causal() by default; its prices say which kinds of faults there are, both where it has none
     time_limit   seconds in all
 
-    Raises TheoryError where the theory has places, whose axioms are not known to the engine that counts faults, and where it asserts something of steps that the trace does not have.
+    Raises TheoryError where the theory has places, whose axioms are not known to the engine that
+    counts faults, and where it asserts something of steps that the trace does not have.
     """
     theory = Theory.causal() if theory is None else checked_theory(theory)
     check_limit("time_limit", "seconds", time_limit)
     if theory.jumped:
         raise TheoryError(
-            "jumped: expected no wrong displacements where faults are counted; leave it out (--set jumped=0)"
+            "jumped: expected no wrong displacements where faults are counted; leave it out "
+            "(--set jumped=0)"
         )
     if theory.level != "causal":
         raise TheoryError(
-            "front: expected a causal theory, got a topological one; take Theory.causal() (--theory causal)"
+            "front: expected a causal theory, got a topological one; take Theory.causal() "
+            "(--theory causal)"
         )
     if theory.rules or theory.without or theory.prefer not in (("dstates",), ("auto",)):
         raise TheoryError(
-            "front: expected the causal axioms alone, fewest dstates first; leave out --rules, --set without and --set prefer"
+            "front: expected the causal axioms alone, fewest dstates first; leave out --rules, "
+            "--set without and --set prefer"
         )
     if not is_whole(most) or not 0 <= most <= 1000:
         raise TheoryError(f"front: expected a number of faults from 0 to 1000, got {brief(most)}")

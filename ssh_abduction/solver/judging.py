@@ -1,7 +1,9 @@
 """The second net: maps pass the checker, which shares nothing with the encodings, before they are answers.
 
-To check each step of a long replay, or each map of a long list, would take longer than to find them. So checking has a tenth of the time of the search, and a hundredth of a second more:
-the first maps are checked always, by the steps that clingo was given at least; of what comes after, as many as that share allows.
+To check each step of a long replay, or each map of a long list, would take longer than to find
+them. So checking has a tenth of the time of the search, and a hundredth of a second more: the first
+maps are checked always, by the steps that clingo was given at least; of what comes after, as many
+as that share allows.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem
 
-# At most such a share of the time of the search, and so many seconds more, are spent on checking what is not checked always.
+# At most such a share of the time of the search, and so many seconds more, are spent on checking
+# what is not checked always.
 SHARE = 0.1
 BEYOND = 0.01
 # So many maps are checked however long that takes, by the steps that clingo was given at least.
@@ -27,7 +30,8 @@ ALWAYS = 3
 SAMPLE = 1000
 # So many seconds the checker takes for a step, about, before the first check has shown it.
 A_STEP = 5e-6
-# Without these axioms a map shows one of several places, courses or headings of a dstate, so that the checker cannot judge it.
+# Without these axioms a map shows one of several places, courses or headings of a dstate, so that
+# the checker cannot judge it.
 UNSHOWN = frozenset({"one_place", "one_course", "one_heading", "gateway_heading"})
 
 
@@ -118,7 +122,10 @@ class Judging:
         self._judged += 1
 
     def has_time_for(self, steps: int, elapsed: float) -> bool:
-        """Whether a map of so many steps can be checked within the share of the time so far. The first short ones always can."""
+        """Whether a map of so many steps can be checked within the share of the time so far.
+
+        The first short ones always can.
+        """
         return self._shown and self._a_step * steps <= BEYOND + SHARE * elapsed - self._seconds
 
     def pass_grown_map(self, trace: Trace, ssh_map: SSHMap) -> None:
@@ -156,8 +163,10 @@ class Judging:
     def _fail(self, violation: Violation) -> None:
         where = f" at step {violation.steps[-1]}" if violation.steps else ""
         raise InternalError(
-            f"internal error: a map that was found breaks {violation.axiom}{where} (trace {self._trace.digest}): {violation.message} "
-            "This is a defect of ssh-abduction, not of the trace; please report it with the trace, and try solve --set without_speedups=prefixes,names,ways"
+            f"internal error: a map that was found breaks {violation.axiom}{where} (trace "
+            f"{self._trace.digest}): {violation.message} "
+            "This is a defect of ssh-abduction, not of the trace; please report it with the "
+            "trace, and try solve --set without_speedups=prefixes,names,ways"
         )
 
 

@@ -1,15 +1,21 @@
 """Maps with faults in theories that have places: faults are guessed and mended in the trace, and the mended trace is solved as if nothing had been wrong.
 
-To disbelieve a view is to believe another one, to disbelieve an action is to know nothing of it, and a displacement that is disbelieved might be missing. So a map with faults is a map without them of a mended trace, which
-all fast engines take. Where faults may be is guessed twice: by robust merging of visits (`guesses/voting.py`), where places have frames, and by the causal theory with
+To disbelieve a view is to believe another one, to disbelieve an action is to know nothing of it,
+and a displacement that is disbelieved might be missing. So a map with faults is a map without them
+of a mended trace, which all fast engines take. Where faults may be is guessed twice: by robust
+merging of visits (`guesses/voting.py`), where places have frames, and by the causal theory with
 faults (`engines/faulty.py`), whose maps any map with places is one of, places aside.
 
-*Displacements.* Which of them may be wrong is guessed by labels for which displacements were not asked (`guesses/outliers.py`), and by those of the maps that come of that.
-A map need not disbelieve all that were guessed: those are believed again with which it agrees.
+*Displacements.* Which of them may be wrong is guessed by labels for which displacements were not
+asked (`guesses/outliers.py`), and by those of the maps that come of that. A map need not disbelieve
+all that were guessed: those are believed again with which it agrees.
 
-*Bound.* A map of the theory, its places taken away, is a causal map with the same dstates, and with no more faults: so what is proven of the causal theory holds here.
-Where the mended trace has a map that costs no more, its dstates and faults are minimal. And where all cheapest causal maps are listed, each minimal map of the theory has
-the labels and faults of one of them: so it is among the minimal maps of the traces that these mend, and the best of all of them are the answer, and all of it.
+*Bound.* A map of the theory, its places taken away, is a causal map with the same dstates, and with
+no more faults: so what is proven of the causal theory holds here. Where the mended trace has a map
+that costs no more, its dstates and faults are minimal. And where all cheapest causal maps are
+listed, each minimal map of the theory has the labels and faults of one of them: so it is among the
+minimal maps of the traces that these mend, and the best of all of them are the answer, and all of
+it.
 """
 
 from __future__ import annotations
@@ -32,17 +38,21 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
 
-# So many causal maps that cost the least are mended at most: where there are more, the list of minimal maps is not known to be complete.
+# So many causal maps that cost the least are mended at most: where there are more, the list of
+# minimal maps is not known to be complete.
 MOST_CAUSAL = 200
 # The rounds of robust merging that begin with the last map, while that gets better.
 ROUNDS = 5
-# For so many seconds a better map is sought of what merging mends, and for such a share of the time that is left at most.
+# For so many seconds a better map is sought of what merging mends, and for such a share of the time
+# that is left at most.
 MERGED, SHARE = 30.0, 0.5
-# A dstate that is visited so many times or less is rare; one of so many actions before it may have slipped; so many actions are suspected at most.
+# A dstate that is visited so many times or less is rare; one of so many actions before it may have
+# slipped; so many actions are suspected at most.
 RARE, BEFORE, SUSPECTED = 1, 3, 60
 
-# Solves a mended trace by a theory without faults, and lists so many maps at most (0: all): its minimal maps, and True; or the best one known, and False.
-# The last argument are the seconds that it may take.
+# Solves a mended trace by a theory without faults, and lists so many maps at most (0: all): its
+# minimal maps, and True; or the best one known, and False. The last argument are the seconds that
+# it may take.
 Solver = Callable[[Trace, Theory, int, float], tuple[tuple[SSHMap, ...], bool]]
 
 
@@ -52,7 +62,8 @@ class Mending:
     def __init__(self, task: Task, solver: Solver) -> None:
         self._task, self._solver = task, solver
         self._without_faults = task.theory.without_faults()
-        # The best map of each mended trace that was solved, and whether it is known to be minimal. One that is not is sought once more where there is more time.
+        # The best map of each mended trace that was solved, and whether it is known to be minimal.
+        # One that is not is sought once more where there is more time.
         self._solved: dict[Trace, tuple[Found | None, bool]] = {}
         self._best: Found | None = None
         self._best_mended: Trace | None = None
@@ -61,7 +72,8 @@ class Mending:
         ] = []  # what all causal maps mend that cost the least, once these are known
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
         self._causal_labels: tuple[int, ...] = ()  # of the last causal map
-        # The log is that of the theory: so stars tell dstates apart, and so do pairs of steps that are not at one place.
+        # The log is that of the theory: so stars tell dstates apart, and so do pairs of steps that
+        # are not at one place.
         self._causal = FaultyEngine(replace(task, problem=task.problem.changed(theory=causal)))
 
     @property
@@ -120,7 +132,8 @@ class Mending:
     def _by_merging(self, trace: Trace) -> Iterator[Found]:
         """Maps of what robust merging mends; then once more from the places of the best map, while that gets better.
 
-        The merged groups are nearly a map, which is there at once; what is better is sought for a share of the time.
+        The merged groups are nearly a map, which is there at once; what is better is sought for a
+        share of the time.
 
         trace  that of the task, some displacements of which may be missing
         """
@@ -189,7 +202,8 @@ class Mending:
     def _by_rare_dstates(self) -> Iterator[Found]:
         """Maps in which an action slipped shortly before a dstate that is hardly ever visited, while that gives better ones.
 
-        The causal theory does not see each slip: what it takes for one more link may break a path. Then the places behind it come out as new ones.
+        The causal theory does not see each slip: what it takes for one more link may break a path.
+        Then the places behind it come out as new ones.
         """
         before: Found | None = None
         while self._task.theory.slipped and self._best is not before:
@@ -289,7 +303,10 @@ def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
 
 
 def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) -> SSHMap:
-    """A map of a mended trace as a map of the trace, with what was mended as its faults. Each dstate has the view that most of its steps show."""
+    """A map of a mended trace as a map of the trace, with what was mended as its faults.
+
+    Each dstate has the view that most of its steps show.
+    """
     votes: dict[int, Counter[View]] = {}
     for label, step in zip(ssh_map.labels, trace.steps, strict=True):
         assert step.view is not None

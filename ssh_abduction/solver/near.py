@@ -1,10 +1,12 @@
 """Maps that cost more than the least: for each number of dstates up to so many more, the best of the maps that have just so many.
 
-The proof in `solver/prefixes.py`, that a prefix may stand for the trace, speaks of minimal maps alone: cut down to a prefix, a map with one dstate more than
-the least may well be minimal. So these maps are asked of the readable encodings for the whole trace, where one rule says how many dstates there are.
+The proof in `solver/prefixes.py`, that a prefix may stand for the trace, speaks of minimal maps
+alone: cut down to a prefix, a map with one dstate more than the least may well be minimal. So these
+maps are asked of the readable encodings for the whole trace, where one rule says how many dstates
+there are.
 
-Where the theory prefers few paths or places first, it is these that are counted. Excuses are not, as they are witnesses: what some excuses make consistent,
-more of them do, too.
+Where the theory prefers few paths or places first, it is these that are counted. Excuses are not,
+as they are witnesses: what some excuses make consistent, more of them do, too.
 """
 
 from __future__ import annotations

@@ -58,11 +58,16 @@ from ssh_abduction.theory.evidence import Equality
 _log = log_of(__name__)
 
 FIRST_PREFIX = 8  # The first prefix has so many steps: solving it costs next to nothing.
-HELD_BACK = 1000  # So many maps are kept until a prefix proves long enough; from there on they stream, so that memory stays constant.
-# Where all maps are asked for and evidence may refuse some, so many are remembered. Until then what is refused is forbidden, and maps are listed anew;
-# from there on refused maps are left out one by one.
+# So many maps are kept until a prefix proves long enough; from there on they stream, so that memory
+# stays constant.
+HELD_BACK = 1000
+# Where all maps are asked for and evidence may refuse some, so many are remembered. Until then what
+# is refused is forbidden, and maps are listed anew; from there on refused maps are left out one by
+# one.
 REMEMBERED = 10_000
-FIRST_PATHS = 8  # So many names for paths there are to begin with: few traces need more, and grounding grows with the square of their number.
+# So many names for paths there are to begin with: few traces need more, and grounding grows with
+# the square of their number.
+FIRST_PATHS = 8
 
 
 class Prefixes:
@@ -160,14 +165,20 @@ class Prefixes:
         self.engine.forbid(equalities)
 
     def _tell(self, equalities: frozenset[Equality]) -> bool:
-        """Tell the engine that no map has all of these equalities. False where it cannot be told so."""
+        """Tell the engine that no map has all of these equalities.
+
+        False where it cannot be told so.
+        """
         can_be_told = isinstance(self.engine, StepEngine) or all(
             equality.holds for equality in equalities
         )
         return can_be_told and self.engine.forbid(equalities)
 
     def _minimise_as_told(self) -> Found | None:
-        """A minimal map of the prefix by what clingo was told, or None. Better maps of the whole trace are kept on the way."""
+        """A minimal map of the prefix by what clingo was told, or None.
+
+        Better maps of the whole trace are kept on the way.
+        """
         while True:
             minimal = None
             for found in self.engine.improving_maps(
@@ -197,7 +208,10 @@ class Prefixes:
         return whole and not self._judging.why_refused(self._whole(found.map, replayed))
 
     def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
-        """Take a control with more names for paths, if the minimal cost found needs them. Says whether it was so."""
+        """Take a control with more names for paths, if the minimal cost found needs them.
+
+        Says whether it was so.
+        """
         needed = paths_needed(self._task, self.engine.size, cost)
         if needed <= self.engine.paths:
             return False
@@ -229,7 +243,8 @@ class Prefixes:
     ) -> Generator[SSHMap, None, int]:
         """Hold back the minimal maps of this prefix that replay to the end, or give them where they are many or the prefix is the whole trace.
 
-        Returns the farthest step that some map fails at; 0 where all replay, so that there are no others.
+        Returns the farthest step that some map fails at; 0 where all replay, so that there are no
+        others.
         """
         enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
         asked = self._most and self._most + 1
@@ -274,13 +289,18 @@ class Prefixes:
                 continue
             if stuck or not asked or came < asked:
                 break
-            asked *= 2  # as many maps came as were asked for, but some of these were refused: there may be others
+            # as many maps came as were asked for, but some of these were refused: there may be
+            # others
+            asked *= 2
         if stuck and streaming:
             streamed.append(self.engine.size)
         return stuck
 
     def _replay(self, ssh_map: SSHMap, known: int | None = None) -> Replay:
-        """The trace replayed over a map of a prefix, of which so many steps make links. Where stars agree in tolerance, those of all steps have to."""
+        """The trace replayed over a map of a prefix, of which so many steps make links.
+
+        Where stars agree in tolerance, those of all steps have to.
+        """
         log = self._task.log
         replayed = log.replay(
             ssh_map.labels, known, [s.place for s in ssh_map.dstates] if log.pairs else None
@@ -302,7 +322,10 @@ class Prefixes:
         return replayed
 
     def _whole(self, ssh_map: SSHMap, replayed: Replay) -> SSHMap:
-        """A map of a prefix as a map of the steps that are replayed over it. Where stars agree in tolerance, its headings are those that all of them allow."""
+        """A map of a prefix as a map of the steps that are replayed over it.
+
+        Where stars agree in tolerance, its headings are those that all of them allow.
+        """
         whole = replace(ssh_map, labels=replayed.labels)
         if not self._in_tolerance or len(ssh_map.labels) == len(replayed.labels):
             return whole

@@ -14,11 +14,14 @@ from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.theory.evidence.displacement import jumped
 
-# So many maps are ranked, at most; of a longer list those that come later stay in the order in which they are found, so that memory stays constant.
+# So many maps are ranked, at most; of a longer list those that come later stay in the order in
+# which they are found, so that memory stays constant.
 RANKED = 1000
-# The noise of the odometry is said to be wrong where a chi-square like that of the best map is as unlikely as this, in either direction,
+# The noise of the odometry is said to be wrong where a chi-square like that of the best map is as
+# unlikely as this, in either direction,
 DOUBTED = 1e-3
-# and the standard deviations are too small by this factor at least, or too large by that one: less changes no answer, and too large ones only exclude less.
+# and the standard deviations are too small by this factor at least, or too large by that one: less
+# changes no answer, and too large ones only exclude less.
 TOO_SMALL, TOO_LARGE = 1.5, 2.0
 # A displacement of so many standard deviations may be that of a robot which stands still.
 STANDING = 2.0
@@ -32,7 +35,10 @@ _Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...], tuple[int, ...]
 
 
 class Ranking:
-    """Says of maps of one trace how well they close. Maps that differ in paths alone close alike, so that is worked out once."""
+    """Says of maps of one trace how well they close.
+
+    Maps that differ in paths alone close alike, so that is worked out once.
+    """
 
     def __init__(self, trace: Trace) -> None:
         self._trace = trace
@@ -52,7 +58,8 @@ class Ranking:
 
         Args:
             maps: As they are found.
-            over: Whether the limits are over. Then maps come as they are found, without how well they close; for the first one OVERTIME more may be used.
+            over: Whether the limits are over. Then maps come as they are found, without how well
+                they close; for the first one OVERTIME more may be used.
         """
         overtime = Watch(OVERTIME)
 
@@ -85,7 +92,8 @@ def in_order(maps: Sequence[SSHMap], counts: Iterable[int]) -> tuple[SSHMap, ...
     """Maps in an order that is the same in each run, whatever order they are found in: those that close best first, and of equal ones by their labels, then by their
     places, then by their courses, each as numbered by first visit.
 
-    counts  how many maps there are of each level; each level is put in order by itself, and what is beyond stays as it is
+    counts  how many maps there are of each level; each level is put in order by itself, and what is
+    beyond stays as it is
     """
     left = iter(maps)
     levels = [sorted(islice(left, count), key=_order) for count in counts]
@@ -110,7 +118,10 @@ def _order(ssh_map: SSHMap) -> tuple[object, ...]:
 
 
 def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
-    """How likely rival maps are, as displacements alone say, among these: exp(-chi2/2), normalised. Empty unless all of them have a fit."""
+    """How likely rival maps are, as displacements alone say, among these: exp(-chi2/2), normalised.
+
+    Empty unless all of them have a fit.
+    """
     squares = [ssh_map.fit.chi2 for ssh_map in maps if ssh_map.fit]
     if not squares or len(squares) < len(maps):
         return ()
@@ -126,11 +137,15 @@ def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
     if 1 / TOO_LARGE < factor < TOO_SMALL:
         return None
     if factor < 1 and trace.odometry and trace.odometry.offset:
-        return None  # How far off dstates are taken to be counts at each displacement there, which is more than there is.
+        # How far off dstates are taken to be counts at each displacement there, which is more than
+        # there is.
+        return None
     how, told = ("smaller", "tight") if factor > 1 else ("larger", "loose")
     return (
-        f"the noise model of the odometry is too {told}: the best map closes with a chi-square of {fit.chi2:.0f} where {fit.dof} is expected, "
-        f"so its standard deviations are {_times(factor)} {how} than the errors; multiply them by {factor:.2g}"
+        f"the noise model of the odometry is too {told}: the best map closes with a chi-square of "
+        f"{fit.chi2:.0f} where {fit.dof} is expected, "
+        f"so its standard deviations are {_times(factor)} {how} than the errors; multiply them by "
+        f"{factor:.2g}"
     )
 
 
@@ -155,7 +170,8 @@ def units_warning(trace: Trace) -> str | None:
     if not ways:
         return None
     return (
-        f"the odometry tells no travel from standing still: the longest displacement of one is {max(ways):.3g} m, and its noise about {max(sigmas):.2g} m; "
+        "the odometry tells no travel from standing still: the longest displacement of one is "
+        f"{max(ways):.3g} m, and its noise about {max(sigmas):.2g} m; "
         "give metres and not kilometres, or the noise that the odometry has"
     )
 

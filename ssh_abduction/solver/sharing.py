@@ -32,7 +32,8 @@ SORTS: tuple[Sort, ...] = ("dstates", "places", "paths", "courses")
 PRINTED = 1000
 # So many stretches of steps a sentence names, at most.
 NAMED = 6
-# So many ways in which dstates have places, paths or courses are remembered, so that none is compared twice.
+# So many ways in which dstates have places, paths or courses are remembered, so that none is
+# compared twice.
 REMEMBERED = 10_000
 
 
@@ -44,8 +45,9 @@ class Shared:
     sometimes  pairs of steps that are one in some maps and not in others. Each step stands for all of its number, and is the first of these
     untold     where a file has only some of the pairs (PRINTED): the steps in which the maps differ, all the same
 
-    Steps of any other two numbers are one in no map. Where a dstate is along no path, its steps have a number that no others have; a pair of a step with
-    itself says that it is along some path in some maps, and along none in others.
+    Steps of any other two numbers are one in no map. Where a dstate is along no path, its steps
+    have a number that no others have; a pair of a step with itself says that it is along some path
+    in some maps, and along none in others.
     """
 
     always: tuple[int, ...]
@@ -93,9 +95,12 @@ class Shared:
 class Backbone:
     """What all minimal maps of a trace share.
 
-    dstates, places, paths, courses  which steps are one, in all maps or in some. Of theories without places only dstates
-    proven                           whether this holds of all minimal maps. Else it is what those found share: pairs of steps that are one in some of these
-                                     are so in some minimal maps, but other minimal maps may differ in more
+    dstates, places, paths, courses  which steps are one, in all maps or in some. Of theories
+        without places only dstates
+    proven                           whether this holds of all minimal maps. Else it is what those
+        found share: pairs of steps that are one in some of these
+                                     are so in some minimal maps, but other minimal maps may differ
+                                         in more
     """
 
     dstates: Shared
@@ -137,7 +142,10 @@ class Backbone:
 
     @classmethod
     def from_dict(cls, data: Any, steps: int, where: str = "backbone") -> Backbone:
-        """What `to_dict` wrote, for a trace of so many steps. Raises MapError with the field that is wrong."""
+        """What `to_dict` wrote, for a trace of so many steps.
+
+        Raises MapError with the field that is wrong.
+        """
         a_text("where", where, MapError)
         a_whole_number("steps", steps, MapError, 1)
         if (
@@ -146,7 +154,8 @@ class Backbone:
             or "dstates" not in data
         ):
             raise MapError(
-                f"{where}: expected an object with proven and dstates, got {brief(data)}; write it with solve --json"
+                f"{where}: expected an object with proven and dstates, got {brief(data)}; write "
+                "it with solve --json"
             )
         dstates = _read_shared(data["dstates"], None, steps, f"{where}: dstates")
         of_step = dstates.always
@@ -161,9 +170,12 @@ class Backbone:
 
 
 class Sharing:
-    """Takes in maps of one trace, one by one, and keeps what they share. The memory that it takes does not grow with their number.
+    """Takes in maps of one trace, one by one, and keeps what they share.
 
-    Steps that are one dstate in all maps so far are a *class*. They are at one place, and along one course, in all of them, too: so these are compared by class.
+    The memory that it takes does not grow with their number.
+
+    Steps that are one dstate in all maps so far are a *class*. They are at one place, and along one
+    course, in all of them, too: so these are compared by class.
 
     maps     how many maps were taken in
     classes  the class of each step
@@ -294,18 +306,21 @@ def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: st
         or not all(is_whole(n) and n >= 0 for n in always)
     ):
         raise MapError(
-            f"{where}.always: expected {expected} numbers, got {brief(always)}; write it with solve --json"
+            f"{where}.always: expected {expected} numbers, got {brief(always)}; write it with "
+            "solve --json"
         )
     pairs, told = data.get("sometimes"), data.get("differing", [])
     if not isinstance(pairs, list) or not all(
         isinstance(pair, list) and len(pair) == 2 and _are_steps(pair, steps) for pair in pairs
     ):
         raise MapError(
-            f"{where}.sometimes: expected pairs of steps, 0 to {steps - 1}, got {brief(pairs)}; write it with solve --json"
+            f"{where}.sometimes: expected pairs of steps, 0 to {steps - 1}, got {brief(pairs)}; "
+            "write it with solve --json"
         )
     if not isinstance(told, list) or not _are_steps(told, steps):
         raise MapError(
-            f"{where}.differing: expected steps, 0 to {steps - 1}, got {brief(told)}; write it with solve --json"
+            f"{where}.differing: expected steps, 0 to {steps - 1}, got {brief(told)}; write it "
+            "with solve --json"
         )
     by_step = tuple(always if of_step is None else (always[number] for number in of_step))
     return Shared(by_step, tuple((i, j) for i, j in pairs), tuple(told))

@@ -18,7 +18,8 @@ FIRST = (
     "gateways",
 )  # each needs those before it; files that are added come after them, by name
 _AXIOM = re.compile(
-    r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if (?P<when>.+))?|(?P<alone>.+))$"
+    r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if "
+    r"(?P<when>.+))?|(?P<alone>.+))$"
 )
 _WHEN = re.compile(r"^% @when (?P<when>.+)$")
 _KEEPS = re.compile(r"^% @keeps (?P<names>.+)$")
@@ -54,7 +55,10 @@ class Axiom:
 
 
 def _holds(condition: str, choices: Mapping[str, object]) -> bool:
-    """Whether a condition holds: `field=value|value`, `field`, `field|field` (any of these fields), or `not field`."""
+    """Whether a condition holds:
+
+    `field=value|value`, `field`, `field|field` (any of these fields), or `not field`.
+    """
     if "=" in condition:
         field, values = condition.split("=")
         return choices[field] in values.split("|")
@@ -76,7 +80,10 @@ def path(name: str) -> str:
 
 @cache
 def levels() -> tuple[str, ...]:
-    """The encodings that hold axioms, in the order to load them. They are found in the folder, so a file that is put there is one of them."""
+    """The encodings that hold axioms, in the order to load them.
+
+    They are found in the folder, so a file that is put there is one of them.
+    """
     found = [
         file.stem
         for file in folder().glob("*.lp")
@@ -146,7 +153,8 @@ def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
 def paths(name: str) -> tuple[str, ...]:
     """The paths of all files that make the encoding `name`: its own, and before it those that it shares with another one, as `% @with` says at its head.
 
-    Clingo's `#include` is not used for that, as it prefers a file of the working directory which happens to have the same name.
+    Clingo's `#include` is not used for that, as it prefers a file of the working directory which
+    happens to have the same name.
     """
     own = path(name)
     return (*(path(shared) for shared in _said(own, _WITH)), own)

@@ -14,7 +14,9 @@ Earlier: TypeAlias = Mapping[
 
 @dataclass(frozen=True)
 class Pairs:
-    """What is known of pairs of steps before any map is sought. Each mapping leads from a step to earlier steps.
+    """What is known of pairs of steps before any map is sought.
+
+    Each mapping leads from a step to earlier steps.
 
     apart      they are not one dstate; these include all pairs that are not at one place
     elsewhere  they are not at one place

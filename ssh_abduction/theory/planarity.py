@@ -6,8 +6,9 @@ True
 >>> is_planar({"a": (0, 2, 4), "b": (5, 3, 1)}), is_planar({"a": (0, 2, 4), "b": (1, 3, 5)})
 (True, False)
 
-Edge number e has two ends, 2e and 2e + 1. The ends around each place, clockwise, make a *rotation system*. Its faces are traced by going along an edge and
-leaving by the next end around the place. It is the one of a drawing in the plane without crossings exactly if V - E + F = 2 for each
+Edge number e has two ends, 2e and 2e + 1. The ends around each place, clockwise, make a *rotation
+system*. Its faces are traced by going along an edge and leaving by the next end around the place.
+It is the one of a drawing in the plane without crossings exactly if V - E + F = 2 for each
 connected part (Euler; Edmonds 1960; Mohar & Thomassen, Graphs on Surfaces, 2001, chapter 3).
 """
 
@@ -28,7 +29,8 @@ Step = TypeVar("Step")
 def is_planar(around: Mapping[Place, Ends]) -> bool:
     """Whether a rotation system is one of the plane.
 
-    around  for each place, the ends of edges around it, clockwise, from any end on; each edge has both ends in it
+    around  for each place, the ends of edges around it, clockwise, from any end on; each edge has
+    both ends in it
     """
     places = [place for place, ends in around.items() if ends]
     edges = sum(len(around[place]) for place in places) // 2
@@ -71,7 +73,8 @@ def can_be_drawn(
     """Whether there is an order of the ends around each place in which the edges do not cross.
 
     edges   the two places that each one joins
-    allows  whether some ends may lie around a place in this order, clockwise, from any of them on. What it allows of some ends it allows of fewer of them, and it
+    allows  whether some ends may lie around a place in this order, clockwise, from any of them on.
+        What it allows of some ends it allows of fewer of them, and it
             allows some order of all ends that has an allowed order of some in it.
     """
     place_of = [place for edge in edges for place in edge]
@@ -145,7 +148,8 @@ def _leaves_room(
 ) -> bool:
     """Whether places are drawn so that each connected part of the others can lie in one face.
 
-    Such a part is drawn as one place, with the ends that lead to it in the order in which that face meets them.
+    Such a part is drawn as one place, with the ends that lead to it in the order in which that face
+    meets them.
     """
     part = _parts_of_rest(drawn, orders, place_of)
     following = {
@@ -200,7 +204,10 @@ def _parts_of_rest(
 def has_way(
     start: State, steps: Sequence[Step], ways: Callable[[State, Step], Iterator[State]]
 ) -> bool:
-    """Whether all steps can be gone from a start, each in one of its ways. It is a depth-first search, without recursion as there may be many steps."""
+    """Whether all steps can be gone from a start, each in one of its ways.
+
+    It is a depth-first search, without recursion as there may be many steps.
+    """
     gone: list[Iterator[State]] = []
     state = start
     while len(gone) < len(steps):

@@ -1,9 +1,8 @@
 """A user's own rules, written over the predicates of the encodings, as part of a theory.
 
->>> from ssh_abduction.theory.rules import Rules
->>> rules = Rules("own.lp", "% @axiom(brief) No dstate is seen again later.\\n#program step(t).\\nviolation(brief,t) :- same(I,t), t > 9.")
->>> [axiom.sentence for axiom in rules.axioms]
-['No dstate is seen again later.']
+>>> from ssh_abduction.theory.rules import Rules >>> rules = Rules("own.lp", "% @axiom(brief) No
+dstate is seen again later.\\n#program step(t).\\nviolation(brief,t) :- same(I,t), t > 9.") >>>
+[axiom.sentence for axiom in rules.axioms] ['No dstate is seen again later.']
 """
 
 from __future__ import annotations
@@ -18,9 +17,11 @@ from ssh_abduction.data.errors import TheoryError, brief, is_writable
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.theory.encodings import Axiom, axioms_in
 
-# Bytes that a file of rules may have: a device that never ends is refused before it fills the memory.
+# Bytes that a file of rules may have: a device that never ends is refused before it fills the
+# memory.
 LARGEST = 2**24
-# What may hold any character outside of a block comment, or opens one; the group is what rules cannot have: other characters than ASCII, and scripts, in which % is no comment.
+# What may hold any character outside of a block comment, or opens one; the group is what rules
+# cannot have: other characters than ASCII, and scripts, in which % is no comment.
 _OUTSIDE = re.compile(r'"(?:\\["\\n]|[^"\\\n])*"|%\*|%[^\n]*|([^\x01-\x7f]|#script\b)')
 # What opens and closes block comments, which nest, and hides both.
 _INSIDE = re.compile(r"%\*|\*%|%[^\n]*")
@@ -28,7 +29,9 @@ _INSIDE = re.compile(r"%\*|\*%|%[^\n]*")
 
 @dataclass(frozen=True)
 class Rules:
-    """A file of rules: its name, for messages, and its text. `ssh_abduction.solver.asp.rules` says whether clingo can read it.
+    """A file of rules: its name, for messages, and its text.
+
+    `ssh_abduction.solver.asp.rules` says whether clingo can read it.
 
     A byte order mark is dropped, and each line ends in a line feed.
     """
@@ -40,11 +43,13 @@ class Rules:
         """Raises TheoryError for a text that clingo's lexer cannot take: it aborts the process, or ends without a word where a null character is."""
         if not isinstance(self.name, str) or not isinstance(self.text, str):
             raise TheoryError(
-                f"rules: expected a name and a text, got {brief(self.name)} and {brief(self.text)}; read them from a file"
+                f"rules: expected a name and a text, got {brief(self.name)} and "
+                f"{brief(self.text)}; read them from a file"
             )
         if not is_writable(self.text):
             raise TheoryError(
-                f"{self.name}: expected a text, got one with half a character (a surrogate); save it as UTF-8"
+                f"{self.name}: expected a text, got one with half a character (a surrogate); save "
+                "it as UTF-8"
             )
         text = self.text.removeprefix("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
         object.__setattr__(self, "text", text)
@@ -55,7 +60,8 @@ class Rules:
             line, column = text.count("\n", 0, stray) + 1, stray - text.rfind("\n", 0, stray)
             if text.startswith("#script", stray):
                 raise TheoryError(
-                    f"{self.name}:{line}: expected rules, got #script; say it in rules, as no program runs in them"
+                    f"{self.name}:{line}: expected rules, got #script; say it in rules, as no "
+                    "program runs in them"
                 )
             mend = (
                 "save it as UTF-8"
@@ -63,7 +69,8 @@ class Rules:
                 else 'put it in quotes, as in "é", or write it in ASCII'
             )
             raise TheoryError(
-                f"{self.name}:{line}:{column}: expected ASCII outside of quotes and comments, got {text[stray]!r} (U+{ord(text[stray]):04X}); {mend}"
+                f"{self.name}:{line}:{column}: expected ASCII outside of quotes and comments, got "
+                f"{text[stray]!r} (U+{ord(text[stray]):04X}); {mend}"
             )
 
     @property
@@ -84,7 +91,8 @@ class Rules:
             return cls(value["name"], value["text"])
         if not isinstance(value, str | os.PathLike) or not str(value):
             raise TheoryError(
-                f"rules: expected files of rules, got {brief(value)}; give their paths, as in rules=['own.lp']"
+                f"rules: expected files of rules, got {brief(value)}; give their paths, as in "
+                "rules=['own.lp']"
             )
         try:
             text = read_at_most(value, LARGEST).decode("utf-8")
@@ -99,14 +107,18 @@ class Rules:
 
     @classmethod
     def all_of(cls, value: Any) -> tuple[Rules, ...]:
-        """Rules in a list, or a single one; paths as text may have commas between. Raises TheoryError."""
+        """Rules in a list, or a single one; paths as text may have commas between.
+
+        Raises TheoryError.
+        """
         if isinstance(value, str):
             value = [part.strip() for part in value.split(",") if part.strip()]
         elif isinstance(value, Rules | os.PathLike | Mapping):
             value = [value]
         if not isinstance(value, Iterable):
             raise TheoryError(
-                f"rules: expected a list of files of rules, got {brief(value)}; give their paths, as in rules=['own.lp']"
+                f"rules: expected a list of files of rules, got {brief(value)}; give their paths, "
+                "as in rules=['own.lp']"
             )
         return tuple(map(cls.of, value))
 

@@ -29,7 +29,8 @@ class Problem:
     Attributes:
         trace: The trace.
         theory: The theory, with `star`, `displacement`, `prefer` and `returns` settled.
-        evidence: The kinds of evidence that take part, made for this theory. They remember what they
+        evidence: The kinds of evidence that take part, made for this theory. They remember what
+            they
             worked out about the trace.
     """
 

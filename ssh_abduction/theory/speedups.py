@@ -1,8 +1,9 @@
 """What makes solving fast, and for which theories: the one table that decides.
 
-Users add axioms and evidence, and speed-ups rest on the axioms that they were made for. So a speed-up names the axioms that it rests on, which no
-one may have given up, and the axioms that it keeps: it is on for a theory only if it keeps all that the theory demands. What it does not know switches
-it off, so that an axiom that is added is obeyed everywhere.
+Users add axioms and evidence, and speed-ups rest on the axioms that they were made for. So a
+speed-up names the axioms that it rests on, which no one may have given up, and the axioms that it
+keeps: it is on for a theory only if it keeps all that the theory demands. What it does not know
+switches it off, so that an axiom that is added is obeyed everywhere.
 
 >>> from ssh_abduction import Theory
 >>> from ssh_abduction.theory.speedups import Speedups
@@ -26,7 +27,10 @@ from ssh_abduction.theory.theory import EXCUSED, Theory, checked_theory
 
 @dataclass(frozen=True, slots=True)
 class Speedups:
-    """Which speed-ups are on. No speed-up changes an answer. `TABLE` says what each one does, and for which theories it holds."""
+    """Which speed-ups are on.
+
+    No speed-up changes an answer. `TABLE` says what each one does, and for which theories it holds.
+    """
 
     prefixes: bool = True
     path_names: bool = True
@@ -78,7 +82,8 @@ def checked_speedups(value: object) -> Speedups:
     """The speed-ups that a caller gives. Raises SolverError."""
     if not isinstance(value, Speedups):
         raise SolverError(
-            f"speedups: expected Speedups, got {brief(value)}; take Speedups() or Speedups.without(…)"
+            f"speedups: expected Speedups, got {brief(value)}; take Speedups() or "
+            "Speedups.without(…)"
         )
     return value
 
@@ -94,8 +99,10 @@ class Speedup:
     switch    the field of `Speedups` that turns it on or off
     sentence  what it does
     suits     whether it is made for a theory
-    rests_on  axioms that it needs: none of them may be left out or be excused, unless the theory has nothing that they speak of
-    keeps     the axioms for which it is exact: it neither loses maps that satisfy them, nor lets maps pass that do not. EVERY, where each further axiom
+    rests_on  axioms that it needs: none of them may be left out or be excused, unless the theory
+        has nothing that they speak of
+    keeps     the axioms for which it is exact: it neither loses maps that satisfy them, nor lets
+        maps pass that do not. EVERY, where each further axiom
               only takes maps away, or every map is checked anyway
     """
 
@@ -203,7 +210,8 @@ GATEWAYS = frozenset(
     }
 )
 NOTHING: frozenset[str] = frozenset()
-# The axioms that a map of a trace still satisfies when it is cut to some first steps, and that speak of nothing but links, observations and pairs of steps.
+# The axioms that a map of a trace still satisfies when it is cut to some first steps, and that
+# speak of nothing but links, observations and pairs of steps.
 SURVIVE_A_CUT = FRAMES | {
     "next_place",
     "all_on_paths",
@@ -219,7 +227,8 @@ SURVIVE_A_CUT = FRAMES | {
     "one_star",
     "one_pose",
 }
-# Kinds of evidence that say nothing but which steps are not one dstate, or not at one place, and which labels go not together.
+# Kinds of evidence that say nothing but which steps are not one dstate, or not at one place, and
+# which labels go not together.
 PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "planar")
 
 TABLE = (
@@ -234,7 +243,8 @@ TABLE = (
     Speedup(
         "prefixes in tolerance",
         "prefixes",
-        "The same where stars agree in tolerance: a map that is replayed has to fit the stars of all steps.",
+        "The same where stars agree in tolerance: a map that is replayed has to fit the stars of "
+        "all steps.",
         lambda theory: theory.star == "gateways",
         ONE_OF_EACH | {"gateway_heading"},
         lambda: SURVIVE_A_CUT | GATEWAYS,
@@ -258,7 +268,8 @@ TABLE = (
     Speedup(
         "named dstates with faults",
         "names",
-        "Causal theory with faults: give the dstates names, and clingo the steps that a map does not predict.",
+        "Causal theory with faults: give the dstates names, and clingo the steps that a map does "
+        "not predict.",
         lambda theory: (
             theory.level == "causal" and theory.has_faults and theory.prefer == ("dstates",)
         ),
@@ -277,7 +288,8 @@ TABLE = (
     Speedup(
         "mending",
         "names",
-        "Places, or displacements that may be wrong, and faults: guess the faults, mend the trace, and solve it without; causal maps with faults say what is minimal.",
+        "Places, or displacements that may be wrong, and faults: guess the faults, mend the "
+        "trace, and solve it without; causal maps with faults say what is minimal.",
         lambda theory: (
             (theory.level == "topological" or theory.jumped > 0)
             and theory.has_faults
@@ -301,7 +313,8 @@ TABLE = (
     Speedup(
         "ways",
         "ways",
-        "Places without stars: where clingo takes its time, settle dstates before places and paths, with names.",
+        "Places without stars: where clingo takes its time, settle dstates before places and "
+        "paths, with names.",
         _has_bare_places,
         PLACES,
         _kept_by("names", "sides_frameless", "paths_frameless", and_also=PAIRS_OF_STEPS),
@@ -373,7 +386,8 @@ TABLE = (
     Speedup(
         "certain sketches",
         "greedy",
-        "While a robot drives: a map made without a search is consistent as it is made, and is not checked.",
+        "While a robot drives: a map made without a search is consistent as it is made, and is "
+        "not checked.",
         _keeps_headings,
         PLACES - {"course_needs_travel"},
         lambda: SURVIVE_A_CUT - {"asserted same", *PAIRS_OF_STEPS},
@@ -381,7 +395,8 @@ TABLE = (
     Speedup(
         "framing",
         "framing",
-        "Places that need no frames: where clingo takes its time, a map in which they have some; it passes the checker.",
+        "Places that need no frames: where clingo takes its time, a map in which they have some; "
+        "it passes the checker.",
         lambda theory: (
             (framed := theory.with_frames()) is not None and row("visits").holds_for(framed)
         ),

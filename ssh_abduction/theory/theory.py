@@ -40,11 +40,13 @@ CHOICES: dict[str, tuple[str, ...]] = {
 # The readings of stars that take each gateway to be in its direction as far as its spread says.
 IN_TOLERANCE = ("alike", "gateways")
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
-# What is preferred unless a user says so. Displacements tell places apart, so that fewest places are seldom too few; without them it is the other way round (docs/measurements/truth.md).
+# What is preferred unless a user says so. Displacements tell places apart, so that fewest places
+# are seldom too few; without them it is the other way round (docs/measurements/truth.md).
 AUTO: tuple[Count, ...] = ("auto",)
 PREFERRED: tuple[Count, ...] = ("dstates", "paths", "places")
 WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
-# What a fault of a kind takes away from the axioms: they may be broken where there is one, so nothing may rely on them.
+# What a fault of a kind takes away from the axioms: they may be broken where there is one, so
+# nothing may rely on them.
 EXCUSED = {
     "misread": {"functional_view", "star_pattern", "star_frame"},
     "slipped": {
@@ -61,16 +63,19 @@ EXCUSED = {
     },
     "jumped": {"one_pose"},
 }
-# A step of little confidence costs so many times the price, and one that is all sure so many times: no view is so sure that nothing else could be wrong instead.
+# A step of little confidence costs so many times the price, and one that is all sure so many times:
+# no view is so sure that nothing else could be wrong instead.
 LEAST_SURE, MOST_SURE = 0.1, 5.0
 LARGEST_TOML = 2**20  # bytes
 DEAREST = 1000.0  # a fault costs so many dstates at most
 # So many returns, at most, may be tested together.
 MOST_JOINT = 2
-# Every trace has fewer steps than this: clingo's numbers have 32 bits, so a pair with a greater step could not even be written as a fact.
+# Every trace has fewer steps than this: clingo's numbers have 32 bits, so a pair with a greater
+# step could not even be written as a fact.
 MOST_STEPS = 2**31
 ASSERTIONS = ("same", "different", "elsewhere")
-# The fields that some axiom reads, or that `prefer` stands for. Any other field, such as one that somebody adds, is demanded of speed-ups under its own name.
+# The fields that some axiom reads, or that `prefer` stands for. Any other field, such as one that
+# somebody adds, is demanded of speed-ups under its own name.
 SPOKEN_FOR = {
     "level",
     *CHOICES,
@@ -179,21 +184,25 @@ class Theory:
             for name, values in (("boundary", ("none",)), ("star", ("none", "alike"))):
                 if getattr(self, name) not in values:
                     raise TheoryError(
-                        f"{name}: expected {' or '.join(values)} with level=causal, got {getattr(self, name)}; take {CAUSAL}"
+                        f"{name}: expected {' or '.join(values)} with level=causal, got "
+                        f"{getattr(self, name)}; take {CAUSAL}"
                     )
             if set(self.prefer) - {"dstates", *AUTO}:
                 raise TheoryError(
-                    f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; take {CAUSAL}"
+                    f"prefer: expected dstates with level=causal, got {', '.join(self.prefer)}; "
+                    f"take {CAUSAL}"
                 )
         if "auto" in self.prefer and self.prefer != AUTO:
             raise TheoryError(
-                f"prefer: expected auto alone, got {', '.join(self.prefer)}; name the counts, or leave it out"
+                f"prefer: expected auto alone, got {', '.join(self.prefer)}; name the counts, or "
+                "leave it out"
             )
         if self.has_faults:
             self._check_faults()
         if "excuses" in self.prefer and self.boundary != "defeasible":
             raise TheoryError(
-                f"prefer: expected no excuses with boundary={self.boundary}; take {choice('boundary', 'defeasible')}"
+                f"prefer: expected no excuses with boundary={self.boundary}; take "
+                f"{choice('boundary', 'defeasible')}"
             )
 
     def __repr__(self) -> str:
@@ -202,23 +211,28 @@ class Theory:
     def _check_faults(self) -> None:
         if self.prefer != AUTO and self.prefer[:1] != ("dstates",):
             raise TheoryError(
-                f"prefer: expected dstates first where faults are allowed, got {', '.join(self.prefer) or 'nothing'}; faults cost dstates"
+                "prefer: expected dstates first where faults are allowed, got "
+                f"{', '.join(self.prefer) or 'nothing'}; faults cost dstates"
             )
         if self.star == "gateways":
             raise TheoryError(
-                f"star: expected no stars of any gateways where faults are allowed, got gateways; take {choice('star', 'alike')}"
+                "star: expected no stars of any gateways where faults are allowed, got gateways; "
+                f"take {choice('star', 'alike')}"
             )
         if self.boundary == "defeasible":
             raise TheoryError(
-                f"boundary: expected no excuses where faults are allowed, got defeasible; take {choice('boundary', 'strict')}"
+                "boundary: expected no excuses where faults are allowed, got defeasible; take "
+                f"{choice('boundary', 'strict')}"
             )
         if self.jumped and self.displacement == "none":
             raise TheoryError(
-                f"jumped: expected displacements to be used, which may be wrong, got displacement=none; leave it out, or take {choice('displacement', 'auto')}"
+                "jumped: expected displacements to be used, which may be wrong, got "
+                f"displacement=none; leave it out, or take {choice('displacement', 'auto')}"
             )
         if self.planar:
             raise TheoryError(
-                "planar: expected no planarity where faults are allowed; leave it out (--set planar=false)"
+                "planar: expected no planarity where faults are allowed; leave it out (--set "
+                "planar=false)"
             )
 
     def _check_numbers(self) -> None:
@@ -226,12 +240,14 @@ class Theory:
             price = getattr(self, name)
             if not is_finite(price) or not (price == 0 or 0.1 <= price <= DEAREST):
                 raise TheoryError(
-                    f"{name}: expected a number of dstates from 0.1 to {DEAREST:g}, or 0 for no such faults, got {brief(price)}"
+                    f"{name}: expected a number of dstates from 0.1 to {DEAREST:g}, or 0 for no "
+                    f"such faults, got {brief(price)}"
                 )
             object.__setattr__(self, name, round(float(price), 1))
         if not is_finite(self.reject) or not 0 < self.reject < 1:
             raise TheoryError(
-                f"reject: expected a probability above 0 and below 1, got {brief(self.reject)}; take 0.001, or another small one"
+                f"reject: expected a probability above 0 and below 1, got {brief(self.reject)}; "
+                "take 0.001, or another small one"
             )
         for name, least, most in (("joint", 1, MOST_JOINT), ("returns", 0, MOST_STEPS)):
             value = getattr(self, name)
@@ -248,7 +264,8 @@ class Theory:
             for axiom in rules.axioms:
                 if axiom.name in taken:
                     raise TheoryError(
-                        f"{rules.name}: @axiom({axiom.name}): expected a name that no other axiom has; give it one of its own"
+                        f"{rules.name}: @axiom({axiom.name}): expected a name that no other axiom "
+                        "has; give it one of its own"
                     )
                 taken.add(axiom.name)
 
@@ -278,7 +295,10 @@ class Theory:
 
     @classmethod
     def topological(cls) -> Theory:
-        """All levels, fewest dstates first: closest to the words of Kuipers & Beeson (2002). The default."""
+        """All levels, fewest dstates first: closest to the words of Kuipers & Beeson (2002).
+
+        The default.
+        """
         return cls()
 
     @classmethod
@@ -291,13 +311,17 @@ class Theory:
         unknown = set(choices) - {f.name for f in fields(self)}
         if unknown:
             raise TheoryError(
-                f"theory: expected fields out of {', '.join(f.name for f in fields(self))}, got {brief(min(unknown))}"
+                f"theory: expected fields out of {', '.join(f.name for f in fields(self))}, got "
+                f"{brief(min(unknown))}"
             )
         return replace(self, **choices)
 
     @property
     def priorities(self) -> tuple[Count, ...]:
-        """What is minimised, first to last, with the excuses of boundary=defeasible in their place. With displacement=auto, that of a trace without displacements."""
+        """What is minimised, first to last, with the excuses of boundary=defeasible in their place.
+
+        With displacement=auto, that of a trace without displacements.
+        """
         prefer = self.prefer
         if self.has_faults:
             return (
@@ -328,9 +352,11 @@ class Theory:
     def fault_tenths(self, kind: str, step: Step) -> int:
         """What it costs to disbelieve a step, in tenths of dstates; 0 where the theory allows no such fault.
 
-        What is seen costs less where the step's confidence is small, as log odds: that of 0.99, which is also that of a step without one, costs the whole price.
+        What is seen costs less where the step's confidence is small, as log odds: that of 0.99,
+        which is also that of a step without one, costs the whole price.
 
-        kind  misread (the view), misseen (the star), slipped (the action done there), or jumped (the displacement that led there)
+        kind  misread (the view), misseen (the star), slipped (the action done there), or jumped
+        (the displacement that led there)
         """
         if not isinstance(kind, str) or kind not in FAULTS:
             one_of("kind", kind, FAULTS, TheoryError)
@@ -344,7 +370,10 @@ class Theory:
 
     @cached_property
     def axioms(self) -> tuple[str, ...]:
-        """The names of the axioms that hold, those of the user's own rules last. With star=auto and displacement=auto, those of a trace that has neither."""
+        """The names of the axioms that hold, those of the user's own rules last.
+
+        With star=auto and displacement=auto, those of a trace that has neither.
+        """
         own = [axiom.name for rules in self.rules for axiom in rules.axioms]
         return (
             *(
@@ -390,14 +419,21 @@ class Theory:
 
     @cached_property
     def asserted(self) -> Pairs:
-        """What somebody asserts of pairs of steps. It is computed once for a theory, as there may be many pairs."""
+        """What somebody asserts of pairs of steps.
+
+        It is computed once for a theory, as there may be many pairs.
+        """
         return Pairs.of(self.different, self.elsewhere, self.same)
 
     def with_frames(self) -> Theory | None:
-        """A theory in which places have frames and fewest dstates come first. Its maps, without their headings, are maps of this theory, too.
+        """A theory in which places have frames and fewest dstates come first.
 
-        None for the causal level, and for stars that are read in tolerance. The trace need not have stars. The maps satisfy all axioms of this theory: their paths are totally
-        ordered; the axioms of sides, if there are any, hold without excuses; and stars that agree in a frame are one pattern.
+        Its maps, without their headings, are maps of this theory, too.
+
+        None for the causal level, and for stars that are read in tolerance. The trace need not have
+        stars. The maps satisfy all axioms of this theory: their paths are totally ordered; the
+        axioms of sides, if there are any, hold without excuses; and stars that agree in a frame are
+        one pattern.
         """
         if self.level == "causal" or self.star in IN_TOLERANCE:
             return None
@@ -408,7 +444,10 @@ class Theory:
         )
 
     def require(self, step: Step, where: str) -> None:
-        """Raises TraceError, which says where, if a step lacks what the axioms need. Star has to be settled."""
+        """Raises TraceError, which says where, if a step lacks what the axioms need.
+
+        Star has to be settled.
+        """
         a_text("where", where, TraceError)
         _checked_step(step)
         if (
@@ -418,21 +457,25 @@ class Theory:
             and not step.action.slipped
         ):
             raise TraceError(
-                f'{where}: action.kind: expected "travel" or "turn" in a topological theory, got none for {brief(step.action.name)}; '
-                f'write {{"name": …, "kind": "travel"}} or {{"name": …, "kind": "turn", "turn": "right"}}, or take {CAUSAL}'
+                f'{where}: action.kind: expected "travel" or "turn" in a topological theory, got '
+                f"none for {brief(step.action.name)}; "
+                f'write {{"name": …, "kind": "travel"}} or {{"name": …, "kind": "turn", "turn": '
+                f'"right"}}, or take {CAUSAL}'
             )
         if self.star == "none":
             return
         if step.star is None:
             raise TraceError(
-                f"{where}: star: expected one, as other steps have stars; add it, or take {choice('star', 'none')}"
+                f"{where}: star: expected one, as other steps have stars; add it, or take "
+                f"{choice('star', 'none')}"
             )
         if self.star == "alike":
             return
         if self.star == "gateways":
             if step.gateways and (near := step.gateways.too_near):
                 raise TraceError(
-                    f"{where}: star: expected gateways that their spreads tell apart, got {near[0]:g} and {near[1]:g} degrees; "
+                    f"{where}: star: expected gateways that their spreads tell apart, got "
+                    f"{near[0]:g} and {near[1]:g} degrees; "
                     f"give smaller spreads, or merge the two"
                 )
             return
@@ -448,7 +491,8 @@ class Theory:
             for pair in getattr(self, name):
                 if max(pair) >= len(trace):
                     raise TheoryError(
-                        f"{name} (--{name}): expected steps from 0 to {len(trace) - 1}, got {pair[0]},{pair[1]}"
+                        f"{name} (--{name}): expected steps from 0 to {len(trace) - 1}, got "
+                        f"{pair[0]},{pair[1]}"
                     )
 
     def of_steps(self, first: int, length: int) -> Theory:
@@ -476,7 +520,10 @@ class Theory:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Theory:
-        """The theory that `to_dict` wrote; fields that are missing are those of the level's preset. Raises TheoryError."""
+        """The theory that `to_dict` wrote; fields that are missing are those of the level's preset.
+
+        Raises TheoryError.
+        """
         if not isinstance(data, Mapping):
             raise TheoryError(f"theory: expected an object, got {brief(data)}")
         preset = cls.causal() if data.get("level") == "causal" else cls()
@@ -531,7 +578,11 @@ def _checked_step(value: object) -> Step:
 
 
 class _Checked(tuple[Pair, ...]):
-    """Pairs that were checked already. There may be many, and theories are often made from another one, which need not check them again."""
+    """Pairs that were checked already.
+
+    There may be many, and theories are often made from another one, which need not check them
+    again.
+    """
 
 
 def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
@@ -579,9 +630,13 @@ PRESETS: dict[str, Callable[[], Theory]] = {
 
 
 def checked_theory(value: object) -> Theory:
-    """The theory that a caller gives, or Theory.topological() where that is None. Raises TheoryError."""
+    """The theory that a caller gives, or Theory.topological() where that is None.
+
+    Raises TheoryError.
+    """
     if not isinstance(value, Theory | None):
         raise TheoryError(
-            f"theory: expected a Theory, got {brief(value)}; take Theory.topological(), Theory.causal() or Theory(…)"
+            f"theory: expected a Theory, got {brief(value)}; take Theory.topological(), "
+            "Theory.causal() or Theory(…)"
         )
     return value or Theory.topological()

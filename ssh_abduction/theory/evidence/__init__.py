@@ -1,4 +1,6 @@
-"""What is known besides views and actions. A kind of evidence is a module of this folder, and an encoding of the same name.
+"""What is known besides views and actions.
+
+A kind of evidence is a module of this folder, and an encoding of the same name.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.theory.evidence import pairs_of
@@ -6,8 +8,9 @@
 >>> pairs_of(trace, Theory(different=[(0, 2)])).apart
 {2: frozenset({0})}
 
-`KINDS` lists the kinds; nothing else knows them by name. What a kind says of pairs of steps is wired in where engines make the domains of their
-variables (`Pairs`), so that evidence makes solving faster. What it finds out only once there is a map is asked by one loop (`refuse`).
+`KINDS` lists the kinds; nothing else knows them by name. What a kind says of pairs of steps is
+wired in where engines make the domains of their variables (`Pairs`), so that evidence makes solving
+faster. What it finds out only once there is a map is asked by one loop (`refuse`).
 """
 
 from __future__ import annotations

@@ -20,7 +20,10 @@ _Seen = tuple[str | None, Star]  # a view, or None where views say nothing of ds
 
 @dataclass(frozen=True)
 class Alike:
-    """Stars that are told apart without being turned. Steps of different views are not one dstate anyway, so they are no pairs."""
+    """Stars that are told apart without being turned.
+
+    Steps of different views are not one dstate anyway, so they are no pairs.
+    """
 
     name: ClassVar[str] = "alike"
     axiom: ClassVar[str] = "one_star"
@@ -67,7 +70,8 @@ def _pairs(seen: tuple[_Seen, ...]) -> Pairs:
 def are_alike(one: Star, other: Star) -> bool:
     """Whether two stars may show the same gateways to a robot that has not turned: each that is seen in one star is a gateway of the other, and no two are one.
 
-    Gateways that were not observed may be there or not. It is enough to pair the gateways seen in one star, and those seen in the other (Mendelsohn & Dulmage 1958).
+    Gateways that were not observed may be there or not. It is enough to pair the gateways seen in
+    one star, and those seen in the other (Mendelsohn & Dulmage 1958).
     """
     return _pairable(one, other) and _pairable(other, one)
 

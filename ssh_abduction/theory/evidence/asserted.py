@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Asserted:
-    """The fields `same`, `different` and `elsewhere` of a theory. Pairs with a step that the trace does not have (yet) say nothing."""
+    """The fields `same`, `different` and `elsewhere` of a theory.
+
+    Pairs with a step that the trace does not have (yet) say nothing.
+    """
 
     name: ClassVar[str] = "asserted"
     axiom: ClassVar[str] = "asserted"

@@ -1,18 +1,24 @@
 """What odometry says: a dstate has one pose, a place one position, and the displacements of the trace agree with that within their covariance.
 
-A *return* is a pair of visits that a map takes for one place, or a pair of steps that it takes for one dstate. By the displacements between, the loop from one
-to the other closes off by something; how likely that is, its covariance says (`theory/loops.py`). The axiom `one_pose` is that no set of at most `joint` returns is refused.
+A *return* is a pair of visits that a map takes for one place, or a pair of steps that it takes for
+one dstate. By the displacements between, the loop from one to the other closes off by something;
+how likely that is, its covariance says (`theory/loops.py`). The axiom `one_pose` is that no set of
+at most `joint` returns is refused.
 
-*One return* says nothing of any other, so it is known before the search which ones are refused: they are pairs of steps that are not at one place, or
-not one dstate, and prune the domains of every engine.
+*One return* says nothing of any other, so it is known before the search which ones are refused:
+they are pairs of steps that are not at one place, or not one dstate, and prune the domains of every
+engine.
 
-*Two returns* are tested together if both are of the first steps of visits, and their loops share displacements. What is refused is looked for in each answer.
+*Two returns* are tested together if both are of the first steps of visits, and their loops share
+displacements. What is refused is looked for in each answer.
 
-*How often a true map is refused.* Each return is tested, and a true map has many. So a return is refused at a p-value that is half of `reject` shared among all
-returns which may be true, and a set of two at the other half shared among all sets of two of these: then a true map is refused with a probability of `reject` at
-most. A return may be true if it does not look false; of the true ones, half have a p-value above one half (Storey 2002, "A direct approach to false discovery
-rates"), so there are about twice as many as have that. The number is rounded up to a power of two: while a robot drives, what is refused stays
-so until there are twice as many.
+*How often a true map is refused.* Each return is tested, and a true map has many. So a return is
+refused at a p-value that is half of `reject` shared among all returns which may be true, and a set
+of two at the other half shared among all sets of two of these: then a true map is refused with a
+probability of `reject` at most. A return may be true if it does not look false; of the true ones,
+half have a p-value above one half (Storey 2002, "A direct approach to false discovery rates"), so
+there are about twice as many as have that. The number is rounded up to a power of two: while a
+robot drives, what is refused stays so until there are twice as many.
 """
 
 from __future__ import annotations
@@ -43,8 +49,9 @@ _Tested: TypeAlias = "dict[bool, tuple[Steps, Steps]]"
 
 # So many loops are worked on in one go: their sums take some hundred megabytes.
 AT_A_TIME = 200_000
-# So many maps of one trace that were accepted are remembered, as they may be asked about again, or go on as the trace grows; and so many sets that were refused,
-# as the next maps mostly have them, too.
+# So many maps of one trace that were accepted are remembered, as they may be asked about again, or
+# go on as the trace grows; and so many sets that were refused, as the next maps mostly have them,
+# too.
 REMEMBERED = 64
 # The traces whose returns a kind of evidence remembers.
 KEPT = 8
@@ -67,7 +74,8 @@ class Displacement:
     @classmethod
     def of(cls, theory: Theory) -> Displacement:
         topological, hard = theory.level == "topological", theory.hard
-        # Where displacements may be wrong, each pair of steps is excused by what lies between its own steps: so it does not stand for others of its visits.
+        # Where displacements may be wrong, each pair of steps is excused by what lies between its
+        # own steps: so it does not stand for others of its visits.
         turns_stay = "turn_stays" in hard and not theory.jumped
         return cls(
             theory.reject,
@@ -193,7 +201,10 @@ class Returns:
 
     @cached_property
     def arrivals(self) -> list[int]:
-        """The first step of each visit: where the robot came to a place. Where it is not known which actions are turns, each step is a visit."""
+        """The first step of each visit: where the robot came to a place.
+
+        Where it is not known which actions are turns, each step is a visit.
+        """
         return [0, *(t for t, action in enumerate(self.trace.actions, 1) if action.kind != "turn")]
 
     def _tested(self, since: int = 0) -> _Tested:
@@ -233,7 +244,10 @@ class Returns:
         )
 
     def _pairs_of(self, tested: _Tested, since: int = 0) -> Pairs:
-        """The pairs of steps that are told apart by these returns, as they are refused alone. They are all, or those that end at the steps which are new."""
+        """The pairs of steps that are told apart by these returns, as they are refused alone.
+
+        They are all, or those that end at the steps which are new.
+        """
         far, other = (self._refused_among(*tested[places], places) for places in (True, False))
         known = self._pairs or NO_PAIRS
         elsewhere = Pairs.joined([known, Pairs.of(elsewhere=far)]).elsewhere
@@ -291,7 +305,9 @@ class Returns:
         return list(zip(first.tolist(), last.tolist(), strict=True))
 
     def _steps_of_visits(self, elsewhere: Earlier, since: int) -> Iterator[tuple[int, int]]:
-        """The pairs of steps that show the same view, in visits that are not at one place. Steps that show different views are apart anyway.
+        """The pairs of steps that show the same view, in visits that are not at one place.
+
+        Steps that show different views are apart anyway.
 
         elsewhere  the first steps of visits that are not at one place
         since      only pairs whose later step is this one or one that follows
@@ -341,7 +357,8 @@ class Returns:
     def refused_together(self, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         """Two returns of a map that are refused together: those of a map that was asked about before, or those that are most clearly; None where no two are.
 
-        since  the map of the steps before this one is known to be a map of these: only returns that end later are asked about
+        since  the map of the steps before this one is known to be a map of these: only returns that
+        end later are asked about
         """
         import numpy as np
 
@@ -433,7 +450,10 @@ class Returns:
                 if (i, j) == (first, last)
                 else f"steps {i + number_from} and {j + number_from}, where their visits begin,"
             )
-            return f"{named} are not at one place: by the odometry {they} are {self.closing(i, j).metres} apart"
+            return (
+                f"{named} are not at one place: by the odometry {they} are "
+                f"{self.closing(i, j).metres} apart"
+            )
         if first not in self.pairs.apart.get(last, ()):
             return None
         closing = self.closing(first, last)
@@ -442,7 +462,10 @@ class Returns:
             closing.square_of_heading > self.threshold(1, False),
         )
         if turned and not far:
-            return f"{named} are not one dstate: by the odometry their headings are {closing.degrees} apart"
+            return (
+                f"{named} are not one dstate: by the odometry their headings are "
+                f"{closing.degrees} apart"
+            )
         off = closing.metres if far else f"{closing.metres} and {closing.degrees}"
         return f"{named} are not one dstate: by the odometry they are {off} apart"
 

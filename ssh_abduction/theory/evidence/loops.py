@@ -1,27 +1,31 @@
 """How far off the loops of a trace close: displacements and their covariances, composed along the trace.
 
->>> from ssh_abduction import Trace
->>> from ssh_abduction.theory.evidence.loops import Loops
->>> square = [(10, 0, 0), (0, 0, 1.5708)] * 4
->>> loops = Loops.of(Trace.from_steps("abababab" + "a", ["travel", "left"] * 4, displacements=square))
->>> closing, covariance = loops.closings([0], [8])
->>> bool(abs(closing[0]).max() < 0.001), covariance.shape
-(True, (1, 3, 3))
+>>> from ssh_abduction import Trace >>> from ssh_abduction.theory.evidence.loops import Loops >>>
+square = [(10, 0, 0), (0, 0, 1.5708)] * 4 >>> loops = Loops.of(Trace.from_steps("abababab" + "a",
+["travel", "left"] * 4, displacements=square)) >>> closing, covariance = loops.closings([0], [8])
+>>> bool(abs(closing[0]).max() < 0.001), covariance.shape (True, (1, 3, 3))
 
-A loop leads from step i to a later step j. It closes if the robot is then where it was before. By the displacements d of the steps between, it closes off by
-P(j) - P(i), where P is the pose by dead reckoning: all displacements composed from the first step on. An error e of a displacement that leads to step k turns all
-that comes after it. So to first order it moves the end of the loop by
+A loop leads from step i to a later step j. It closes if the robot is then where it was before. By
+the displacements d of the steps between, it closes off by P(j) - P(i), where P is the pose by dead
+reckoning: all displacements composed from the first step on. An error e of a displacement that
+leads to step k turns all that comes after it. So to first order it moves the end of the loop by
 
-    R(k) e_xy + e_theta S (p(j) - p(k))        where R(k) is the heading before the displacement, and S a quarter turn,
+    R(k) e_xy + e_theta S (p(j) - p(k))        where R(k) is the heading before the displacement,
+    and S a quarter turn,
 
-and the covariance of the closing is the sum of these over the loop (Smith, Self & Cheeseman 1990, "Estimating uncertain spatial relationships in
-robotics"). It is a polynomial in p(j), so that sums from the first step on give it for any loop at once. Two errors repeat, and are unknown numbers of the
-whole trace rather than noise: a wrong scale, and a steady drift of heading. What a robot takes for the pose of a dstate may be off by itself at each visit, as where
-the middle of a place is told from laser scans: that adds to the covariance at both ends of the loop, and does not grow along the way.
+and the covariance of the closing is the sum of these over the loop (Smith, Self & Cheeseman 1990,
+"Estimating uncertain spatial relationships in robotics"). It is a polynomial in p(j), so that sums
+from the first step on give it for any loop at once. Two errors repeat, and are unknown numbers of
+the whole trace rather than noise: a wrong scale, and a steady drift of heading. What a robot takes
+for the pose of a dstate may be off by itself at each visit, as where the middle of a place is told
+from laser scans: that adds to the covariance at both ends of the loop, and does not grow along the
+way.
 
-*Where headings are lost.* First order takes an arc for its tangent. An error of heading that is rare, at SIGMAS standard deviations, bends the way off the tangent by
-half of itself, as a share of what first order says it moves the end by. So much is added to the covariance, in all directions: where the heading is known to a few degrees that
-is next to nothing, and where it is lost nothing can be said any more.
+*Where headings are lost.* First order takes an arc for its tangent. An error of heading that is
+rare, at SIGMAS standard deviations, bends the way off the tangent by half of itself, as a share of
+what first order says it moves the end by. So much is added to the covariance, in all directions:
+where the heading is known to a few degrees that is next to nothing, and where it is lost nothing
+can be said any more.
 """
 
 from __future__ import annotations
@@ -40,11 +44,14 @@ from ssh_abduction.data.trace import Trace
 Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]
 
-# Tests that together may refuse a true map once in a thousand traces refuse what is about so many standard deviations off.
+# Tests that together may refuse a true map once in a thousand traces refuse what is about so many
+# standard deviations off.
 SIGMAS = 6.0
-# Nothing is said of loops after which the heading is uncertain by more than this, in radians: what is added for that outweighs any error.
+# Nothing is said of loops after which the heading is uncertain by more than this, in radians: what
+# is added for that outweighs any error.
 LOST = 1.0
-# So many values of a steady drift of heading are tried for each standard deviation of it: a loop is refused if it closes badly with each of them.
+# So many values of a steady drift of heading are tried for each standard deviation of it: a loop is
+# refused if it closes badly with each of them.
 BENDS_A_SIGMA = 2
 # Drifts of more standard deviations than this are as unlikely as what is refused.
 MOST_BENDS = 6
@@ -218,7 +225,8 @@ class Reckoning:
 
     bends     the drifts, in radians a metre
     unlikely  the chi-square of each
-    begins    for each step, the first step from which on it is known where this one is: no displacement is missing since, and the heading is not lost.
+    begins    for each step, the first step from which on it is known where this one is: no
+        displacement is missing since, and the heading is not lost.
               That is the same whatever the drift, and of a longer trace, too
     """
 
@@ -312,7 +320,10 @@ class _Rows:
         self._lock = Lock()
 
     def extended(self, size: int, new: Array) -> _Rows:
-        """The first `size` rows, and new ones. The array is the same, unless there is no room or somebody else added other rows."""
+        """The first `size` rows, and new ones.
+
+        The array is the same, unless there is no room or somebody else added other rows.
+        """
         total = size + new.shape[1]
         with self._lock:
             if self._size == size and total <= self.array.shape[1]:

@@ -5,13 +5,17 @@
 >>> [len(solve(trace, Theory(planar=planar, prefer=())).maps) for planar in (False, True)]
 [2, 1]
 
-A travel leads along an edge from a gateway of one place to a gateway of another, and no edge passes a place unseen: a gateway leads to one other gateway.
-Around a place, the order of gateways is told by turns, and where places have frames by stars, too; where it is not told, any order will do. So a map is planar if
-*some* orders make a drawing of it. A map of first steps has fewer edges, and what it says of orders the whole map says, too: a cut keeps a map planar.
+A travel leads along an edge from a gateway of one place to a gateway of another, and no edge passes
+a place unseen: a gateway leads to one other gateway. Around a place, the order of gateways is told
+by turns, and where places have frames by stars, too; where it is not told, any order will do. So a
+map is planar if *some* orders make a drawing of it. A map of first steps has fewer edges, and what
+it says of orders the whole map says, too: a cut keeps a map planar.
 
-To take an equality of places away may make a planar map one that is not: edges that crossed at a place now cross elsewhere. So what cannot be is, that some
-steps are at one place while others are at different ones. It is read off as few travels and turns as cross by themselves. For the places given, an equality of dstates
-only takes drawings away; so of those only as few are said as let the edges cross.
+To take an equality of places away may make a planar map one that is not: edges that crossed at a
+place now cross elsewhere. So what cannot be is, that some steps are at one place while others are
+at different ones. It is read off as few travels and turns as cross by themselves. For the places
+given, an equality of dstates only takes drawings away; so of those only as few are said as let the
+edges cross.
 """
 
 from __future__ import annotations
@@ -40,9 +44,9 @@ SLOTS = 4
 BEHIND = 2  # so many slots from the one that is faced
 
 AHEAD, BACK = 1, -1
-End: TypeAlias = tuple[
-    int, int, int
-]  # of an edge: its place, the group of dstates that it is known from, and its slot as that group has it
+# of an edge: its place, the group of dstates that it is known from, and its slot as that group has
+# it
+End: TypeAlias = tuple[int, int, int]
 Arm: TypeAlias = tuple[int, int]  # what is ahead of a dstate, or back
 Gateway: TypeAlias = tuple[int, Arm]  # of a place, and one of its arms that are this gateway
 
@@ -176,7 +180,9 @@ class _Shown:
 
 
 def _can_draw_framed(shown: _Shown, turns: bool, distinct: bool) -> bool:
-    """Whether there are headings with which the edges can be drawn. Dstates that turns link are turned to each other as the turns say; how others are turned is
+    """Whether there are headings with which the edges can be drawn.
+
+    Dstates that turns link are turned to each other as the turns say; how others are turned is
     open, unless stars tell.
     """
     group, slot, agree = _groups(shown, turns)

@@ -39,7 +39,10 @@ class Evidence(Protocol):
         return self
 
     def pairs(self, trace: Trace) -> Pairs:
-        """What is known of pairs of steps before the search. A map of the trace, cut down to some first steps, keeps what is said of these."""
+        """What is known of pairs of steps before the search.
+
+        A map of the trace, cut down to some first steps, keeps what is said of these.
+        """
         ...
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
@@ -49,6 +52,7 @@ class Evidence(Protocol):
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         """A small set of equalities of a map of the first steps, and of what is not equal (`holds` is False), that cannot all hold, whatever the map; None if there is none.
 
-        since  the map of the steps before this one is known to be a map of these that is not refused, so that it need not be asked about again
+        since  the map of the steps before this one is known to be a map of these that is not
+        refused, so that it need not be asked about again
         """
         ...

@@ -1,14 +1,18 @@
 """Which returns of a map are refused two together, though none of them is refused alone.
 
-Two returns, whose loops close off by o1 and o2 with covariances S1 and S2, and C between them, have the joint chi-square
+Two returns, whose loops close off by o1 and o2 with covariances S1 and S2, and C between them, have
+the joint chi-square
 
     (o1, o2)' (S1, C; C', S2)^-1 (o1, o2)        where that of each alone is z = o' S^-1 o.
 
-A map of a thousand steps has some thousand returns, and some ten million sets of two. To solve as many systems of six equations takes minutes, so most sets are
-passed by a bound. Let s be the largest singular value of S1^-1/2 C S2^-1/2. The eigenvalues of the matrix, once it is whitened, are 1 - s at least, so that the
-joint chi-square is at most (z1 + z2) / (1 - s). And C comes of what both loops share: some displacements, and the errors that repeat. If that contributes F to S1,
-then s squared is at most the largest eigenvalue of S1^-1 F. It is at most the trace, which is a sum over displacements, so that two look-ups in a table
-tell it; and for the few sets that the trace does not pass there is a sharper bound (Wolkowicz & Styan 1980, "Bounds for eigenvalues using traces").
+A map of a thousand steps has some thousand returns, and some ten million sets of two. To solve as
+many systems of six equations takes minutes, so most sets are passed by a bound. Let s be the
+largest singular value of S1^-1/2 C S2^-1/2. The eigenvalues of the matrix, once it is whitened, are
+1 - s at least, so that the joint chi-square is at most (z1 + z2) / (1 - s). And C comes of what
+both loops share: some displacements, and the errors that repeat. If that contributes F to S1, then
+s squared is at most the largest eigenvalue of S1^-1 F. It is at most the trace, which is a sum over
+displacements, so that two look-ups in a table tell it; and for the few sets that the trace does not
+pass there is a sharper bound (Wolkowicz & Styan 1980, "Bounds for eigenvalues using traces").
 """
 
 from __future__ import annotations
@@ -58,7 +62,8 @@ class _Alone:
 class Together:
     """Returns of one map, whose sets of two are tested.
 
-    rows  one row for each return, by last step: its first step, its last step, and whether it is one dstate rather than one place
+    rows  one row for each return, by last step: its first step, its last step, and whether it is
+    one dstate rather than one place
     """
 
     def __init__(
