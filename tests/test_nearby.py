@@ -21,11 +21,18 @@ from ssh_abduction.solver import Search, Status, choosing, fallback
 from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
-from ssh_abduction.solver.engines import naming as named
-from ssh_abduction.solver.engines import nearby
+from ssh_abduction.solver.engines import (
+    name_program,
+    name_search,
+    naming,
+    nearby,
+    pinned,
+    small_maps,
+)
 from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
+from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.annealing import annealed
 from ssh_abduction.solver.prefixes import Prefixes
@@ -38,19 +45,17 @@ CAUSAL = Theory.causal()
 
 
 def nearby_search(trace: Trace) -> NearbySearch:
-    """One that pins a clique, as named.py does."""
+    """One that pins a clique, as the engine does."""
     log = Log(trace, CAUSAL)
     chart = Chart.of_steps(log, len(trace))
-    pinned = chart.continuations.clique()
-    may_be = [(~row[pinned]).nonzero()[0].tolist() for row in chart.apart()]
+    clique = chart.continuations.clique()
+    may_be = [(~row[clique]).nonzero()[0].tolist() for row in chart.apart()]
     watch = Watch(100.0)  # so that what does not end fails
     watch.start()
     return NearbySearch(
         watch,
         Speedups(),
-        chart=chart,
-        clique=pinned,
-        may_be=may_be,
+        Pinned(chart, clique, may_be),
         far=lambda node: chart.continuations.apart_from(node, actions=2),
         configuration="tweety",
     )
@@ -97,10 +102,10 @@ def test_a_search_beside_another_changes_no_answer(
         patch.object(choosing, "FEW_STEPS", 0),
         patch.object(engine, "FIRST_PREFIXES", len(trace)),
         patch.multiple(
-            named, PATIENCE=0, CORES=cores, TRIES=data.draw(st.integers(1, 3), label="tries")
+            name_search, PATIENCE=0, CORES=cores, TRIES=data.draw(st.integers(1, 3), label="tries")
         ),
-        patch.object(named, "annealed", lambda *_, **__: Mock(labels=lambda _: guess)),
-        patch.object(named.Chart, "turned", turned),
+        patch.object(small_maps, "annealed", lambda *_, **__: Mock(labels=lambda _: guess)),
+        patch.object(small_maps.Chart, "turned", turned),
         patch.object(engine.Task, "has_processors", beside),
     ):
         found = solve(trace, CAUSAL, max_maps=most or None)
@@ -120,7 +125,8 @@ def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> Non
     """Then names may still be fewer than dstates: what is at a rest is no map."""
     trace = moore(7, 2, steps=60, seed=seed).trace
     with (
-        patch.multiple(named, PATIENCE=1, GUESSES=1),
+        patch.object(name_search, "PATIENCE", 1),
+        patch.object(small_maps, "GUESSES", 1),
         patch.object(annealing, "STEPS", ((0.75, 100),)),
     ):
         some, every = (
@@ -220,12 +226,12 @@ def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
     truth = {state: number for number, state in enumerate(dict.fromkeys(walk.truth))}
     with (
         patch.object(
-            named,
+            small_maps,
             "annealed",
             lambda *_, **__: Mock(labels=lambda chart: _labels_of(chart, walk.truth, truth)),
         ),
         patch.object(NearbySearch, "_asked", stop),
-        patch.multiple(named, PATIENCE=1, CORES=1, Beside=Awaited),
+        patch.multiple(name_search, PATIENCE=1, CORES=1, Beside=Awaited),
         patch.object(engine.Task, "has_processors", beside),
     ):
         solution = limited.solution(tuple(limited))
@@ -244,19 +250,19 @@ def test_where_clingo_would_prepare_for_too_long_the_search_beside_goes_on() -> 
     """Which proves here what the other one was stopped at."""
     walk = maze(3, 3, steps=300, seed=0)
     expected = solve(walk.trace, CAUSAL).cost
-    check_ahead = named.NamedLabels._check_ahead
+    check_ahead = name_search.Incumbent.check_ahead
     stopped = []
 
-    def stop(self: named.NamedLabels, seconds: float) -> None:
-        if self._beside:
+    def stop(self: name_search.Incumbent, seconds: float) -> None:
+        if self.beside:
             stopped.append(self)
             seconds = math.inf
         check_ahead(self, seconds)
 
     with (
-        patch.multiple(named, PATIENCE=1),
+        patch.multiple(name_search, PATIENCE=1),
         patch.object(engine.Task, "has_processors", True),
-        patch.object(named.NamedLabels, "_check_ahead", stop),
+        patch.object(name_search.Incumbent, "check_ahead", stop),
     ):
         solution = solve(
             walk.trace, CAUSAL, speedups=Speedups.without("prefixes"), max_maps=1, time_limit=100
@@ -362,8 +368,11 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
     watch.start()
     long = CausalEngine(engine.Task.of(Problem.of(trace, CAUSAL), watch))._named
     long.grow(len(trace))
-    with patch.multiple(named, AT_ONCE=first, GUESSED=guessed):
-        found = list(long._from_beginning(watch.check))
+    small = small_maps.SmallMaps(
+        engine.Task.of(Problem.of(trace, CAUSAL), watch), long.program.pinned
+    )
+    with patch.multiple(small_maps, AT_ONCE=first, GUESSED=guessed):
+        found = list(small.from_beginning(watch.check))
     assert bool(found) == goes_on
     fewest = fewest_dstates(trace)
     for labels in found:
@@ -375,16 +384,20 @@ def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
     """The simplest first, so that it comes to an end before it was given all; the map is that of a guess at the beginning, or clingo's."""
     walk = maze(3, 3, steps=2000, seed=1, loops=0.3)
     given: list[int] = []
-    add = named.NamedLabels.add
+    add = name_program.NameProgram.add
 
-    def counted(self: named.NamedLabels, links: list[tuple[int, int, int]]) -> None:
+    def counted(self: name_program.NameProgram, links: list[tuple[int, int, int]]) -> None:
         add(self, links)
-        given.append(len(self._links))
+        given.append(self.links_given)
 
     expected = solve(walk.trace, CAUSAL)
     with (
-        patch.multiple(named, AT_ONCE=500, PATIENCE=10, MORE_LINKS=50),
-        patch.object(named.NamedLabels, "add", counted),
+        patch.object(naming, "AT_ONCE", 500),
+        patch.object(pinned, "AT_ONCE", 500),
+        patch.object(small_maps, "AT_ONCE", 500),
+        patch.object(name_search, "PATIENCE", 10),
+        patch.object(name_program, "MORE_LINKS", 50),
+        patch.object(name_program.NameProgram, "add", counted),
     ):
         found = solve(walk.trace, CAUSAL)
     assert found.status is expected.status is Status.OPTIMAL
@@ -398,7 +411,7 @@ def test_of_a_long_trace_as_much_is_taken_as_adds_to_the_clique() -> None:
     log = Log(trace, CAUSAL)
     long = CausalEngine(engine.Task.of(Problem.of(trace, CAUSAL), Watch(100.0)))
     long._named.size = 32
-    with patch.object(engine, "AT_ONCE", 50), patch.object(named, "AT_ONCE", 50):
+    with patch.object(engine, "AT_ONCE", 50), patch.object(naming, "AT_ONCE", 50):
         size = long.next_size(32)
         assert long.next_size(10) == size
         long._named.size = size

@@ -26,7 +26,7 @@ from ssh_abduction.solver import Search, Status, choosing
 from ssh_abduction.solver.asp.facts import answer_maps, names_lp
 from ssh_abduction.solver.asp.limits import LimitError
 from ssh_abduction.solver.engines import base as engine
-from ssh_abduction.solver.engines import framed
+from ssh_abduction.solver.engines import framed, name_program, name_search, pinned, small_maps
 from ssh_abduction.solver.engines import naming as named
 from ssh_abduction.solver.engines.nearby import NearbySearch
 from ssh_abduction.solver.guesses import annealing
@@ -78,18 +78,15 @@ def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(
     held = data.draw(st.sampled_from([1, 100]), label="held back")
     cores = data.draw(st.sampled_from([0, 1, 10_000]), label="cores")
     spares = data.draw(st.sampled_from([0, 1, 2]), label="spare names")
-    settings = patch.multiple(engine, FIRST_PREFIXES=first, AT_ONCE=at_once)
-    fewer = patch.multiple(
-        named,
-        AT_ONCE=at_once,
-        WHOLE=whole,
-        PATIENCE=patience,
-        HELD_BACK=held,
-        CORES=cores,
-        SPARES=spares,
-        MORE_LINKS=2,
-    )
-    with settings, fewer, patch.object(choosing, "FEW_STEPS", 0):
+    with (
+        patch.multiple(engine, FIRST_PREFIXES=first, AT_ONCE=at_once),
+        patch.multiple(named, AT_ONCE=at_once, WHOLE=whole, HELD_BACK=held, SPARES=spares),
+        patch.multiple(name_search, PATIENCE=patience, CORES=cores),
+        patch.object(name_program, "MORE_LINKS", 2),
+        patch.object(pinned, "AT_ONCE", at_once),
+        patch.object(small_maps, "AT_ONCE", at_once),
+        patch.object(choosing, "FEW_STEPS", 0),
+    ):
         found = solve(trace, Theory.causal(), max_maps=None, speedups=Speedups.without(off))
     assert found.status is expected.status is Status.OPTIMAL
     assert found.cost == expected.cost
@@ -109,8 +106,11 @@ def test_names_read_from_where_actions_lead_are_those_read_whole(seed: int) -> N
         answers.append(names)
         return names
 
-    few = patch.multiple(named, PATIENCE=0, CORES=0, SPARES=0)
-    with few, patch.object(names_lp.NameReader, "read", compared):
+    with (
+        patch.object(named, "SPARES", 0),
+        patch.multiple(name_search, PATIENCE=0, CORES=0),
+        patch.object(names_lp.NameReader, "read", compared),
+    ):
         speedups = Speedups.without(("annealed", "threads"))
         assert solve(
             moore(8, 2, steps=60, seed=seed).trace, Theory.causal(), max_maps=20, speedups=speedups
@@ -153,7 +153,7 @@ def hurried() -> Iterator[None]:
     """What is done only where a search takes its time is done at once."""
     with (
         patch.multiple(choosing, FEW_STEPS=0, FRAME_AFTER=-1.0),
-        patch.multiple(named, PATIENCE=0, CORES=0),
+        patch.multiple(name_search, PATIENCE=0, CORES=0),
         patch.multiple(framed, SOON=-1.0, GUESS_FIRST=-1.0),
         patch.object(annealing, "ANNEALED", ((0.5, 50),)),
     ):
@@ -298,8 +298,8 @@ def test_a_limit_leaves_a_map_of_merged_steps() -> None:
     """Twice as good as one that is made at once, where clingo takes its time and no guess is annealed."""
     walk = maze(5, 5, steps=1600, seed=0)
     with (
-        patch.multiple(named, PATIENCE=1, CORES=1),
-        patch.object(named.NamedLabels, "_more_links", side_effect=[[], KeyboardInterrupt]),
+        patch.multiple(name_search, PATIENCE=1, CORES=1),
+        patch.object(name_program.NameProgram, "more_links", side_effect=[[], KeyboardInterrupt]),
     ):
         solution = solve(
             walk.trace, Theory.causal(), speedups=Speedups.without("prefixes,annealed,threads")
@@ -319,7 +319,7 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
     """Of a machine that does not turn."""
     walk = moore(12, 2, steps=800, seed=seed)
     with (
-        patch.multiple(named, PATIENCE=1, CORES=1),
+        patch.multiple(name_search, PATIENCE=1, CORES=1),
         patch.object(annealing, "STEPS", ((0.75, 300),)),
         patch.object(NearbySearch, "_take", side_effect=KeyboardInterrupt),
     ):
@@ -362,8 +362,8 @@ def test_what_cannot_be_stopped_is_not_begun_where_time_is_short() -> None:
     """clingo is not told where names lead, if the limit would be over before it can be stopped. The clique is a bound by then."""
     walk = moore(8, 2, steps=100, seed=0)
     with (
-        patch.object(named, "SECONDS_A_CHARACTER", 1.0),
-        patch.object(named, "new_control", side_effect=AssertionError),
+        patch.object(name_program, "SECONDS_A_CHARACTER", 1.0),
+        patch.object(name_program, "new_control", side_effect=AssertionError),
     ):
         solution = solve(
             walk.trace, Theory.causal(), time_limit=30, speedups=Speedups.without("prefixes")

@@ -19,7 +19,7 @@ from ssh_abduction.solver import Search, Start, Status, choosing
 from ssh_abduction.solver.asp.facts.readable import most_paths
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import frameless as ways
-from ssh_abduction.solver.engines import naming as named
+from ssh_abduction.solver.engines import name_search, naming
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.frameless import FramelessEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
@@ -62,13 +62,14 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
     theory = data.draw(bare_theories(), label="theory")
     contrary = data.draw(st.sampled_from([0, 1, ways.CONTRARY]), label="contrary")
     spares = data.draw(st.sampled_from([0, 2]), label="spare names")
-    patience = data.draw(st.sampled_from([0, named.PATIENCE]), label="patience")
-    cores = data.draw(st.sampled_from([0, named.CORES]), label="cores")
+    patience = data.draw(st.sampled_from([0, name_search.PATIENCE]), label="patience")
+    cores = data.draw(st.sampled_from([0, name_search.CORES]), label="cores")
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     if not expected.cost:
         return  # the engine is asked only where some map is known
     with (
-        patch.multiple(named, SPARES=spares, PATIENCE=patience, CORES=cores),
+        patch.object(naming, "SPARES", spares),
+        patch.multiple(name_search, PATIENCE=patience, CORES=cores),
         patch.object(ways, "CONTRARY", contrary),
     ):
         known = data.draw(st.sampled_from([None, expected.maps[0].labels]), label="known")
@@ -128,7 +129,7 @@ def test_a_limit_while_labels_are_listed_is_a_limit() -> None:
     trace = maze(3, 3, steps=30, seed=0).trace
     theory = settle(trace).theory
     known = solve(trace, theory).maps[0].labels
-    with patch.object(named, "SPARES", 0):
+    with patch.object(naming, "SPARES", 0):
         engine = FramelessEngine(Task.of(Problem.of(trace, theory)), known)
         engine.grow(len(trace))
         maps = engine.improving_maps()

@@ -41,6 +41,7 @@ from ssh_abduction.solver.engines.base import Found, Task, next_charted_size
 from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
 from ssh_abduction.solver.engines.paths import Paths
+from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted_of
 from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import OPEN, VisitLabels, smaller
@@ -255,17 +256,9 @@ class FramedEngine:
 
     def _search_beside(self, chart: FramedChart) -> None:
         """Begin to guess beside this, and to prove from there that the causal axioms need so many dstates."""
-        watch, pinned = Watch(beside=self.asker.watch), self._visits.clique or [0]
-        apart = chart.apart(others=pinned)
-        self._named = NearbySearch(
-            watch,
-            self._task.speedups,
-            chart=chart,
-            clique=pinned,
-            may_be=[(~row).nonzero()[0].tolist() for row in apart],
-            far=None,
-        )
-
+        watch = Watch(beside=self.asker.watch)
+        pinned = Pinned.framed(chart, self._visits.clique or [0])
+        self._named = NearbySearch(watch, self._task.speedups, pinned, far=None)
         self._beside = Beside(self._named, watch, self._fewer_labels(self._named, chart, watch))
 
     def _fewer_labels(

@@ -269,7 +269,7 @@ class PlacesAndPaths:
     def tell_again(self) -> None:
         told, self._told = self._told, set()
         if told:
-            self._tell_of([key for key in self.named.names() if key in told])
+            self._tell_of([key for key in self.named.program.names() if key in told])
 
     def forbid_together(self, equalities: Collection[Equality]) -> None:
         """From now on not all of these equalities hold."""
@@ -280,7 +280,7 @@ class PlacesAndPaths:
     def _tell_of(self, dstates: Collection[tuple[int, int]]) -> None:
         """Tell clingo what the paths of these dstates demand, of which it does not know yet."""
         with self._asker.grounding_timed():
-            control, names = self._asker.control, self.named.names()
+            control, names = self._asker.control, self.named.program.names()
             parts: list[tuple[str, list[clingo.Symbol]]] = []
             if not self._told:
                 control.load(encodings.path("sides_frameless"))
@@ -360,7 +360,7 @@ class PlacesAndPaths:
         links = self._links_of(labels)
         control = self._control_for(links, parts=("base",))
         contrary = next(self._asker.answers(paths_lp.read_contraries, "ignore", 1, control=control))
-        dstate_of = {name: dstate for dstate, name in self.named.names().items()}
+        dstate_of = {name: dstate for dstate, name in self.named.program.names().items()}
         new = [
             dstate
             for name in contrary
@@ -374,9 +374,9 @@ class PlacesAndPaths:
             _Members.of(smaller(_Members([*links], far).all(), self._clashing))
         ]:
             placed = {at for apart in members.far for at in apart.placed}
-            self.named.add_links_at({step for step, _ in placed})
+            self.named.program.add_links_at({step for step, _ in placed})
             self._forbidden += 1
-            self.named.tell(
+            self.named.program.tell(
                 f"forbidden_{self._forbidden}", names_lp.forbidden_links(members.links, placed)
             )
 

@@ -1,27 +1,36 @@
-"""Small maps of the causal theory near a guess, and the proof that there is none with fewer dstates, from the guess outwards.
+"""Small maps near a guess, and the proof that none is smaller, from the guess outwards.
 
-To find a map of the fewest dstates takes long where all steps are free. So most of them stay where a known map has them. Let a
-dstate be spared: if that cannot be, clingo tells which steps are in the way (a core of assumptions), and the dstates of these
-are free to change, until some steps can move or it is shown that the dstate is needed. Where that is left open, all steps of some part of the
-map are free at once, of parts as large as can be settled soon (large neighbourhood search: Shaw 1998).
+This serves the causal theory, and the causal axioms of theories with frames. `NearbySearch` yields
+ever smaller maps; when it ends with a `bound`, the last one is minimal. `Beside` runs such a search
+in a thread of its own.
 
-When each dstate is needed, nothing is assumed any more of where steps are, but still how many names each view has: no more than in the
-known map. Then views are allowed more names, one after the other, and in the end any number of dstates (the rest, see `engines/causal.py`).
-Each time clingo is asked for a map of fewer dstates in all.
+To find a map of the fewest dstates takes long if all steps are free. So most of them stay where a
+known map has them. The search tries to spare one dstate. If that is impossible, clingo returns a
+core of assumptions: the steps that are in the way. Their dstates become free, until some steps can
+move, or it is shown that the dstate is needed. If that stays open, all steps of some part of the
+map become free at once; the parts are as large as can be settled soon (large neighbourhood search:
+Shaw 1998).
+
+When each dstate is needed, nothing is assumed any more of where steps are. But each view may still
+use no more names than in the known map. Then views are allowed more names, one after the other, and
+in the end any number of dstates (the rest, see `engines/naming.py`). Each time clingo is asked for
+a map of fewer dstates in all.
 
 *Claim.* If there is none when everything is allowed, the known map is minimal.
-*Proof.* What is asked then is what `engines/causal.py` asks, at a cost of one less: by the claim there, each map of so few dstates is an
-answer. ∎
+*Proof.* What is asked then is what `engines/naming.py` asks, at a cost of one less: by the claim
+there, each map with fewer dstates is an answer. ∎
 
-To allow everything at once is to ask for a proof that may take hours; what clingo learns from each question makes the next one short. So names
-are allowed one, two, four at a time, as long as that goes well.
+To allow everything at once is to ask for a proof that may take hours. What clingo learns from each
+question makes the next one short. So names are allowed one, two, four at a time, as long as that
+goes well.
 
-The nodes need not be the steps of a trace: where places have frames, they are those of `Chart.framed`, and rotations are links as actions
-are. What is found then need not fit a frame, as names.lp does not know how rotations compose; but the bound holds. Names are poor at
-raising that bound core by core, which is why `engines/visit_labels.py` has none, but good at this.
+The nodes need not be the steps of a trace. If places have frames, they are those of
+`Chart.framed`, and rotations are links like actions. What is found then need not fit a frame, as
+names.lp does not know how rotations compose; but the bound holds. Names are poor at raising that
+bound core by core, which is why `engines/visit_labels.py` has none, but good at this.
 
-In the causal theory clasp searches as its configuration `tweety` does, which proves several times as soon what its default proves; where
-places have frames its default is better, above all to list answers.
+In the causal theory clasp uses its configuration `tweety`, which proves several times as soon as
+its default. With frames its default is better, above all to list answers.
 """
 
 from __future__ import annotations
@@ -30,8 +39,17 @@ import random
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Collection,
+    Generator,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from contextlib import closing
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import clingo
@@ -41,25 +59,29 @@ from ssh_abduction.solver.asp.control import Asker, give_threads, has_processors
 from ssh_abduction.solver.asp.facts import names_lp
 from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart, numbered
 from ssh_abduction.theory.speedups import Speedups
 
-# After so many conflicts a question is left open, at first; each round of questions has twice as many as the one before.
+# After this many conflicts a question is left open, at first; each round of questions doubles it.
 CONFLICTS = 2000
-# A question that assumes nothing of where steps are may take so many times as many conflicts, as it decides more.
+# A question that assumes nothing of where steps are decides more: it may take this many times as
+# many conflicts.
 WIDE = 10
-# So many parts of the map are drawn anew in vain before anything else is tried.
+# Draw this many parts of the map in vain before anything else is tried.
 REGIONS = 40
-# Such a part has so many dstates at first, and at least.
+# Such a part has this many dstates at first, and at least.
 FIRST_REGION = 10
-# It gets so many dstates more where it is shown not to need fewer, and so many less where that was left open.
+# It gets this many dstates more if it is shown not to need fewer, and this many less if that was
+# left open.
 LARGER, SMALLER = 2, 4
-# So many times as long as grounding took clingo prepares to solve, about, and cannot be stopped.
+# After grounding, clingo prepares to solve for about as long again, and cannot be stopped.
 PREPARING = 1.0
-# Clingo is given so many links in one go, as it cannot be stopped meanwhile.
+# Give clingo this many links in one go, as it cannot be stopped meanwhile.
 AT_A_TIME = 100
-# Clingo takes so many seconds a character, at most about, to read and ground where names lead. It cannot be stopped meanwhile.
+# Seconds a character, about and at most, that clingo takes to read and ground where names lead. It
+# cannot be stopped meanwhile.
 SECONDS_A_CHARACTER = 1e-6
 
 Labels: TypeAlias = list[int]
@@ -67,63 +89,92 @@ _Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label
 _Verdict: TypeAlias = Literal["moved", "needed", "open"]
 
 
-class NearbySearch:
-    """Maps of the first steps near a guess.
+@dataclass(frozen=True)
+class _Names:
+    """The names that the control knows.
 
-    bound  the number of dstates of the last map, once that is proven to be the least
+    Attributes:
+        spare: The spare names of each view; the last one is the rest.
+        rests: All rests.
+        choices: For each node, the names that it may be at.
+        used: For each spare name, the literal that it is used.
+        ordered: The literal that nodes are at spare names in the order of the names.
+    """
+
+    spare: Mapping[int, range]
+    rests: frozenset[int]
+    choices: Sequence[Sequence[int]]
+    used: Mapping[int, int]
+    ordered: int
+
+
+class NearbySearch:
+    """Maps near a guess.
+
+    Attributes:
+        bound: The number of dstates of the last map, once that is proven to be the fewest.
     """
 
     def __init__(
         self,
         watch: Watch,
         speedups: Speedups,
+        pinned: Pinned,
         *,
-        chart: Chart,
-        clique: Sequence[int],
-        may_be: Sequence[Sequence[int]],
         far: Callable[[int], Matrix] | None,
         configuration: str | None = None,
     ) -> None:
+        """Prepare a search.
+
+        Args:
+            watch: The limits.
+            speedups: Those that are on.
+            pinned: The nodes and links, and the nodes that have names of their own.
+            far: The nodes that are different dstates from a node, as a row, if clingo has to be
+                told of these.
+            configuration: Of clasp, if not its default.
+        """
         self.bound: int | None = None
         self._asker = Asker(watch)
-        self._speedups = speedups
-        self._chart = chart
-        self.clique = list(clique)
-        self._may_be = may_be
-        self._far = far
-        self._configuration = configuration  # of clasp, if not its default
+        self._speedups, self._pinned, self._far = speedups, pinned, far
+        self._configuration = configuration
+        self._names = _Names({}, frozenset(), (), {}, 0)
         self._labels: Labels = []
         self._needed: set[int] = set()  # names that cannot be spared
-        self._fewest: dict[
-            int, int
-        ] = {}  # by view, spare names that are not taken back, as once they were not enough
-        self._allowed: list[int] | None = (
-            None  # names that do not help, though all are allowed; None before they were tried one by one
-        )
+        # By view, the spare names that it keeps, as once they were not enough.
+        self._fewest: dict[int, int] = {}
+        # Names that do not help, though all are allowed; None before they were tried one by one.
+        self._allowed: list[int] | None = None
         self._waiting: list[int] = []  # names yet to be allowed
         self._region = FIRST_REGION
         self._random = random.Random(0)
 
     def fewer(self, guess: Sequence[int], tries: int | None = None) -> Iterator[Labels]:
-        """Labels of all steps, each time fewer. Where the iteration ends, the last are fewest if `bound` says so.
+        """Labels of all nodes, each with fewer dstates than the ones before.
 
-        guess  a label of each step; -1 where it is not known. Need not be a map
-        tries  how often to ask with more conflicts, before it is left open whether there are fewer. None: until all is settled
+        After the last ones, `bound` says whether there are no fewer dstates.
+
+        Args:
+            guess: A label of each node, -1 where it is not known. It need not be a map.
+            tries: How often to ask with more conflicts before it is left open whether there are
+                fewer dstates. None: until that is settled.
         """
-        if known := self._chart.is_map(guess):
+        if known := self._pinned.chart.is_map(guess):
             yield list(guess)
-        guessed = _keys(guess, self._chart)
-        name_of = {guessed[node]: name for name, node in reversed(list(enumerate(self.clique)))}
-        extra = dict.fromkeys(
-            key for key in guessed if key is not None and key not in name_of
-        )  # of no step of the clique
+        guessed = _keys(guess, self._pinned.chart)
+        name_of = {
+            guessed[node]: name for name, node in reversed(list(enumerate(self._pinned.clique)))
+        }
+        # What the guess has beyond the clique needs spare names.
+        extra = dict.fromkeys(key for key in guessed if key is not None and key not in name_of)
         counts = Counter(view for view, _ in extra)
-        self._take({view: counts[view] for view in dict.fromkeys(self._chart.seen)})
-        left = {view: iter(spare) for view, spare in self._spare.items()}
+        self._take({view: counts[view] for view in dict.fromkeys(self._pinned.chart.seen)})
+        left = {view: iter(spare) for view, spare in self._names.spare.items()}
         name_of |= {key: next(left[key[0]]) for key in extra}
         self._labels = [-1 if key is None else name_of[key] for key in guessed]
-        # Even where the guess is a map: clasp goes on choosing as in its last answer, and so stays near.
-        for allowed in ((), [name for spare in self._spare.values() for name in spare[:-1]]):
+        # Do so even if the guess is a map: clasp goes on choosing as in its last answer, and so
+        # stays near. First allow only the names of the guess, then all others.
+        for allowed in ((), [name for spare in self._names.spare.values() for name in spare[:-1]]):
             verdict = self._moved(
                 self._not_allowed(allowed), (), WIDE * CONFLICTS, step_by_step=True
             )
@@ -146,19 +197,22 @@ class NearbySearch:
                 conflicts, failed = 2 * conflicts, failed + 1
 
     def listed(self, watch: Watch) -> Iterator[list[int]]:
-        """All labels with as few dstates as `bound`, once that is known; the same ones now and then once more."""
+        """All labels with as few dstates as `bound`, once that is known. Some may come twice."""
         self._asker.watch = watch
         assert self.bound is not None
-        spares = self.bound - len(self.clique)
+        spares = self.bound - len(self._pinned.clique)
         while True:
             give_threads(self._asker.control, two=has_processors(self._speedups))
             with closing(
                 self._asker.answers(
-                    names_lp.read_names, f"enum,{spares},{spares}", 0, assumptions=[self._ordered]
+                    names_lp.read_names,
+                    f"enum,{spares},{spares}",
+                    0,
+                    assumptions=[self._names.ordered],
                 )
             ) as answers:
                 for answer in answers:
-                    if resting := self._rests.intersection(answer.values()):
+                    if resting := self._names.rests.intersection(answer.values()):
                         break
                     yield numbered(answer[node] for node in range(len(answer)))
                 else:
@@ -166,35 +220,44 @@ class NearbySearch:
             self._name_more(resting)
 
     def _take(self, counts: Mapping[int, int]) -> None:
-        """Take a control with so many spare names for each view, one more, and a rest."""
+        """Take a control with this many spare names for each view, one more, and a rest."""
         began = time.perf_counter()
-        seen = self._chart.seen
-        names = [(name, seen[node]) for name, node in enumerate(self.clique)]
-        self._spare: dict[int, range] = {}
+        seen, clique = self._pinned.chart.seen, self._pinned.clique
+        names = [(name, seen[node]) for name, node in enumerate(clique)]
+        spare: dict[int, range] = {}
         for view, count in counts.items():
-            self._spare[view] = range(len(names), len(names) + count + 2)
-            names += [(name, view) for name in self._spare[view]]
-        self._rests = {spare[-1] for spare in self._spare.values()}
-        pinned = set(self.clique)
-        self._choices = [
-            options if t in pinned else [*options, *self._spare[seen[t]]]
-            for t, options in enumerate(map(list, self._may_be))
+            spare[view] = range(len(names), len(names) + count + 2)
+            names += [(name, view) for name in spare[view]]
+        pinned = set(clique)
+        choices = [
+            options if t in pinned else [*options, *spare[seen[t]]]
+            for t, options in enumerate(map(list, self._pinned.may_be))
         ]
-        links = self._chart.links
-        base = names_lp.name_facts(names, self._spare.values(), links, self._choices, ordered=False)
+        links = self._pinned.chart.links
+        base = names_lp.name_facts(names, spare.values(), links, choices, ordered=False)
         self._asker.watch.check(SECONDS_A_CHARACTER * len(base))
         self._asker.control = new_control("names", base, ["--eq=1"])
         if self._configuration:
             configuration: Any = self._asker.control.configuration
             configuration.configuration, configuration.sat_prepro = self._configuration, "no"
-        self._used = {
-            name: self._literal(names_lp.used(name))
-            for spare in self._spare.values()
-            for name in spare
+        used = {
+            name: self._literal(names_lp.used(name)) for some in spare.values() for name in some
         }
+        self._names = _Names(
+            spare,
+            frozenset(some[-1] for some in spare.values()),
+            choices,
+            used,
+            self._literal(names_lp.ordered()),
+        )
+        self._give_links(pinned)
+        self._asker.watch.check(PREPARING * (time.perf_counter() - began))
+
+    def _give_links(self, pinned: Collection[int]) -> None:
+        """Give a new control all links, in batches, and their nodes."""
+        seen, links = self._pinned.chart.seen, self._pinned.chart.links
         given: set[int] = set()
-        last: dict[int, int] = {}  # by view, the last step that has a choice
-        self._ordered = self._literal(names_lp.ordered())
+        last: dict[int, int] = {}  # by view, the last node that has a choice
         for batch, start in enumerate(range(0, len(links), AT_A_TIME)):
             self._asker.watch.check()
             part, added = f"batch_{batch}", links[start : start + AT_A_TIME]
@@ -202,7 +265,7 @@ class NearbySearch:
             given.update(new)
             nodes: list[tuple[int, int, Sequence[int], int | None]] = []
             for t in new:
-                nodes.append((t, seen[t], self._choices[t], last.get(seen[t])))
+                nodes.append((t, seen[t], self._names.choices[t], last.get(seen[t])))
                 if t not in pinned:
                     last[seen[t]] = t
             far = (
@@ -212,7 +275,6 @@ class NearbySearch:
             )
             self._asker.control.add(part, [], names_lp.batch_facts(batch, nodes, added, far))
             self._asker.control.ground([(part, []), ("more", numbers(batch))])
-        self._asker.watch.check(PREPARING * (time.perf_counter() - began))
 
     def _literal(self, symbol: clingo.Symbol) -> int:
         atom = self._asker.control.symbolic_atoms[symbol]
@@ -220,9 +282,9 @@ class NearbySearch:
         return atom.literal
 
     def _not_allowed(self, allowed: Collection[int]) -> list[int]:
-        """That no names are used but those of the labels, and these."""
+        """The assumptions that only the names of the labels and these are used."""
         taken = {*self._labels, *allowed}
-        return [-literal for name, literal in self._used.items() if name not in taken]
+        return [-literal for name, literal in self._names.used.items() if name not in taken]
 
     def _moved(
         self,
@@ -232,7 +294,20 @@ class NearbySearch:
         *,
         step_by_step: bool = False,
     ) -> _Verdict:
-        """Move steps so that this holds; those at names that are not free stay, unless they, or others at their names, are in the way."""
+        """Move nodes so that the assumptions hold.
+
+        Nodes at names that are not free stay, unless a core shows that they are in the way.
+
+        Args:
+            assumed: Literals.
+            free: Names whose nodes may move.
+            conflicts: After this many, the question is left open.
+            step_by_step: Of what is in the way, let only the nodes of the core move. Otherwise all
+                nodes at their names move, too.
+
+        Returns:
+            "moved"; "needed" if the assumptions cannot hold; "open" if that is not known.
+        """
         free = {-1, *free}
         literals = self._literals()
         while True:
@@ -242,7 +317,7 @@ class NearbySearch:
                 if literal and name not in free
             }
             answer, core = self._asker.verdict(
-                names_lp.read_names, [-self._ordered, *assumed, *stay], conflicts
+                names_lp.read_names, [-self._names.ordered, *assumed, *stay], conflicts
             )
             if answer is not None:
                 self._keep(answer)
@@ -258,19 +333,19 @@ class NearbySearch:
                 free |= {stay[literal] for literal in moving}
 
     def _literals(self) -> list[int]:
-        """Of each step, that it is where its label says; 0 where there is no choice."""
+        """For each node, the literal that it is where its label says; 0 if it has no choice."""
         return [
             0
-            if name < 0 or len(self._choices[t]) == 1 or name not in self._choices[t]
+            if name < 0 or len(self._names.choices[t]) == 1 or name not in self._names.choices[t]
             else self._literal(names_lp.named(t, name))
             for t, name in enumerate(self._labels)
         ]
 
     def _keep(self, answer: Mapping[int, int]) -> None:
-        """Take an answer for the labels, where steps are at the first spare names of each view."""
+        """Take an answer for the labels, renamed so that it uses the first spare names."""
         taken = set(answer.values())
-        name_of = {name: name for name in range(len(self.clique))}
-        for spare in self._spare.values():
+        name_of = {name: name for name in range(len(self._pinned.clique))}
+        for spare in self._names.spare.values():
             name_of |= dict(zip([name for name in spare if name in taken], spare, strict=False))
         self._label([name_of[answer[t]] for t in range(len(answer))])
 
@@ -278,13 +353,16 @@ class NearbySearch:
         self._labels, self._allowed, self._needed = labels, None, set()
 
     def _spared(self, conflicts: int) -> Iterator[Labels]:
-        """Labels with one dstate less, and again, while there is one that can be spared; only names that the labels use are allowed."""
+        """Labels with one dstate less, and again, while some dstate can be spared.
+
+        Only names that the labels use are allowed.
+        """
         tried: set[int] = set()
         while True:
             count = Counter(self._labels)
             last = [
                 max(used)
-                for spare in self._spare.values()
+                for spare in self._names.spare.values()
                 if (used := [name for name in spare if name in count])
             ]
             left = [name for name in last if name not in tried and name not in self._needed]
@@ -292,7 +370,9 @@ class NearbySearch:
                 return
             name = min(left, key=lambda name: (count[name], name))
             tried.add(name)
-            verdict = self._moved([*self._not_allowed(()), -self._used[name]], {name}, conflicts)
+            verdict = self._moved(
+                [*self._not_allowed(()), -self._names.used[name]], {name}, conflicts
+            )
             if verdict == "moved":
                 tried.clear()
                 yield self._labels
@@ -300,16 +380,19 @@ class NearbySearch:
                 self._needed.add(name)
 
     def _redrawn(self, conflicts: int) -> Iterator[Labels]:
-        """Labels with fewer dstates where the steps of dstates that lead to each other are free, from some spare name on, and all others stay."""
+        """Labels with fewer dstates, from freeing the nodes of one part of the map at a time.
+
+        A part begins at a spare name drawn at random, and grows along the links.
+        """
         tried = 0
         while tried < REGIONS:
             tried += 1
             taken = set(self._labels)
-            begin = sorted(taken.difference(range(len(self.clique))))
+            begin = sorted(taken.difference(range(len(self._pinned.clique))))
             if not begin:
                 return
             near: dict[int, set[int]] = {}
-            for t, _, u in self._chart.links:
+            for t, _, u in self._pinned.chart.links:
                 here, there = self._labels[t], self._labels[u]
                 near.setdefault(here, set()).add(there)
                 near.setdefault(there, set()).add(here)
@@ -327,7 +410,7 @@ class NearbySearch:
                 if literal and name not in free
             ]
             answer, core = self._with_fewer(
-                [-self._ordered, *self._not_allowed(()), *stay], conflicts
+                [-self._names.ordered, *self._not_allowed(()), *stay], conflicts
             )
             if answer is not None:
                 self._keep(answer)
@@ -339,11 +422,19 @@ class NearbySearch:
                 self._region = max(self._region - SMALLER, FIRST_REGION)
 
     def _widened(self, conflicts: int) -> Generator[Labels, None, _Verdict]:
-        """Labels with fewer dstates, if allowing more names leads to some; "needed" if there are none whatever is allowed."""
+        """Labels with fewer dstates, if allowing more names leads to some.
+
+        Returns:
+            "moved"; "needed" if all names are allowed and there are none; "open" if that is not
+            known.
+        """
         if self._allowed is None:  # first no more names, then each of them alone
             taken = set(self._labels)
             more = [
-                name for spare in self._spare.values() for name in spare[:-1] if name not in taken
+                name
+                for spare in self._names.spare.values()
+                for name in spare[:-1]
+                if name not in taken
             ]
             for names in ((), *((name,) for name in more)):
                 verdict = yield from self._asked(names, conflicts)
@@ -351,7 +442,7 @@ class NearbySearch:
                     return verdict
             self._allowed, self._waiting = (
                 [],
-                [*more, *(spare[-1] for spare in self._spare.values())],
+                [*more, *(spare[-1] for spare in self._names.spare.values())],
             )
         at_once = 1  # names that are allowed in one go
         left: list[int] | None = None
@@ -375,11 +466,13 @@ class NearbySearch:
         return "open" if self._waiting else "needed"
 
     def _asked(self, allowed: Collection[int], conflicts: int) -> Generator[Labels, None, _Verdict]:
-        """Labels with fewer dstates that use these names, too."""
-        answer, core = self._with_fewer([self._ordered, *self._not_allowed(allowed)], conflicts)
+        """Labels with fewer dstates that may use these names, too."""
+        answer, core = self._with_fewer(
+            [self._names.ordered, *self._not_allowed(allowed)], conflicts
+        )
         if answer is None:
             return "open" if core is None else "needed"
-        if resting := self._rests.intersection(answer.values()):
+        if resting := self._names.rests.intersection(answer.values()):
             self._name_more(resting)
         else:
             self._keep(answer)
@@ -389,15 +482,15 @@ class NearbySearch:
     def _with_fewer(
         self, assumed: Sequence[int], conflicts: int
     ) -> tuple[dict[int, int] | None, list[int] | None]:
-        """An answer of fewer dstates where this holds, or a core of it."""
-        cost = len(set(self._labels)) - 1 - len(self.clique)
+        """An answer of fewer dstates under these assumptions, or a core of them."""
+        cost = len(set(self._labels)) - 1 - len(self._pinned.clique)
         if cost < 0:
             return None, []
         return self._asker.verdict(names_lp.read_names, assumed, conflicts, f"enum,{cost},{cost}")
 
     def _name_more(self, resting: Collection[int]) -> None:
         """Take a control with more names for the views of these rests."""
-        before, taken = self._spare, set(self._labels)
+        before, taken = self._names.spare, set(self._labels)
         used = {view: [name for name in spare if name in taken] for view, spare in before.items()}
         self._fewest |= {
             view: len(spare) - 1 for view, spare in before.items() if spare[-1] in resting
@@ -408,15 +501,22 @@ class NearbySearch:
         renamed = {
             old: new
             for view, names in used.items()
-            for old, new in zip(names, self._spare[view], strict=False)
+            for old, new in zip(names, self._names.spare[view], strict=False)
         }
         self._label([renamed.get(name, name) for name in self._labels])
 
 
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:
-    """A guess at the labels of all steps, -1 where it is not known, in which they are where most like actions led, if what is seen there agrees.
+    """Mend a guess: put each node where the same action from the same dstate mostly leads.
 
-    Where few steps are guessed wrong, that mends them: from a right one on, all that follow are.
+    That mends a few wrong labels: from a right one on, all that follow become right.
+
+    Args:
+        guess: A label of each node, -1 where it is not known.
+        chart: The nodes and links.
+
+    Returns:
+        The mended labels. A label stays if the view at the node speaks against the new one.
     """
     keys = _keys(guess, chart)
     leads: dict[tuple[_Key, int], Counter[_Key]] = {}
@@ -435,17 +535,20 @@ def mended(guess: Sequence[int], chart: Chart) -> list[int]:
 
 
 def _keys(guess: Sequence[int], chart: Chart) -> list[_Key | None]:
-    """What is seen at each node, and its label, where it has one: steps that show different things are not at one dstate."""
+    """The observation and the label of each node; None where the label is not known."""
     return [
         None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)
     ]
 
 
 class Beside:
-    """A search for small maps in a thread of its own: numpy and clingo let go of Python's lock while they work.
+    """A search for small maps in a thread of its own.
 
-    labels  of the last map found, if any
-    bound   of the search, once the search is over
+    Threads help, as numpy and clingo release Python's lock while they work.
+
+    Attributes:
+        labels: Those of the last map found, if any.
+        bound: That of the search, once the search is over.
     """
 
     def __init__(self, search: NearbySearch, watch: Watch, found: Iterator[Labels]) -> None:
@@ -459,19 +562,20 @@ class Beside:
 
     @property
     def running(self) -> bool:
+        """Whether the thread is still at work."""
         return self._thread.is_alive()
 
     def check(self) -> None:
-        """Raise what went wrong there."""
+        """Raise the error that ended the thread, if one did."""
         if self._error is not None:
             raise self._error
 
     def end(self) -> None:
+        """Stop the search, and wait until the thread has ended."""
         self._watch.interrupted = True
         self._thread.join()
-        threading.Thread(
-            target=self._held.clear
-        ).start()  # to free clingo's control may take seconds, for which nobody has to wait
+        # To free clingo's control may take seconds. Nobody has to wait for that.
+        threading.Thread(target=self._held.clear).start()
 
     def _run(self, search: NearbySearch, found: Iterator[Labels]) -> None:
         try:

@@ -1,0 +1,320 @@
+"""Searches for the fewest named dstates, for the engines without frames.
+
+Clasp raises the lower bound core by core. A core is a set of spare names that cannot all be left
+unused. Cores are small at first, as the names of a view are its own.
+
+Meanwhile another thread looks for small maps (`engines/small_maps.py`, `engines/nearby.py`). The
+search ends as soon as some map has as few dstates as the bound. With one processor, steps are
+merged at once, and the guess waits until raising the bound takes long. If no small maps are
+looked for, clasp uses the second processor: two threads, which exchange what they learn.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
+
+from ssh_abduction.solver.asp.control import Asker, give_threads
+from ssh_abduction.solver.asp.facts import names_lp
+from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch
+from ssh_abduction.solver.engines.base import Task
+from ssh_abduction.solver.engines.name_program import Fitting, NameProgram
+from ssh_abduction.solver.engines.nearby import Beside
+from ssh_abduction.solver.engines.refusing import first_accepted_of
+from ssh_abduction.solver.engines.small_maps import SmallMaps
+from ssh_abduction.solver.steps.chart import Link
+
+# After this many conflicts clingo is given more links: it shows soon if the links that it has do
+# not decide much.
+PATIENCE = 2000
+# After this many conflicts with all links, and with nothing beside, look for a map near a guess.
+# Then clingo goes on for as long as it takes.
+CORES = 10_000
+# With nothing beside, ask this often with more conflicts: later tries rarely find a smaller map.
+TRIES = 3
+
+
+class Incumbent:
+    """The best labels known, a lower bound, and the search beside that betters both.
+
+    Attributes:
+        bound: No labels have fewer dstates; None while nothing is known.
+        labels: Labels of a map with few dstates; None if no map is known.
+        beside: A search near a guess in another thread, if there is one.
+    """
+
+    def __init__(self, asker: Asker, is_allowed: Callable[[Sequence[int]], bool]) -> None:
+        """Know nothing yet.
+
+        Args:
+            asker: Its limits are checked.
+            is_allowed: Whether labels keep what evidence says of pairs of steps.
+        """
+        self.bound: int | None = None
+        self.labels: list[int] | None = None
+        self.beside: Beside | None = None
+        self._asker, self._is_allowed = asker, is_allowed
+
+    def raise_bound(self, bound: int) -> None:
+        """Take this bound if it is higher."""
+        self.bound = max(self.bound or 0, bound)
+
+    @property
+    def is_beside(self) -> bool:
+        """Whether the search beside is running."""
+        return self.beside is not None and self.beside.running
+
+    def is_settled(self) -> bool:
+        """Whether known labels have as few dstates as the bound."""
+        if self.beside is not None:
+            self.beside.check()
+            self.take(self.beside.labels, self.beside.bound)
+        return self.labels is not None and len(set(self.labels)) <= (self.bound or 0)
+
+    def check_ahead(self, seconds: float) -> None:
+        """Raise LimitError if there is no time for work that cannot be interrupted.
+
+        First let the search beside use what time is left.
+
+        Args:
+            seconds: How long the work takes.
+        """
+        if not self._asker.watch.allows(seconds):
+            while self.is_beside and not self.is_settled():
+                self._asker.watch.check()
+                time.sleep(POLL)
+        self._asker.watch.check(seconds)
+
+    def end_beside(self) -> None:
+        """End the search beside, and take what it knows."""
+        if self.beside is not None:
+            self.beside.end()
+            self.take(self.beside.labels, self.beside.bound)
+            self.beside = None
+
+    def take(self, labels: list[int] | None, bound: int) -> None:
+        """Take what a search near a guess knows, if it is better.
+
+        Such a search knows nothing of what evidence says of pairs of steps.
+        """
+        fewer = labels is not None and (
+            self.labels is None or len(set(labels)) < len(set(self.labels))
+        )
+        if labels is not None and fewer and self._is_allowed(labels):
+            self.labels = labels
+        self.raise_bound(bound)
+
+
+@dataclass
+class _Answer:
+    """An answer of clingo.
+
+    Attributes:
+        names: The names of the nodes that clingo was told of.
+        labels: The labels of all nodes, once the answer was followed.
+    """
+
+    names: dict[int, int]
+    labels: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Lacking:
+    """What clingo has to be told, one of these.
+
+    Attributes:
+        views: Views that need another name.
+        links: Links that the answer does not explain.
+        labels: Labels that do not fit what goes beyond the causal theory.
+    """
+
+    views: Collection[int] = ()
+    links: Collection[Link] = ()
+    labels: Sequence[int] = ()
+
+
+class NameSearch:
+    """The search for the fewest dstates of one chart."""
+
+    def __init__(
+        self,
+        task: Task,
+        asker: Asker,
+        program: NameProgram,
+        incumbent: Incumbent,
+        fitting: Fitting | None,
+    ) -> None:
+        """Prepare a search.
+
+        Args:
+            task: The trace and the speed-ups that are on.
+            asker: It asks clingo.
+            program: The control that names dstates.
+            incumbent: The best labels and the bound, which are bettered.
+            fitting: Further demands on labels; None in the causal theory.
+        """
+        self._task, self._asker, self._program = task, asker, program
+        self._incumbent, self._fitting = incumbent, fitting
+        self._small = SmallMaps(task, program.pinned)
+        self._hard = False  # whether few conflicts were not enough
+        self._had_all_help = False  # whether clingo has all links, and small maps were looked for
+
+    def improving(self) -> Iterator[list[int]]:
+        """Labels of all nodes; the last ones have the fewest dstates.
+
+        If that takes its time, labels with few dstates come before.
+        """
+        known = self._incumbent
+        if not self._program.chart.links:
+            yield [0]
+            return
+        try:
+            for labels in self._searched():
+                if self._program.is_allowed(labels):
+                    known.labels = labels
+                    yield labels
+        except (LimitError, KeyboardInterrupt) as end:
+            known.end_beside()
+            if known.labels:
+                yield known.labels
+            if isinstance(end, KeyboardInterrupt) or not known.is_settled():
+                raise
+        finally:
+            known.end_beside()
+
+    def name_more(self, views: Collection[int]) -> None:
+        """Take one more spare name for each of these views."""
+        self._program.name_more(views)
+        self._configure()
+
+    def _searched(self) -> Iterator[list[int]]:
+        """As `improving`. End early if the search beside has the fewest dstates."""
+        found = yield from first_accepted_of(self._cheapest_answer, self._why_not, self._tell_why)
+        if found is None:
+            self._incumbent.end_beside()
+        yield found.labels if found else self._incumbent.labels or []
+
+    def _cheapest_answer(self) -> Generator[list[int], None, _Answer | None]:
+        """The cheapest answer by what clingo was told; None if a known map is as good.
+
+        If that takes its time, yield labels that are found otherwise.
+        """
+        while True:
+            names, proven = self._cheapest(self._patience)
+            if proven and names is not None:
+                return _Answer(names)
+            yield from self._helped()
+            if self._incumbent.is_settled():
+                return None
+            self._program.add(self._program.more_links())
+            self._configure()
+
+    def _cheapest(self, conflicts: int) -> tuple[dict[int, int] | None, bool]:
+        """The best answer within this many conflicts, and whether it is proven to be the best."""
+        pinned = len(self._program.pinned.clique)
+        answer = None
+        answers = self._asker.answers(
+            names_lp.read_names,
+            "opt",
+            0,
+            conflicts=conflicts,
+            on_bound=lambda costs: self._incumbent.raise_bound(pinned + costs[0]),
+            until=self._incumbent.is_settled,
+        )
+        while True:
+            try:
+                answer = next(answers)
+            except StopIteration as end:
+                return answer, bool(end.value)
+
+    def _why_not(self, answer: _Answer) -> _Lacking | None:
+        """What clingo has to be told, as an answer shows; None if the answer is a map."""
+        program = self._program
+        if views := program.rests(answer.names):
+            return _Lacking(views=views)
+        pinned = len(program.pinned.clique)
+        spares = sum(name >= pinned for name in set(answer.names.values()))
+        self._incumbent.raise_bound(pinned + spares)
+        answer.labels, failed = program.follow(answer.names)
+        if failed:
+            return _Lacking(links=failed)
+        if self._fitting is None or self._fitting.fits(answer.labels):
+            return None
+        return _Lacking(labels=answer.labels)
+
+    def _tell_why(self, lacking: _Lacking) -> None:
+        if lacking.views:
+            self.name_more(lacking.views)
+        elif lacking.links:
+            self._program.add(lacking.links)
+        elif self._fitting:
+            self._fitting.forbid(lacking.labels)
+
+    @property
+    def _patience(self) -> int:
+        """After how many conflicts something else is done; -1 for never."""
+        if not self._program.has_all_links:
+            return PATIENCE
+        return -1 if self._had_all_help or not self._may_help else CORES
+
+    @property
+    def _may_help(self) -> bool:
+        """Whether small maps may be looked for without clingo.
+
+        A small map of the causal theory need not fit further demands.
+        """
+        return self._fitting is None and (
+            self._task.speedups.greedy or self._task.speedups.annealed
+        )
+
+    def _helped(self) -> Iterator[list[int]]:
+        """Labels of small maps that are found otherwise, as clingo's search takes long."""
+        if self._may_help and not self._hard:
+            yield from self._begin_help()
+        self._hard = True
+        if self._program.has_all_links and self._may_help and not self._had_all_help:
+            self._had_all_help = True
+            if not self._task.has_processors:
+                yield from self._search_alone()
+
+    def _begin_help(self) -> Iterator[list[int]]:
+        """Begin to look for small maps in another thread.
+
+        With one processor, yield labels of a map merged by evidence instead.
+        """
+        is_long = self._program.pinned.is_long
+        if self._task.has_processors:
+            watch = Watch(beside=self._asker.watch)
+            search = self._small.search(watch)
+            near = chain(
+                self._small.merged(watch.check), self._small.near_guess(search, watch.check)
+            )
+            found = self._small.from_beginning(watch.check) if is_long else near
+            self._incumbent.beside = Beside(search, watch, _ever_fewer(found))
+        elif not is_long:
+            yield from self._small.merged(self._asker.watch.check)
+
+    def _search_alone(self) -> Iterator[list[int]]:
+        """Look for small maps near a guess for a while, with nothing beside."""
+        check, known = self._asker.watch.check, self._incumbent.labels
+        if self._program.pinned.is_long:
+            yield from _ever_fewer(self._small.from_beginning(check), known)
+            return
+        search = self._small.search(self._asker.watch)
+        yield from _ever_fewer(self._small.near_guess(search, check, TRIES), known)
+        self._incumbent.take(None, search.bound or 0)
+
+    def _configure(self) -> None:
+        """Give clasp two threads if the search is hard and nothing runs beside."""
+        if self._hard and not self._incumbent.is_beside and self._task.has_processors:
+            give_threads(self._asker.control, two=True)
+
+
+def _ever_fewer(found: Iterable[list[int]], known: list[int] | None = None) -> Iterator[list[int]]:
+    """Those labels that have fewer dstates than all before them."""
+    for labels in found:
+        if known is None or len(set(labels)) < len(set(known)):
+            known = labels
+            yield labels

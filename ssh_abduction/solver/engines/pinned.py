@@ -1,0 +1,50 @@
+"""A chart together with a clique of its nodes, which have names of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssh_abduction.solver.engines.base import AT_ONCE
+from ssh_abduction.solver.steps.apart import Matrix
+from ssh_abduction.solver.steps.chart import Chart, FramedChart
+from ssh_abduction.solver.steps.log import Log
+
+
+@dataclass(frozen=True)
+class Pinned:
+    """A chart and a clique of its nodes, which are pinned to the names 0, 1, and so on.
+
+    Attributes:
+        chart: The nodes and the links between them.
+        clique: Nodes that are pairwise apart.
+        may_be: For each node, the names of the clique that it is not apart from.
+    """
+
+    chart: Chart
+    clique: Sequence[int]
+    may_be: Sequence[Sequence[int]]
+
+    @classmethod
+    def of_steps(cls, log: Log, steps: int, *, largest: bool = True) -> Pinned:
+        """Chart the first steps and pin a largest clique of them, or else only the first step."""
+        chart = Chart.of_steps(log, steps)
+        clique = chart.continuations.clique() if largest else [0]
+        columns = [chart.continuations.apart_from(step) for step in clique]
+        return cls(chart, clique, _not_apart(np.stack(columns, axis=1)))
+
+    @classmethod
+    def framed(cls, chart: FramedChart, clique: Sequence[int]) -> Pinned:
+        """Pin these nodes of a chart with frames."""
+        return cls(chart, clique, _not_apart(chart.apart(others=clique)))
+
+    @property
+    def is_long(self) -> bool:
+        """Whether there are too many nodes to compare them in pairs."""
+        return len(self.chart.seen) > AT_ONCE
+
+
+def _not_apart(apart: Matrix) -> list[list[int]]:
+    return [(~row).nonzero()[0].tolist() for row in apart]
