@@ -25,7 +25,7 @@ from ssh_abduction.data import Step
 from ssh_abduction.data.errors import MapError, TheoryError
 from ssh_abduction.data.maps import Fault, SSHMap
 from ssh_abduction.solver import Status, choosing
-from ssh_abduction.solver.engines import faulty
+from ssh_abduction.solver.engines import faulty, faulty_control
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.blocks import Blocks
 from ssh_abduction.solver.front import fault_front
@@ -154,15 +154,8 @@ def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) 
         slipped=data.draw(st.sampled_from([0.3, 1.0])),
     )
     with (
-        patch.multiple(
-            faulty,
-            FEW=data.draw(st.sampled_from([2, 9])),
-            AT_FIRST=2,
-            AROUND=0,
-            PLACES=1,
-            NAMES=1,
-            MORE_NAMES=1,
-        ),
+        patch.multiple(faulty, FEW=data.draw(st.sampled_from([2, 9])), AT_FIRST=2, PLACES=1),
+        patch.multiple(faulty_control, AROUND=0, NAMES=1, MORE_NAMES=1),
         patch.object(choosing, "FEW_STEPS", 0),
     ):
         solution = solve(trace, theory, max_maps=None)

@@ -1,0 +1,195 @@
+"""What clingo knows of some steps of a trace with faults (faulty.lp), and the answers it gives.
+
+Dstates have names: each view has as many as it needs, and a rest, which stands for all its other
+dstates. A rest costs one dstate, and nothing is asked of the steps at it. So a minimal answer that
+uses no rest is minimal for any number of names. If one uses a rest, its view gets more names.
+
+At first a step that is misread is *lost*: nothing links it with other steps. If a minimal answer loses
+a step, the step becomes *full*: it may be at any dstate.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import clingo
+
+from ssh_abduction.solver.asp.control import Asker, Control
+from ssh_abduction.solver.asp.facts import faulty_lp
+from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.engines.base import Task
+from ssh_abduction.theory.evidence import Equality
+
+LONG = 1000  # steps from which on a trace is bounded by blocks before clingo is asked
+AROUND = 8  # steps given before and after one that a map does not predict
+NAMES = 3  # names of each view at first
+MORE_NAMES = 2  # further names of a view whose rest is used
+OPTIONS = ("--opt-strategy=usc,stratify",)
+
+
+@dataclass(frozen=True)
+class FaultyAnswer:
+    """An answer of clingo.
+
+    Attributes:
+        cost: Tenths of dstates.
+        where: The name of the dstate of each given step.
+        slips: The given steps whose action slipped.
+        lost: The given steps that are misread and at no dstate.
+        rests: The views whose rest is used.
+    """
+
+    cost: int
+    where: Mapping[int, int]
+    slips: frozenset[int]
+    lost: frozenset[int]
+    rests: frozenset[int]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether clingo has to be told more before this can be a map."""
+        return bool(self.rests or self.lost)
+
+
+@dataclass
+class _Told:
+    """What the present control was told.
+
+    Attributes:
+        names: The number of names of each view.
+        full: The steps that may be at any dstate.
+        steps: The given steps, in the order in which they were given.
+        batches: The number of batches of steps.
+        forbidden: The number of forbidden sets.
+    """
+
+    names: dict[int, int] = field(default_factory=dict)
+    full: set[int] = field(default_factory=set)
+    steps: list[int] = field(default_factory=list)
+    batches: int = 0
+    forbidden: int = 0
+
+
+class FaultyControl:
+    """Asks clingo about the given steps.
+
+    Attributes:
+        names: The number of names of each view, besides its rest.
+        given: The steps that clingo is given.
+        full: Those that may be at any dstate, even if their view is misread.
+        forbidden: Sets of equalities of steps that do not all hold.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        asker: Asker,
+        price: Mapping[str, Sequence[int]],
+        most_faults: int | None,
+        on_bound: Callable[[Sequence[int]], None],
+    ) -> None:
+        """Nothing is given to clingo yet.
+
+        Args:
+            task: What to solve.
+            asker: Asks clingo.
+            price: Tenths of dstates that each kind of fault costs, at each step.
+            most_faults: The most faults of a map, which then cost nothing; None for any number.
+            on_bound: Called with each bound that clingo proves.
+        """
+        self.names = dict.fromkeys(range(max(task.log.seen) + 1), NAMES)
+        self.given: set[int] = set()
+        self.full: set[int] = set()
+        self.forbidden: list[Collection[Equality]] = []
+        self._asker, self._log, self._price = asker, task.log, price
+        self._most_faults, self._on_bound = most_faults, on_bound
+        self._told = _Told()
+
+    def give_around(self, steps: Collection[int]) -> None:
+        """Give clingo these steps, and those around them."""
+        size = len(self._log.seen)
+        for step in steps:
+            self.given |= set(range(max(step - AROUND, 0), min(step + AROUND + 1, size)))
+
+    def learn_from(self, answer: FaultyAnswer) -> None:
+        """Add the names and full steps that an open answer asks for."""
+        if answer.rests:
+            used = Counter(
+                view
+                for name, view in faulty_lp.faulty_names(self.names)
+                if name in set(answer.where.values())
+            )
+            # A view with all its names in use soon needs another one.
+            for view in self.names:
+                self.names[view] += (
+                    MORE_NAMES if view in answer.rests else used[view] == self.names[view]
+                )
+        self.full |= answer.lost
+
+    def _prepare(self) -> None:
+        """Tell clingo what it does not know yet, in a new control where names changed."""
+        with self._asker.grounding_timed():
+            if (self._told.names, self._told.full) != (self.names, self.full):
+                self._begin()
+            control, told = self._asker.control, self._told
+            if new := sorted(self.given.difference(told.steps)):
+                self._give(new)
+            for number in range(told.forbidden, len(self.forbidden)):
+                rule = faulty_lp.not_all_one(self.forbidden[number])
+                control.add(f"forbidden_{number}", [], rule)
+                control.ground([(f"forbidden_{number}", [])])
+            told.forbidden = len(self.forbidden)
+
+    def _begin(self) -> None:
+        """Take a control that knows the names, and no step yet."""
+        self._told = _Told(dict(self.names), set(self.full))
+        control = self._asker.control = Control(OPTIONS, self._asker.watch.check)
+        control.load_encodings("faulty")
+        base = faulty_lp.faulty_base(self._log.actions, self.names, self._price)
+        control.add("base", [], base)
+        control.ground([("base", [])])
+
+    def _give(self, new: list[int]) -> None:
+        """Ground one batch of steps."""
+        control, told, batch = self._asker.control, self._told, self._told.batches
+        seen, actions, pairs = self._log.seen, self._log.actions, self._log.pairs
+        price = self._price
+        if self._most_faults is not None:
+            price = {kind: [0] * len(seen) for kind in self._price}
+        rules = faulty_lp.faulty_batch(
+            batch, seen, actions, new, told.steps, pairs, price, self.full
+        )
+        control.add(f"batch_{batch}", [], rules)
+        control.ground([(f"batch_{batch}", []), ("more", numbers(batch))])
+        if self._most_faults is not None:
+            control.add(f"most_{batch}", [], faulty_lp.at_most_faults(self._most_faults))
+            control.ground([(f"most_{batch}", [])])
+        told.steps += new
+        told.batches += 1
+
+    def answers(self, mode: str) -> Iterator[FaultyAnswer]:
+        """Answers for the given steps, each cheaper than the one before; the last is minimal."""
+        self._prepare()
+        yield from self._asker.answers(self._read, mode, 0, on_bound=self._on_bound)
+
+    def answers_of_cost(self, cost: int, enough: int) -> Iterator[FaultyAnswer]:
+        """Answers for the given steps of the least cost, each once; `enough` of them, 0 for all."""
+        self._prepare()
+        seen: set[tuple[frozenset[tuple[int, int]], frozenset[int]]] = set()
+        # The bound of a long trace is proven by blocks, and not of the given steps.
+        mode = f"optN,{cost}" if len(self._log.seen) < LONG else f"enum,{cost}"
+        for answer in self._asker.answers(self._read, mode, 0):
+            key = frozenset(answer.where.items()), answer.slips
+            if answer.cost == cost and key not in seen:
+                seen.add(key)
+                yield answer
+                if len(seen) == enough:
+                    return
+
+    def _read(self, model: clingo.Model) -> FaultyAnswer:
+        where, slips, lost = faulty_lp.read_faulty(model)
+        used = set(where.values())
+        rests = frozenset(view for name, view in faulty_lp.faulty_rests(self.names) if name in used)
+        return FaultyAnswer(model.cost[0] if model.cost else 0, where, slips, lost, rests)
