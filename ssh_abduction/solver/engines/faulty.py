@@ -1,14 +1,14 @@
-"""For the causal theory with faults: finds maps with the fewest dstates and faults.
+"""For the causal theory with faults: finds all maps with the fewest dstates and faults.
 
 A view may be misread, and an action may slip. Clingo is given some steps of the trace
-(`faulty_control.py`). Fewer steps are fewer constraints, so what they cost is a lower bound for all of
-the trace. A map of the given steps is followed through the others. If it predicts all views there, it is
-a minimal map of the whole trace. If not, clingo is given the steps around.
+(`faulty_control.py`). Fewer steps are fewer constraints, so their cost is a lower bound for the
+whole trace. A map of the given steps is followed through the others. If it predicts all views
+there, it is a minimal map of the whole trace. If not, clingo is given the steps around.
 
-A Viterbi pass chooses these steps: it finds the fewest faults by which a map explains the whole trace
-(Viterbi 1967). That is a map of the whole trace, too, and the incumbent. The first maps are guessed
-(`guesses/robust.py`), and clingo is only asked for cheaper ones. A long trace is bounded by blocks of it
-(`engines/blocks.py`).
+A Viterbi pass chooses these steps: it finds the fewest faults by which a map explains the whole
+trace (Viterbi 1967). That is a map of the whole trace, too, and the incumbent. The first maps are
+guessed (`guesses/robust.py`), and clingo is only asked for cheaper ones. The bound of a long trace
+comes from blocks of it (`engines/blocks.py`).
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class FaultyEngine:
                     return
 
     def _guessed(self) -> Iterator[Found]:
-        """Guessed maps of the whole trace. Clingo gets the number of names and the faults of the best."""
+        """Guessed maps of the whole trace. The best one says which names and steps clingo gets."""
         if self.size <= FEW or self._task.log.pairs.one or not self._price:
             return
         watch = self._task.watch
@@ -291,7 +291,7 @@ class FaultyEngine:
         )
 
     def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
-        """The views of dstates. One that is never read right gets the view seen there most often."""
+        """The view of each dstate. One never read right gets the view seen there most often."""
         views = list(shown)
         for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:
             views[s] = Counter(

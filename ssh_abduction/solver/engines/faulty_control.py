@@ -4,8 +4,8 @@ Dstates have names: each view has as many as it needs, and a rest, which stands 
 dstates. A rest costs one dstate, and nothing is asked of the steps at it. So a minimal answer that
 uses no rest is minimal for any number of names. If one uses a rest, its view gets more names.
 
-At first a step that is misread is *lost*: nothing links it with other steps. If a minimal answer loses
-a step, the step becomes *full*: it may be at any dstate.
+At first a step that is misread is *lost*: nothing links it with other steps. If a minimal answer
+loses a step, the step becomes *full*: it may be at any dstate.
 """
 
 from __future__ import annotations

@@ -52,7 +52,10 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
 
 
 def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
-    """The dstate and the place of each step in an answer set, which may break axioms; in a causal theory no step has a place."""
+    """The dstate and the place of each step in an answer set, which may break axioms.
+
+    In a causal theory no step has a place.
+    """
     found: dict[str, dict[int, int]] = {"is": {}, "at": {}}
     for name, args in map(read_atom, model.symbols(shown=True)):
         if name in found:
@@ -72,7 +75,7 @@ def _map(
     faults: Sequence[tuple[int, str]] = (),
     theory: Theory | None = None,
 ) -> SSHMap:
-    """The map of these dstates, places, courses and headings of steps; dstates and places are named by the first step at them."""
+    """The map of these steps. A dstate or place is named by the first step at it."""
     views = views_of(is_at, trace, faults)
     names = sorted(set(is_at.values()))
     dstate_of = {name: i for i, name in enumerate(names)}
@@ -113,10 +116,15 @@ def _map(
 def views_of(
     labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
 ) -> dict[int, View | None]:
-    """The view of each dstate: that of its first step at which it is known and not misread; None where there is no such step.
+    """The view of each dstate: the first view there that is known and not misread.
 
-    labels  the dstate of each step
-    faults  steps and kinds of faults
+    Args:
+        labels: The dstate of each step.
+        trace: The trace.
+        faults: Steps and kinds of faults.
+
+    Returns:
+        The views by dstate; None for a dstate without such a view.
     """
     misread = {t for t, kind in faults if kind == "misread"}
     views: dict[int, View | None] = dict.fromkeys(labels.values())
@@ -153,7 +161,7 @@ def faults_of(
 
 
 def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
-    """The map of the causal level that these labels of the first steps make, dstates numbered by first visit."""
+    """The causal map that these labels make. Dstates are numbered by first visit."""
     number: dict[int, int] = {}
     first: list[int] = []
     for t, label in enumerate(labels):
@@ -170,7 +178,7 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
 def faulty_map(
     labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]], theory: Theory
 ) -> SSHMap:
-    """The map of the causal level that these labels make, where some steps are disbelieved; dstates are numbered by first visit."""
+    """The causal map that these labels make, with faults. Dstates are numbered by first visit."""
     number: dict[int, int] = {}
     found = tuple(number.setdefault(label, len(number)) for label in labels)
     is_at = dict(enumerate(found))
@@ -187,7 +195,7 @@ def faulty_map(
 def links_of(
     labels: Sequence[int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
 ) -> tuple[tuple[int, str, int], ...]:
-    """The distinct links that a labelling of the trace's first steps makes, sorted; without those of actions that slipped."""
+    """The distinct links that these labels make, sorted, without actions that slipped."""
     slipped = {t for t, kind in faults if kind == "slipped"}
     links = enumerate(zip(pairwise(labels), trace.actions, strict=False))
     return tuple(sorted({(s, action.name, x) for t, ((s, x), action) in links if t not in slipped}))
@@ -217,7 +225,7 @@ def _paths(
 
 
 def in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:
-    """Places in an order in which each comes behind all that are before it. In a strict order, a place has more places before it than each of these has."""
+    """The places sorted by the strict order `before`: by the number of places before each."""
     behind = dict.fromkeys(places, 0)
     for _, q in before:
         behind[q] += 1

@@ -15,7 +15,10 @@ def constant(value: str | int) -> str:
 
 @lru_cache(maxsize=2**14)
 def read_atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
-    """The name and the arguments of an atom of a map. They are cached, as maps have most atoms in common and each part takes a call to clingo."""
+    """The name and the arguments of an atom of a map.
+
+    They are cached, as maps have most atoms in common and each part takes a call to clingo.
+    """
     return symbol.name, tuple(
         arg.number if arg.type is SymbolType.Number else COURSE[arg.name]
         for arg in symbol.arguments

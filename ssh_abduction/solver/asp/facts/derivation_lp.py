@@ -1,4 +1,4 @@
-"""Conclusions of `derivation.lp`, for explanations: atoms that ask for them, and answers that hold them."""
+"""Conclusions of `derivation.lp`, for explanations: how to ask for them, and how to read them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,12 @@ def conclusions_of(control: Control) -> list[Symbol]:
 
 
 def read_argument(model: Model) -> tuple[frozenset[Symbol], frozenset[Symbol], frozenset[Symbol]]:
-    """Of an answer: the conclusions that hold, what would make the axioms active that are broken, and the atoms of steps that are one dstate."""
+    """Read an answer of an explanation.
+
+    Returns:
+        The conclusions that hold, the `active` atoms of the broken axioms, and the atoms of
+        steps that are one dstate.
+    """
     conclusions, broken, one = set[Symbol](), set[Symbol](), set[Symbol]()
     for symbol in model.symbols(atoms=True):
         if symbol.name == "so":

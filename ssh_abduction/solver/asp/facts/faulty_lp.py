@@ -13,7 +13,11 @@ from ssh_abduction.theory.evidence import Equality, Pairs
 
 
 def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
-    """The names of dstates for faulty.lp, and the view of each: for each view so many, and one more, which is the rest of the view."""
+    """The name and view of each dstate.
+
+    Args:
+        names: The number of names of each view, besides its rest.
+    """
     first = 0
     for view, count in names.items():
         yield from ((name, view) for name in range(first, first + count + 1))
@@ -33,7 +37,7 @@ def at_most_faults(most: int) -> str:
 
 
 def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
-    """That there are so many dstates at most, and that their faults cost no more than this, as rules for faulty.lp."""
+    """Rules for faulty.lp: at most so many dstates, and faults of at most this cost."""
     faults = (
         "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
     )
@@ -41,9 +45,12 @@ def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
 
 
 def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
-    """The names of dstates, the actions, and the kinds of faults that may be, as facts for faulty.lp.
+    """The names, the actions and the allowed kinds of faults, as facts for faulty.lp.
 
-    names  how many names each view has, beside the rest
+    Args:
+        actions: The actions as numbers.
+        names: The number of names of each view, besides its rest.
+        kinds: The kinds of faults that are allowed.
     """
     found = [f"action({action})." for action in sorted(set(actions))]
     found += [f"allowed({kind})." for kind in kinds]
@@ -67,10 +74,15 @@ def faulty_batch(
 ) -> str:
     """These steps of a trace as a batch of facts for faulty.lp.
 
-    full   steps of which it is asked where they are, also where their views are misread
-    price  tenths of dstates for each kind of fault that may be, at each step
-    steps  in the order in which they are given
-    known  those that were given before, in that order
+    Args:
+        batch: The number of the batch.
+        seen: The view of each step of the trace, as a number.
+        actions: The action after each step, as a number.
+        steps: The new steps, in the order in which they are given.
+        known: The steps given before, in their order.
+        pairs: What evidence says of pairs of steps.
+        price: Tenths of dstates for each kind of fault, at each step.
+        full: Steps that may be at any dstate, even if misread.
     """
     given = {*known, *steps}
     new = set(steps)
@@ -104,7 +116,12 @@ def not_all_one(equalities: Collection[Equality]) -> str:
 
 
 def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int], frozenset[int]]:
-    """Where each given step is, by the names of faulty.lp; the steps whose actions slipped; and those that are lost, as nobody asks where they are."""
+    """Read an answer of faulty.lp.
+
+    Returns:
+        The name of each given step, the steps whose action slipped, and the lost steps, which
+        have no name.
+    """
     where: dict[int, int] = {}
     steps: dict[str, set[int]] = {"slips": set(), "lost": set()}
     for name, args in map(read_atom, model.symbols(shown=True)):

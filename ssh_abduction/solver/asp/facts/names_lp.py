@@ -20,11 +20,13 @@ def name_facts(
 ) -> str:
     """The facts of names.lp that hold for all batches.
 
-    names    each with its view
-    spares   for each view its spare names; the last one is the rest
-    links    of the nodes, with their actions
-    choices  for each node, the names that it can be at
-    ordered  whether steps have to be at spare names in the order of the names; if not, that may be assumed in a question
+    Args:
+        names: Each name with its view.
+        spares: For each view its spare names; the last one is the rest.
+        links: Links of the nodes, with their actions.
+        choices: For each node, the names that it can have.
+        ordered: Whether spare names are used in the order of nodes. If not, a question may
+            assume that.
     """
     view_of = dict(names)
     rests = {spare[-1] for spare in spares}
@@ -59,9 +61,12 @@ def batch_facts(
 ) -> str:
     """The facts of names.lp for one batch.
 
-    nodes  each with its view, the names that it can be at, and the node of that view that was given before it
-    links  with their actions
-    apart  pairs of nodes
+    Args:
+        batch: The number of the batch.
+        nodes: Each node with its view, the names that it can have, and the node of that view
+            that was given before it.
+        links: Links with their actions.
+        apart: Pairs of nodes that are not one dstate.
     """
     facts = []
     for t, view, names, before in nodes:
@@ -74,7 +79,7 @@ def batch_facts(
 
 
 def resting(batch: int) -> Symbol:
-    """The atom that some step of the batches up to this one is at the rest of its view. It is assumed, or assumed false, in a question."""
+    """The atom that some step of the batches up to this one is at the rest of its view."""
     return Function("resting", numbers(batch))
 
 
@@ -100,16 +105,20 @@ def read_names(model: Model) -> dict[int, int]:
 
 @lru_cache(maxsize=2**16)
 def _named(symbol: Symbol) -> tuple[int, int]:
-    """A step and its name. They are cached, as successive answers have most atoms in common and each part takes a call to clingo."""
+    """A step and its name.
+
+    They are cached, as successive answers have most atoms in common.
+    """
     step, name = symbol.arguments
     return step.number, name.number
 
 
 class NameReader:
-    """Reads answers of names.lp that was given all links of a trace. The name of each step then follows from where actions lead, which takes fewer questions.
+    """Reads answers of names.lp that was given all links of a trace.
 
-    actions  after each step but the last, as numbers
-    choices  for each step, the names that it can be at
+    The name of each step follows from where actions lead, which takes fewer calls to clingo.
+    `actions` has the action after each step but the last, as numbers. `choices` has the names
+    that each step can have.
     """
 
     def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]]) -> None:
@@ -148,9 +157,11 @@ class NameReader:
 
 
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
-    """The rule that these pairs of steps with names are not all one dstate. At a rest steps need not be one.
+    """The rule that these pairs of steps are not all one dstate, unless they are at a rest.
 
-    number  another one for each such rule
+    Args:
+        number: Another one for each such rule.
+        pairs: Pairs of steps with names.
     """
     together = [
         f"together({number},{k}) :- is({i},S), is({j},S), not rest(S)."
@@ -164,5 +175,5 @@ def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
 def forbidden_links(
     links: Iterable[tuple[int, int, int]], placed: Iterable[tuple[int, int]] = ()
 ) -> str:
-    """The rule that these links of named dstates do not all hold while these steps are at these dstates."""
+    """The rule that these links do not all hold while these steps are at these dstates."""
     return f":- {', '.join([*(f'goes({s},{a},{x})' for s, a, x in links), *(f'is({t},{s})' for t, s in placed)])}."

@@ -25,9 +25,10 @@ _Ahead: TypeAlias = tuple[
 class PathAnswer:
     """An answer of paths_framed.lp or paths_frameless.lp.
 
-    at     for each place that the turns tell, the place that it is at, and how it is turned to it
-    part   for each segment, the path that it is part of, and in which direction
-    order  for each path, its places in order
+    Attributes:
+        at: For each place of the turns, the place of the map, and how it is turned to it.
+        part: For each segment, its path, and its direction on that.
+        order: For each path, its places in order.
     """
 
     at: dict[int, tuple[int, int]]
@@ -36,10 +37,10 @@ class PathAnswer:
 
 
 class PathReader:
-    """Reads maps from answers of paths_framed.lp or paths_frameless.lp, for one labelling of the nodes. What the labels alone tell is worked out once.
+    """Reads maps from answers of paths_framed.lp or paths_frameless.lp, for fixed labels.
 
-    Instead of reading all atoms of an answer, this asks it for the atoms that can be in it, beginning with those of the answer before. That takes a third of
-    the time.
+    It asks an answer for the atoms that can be in it, those of the last answer first. That takes
+    a third of the time of reading all atoms. What follows from the labels is computed once.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class PathReader:
         ] = {}  # dstates made so far, as most of them are in most maps
 
     def condition(self, sort: str, i: int, j: int) -> str | None:
-        """The condition that two dstates of a map are one in the answer: as to place, path or course. None where they never are."""
+        """The condition that two dstates share a place, path or course; None if they never do."""
         if sort == "places":
             return f"at({self._dstates[i][1]},P,_), at({self._dstates[j][1]},P,_)"
         runs = {
@@ -106,7 +107,7 @@ class PathReader:
         )
 
     def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
-        """The places of a path in order. This begins with their order in the last answer, which is mostly nearly the same."""
+        """The places of a path in order, sorted from their order in the last answer."""
         order = list(
             dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places])
         )
@@ -185,12 +186,13 @@ class PathReader:
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """What the places of an answer tell of a map.
+    """The part of a map that follows from the places of an answer.
 
-    at       as in PathAnswer
-    number   for each place, its number in the map
-    dstates  the dstates of the map, without paths
-    along    the dstates of a segment with their paths, by the segment, the path that it is part of, and in which direction
+    Attributes:
+        at: As in PathAnswer.
+        number: For each place, its number in the map.
+        dstates: The dstates of the map, without paths.
+        along: The dstates of a segment with their paths, by segment, path and direction.
     """
 
     at: dict[int, tuple[int, int]]
@@ -200,7 +202,7 @@ class _Placed:
 
 
 class _Choices:
-    """The atoms of a predicate with three arguments of which an answer has exactly one for each first argument."""
+    """The atoms of a predicate whose first argument has exactly one atom in each answer."""
 
     def __init__(self, control: Control, name: str) -> None:
         self._among: dict[

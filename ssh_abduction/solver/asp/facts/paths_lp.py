@@ -1,4 +1,4 @@
-"""Facts for `fast/paths*.lp`, which find places and paths for labels that are settled, and what these say before a choice."""
+"""Facts for `fast/paths*.lp`, which find places and paths for fixed labels, and their answers."""
 
 from __future__ import annotations
 
@@ -54,10 +54,15 @@ def paths_frameless_facts(
     *,
     single: bool = False,
 ) -> str:
-    """Dstates, the numbered actions that link them, and what is preferred, as facts for paths_frameless.lp.
+    """Dstates and their links, as facts for paths_frameless.lp.
 
-    far     sets of pairs of dstates: evidence says that in each set there is a pair that is not at one place. Most sets are a single pair
-    single  ask only for places and paths in which no two places and no two segments are one, unless they have to be
+    Args:
+        theory: The theory.
+        dstates: The dstates.
+        links: Links with actions as numbers.
+        actions: The actions by number.
+        far: Sets of pairs of dstates. In each set some pair is not at one place.
+        single: Merge no places or segments unless they have to be one.
     """
     facts = [
         sides_framed_facts(theory),
@@ -79,7 +84,12 @@ def paths_frameless_facts(
 
 
 def read_contrary(model: Model) -> tuple[list[int], list[int]]:
-    """Dstates whose segments show that there are no places and paths, those of short segments first; and dstates where paths cross that seem to meet again."""
+    """Dstates that show that there are no places and paths.
+
+    Returns:
+        The dstates of contrary segments, short ones first; and dstates whose paths seem to
+        cross twice.
+    """
     atoms = list(map(read_atom, model.symbols(shown=True)))
     contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")
     return [dstate for _, dstate in contrary], sorted(
@@ -95,9 +105,14 @@ def settled_facts(
     *,
     single: bool = False,
 ) -> str:
-    """The dstates of these nodes, what is open from each dstate, and what is preferred, as facts for the fewest places and paths (paths_framed.lp).
+    """The labels of these nodes, as facts for paths_framed.lp.
 
-    single  ask only for places and paths in which no two places and no two segments are one, unless they have to be
+    Args:
+        theory: The theory.
+        chart: The chart of the nodes.
+        labels: The dstate of each node.
+        nodes: The nodes to use.
+        single: Merge no places or segments unless they have to be one.
     """
     facts = [
         settled_labels((node, labels[node]) for node in nodes),
@@ -113,7 +128,7 @@ def settled_facts(
 
 
 def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
-    """The segments of a control, and the pairs of them that cannot be one path in either direction."""
+    """All segments, and the pairs of them that cannot be one path in either direction."""
     segments = sorted(
         read_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("segment", 1)
     )
@@ -173,7 +188,12 @@ def pinned_facts(segments: Iterable[int]) -> str:
 
 
 def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int, int]]]:
-    """Whether the labels of nodes have no places and paths; and if not so, which pairs of dstates are at different places, and which are one."""
+    """Read what follows from labels of nodes.
+
+    Returns:
+        Whether they have no places and paths. If they may have: the pairs of dstates at
+        different places, and the pairs that are one.
+    """
     found: dict[str, list[tuple[int, int]]] = {"elsewhere": [], "one": []}
     for name, args in map(read_atom, model.symbols(shown=True)):
         if name == "violated":
@@ -183,7 +203,7 @@ def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int
 
 
 def is_violated(control: Control) -> bool:
-    """Whether no places and paths fit the labels of nodes, as far as that can be seen without a choice."""
+    """Whether grounding alone shows that no places and paths fit the labels of nodes."""
     return control.symbolic_atoms[Function("violated")] is not None
 
 
@@ -198,7 +218,7 @@ def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """The dstate of each node, for clingo to take or to leave out, so that what it takes has no places and paths."""
+    """Labels of nodes of which clingo chooses some that have no places and paths."""
     return "\n".join(
         [
             *(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)),

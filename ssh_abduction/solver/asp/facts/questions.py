@@ -1,4 +1,4 @@
-"""Rules for questions about maps that are known: other maps, maps with given counts, and equalities that do not all hold."""
+"""Rules for questions about known maps: other maps, maps of given size, forbidden equalities."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ def are_one(first: int, second: int) -> Symbol:
 def forbidden_equalities(
     equalities: Iterable[Equality], where: Symbol | None = None, excusable: bool = False
 ) -> str:
-    """The rule that these equalities of steps do not all hold; where an atom is given, only if that holds.
+    """The rule that these equalities of steps do not all hold.
 
-    excusable  what refuses them are displacements, and says nothing where one of these, between two of the steps, is disbelieved
+    Args:
+        equalities: The equalities.
+        where: An atom; the rule holds only if the atom does. None for always.
+        excusable: The rule does not hold where a displacement between the steps is disbelieved.
     """
     atoms = [str(where)] if where else []
     if excusable:
@@ -40,7 +43,14 @@ def rests_on(axiom: str, t: int, other: str) -> str:
 
 
 def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
-    """The rules that say: some doubt holds where this one is open, and two things are one (or are not); the condition of that is None where they never are."""
+    """The rules that some doubt holds if this one is open and two things are one, or are not.
+
+    Args:
+        number: The number of the doubt.
+        part: The program part.
+        condition: The condition that the two things are one; None if they never are.
+        one: Whether the doubt is that they are one.
+    """
     rules = [f"#external {open_doubt(number)}."]
     rules += (
         [f"one_in_doubt({number}) :- {condition}."]
@@ -65,7 +75,10 @@ def doubts_before(part: int) -> str:
 
 
 def steps_are_one(sort: str, i: int, j: int) -> str:
-    """The condition that two steps, the earlier one first, are one in the readable encodings: as to dstate, place, path or course. A step with itself: that it is along a path."""
+    """The condition that two steps share a dstate, place, path or course.
+
+    The earlier step comes first. For a step and itself: that it is along a path.
+    """
     return {
         "dstates": f"same({i},{j})",
         "places": f"same_place({i},{j})",

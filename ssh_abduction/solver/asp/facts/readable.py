@@ -45,12 +45,15 @@ def own_rules(theory: Theory) -> str:
 
 
 def run_by_steps() -> Symbol:
-    """The external atom that says that the program parts of steps are grounded: without it the encodings have no answer."""
+    """The external atom that program parts of steps are grounded. Without it there is no answer."""
     return Function("run_by_steps")
 
 
 def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
-    """The most paths that a map of the first steps can have: a path begins at the start, or where a turn right or left ends."""
+    """The most paths of a map of the first steps.
+
+    A path begins at the start, or where a turn right or left ends.
+    """
     if TRAVELS_AND_TURNS & theory.given_up:
         return steps
     return 1 + sum(
@@ -59,7 +62,7 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
 
 
 def trace_facts(problem: Problem, start: int, stop: int) -> str:
-    """What happened in steps `start` to `stop - 1`, and the links between them and from the step before, as facts."""
+    """Steps `start` to `stop - 1`, and the links to them, as facts."""
     trace, theory = problem.trace, problem.theory
     facts = []
     for t in range(start, stop):
@@ -97,7 +100,7 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
 
 
 def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
-    """What these steps see of gateways, and how that fits what earlier steps see, as facts for gateways.lp."""
+    """The gateways that these steps see, and how they fit earlier ones, for gateways.lp."""
     found = frames.Frames(trace, stop)
     known = len(frames.Frames(trace, start).frames)
     yield from (f"star({t},{found.stars[t]})." for t in range(start, stop))

@@ -1,4 +1,4 @@
-"""Facts for `fast/sides_framed.lp` and `fast/sides_frameless.lp`: what the sides of paths demand of labels."""
+"""Facts for `fast/sides_*.lp`: what the sides of paths demand of labels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def sides_framed_facts(theory: Theory) -> str:
 
 
 def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
-    """Which numbered actions are travels and turns, and which axioms of sides hold, as facts for sides_frameless.lp."""
+    """Kinds of actions, and the axioms of sides, as facts for sides_frameless.lp."""
     kinds = [
         f"turns({a},{action.turn})." if action.turn else f"travels({a})."
         for a, action in actions.items()

@@ -17,12 +17,14 @@ def visit_facts(
     fits: Iterable[tuple[int, int, int]],
     unfit: Iterable[tuple[int, int, int]] = (),
 ) -> str:
-    """The facts of visits.lp for one batch: what is new of visits.
+    """The facts of visits.lp for one batch.
 
-    nodes   number, visit and slot of each
-    leaves  visits that end: the visit, the slot and the action
-    fits    pairs of visits that may be at one place, and how turned
-    unfit   such pairs of earlier batches that may no longer be
+    Args:
+        batch: The number of the batch.
+        nodes: Number, visit and slot of each node.
+        leaves: Visits that end: the visit, the slot and the action.
+        fits: Pairs of visits that may be at one place, and how they are turned.
+        unfit: Such pairs of earlier batches that no longer may be.
     """
     new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit}
     return "\n".join(
@@ -80,9 +82,12 @@ def forbidden_pairs(
     different: Iterable[tuple[int, int, int]] = (),
     listed: int | None = None,
 ) -> str:
-    """The rule that not all of these pairs of visits are at one place while all those `different` ones are not.
+    """The rule that not all `pairs` of visits are at one place while no `different` pair is.
 
-    listed  the rule holds only while answers up to this batch are listed (default always)
+    Args:
+        pairs: Pairs of visits, and how they are turned.
+        different: The same.
+        listed: The rule holds only while answers up to this batch are listed; None for always.
     """
     body = [
         *(f"same({i},{j},{r})" for i, j, r in pairs),
@@ -92,5 +97,5 @@ def forbidden_pairs(
 
 
 def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> str:
-    """The rules that not all of these equalities hold, each of which is that one of some pairs of visits is one place, however turned."""
+    """The rules that not all equalities hold. An equality is that one of its pairs is one place."""
     return "\n".join(forbidden_pairs(pairs) for pairs in product(*equalities))
