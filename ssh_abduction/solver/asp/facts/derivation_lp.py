@@ -66,6 +66,7 @@ def some_fail() -> Symbol:
 def may_fail(conclusions: Iterable[Symbol]) -> str:
     """The rules that say so."""
     return "\n".join(
-        f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}. #heuristic {c} : {picked(c)}. [1,false]"
+        f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}. "
+        f"#heuristic {c} : {picked(c)}. [1,false]"
         for c in conclusions
     )

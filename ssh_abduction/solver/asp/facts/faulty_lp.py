@@ -41,7 +41,10 @@ def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
     faults = (
         "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
     )
-    return f"#program more(b).\n:- #sum {{ {faults} }} > {tenths}.\n:- #count {{ S : used(S) }} > {dstates}."
+    return (
+        f"#program more(b).\n:- #sum {{ {faults} }} > {tenths}.\n"
+        f":- #count {{ S : used(S) }} > {dstates}."
+    )
 
 
 def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
@@ -112,7 +115,8 @@ def faulty_batch(
 
 def not_all_one(equalities: Collection[Equality]) -> str:
     """That these equalities of given steps do not all hold, as a rule for faulty.lp."""
-    return f":- {', '.join(f'is({e.first},S{k}), is({e.second},S{k})' for k, e in enumerate(equalities))}."
+    body = (f"is({e.first},S{k}), is({e.second},S{k})" for k, e in enumerate(equalities))
+    return f":- {', '.join(body)}."
 
 
 def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int], frozenset[int]]:

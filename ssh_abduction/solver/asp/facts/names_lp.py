@@ -176,4 +176,5 @@ def forbidden_links(
     links: Iterable[tuple[int, int, int]], placed: Iterable[tuple[int, int]] = ()
 ) -> str:
     """The rule that these links do not all hold while these steps are at these dstates."""
-    return f":- {', '.join([*(f'goes({s},{a},{x})' for s, a, x in links), *(f'is({t},{s})' for t, s in placed)])}."
+    body = [f"goes({s},{a},{x})" for s, a, x in links] + [f"is({t},{s})" for t, s in placed]
+    return f":- {', '.join(body)}."

@@ -30,10 +30,9 @@ def forbidden_equalities(
     atoms = [str(where)] if where else []
     if excusable:
         atoms += [f"not jumped_since({e.first},{e.second})" for e in equalities]
-    atoms += [
-        f"{'' if e.holds else 'not '}same{'' if e.of == 'dstate' else '_place'}({min(e.first, e.second)},{max(e.first, e.second)})"
-        for e in equalities
-    ]
+    for e in equalities:
+        sign, of = "" if e.holds else "not ", "same" if e.of == "dstate" else "same_place"
+        atoms.append(f"{sign}{of}({min(e.first, e.second)},{max(e.first, e.second)})")
     return f":- {', '.join(atoms)}."
 
 
@@ -60,7 +59,8 @@ def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
     return "\n".join(
         [
             *rules,
-            f"{some_doubt(part)} :- {open_doubt(number)}, {'' if one else 'not '}one_in_doubt({number}).",
+            f"{some_doubt(part)} :- {open_doubt(number)}, "
+            f"{'' if one else 'not '}one_in_doubt({number}).",
         ]
     )
 
@@ -104,7 +104,8 @@ def exactly(number: int, count: Count) -> str:
         "places": "T : at(T,T)",
         "paths": "(T,H) : first_along(T,H)",
     }[count]
-    return f"#external {of_number(number, count)}.\n:- {of_number(number, count)}, #count {{ {counted} }} != {number}."
+    atom = of_number(number, count)
+    return f"#external {atom}.\n:- {atom}, #count {{ {counted} }} != {number}."
 
 
 def of_number(number: int, count: Count) -> Symbol:

@@ -164,7 +164,8 @@ def program(problem: Problem) -> str:
     files = " ".join(f"{name}.lp" for name in encoding_names(theory))
     return "\n".join(
         [
-            f"% {len(trace)} steps{f' of {trace.name!r}' if trace.name else ''}. In {encodings.folder()}, run",
+            f"% {len(trace)} steps{f' of {trace.name!r}' if trace.name else ''}. "
+            f"In {encodings.folder()}, run",
             f"%   python run.py --project=project --opt-mode=optN -n 0 THIS_FILE {files}",
             theory_facts(theory, most_paths(trace, theory, len(trace))),
             trace_facts(problem, 0, len(trace)),
