@@ -11,51 +11,49 @@ from typing import Literal, TypeAlias
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
 
-# The search for minimal maps of prefixes ends when this share of the time limit is left. Until then it may have no map of the whole trace, and the rest of the
-# time is for finding one, minimal or not.
+# The search for minimal maps of prefixes ends when this share of the time limit is left. The rest
+# of the time is for finding any map of the whole trace, minimal or not.
 RESERVE = 0.2
-# A search of the whole trace that has found no map ends when this share of the time limit is left: it is for making some map without a search.
+# A search of the whole trace that has found no map ends when this share of the time limit is left.
+# The rest of the time is for making a map without a search.
 LAST = 0.05
-# Seconds between two looks at the clock and at Ctrl-C while clingo is busy: short against the second by which a limit may be overrun, and long against the time
-# that a look takes.
+# Seconds between two checks of the clock and of Ctrl-C while clingo is busy. A limit may be overrun
+# by a second, and a check takes far less than this.
 POLL = 0.05
-# Seconds between two reports of progress: as often as somebody can read them.
+# Seconds between two reports of progress: as often as a person can read them.
 TICK = 0.5
 
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit", "no proof"]
 
 
 def check_limit(name: str, unit: str, limit: object) -> None:
-    """Raises SolverError where a limit that a caller gives is neither None nor a number above 0."""
+    """Raise SolverError if a limit of a caller is neither None nor a number above 0."""
     if (
         limit is not None
         and not (is_finite(limit) and limit > 0)
         and not (isinstance(limit, float) and limit == math.inf)
     ):
         raise SolverError(
-            f"{name}: expected a number of {unit} above 0, got {brief(limit)}; leave it out for none"
+            f"{name}: expected a number of {unit} above 0, got {brief(limit)}; "
+            "leave it out for none"
         )
 
 
 class LimitError(Exception):
-    """A limit of a search is over, or somebody interrupted it. What is known by then is the answer."""
+    """A limit of a search is reached, or it was interrupted. The incumbent is the answer."""
 
     def __init__(self, reason: Stop) -> None:
         self.reason = reason
 
 
 class StageTimeError(Exception):
-    """The time is over that one stage of a search has: the next stage begins."""
+    """The time of one stage of a search is over, and the next stage begins."""
 
 
 class Watch:
-    """The limits of a search: `check` raises when one is over. Time that the caller of a stream takes between two maps does not count.
+    """The limits of a search: `check` raises when one is reached.
 
-    limit    seconds, or None
-    memory   MiB that the process may use, or None
-    on_tick  called now and then, to report progress
-    beside   the watch of another search, where this one runs beside it in a thread or process. The other search ends this one, so its time limit only keeps
-             this one from beginning what cannot be interrupted and would take longer
+    Time that the caller of a stream spends between two maps does not count.
     """
 
     def __init__(
@@ -66,6 +64,15 @@ class Watch:
         *,
         beside: Watch | None = None,
     ) -> None:
+        """Set the limits. `start` begins to count time.
+
+        Args:
+            limit: Seconds; None for no limit.
+            memory: MiB that the process may use; None for no limit.
+            on_tick: Called now and then, to report progress.
+            beside: The watch of another search that this one runs beside, and that ends this one.
+                Its time limit only keeps this one from beginning what would outlast it.
+        """
         self._beside = beside
         self._on_tick = on_tick
         self._next_tick = TICK
@@ -114,32 +121,37 @@ class Watch:
 
     @property
     def reserve_begins(self) -> float:
-        """When only the share of the time limit is left that is kept for what comes last."""
+        """Seconds after which only the share for finding any map is left."""
         return math.inf if self._limit is None else self._limit * (1 - RESERVE)
 
     def part(self, seconds: float) -> Watch:
-        """A watch that allows so many seconds from now, and ends earlier where this one does."""
+        """A watch for so many seconds from now, which ends earlier if this one does."""
         part = Watch(seconds, self._memory, self.check)
         part.use_reserve()
         part.start()
         return part
 
     def shorten(self, seconds: float) -> None:
-        """From now on the time limit is this, if that is less."""
+        """Set the time limit to this, if that is less."""
         self._limit = self._allowed = seconds if self._limit is None else min(seconds, self._limit)
 
     def end_stage_after(self, seconds: float) -> None:
-        """Let `check` raise StageTimeError, once, when so much time was spent."""
+        """Let `check` raise StageTimeError, once, after so many seconds of search."""
         self._stage_ends = seconds
 
     def elapsed(self) -> float:
         return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
 
     def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
-        """Raise if a limit is over, or would be after something that cannot be interrupted.
+        """Raise if a limit is reached, or will be by something that cannot be interrupted.
 
-        ahead      seconds that it will take
-        mebibytes  memory that it will take
+        Args:
+            ahead: Seconds that it will take.
+            mebibytes: Memory that it will take.
+
+        Raises:
+            LimitError: A limit is reached, or the search was interrupted.
+            StageTimeError: The time of the present stage is over.
         """
         if self.interrupted:
             raise LimitError("interrupted")
@@ -155,13 +167,13 @@ class Watch:
             raise StageTimeError
 
     def allows(self, seconds: float) -> bool:
-        """Whether there is time for something that cannot be interrupted and takes so many seconds."""
+        """Whether there is time for so many seconds that cannot be interrupted."""
         if self._allowed is not None and self.elapsed() + seconds > self._allowed:
             return False
         return not seconds or self._beside is None or self._beside.left() >= seconds
 
     def memory_left(self) -> float | None:
-        """MiB until the memory limit, of which other processes may use as much."""
+        """MiB until the memory limit, for other processes to use; None for no limit."""
         if self._memory is None:
             return self._beside.memory_left() if self._beside else None
         return self._memory - peak_memory()
@@ -172,14 +184,17 @@ class Watch:
 
 
 def resident_memory() -> float:
-    """The memory that this process uses now, in MiB; the most that it has used, where the system does not tell."""
+    """The memory that this process uses now, in MiB; its peak if the system lacks that number."""
     with suppress(OSError, StopIteration), open("/proc/self/status", "rb") as status:
         return next(int(line.split()[1]) for line in status if line.startswith(b"VmRSS:")) / 2**10
     return peak_memory()
 
 
 def peak_memory() -> float:
-    """The most memory this process has used, in MiB. On Linux getrusage begins with what the process that began this one used."""
+    """The most memory that this process has used, in MiB.
+
+    On Linux getrusage counts what the parent process used, so /proc is read there.
+    """
     with suppress(OSError, StopIteration), open("/proc/self/status", "rb") as status:
         return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) / 2**10
     import resource

@@ -1,7 +1,8 @@
-"""Does work in a process of its own, which can have a processor to itself: of the threads of one process only one runs Python at a time, and only one grounds.
+"""Runs Python work in a process of its own, so that it can use a second processor.
 
-To make guesses is mostly Python, and so is the search that goes on meanwhile: as two threads both would take three times as long. And two threads that
-ground at the same time wait for each other at each symbol, so within one process one of them waits until the other has grounded (`asp/control.py`).
+Guesses are mostly Python, and so is the search that goes on meanwhile. As two threads, both would
+take three times as long, as one thread at a time runs Python. One thread at a time grounds, too
+(`asp/control.py`).
 """
 
 from __future__ import annotations
@@ -26,12 +27,18 @@ _under_way: set[subprocess.Popen[bytes]] = set()
 
 
 def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) -> Result:
-    """The result of `work`, called with these arguments and a watch, which comes last. It is called in this process if there can be no other.
+    """Call `work` in another process, or in this one if there can be no other.
 
-    work, arguments  picklable; so are the result, and what work raises
-    watch            ends the other process when a limit is over. What is left of its memory limit is the memory limit of the other process
+    Args:
+        work: What to call; it, its arguments, its result and its errors can be pickled.
+        arguments: The first arguments.
+        watch: The last argument. Its limits end the other process.
 
-    Raises LimitError, also where something from outside ends the process.
+    Returns:
+        The result of `work`.
+
+    Raises:
+        LimitError: A limit is reached, or a signal ended the process.
     """
     code, answer = _run(work, arguments, watch)
     if code == 0:
@@ -41,19 +48,20 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
             raise error
         return result
     if code < 0:
-        raise LimitError(
-            "memory limit"
-        )  # a signal ended it, as the system does where memory is short
+        # A signal ended it, as the system does when memory is short.
+        raise LimitError("memory limit")
     return work(*arguments, watch)
 
 
 def _run(
     work: Callable[..., object], arguments: tuple[object, ...], watch: Watch
 ) -> tuple[int, bytes]:
-    """The exit code of a process that does this work, and what it wrote. Should this process end first, the other one's input ends, and it ends with that."""
-    if (
-        "python" not in os.path.basename(sys.executable or "").lower()
-    ):  # this is a program that embeds Python, and cannot be run as Python
+    """The exit code and the output of a process that does this work.
+
+    If this process ends first, the input of the other one ends, and so does the other one.
+    """
+    # A program that embeds Python cannot be run as Python.
+    if "python" not in os.path.basename(sys.executable or "").lower():
         return 1, b""
     with (
         suppress(OSError),
@@ -82,16 +90,15 @@ def _run(
 
 
 def end_all() -> None:
-    """End all processes that this one waits for, as it is about to end itself."""
+    """End all processes that this one waits for, before it ends itself."""
     for process in list(_under_way):
         process.kill()
 
 
 def serve() -> None:
-    """Do the work that comes in, and write its result, or what it raised, to the output."""
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C is meant for the process that waits for this one
+    """Do the work that comes in, and write its result or error to the output."""
+    # Ctrl-C is meant for the process that waits for this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     work, arguments, memory = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_end_with_input, daemon=True).start()
     watch = Watch(memory=memory)
@@ -108,7 +115,7 @@ def serve() -> None:
 
 
 def _end_with_input() -> None:
-    """End this process as soon as its input ends, that is when the process that began it does."""
+    """End this process when its input ends, that is when its parent ends."""
     while os.read(0, 1):
         pass
     os._exit(1)
