@@ -42,7 +42,7 @@ USED = {
         "threads",
         "greedy",
     },
-    "full": {"prefixes", "path_names", "framing", "ways"},
+    "full": {"prefixes", "path_names", "ways"},
     "framed": {
         "prefixes",
         "names",

@@ -106,10 +106,10 @@ def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
     first_prefix = data.draw(st.sampled_from([1, prefixes.FIRST_PREFIX]), label="first prefix")
     # Engines that settle dstates first are for longer traces, and those for places without frames only where clingo takes its time.
     few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
-    frame_after = data.draw(st.sampled_from([0.0, choosing.FRAME_AFTER]), label="frame after")
+    frame_after = data.draw(st.sampled_from([0.0, choosing.STEPWISE]), label="frame after")
     with (
         patch.object(prefixes, "FIRST_PREFIX", first_prefix),
-        patch.multiple(choosing, FEW_STEPS=few_steps, FRAME_AFTER=frame_after),
+        patch.multiple(choosing, FEW_STEPS=few_steps, STEPWISE=frame_after),
         patch.multiple(map_list, ONE_MORE=0.0, ONE_MORE_SHARE=0.0),
     ):
         every = solve(trace, theory, max_maps=None, time_limit=LIMIT)
@@ -175,7 +175,7 @@ def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
 def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine: type) -> None:
     """32 maps that differ in dstates, too: found by a prefix of the readable encodings, or by labels that are settled before places and paths."""
     trace, theory = walk(TWO_BLOCKS, "a1", 60, 1), Theory(boundary="none", prefer=("dstates",))
-    with patch.object(choosing, "FRAME_AFTER", frame_after):
+    with patch.object(choosing, "STEPWISE", frame_after):
         every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
         search = Search(trace, theory, max_maps=1, _start=Start(reasons=True))
         reasoned = search.solution(tuple(search))

@@ -360,7 +360,7 @@ def test_the_axioms_agree_with_frames_of_four_slots() -> None:
 
 def test_general_stars_switch_off_what_knows_frames_of_four_slots() -> None:
     on = Speedups().that_hold_for(GATEWAYS)
-    assert not any((on.names, on.ways, on.framing, on.sides))
+    assert not any((on.names, on.ways, on.sides))
     assert on.prefixes
     assert on.path_names
     assert on.threads

@@ -76,7 +76,7 @@ CASES = {
 def test_the_maps_are_those_of_the_plain_encoding(case: str, prefer: tuple[str, ...]) -> None:
     trace, theory = CASES[case], Theory.topological().replace(prefer=prefer)
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
-    with patch.multiple(choosing, FEW_STEPS=0, FRAME_AFTER=-1.0):
+    with patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0):
         found = solve(trace, theory, max_maps=None)
     assert (found.status, found.complete) == (Status.OPTIMAL, True)
     assert (found.cost, set(found.maps)) == (expected.cost, set(expected.maps))

@@ -283,9 +283,9 @@ def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.
         patch.object(
             prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 8]), label="first prefix")
         ),
-        patch.multiple(choosing, FEW_STEPS=0, FRAME_AFTER=-1.0),
+        patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0),
     ):
-        asked = Search(trace, theory, max_maps=None, speedups=Speedups.without("framing"))
+        asked = Search(trace, theory, max_maps=None, speedups=Speedups())
         found = tuple(asked)
     assert isinstance(asked._parts.prefixes.engine, kind) or name == "frameless"
     assert asked.status is (Status.OPTIMAL if counts else Status.UNSATISFIABLE)

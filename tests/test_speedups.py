@@ -152,7 +152,7 @@ CASES = {
 def hurried() -> Iterator[None]:
     """What is done only where a search takes its time is done at once."""
     with (
-        patch.multiple(choosing, FEW_STEPS=0, FRAME_AFTER=-1.0),
+        patch.multiple(choosing, FEW_STEPS=0, STEPWISE=-1.0),
         patch.multiple(name_search, PATIENCE=0, CORES=0),
         patch.multiple(framed, SOON=-1.0, GUESS_FIRST=-1.0),
         patch.object(annealing, "ANNEALED", ((0.5, 50),)),

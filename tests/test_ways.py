@@ -141,11 +141,11 @@ def test_a_limit_while_labels_are_listed_is_a_limit() -> None:
             list(maps)
 
 
-@pytest.mark.parametrize("off", ["", "clique", "lazy", "core_guided", "framing"])
+@pytest.mark.parametrize("off", ["", "clique", "lazy", "core_guided"])
 def test_a_maze_without_stars(off: str) -> None:
     """All minimal maps of forty steps, by whatever helps; the bound has a certificate."""
     trace = maze(2, 2, steps=40, seed=1).trace
-    with patch.object(choosing, "FRAME_AFTER", -1.0):
+    with patch.object(choosing, "STEPWISE", -1.0):
         search = Search(trace, max_maps=None, speedups=Speedups.without(off))
         found = search.solution(tuple(search))
     expected = solve(trace, max_maps=None, speedups=Speedups.without("ways"))
@@ -162,7 +162,7 @@ def test_a_maze_without_stars(off: str) -> None:
 def test_the_route_of_a_robot() -> None:
     """As the table of docs/explanation/theory.md has it: (19, 9, 4), 38 maps."""
     trace = Trace.load(EXAMPLES / "aces3-route.jsonl")
-    with patch.multiple(choosing, FRAME_AFTER=-1.0, FEW_STEPS=0):
+    with patch.multiple(choosing, STEPWISE=-1.0, FEW_STEPS=0):
         search = Search(trace, Theory(star="none"), max_maps=None)
         found = search.solution(tuple(search))
     assert isinstance(search._parts.prefixes.engine, FramelessEngine)
@@ -194,7 +194,7 @@ def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled:
     with (
         patch.multiple(Judging, refusal=refusal, may_refuse=True),
         patch.multiple(
-            choosing, FRAME_AFTER=-1.0 if settled else 60.0, FEW_STEPS=0 if settled else 24
+            choosing, STEPWISE=-1.0 if settled else 60.0, FEW_STEPS=0 if settled else 24
         ),
     ):
         few, left = solve(trace, theory, max_maps=1), solve(trace, theory, max_maps=None)
@@ -205,7 +205,7 @@ def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled:
 
 def test_few_of_many_maps() -> None:
     trace = maze(2, 2, steps=120, seed=2).trace
-    with patch.object(choosing, "FRAME_AFTER", -1.0):
+    with patch.object(choosing, "STEPWISE", -1.0):
         few, every = solve(trace, max_maps=3), solve(trace, max_maps=None)
     assert (few.status, few.count, few.complete, few.stopped) == (
         Status.OPTIMAL,
@@ -219,11 +219,11 @@ def test_few_of_many_maps() -> None:
 
 
 @pytest.mark.parametrize("name", ["forget", "fits", "_control_for"])
-def test_what_ends_it_leaves_the_map_with_frames(name: str) -> None:
+def test_what_ends_the_settling_of_dstates_leaves_the_map(name: str) -> None:
     """Whatever it is at: the map that was known before is the answer."""
     trace = maze(2, 2, steps=120, seed=1).trace
     with (
-        patch.object(choosing, "FRAME_AFTER", -1.0),
+        patch.object(choosing, "STEPWISE", -1.0),
         patch.object(ways.PlacesAndPaths, name, side_effect=KeyboardInterrupt),
     ):
         found = solve(trace)
@@ -235,7 +235,7 @@ def test_a_robot_that_goes_on_where_that_ended() -> None:
     """The first search of a mapper may be of many steps; what it proved holds for the steps that come."""
     trace = maze(2, 2, steps=36, seed=1).trace
     first = trace.prefix(32)
-    with patch.object(choosing, "FRAME_AFTER", -1.0):
+    with patch.object(choosing, "STEPWISE", -1.0):
         search = Search(first, max_maps=None)
         before = search.solution(tuple(search))
         assert isinstance(search._parts.prefixes.engine, FramelessEngine)

@@ -19,24 +19,16 @@ from ssh_abduction.solver.guesses.gated import gated_map
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
-from ssh_abduction.theory.speedups import Speedups, row
+from ssh_abduction.theory.speedups import row
 
 _log = log_of(__name__)
 
-# Maps with frames are sought for so many seconds at most: what they are good for is mostly found by
-# then.
-FRAMING = 30.0
-# Or for such a share of the time that is left, if that is less, so that clingo has the larger part.
-FRAMING_SHARE = 0.4
 SKETCH_SHARE = (
     0.4  # A sketch and its check may take such a share of the time that is left for all of them.
 )
 # The surest sketch may take this many seconds even if less time is left. Else a slow machine would
 # leave no map at all.
 SUREST = 1.5
-# Until there is any map that may take so many times as long, as any map is worth more than a better
-# one.
-UNMAPPED = 2.0
 
 
 class Candidates:
@@ -150,26 +142,6 @@ class Candidates:
         later = each_looking(zip(trace.actions[done - 1 :], trace.steps[done:], strict=True))
         if all(sketch.extend(action, step) for action, step in later):
             self.offer(sketch.map())
-
-    def frame(self, speedups: Speedups) -> None:
-        """Make maps in which places have frames, though the theory does not ask for any.
-
-        speedups  those that the caller of the search has on: other ones than here may hold where
-        places have frames
-        """
-        from ssh_abduction.solver.engines.framing import maps_with_frames  # loads numpy
-
-        watch = self._task.watch
-        seconds = min(FRAMING, FRAMING_SHARE * watch.left())
-        part = watch.part(UNMAPPED * seconds)
-        try:
-            with heeding(part.check):
-                for ssh_map in maps_with_frames(self._task.problem, part, speedups):
-                    part.shorten(seconds)
-                    self.offer(ssh_map)
-                    self._report()
-        except LimitError:
-            watch.check()
 
     def offer(self, ssh_map: SSHMap) -> None:
         """Keep a map of the whole trace if it is better than the best one known, and satisfies all axioms."""

@@ -17,9 +17,10 @@ READABLE = 60
 # After this many seconds with the step engine, check whether the dstates are known without a
 # search. The check loads numpy.
 SETTLE_AFTER = 0.15
-# After this many seconds with the step engine, look for a map in which places have frames. Most
-# traces are solved by then.
-FRAME_AFTER = 1.0
+# After this many seconds with the step engine, or this share of the time that is left, go on with
+# an engine that settles dstates first. Most traces are solved by then.
+STEPWISE = 1.0
+STEPWISE_SHARE = 0.4
 
 
 def may_name(task: Task) -> bool:

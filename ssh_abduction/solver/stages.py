@@ -8,7 +8,6 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.logs import log_of
 from ssh_abduction.solver import choosing, prefixes
 from ssh_abduction.solver.asp.limits import LimitError, StageTimeError
-from ssh_abduction.solver.candidates import FRAMING_SHARE
 from ssh_abduction.solver.choosing import may_name, takes_all
 from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.engines.stepwise import StepEngine
@@ -54,8 +53,7 @@ class Stages:
     def find_minimum(self) -> None:
         """Find the minimal cost.
 
-        Where that takes long, look for maps with frames, and change to an engine that settles
-        dstates before places and paths.
+        Where that takes long, change to an engine that settles dstates before places and paths.
         """
         parts, task = self._parts, self._parts.task
         engine, steps = parts.prefixes.engine, len(task.trace)
@@ -68,25 +66,20 @@ class Stages:
                 engine.grow(steps if engine.lists_least else min(steps, prefixes.FIRST_PREFIX))
             return
         may_change = isinstance(engine, StepEngine) and not self._goes_on and takes_all(task)
-        may_frame = may_change and task.speedups.framing
         may_settle = may_change and task.speedups.ways and parts.speedups.names
         if (
             may_settle
-            and not self._find_minimum_soon(min(choosing.SETTLE_AFTER, choosing.FRAME_AFTER))
+            and not self._find_minimum_soon(min(choosing.SETTLE_AFTER, choosing.STEPWISE))
             and parts.candidates.sketch_least()
         ):
             self._settle_dstates_first()
         elif (
-            (may_frame or may_settle)
+            may_settle
             and parts.known.status is Status.UNKNOWN
-            and not self._find_minimum_soon(choosing.FRAME_AFTER)
+            and not self._find_minimum_soon(choosing.STEPWISE)
         ):
             _log.info("no minimum after %.1f s step by step", parts.watch.elapsed())
-            if may_frame:
-                _log.info("maps in which places have frames are sought as candidates")
-                parts.candidates.frame(parts.speedups)
-            if may_settle:
-                self._settle_dstates_first()
+            self._settle_dstates_first()
         if parts.known.status is Status.UNKNOWN:
             parts.prefixes.find_minimum()
 
@@ -128,7 +121,9 @@ class Stages:
                 is left is the limit if that is less.
         """
         parts, watch = self._parts, self._parts.watch
-        watch.end_stage_after(watch.elapsed() + min(seconds, FRAMING_SHARE * watch.left()))
+        watch.end_stage_after(
+            watch.elapsed() + min(seconds, choosing.STEPWISE_SHARE * watch.left())
+        )
         try:
             parts.prefixes.find_minimum()
         except StageTimeError:

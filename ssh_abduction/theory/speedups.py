@@ -40,7 +40,6 @@ class Speedups:
     core_guided: bool = True
     sides: bool = True
     annealed: bool = True
-    framing: bool = True
     ways: bool = True
     threads: bool = True
     processes: bool = True
@@ -391,17 +390,6 @@ TABLE = (
         _keeps_headings,
         PLACES - {"course_needs_travel"},
         lambda: SURVIVE_A_CUT - {"asserted same", *PAIRS_OF_STEPS},
-    ),
-    Speedup(
-        "framing",
-        "framing",
-        "Places that need no frames: where clingo takes its time, a map in which they have some; "
-        "it passes the checker.",
-        lambda theory: (
-            (framed := theory.with_frames()) is not None and row("visits").holds_for(framed)
-        ),
-        NOTHING,
-        EVERY,
     ),
 )
 

@@ -425,24 +425,6 @@ class Theory:
         """
         return Pairs.of(self.different, self.elsewhere, self.same)
 
-    def with_frames(self) -> Theory | None:
-        """A theory in which places have frames and fewest dstates come first.
-
-        Its maps, without their headings, are maps of this theory, too.
-
-        None for the causal level, and for stars that are read in tolerance. The trace need not have
-        stars. The maps satisfy all axioms of this theory: their paths are totally ordered; the
-        axioms of sides, if there are any, hold without excuses; and stars that agree in a frame are
-        one pattern.
-        """
-        if self.level == "causal" or self.star in IN_TOLERANCE:
-            return None
-        boundary = "none" if self.boundary == "none" else "strict"
-        rest = [count for count in self.priorities if count in ("paths", "places")]
-        return self.replace(
-            star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest)
-        )
-
     def require(self, step: Step, where: str) -> None:
         """Raises TraceError, which says where, if a step lacks what the axioms need.
 

@@ -1,0 +1,126 @@
+"""Tests of the stages of a search: when it changes the engine, and what limits do meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from unittest.mock import patch
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instances import maze
+from strategies import theories, traces
+
+from ssh_abduction import OnlineMapper, SSHMap, Theory, solve
+from ssh_abduction.checker.checker import check
+from ssh_abduction.solver import choosing, prefixes
+from ssh_abduction.solver.asp.limits import LimitError, StageTimeError, Watch
+from ssh_abduction.solver.guesses.tree import Sketch
+from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.theory import Speedups
+from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.speedups import SPEEDUPS
+
+THEORIES = {
+    "dstates": Theory.topological(),
+    "paths": Theory.circumscriptive(),
+    "no sides": Theory(boundary="none"),
+    "excuses": Theory(boundary="defeasible"),
+    "partial order": Theory(path_order="partial"),
+}
+
+
+def started(limit: float | None = None) -> Watch:
+    watch = Watch(limit)
+    watch.start()
+    return watch
+
+
+@settings(max_examples=8)
+@given(st.data())
+def test_a_change_of_engine_changes_no_answer(data: st.DataObject) -> None:
+    """The engine that settles dstates first goes on at once."""
+    trace = data.draw(traces(), label="trace")
+    theory = data.draw(theories(trace), label="theory")
+    first = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
+    expected = solve(trace, theory, max_maps=None, speedups=Speedups.without(SPEEDUPS))
+    with (
+        patch.multiple(choosing, STEPWISE=-1.0, FEW_STEPS=0),
+        patch.object(prefixes, "FIRST_PREFIX", first),
+    ):
+        found = solve(trace, theory, max_maps=None, speedups=Speedups.without("names"))
+    assert found.status is expected.status
+    assert found.complete
+    assert set(found.maps) == set(expected.maps)
+    assert found.count == len(set(found.maps))
+    if found.cost and expected.cost:
+        priorities = found.theory.priorities
+        assert [getattr(found.cost, name) for name in priorities] == [
+            getattr(expected.cost, name) for name in priorities
+        ]
+
+
+def test_listing_is_not_paused() -> None:
+    """The cost is found before it is time to change the engine."""
+    trace = maze(2, 2, steps=30, seed=0).trace
+    listed = Prefixes.minimal_maps
+
+    def slowly(self: Prefixes) -> Iterator[SSHMap]:
+        self._task.watch._spent += 2 * choosing.STEPWISE
+        yield from listed(self)
+
+    with patch.object(Prefixes, "minimal_maps", slowly):
+        solution = solve(trace, max_maps=None)
+    assert solution.complete
+    assert set(solution.maps) == set(solve(trace, max_maps=None, speedups=Speedups()).maps)
+
+
+@pytest.mark.parametrize(
+    "theory",
+    [Theory.topological(), Theory(next_place=True), Theory(all_on_paths=True)],
+    ids=["", "next", "on paths"],
+)
+def test_a_sketch_with_frames_is_smaller(theory: Theory) -> None:
+    trace = maze(3, 3, steps=400, seed=0).trace
+    first, *rest = trace.steps
+    sizes = []
+    for sketch in Sketch.all_of(first, settle(trace, theory).theory):
+        assert all(
+            sketch.extend(action, step) for action, step in zip(trace.actions, rest, strict=True)
+        )
+        assert check(trace, sketch.map(), settle(trace, theory).theory) == ()
+        sizes.append(len(sketch.map().dstates))
+    framed, homing = sizes[0], sizes[2]
+    assert framed < homing / 2
+
+
+def test_while_a_robot_drives_the_time_is_clingos() -> None:
+    """The sketch is small enough. The robot was in 27 dstates."""
+    trace = maze(3, 3, steps=120, seed=0).trace
+    mapper = OnlineMapper(trace.steps[0].view or "", time_limit=0.01)
+    with patch.object(choosing, "STEPWISE", -1.0):
+        for action, step in zip(trace.actions, trace.steps[1:], strict=True):
+            answer = mapper.observe(action, step.view or "")
+    assert answer.cost
+    assert answer.cost.dstates <= 1.2 * 27
+    assert check(trace, answer.maps[0], answer.theory) == ()
+
+
+def test_a_pause_comes_once() -> None:
+    watch = started(60)
+    watch.end_stage_after(-1)
+    with pytest.raises(StageTimeError):
+        watch.check()
+    watch.check()
+
+
+def test_a_limit_gets_only_shorter() -> None:
+    watch = started(60)
+    watch.shorten(70)
+    watch.check()
+    watch.shorten(-1)
+    with pytest.raises(LimitError):
+        watch.check()
+    unlimited = started()
+    unlimited.shorten(50)
+    assert unlimited.left() <= 50
