@@ -25,7 +25,7 @@ from ssh_abduction.solver.asp.facts import paths_lp, sides_lp, visits_lp
 from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
-from ssh_abduction.solver.engines import framed
+from ssh_abduction.solver.engines import framed, transitive, visit_program
 from ssh_abduction.solver.engines import paths as paths_module
 from ssh_abduction.solver.engines import visit_labels as same
 from ssh_abduction.solver.engines.base import Found
@@ -33,6 +33,7 @@ from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
 from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import OPEN, VisitLabels
+from ssh_abduction.solver.engines.visit_program import VisitProgram
 from ssh_abduction.solver.guesses import annealing, sampling
 from ssh_abduction.solver.guesses.annealing import Guess, attempts
 from ssh_abduction.solver.guesses.merging import kept, merged_near
@@ -121,8 +122,8 @@ def test_lists_the_maps_of_the_plain_encoding(
     """With prefixes, cores and what is told in one go so small that all of it happens on short traces; and with any speed-ups off."""
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, engine.FIRST_PREFIXES]), label="first prefixes")
+    at_a_time = data.draw(st.sampled_from([1, transitive.AT_A_TIME]), label="at a time")
     cores = {
-        "AT_A_TIME": data.draw(st.sampled_from([1, same.AT_A_TIME]), label="at a time"),
         "MANY": data.draw(st.sampled_from([1, 2, same.MANY]), label="many"),
         "FAR": data.draw(st.sampled_from([0, same.FAR]), label="far"),
         "FIRST_PAIRS": data.draw(
@@ -148,6 +149,7 @@ def test_lists_the_maps_of_the_plain_encoding(
         patch.object(choosing, "FEW_STEPS", 0),
         prefixes,
         patch.multiple(same, **cores),
+        patch.object(transitive, "AT_A_TIME", at_a_time),
         patch.multiple(framed, **sought),
         patch.object(paths_module, "SECONDS", 0.0),
         patch.object(
@@ -282,7 +284,8 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
     first, *rest = trace.steps
     paths = set()
     with (
-        patch.multiple(same, GROWN=100, MANY=1, AT_A_TIME=5),
+        patch.multiple(same, GROWN=100, MANY=1),
+        patch.object(transitive, "AT_A_TIME", 5),
         patch.object(choosing, "FEW_STEPS", 10),
     ):
         mapper = OnlineMapper(first.view or "", star=first.star, time_limit=None, max_maps=None)
@@ -302,7 +305,7 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
             search = mapper._keeper.solver.search
             engine = search and search._parts.prefixes.engine
             if isinstance(engine, FramedEngine):
-                paths.add((engine._visits.batch, len(engine._sides._said)))
+                paths.add((engine._visits.program.batch, len(engine._sides._said)))
     assert max(paths)[0] > 5
     assert seed != 0 or any(told for _, told in paths)
 
@@ -313,7 +316,7 @@ def test_each_speedup_off_alone(seed: int) -> None:
     trace = maze(2, 2, steps=45, seed=seed, stars=True).trace
     expected = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without("names"))
     for off in ("", "clique", "core_guided", "sides"):
-        with patch.multiple(same, MANY=1, AT_A_TIME=5):
+        with patch.object(same, "MANY", 1), patch.object(transitive, "AT_A_TIME", 5):
             found = solve(
                 trace, Theory.topological(), max_maps=None, speedups=Speedups.without(off)
             )
@@ -346,7 +349,7 @@ def test_pairs_that_are_too_many_are_not_listed() -> None:
     chart = Chart.framed(trace, Log(trace, Theory(star="frame")))
     assert chart.fitting[-1] == len(chart.fits(range(len(chart.stars)))) > 50
     with (
-        patch.object(same, "SECONDS_A_PAIR", 1000.0),
+        patch.object(visit_program, "SECONDS_A_PAIR", 1000.0),
         patch.object(FramedChart, "fits", side_effect=AssertionError),
     ):
         solution = solve(trace, time_limit=100)
@@ -683,9 +686,9 @@ def test_what_fails_to_be_transitive_is_among_the_scattered(
     pairs = [(*pair, turn) for pair, turn in every.items() if turn >= 0]
     turned: dict[int, dict[int, int]] = {}
     for pair in pairs:
-        same._take(turned, pair)
-    failing = {pair for pair in pairs if same._apart_yet_joined(pair, turned)}
-    scattered = set(same._scattered(pairs, len(states)))
+        transitive.take(turned, pair)
+    failing = {pair for pair in pairs if transitive.apart_yet_joined(pair, turned)}
+    scattered = set(transitive.scattered(pairs, len(states)))
     assert failing <= scattered
     assert bool(failing) == bool(scattered)
 
@@ -737,7 +740,9 @@ def framed_engine(trace: Trace, theory: Theory) -> FramedEngine:
     watch = Watch()
     watch.start()
     found = FramedEngine(engine.Task.of(Problem.of(trace, resolved), watch))
-    found._visits.chart = Chart.framed(trace, found._task.log)
+    chart = Chart.framed(trace, found._task.log)
+    if chart is not None:
+        found._visits._program = VisitProgram(found._task, found.asker, chart, found._sides)
     return found
 
 
@@ -779,9 +784,9 @@ def test_any_guess_is_merged_to_a_map(
 ) -> None:
     """Of the causal axioms; and where separate paths fit it, others do."""
     asked = framed_engine(trace, theory)
+    if asked._visits._program is None:
+        return  # the trace fits no frame
     chart = asked._chart
-    if chart is None:
-        return
     apart = chart.apart()
     start = guess[: len(chart.seen)]
     labels = (
@@ -862,7 +867,6 @@ def test_a_guess_begins_sooner_under_a_short_limit(
 ) -> None:
     """But not where there is no time for one, as at a step of the online mapper."""
     asked = framed_engine(maze(2, 2, steps=20, seed=0, stars=True).trace, Theory.topological())
-    asked._visits._visits = set()
     if limit is not None:
         asked.asker.watch.shorten(limit)
     with (

@@ -42,9 +42,9 @@ from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
 from ssh_abduction.solver.engines.paths import Paths
 from ssh_abduction.solver.engines.pinned import Pinned
-from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted_of
+from ssh_abduction.solver.engines.refusing import all_accepted, first_accepted_of, smaller
 from ssh_abduction.solver.engines.sides import FramedSides
-from ssh_abduction.solver.engines.visit_labels import OPEN, VisitLabels, smaller
+from ssh_abduction.solver.engines.visit_labels import OPEN, VisitLabels
 from ssh_abduction.solver.guesses.merging import kept
 from ssh_abduction.solver.steps.chart import Chart, FramedChart, numbered
 from ssh_abduction.theory.evidence import Equality
@@ -250,7 +250,9 @@ class FramedEngine:
         if not self._beside and waited > soon and self._task.has_processors:
             self._search_beside(self._chart)
         later = (
-            self._soon if self._visits.knows_all else min(LATER * self._soon, LATER_SHARE * limit)
+            self._soon
+            if self._visits.program.knows_all
+            else min(LATER * self._soon, LATER_SHARE * limit)
         )
         return self._guess is not None or (not self._beside and waited > max(later, GUESS_FIRST))
 
@@ -315,7 +317,7 @@ class FramedEngine:
         """What searched beside, if that alone showed that there are no fewer dstates."""
         return (
             self._named
-            if self._named and self._named.bound == dstates > self._visits.least
+            if self._named and self._named.bound == dstates > self._visits.program.cores.least
             else None
         )
 
@@ -530,9 +532,9 @@ class FramedEngine:
         self._visits.take_back(labels)
         told = (
             self._task.speedups.sides
-            and self._visits.pairs <= MANY_PAIRS
+            and len(self._visits.program.fits) <= MANY_PAIRS
             and self._sides.say_of_path(
-                self._paths, self._chart, labels, self._visits.standing(labels)
+                self._paths, self._chart, labels, self._visits.program.standing(labels)
             )
         )
         if not told:

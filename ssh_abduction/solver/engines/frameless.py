@@ -36,8 +36,7 @@ from ssh_abduction.solver.engines.doubts import Settled
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
 from ssh_abduction.solver.engines.naming import NamedLabels
 from ssh_abduction.solver.engines.paths import PREPARING
-from ssh_abduction.solver.engines.refusing import all_accepted
-from ssh_abduction.solver.engines.visit_labels import smaller
+from ssh_abduction.solver.engines.refusing import all_accepted, smaller
 from ssh_abduction.solver.steps.chart import Link, numbered
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality

@@ -13,6 +13,7 @@ from typing import TypeVar
 Answer = TypeVar("Answer")
 Reason = TypeVar("Reason")
 Meanwhile = TypeVar("Meanwhile")
+Member = TypeVar("Member")
 
 
 def first_accepted(
@@ -75,3 +76,32 @@ def all_accepted(
         if reason is None:
             return
         forbid(reason)
+
+
+def smaller(
+    members: list[Member],
+    shrunk: Callable[[list[Member]], list[Member] | None],
+    tries: int | None = None,
+) -> list[Member]:
+    """A small subset of members that still has a property of all of them.
+
+    Leave out parts, half of the members first, single ones last.
+
+    Args:
+        members: They have the property together.
+        shrunk: Of some members, a subset that has the property; None if they do not have it.
+        tries: Give up after this many tries in vain; None for never.
+    """
+    size, failed = len(members), 0
+    while size := size // 2:
+        start = 0
+        while start < len(members) and len(members) > 1:
+            fewer = shrunk(members[:start] + members[start + size :])
+            if fewer is not None:
+                members = fewer
+                continue
+            start += size
+            failed += 1
+            if failed == tries:
+                return members
+    return members
