@@ -1,9 +1,11 @@
-"""The loop where one image of twenty is bad: whether its map is right, which bad images it names, and what its recogniser is worth.
+"""Bootstrap learning where one image in twenty is bad: maps, images named, recogniser accuracy.
 
-    python benchmarks/bad_images.py [--world notched-rectangle] [--tours 10] [--seeds 300-309] [--only TEXT] [--page docs/measurements/reproduction.md]
+    python benchmarks/bad_images.py [--world notched-rectangle] [--tours 10] [--seeds 300-309]
+                                    [--only TEXT] [--page docs/measurements/reproduction.md]
 
-Bad images show a person in front of the laser, a person at its side, or anything at random (benchmarks/doubts.py). Maps are sought for at most ten seconds, by the
-default theory: openings and displacements are told. The recogniser is tried on the images of another drive, of three circuits, none of them bad.
+A bad image shows a person in front of the laser, a person at its side, or random ranges
+(benchmarks/doubts.py). The solver has ten seconds for a map. It uses the default theory, with
+stars and displacements. The recogniser is tested on another drive: three circuits, no bad images.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ FAULTS = PLAIN.replace(misread=1.5)
 
 
 class Unsure(BootstrapLearner):
-    """A learner whose solver is not told how sure views are."""
+    """A learner that does not pass the confidence of views to its solver."""
 
     def _look(self, traces: Traces, isolated: float | None) -> Traces:
         seen = super()._look(traces, isolated)
@@ -53,7 +55,7 @@ class Unsure(BootstrapLearner):
 
 
 def learners() -> Iterator[tuple[str, BootstrapLearner]]:
-    """What is compared: a row of the table each."""
+    """The learners that are compared, with their names: one row of the table each."""
     by = {name: ViewClusterer(by=name, random_state=0) for name in ("M", "trimmed")}
     yield "no faults, M", BootstrapLearner(PLAIN, by["M"], time_limit=SECONDS)
     yield "no faults, trimmed M", BootstrapLearner(PLAIN, by["trimmed"], time_limit=SECONDS)
@@ -67,7 +69,7 @@ def learners() -> Iterator[tuple[str, BootstrapLearner]]:
 
 
 def with_bad_images(trace: Trace, kind: str, seed: int) -> tuple[Trace, NDArray[np.intp]]:
-    """The trace with one image of twenty bad, and which these are."""
+    """The trace with one image in twenty made bad, and the indices of the bad images."""
     images, bad = spoilt(
         images_of(trace), kind, round(SHARE * len(trace)), np.random.default_rng(seed)
     )
@@ -81,12 +83,14 @@ def with_bad_images(trace: Trace, kind: str, seed: int) -> tuple[Trace, NDArray[
 
 @dataclass(frozen=True)
 class Found:
-    """What came of one drive.
+    """The result of one drive.
 
-    right     the map is the true one
-    said      there was a warning, or no map
-    named     the images without a view, and those that the map says are misread; how many, and how many of them are bad
-    accuracy  of the recogniser on images of another drive
+    Attributes:
+        right: Whether the map is the true one.
+        said: Whether there was a warning, or no map.
+        named: Number of images without a view or called misread by the map.
+        hits: Number of the named images that are bad.
+        accuracy: Accuracy of the recogniser on images of another drive.
     """
 
     right: bool
@@ -97,6 +101,7 @@ class Found:
 
 
 def found(learner: BootstrapLearner, trace: Trace, bad: NDArray[np.intp], other: Trace) -> Found:
+    """Fit a learner to a drive and compare its map, faults and recogniser with the truth."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
@@ -108,6 +113,7 @@ def found(learner: BootstrapLearner, trace: Trace, bad: NDArray[np.intp], other:
         np.flatnonzero(learner.views_ == NOISE).tolist()
     )
     said = any(issubclass(w.category, DOUBTS) for w in caught)
+    # A label stands for the true dstate that most of its images show.
     meant = {label: _most(truth[labels == label]) for label in set(labels.tolist())}
     hit = [
         meant.get(int(label)) == name
@@ -123,17 +129,22 @@ def found(learner: BootstrapLearner, trace: Trace, bad: NDArray[np.intp], other:
 
 
 def _most(names: NDArray[Any]) -> Any:
-    """The most frequent one."""
+    """The most frequent name."""
     values, counts = np.unique(names, return_counts=True)
     return values[counts.argmax()]
 
 
 def rows(world: str, tours: int, seeds: list[int], only: str) -> Iterator[str]:
-    yield f"| {world}, {len(seeds)} drives of {tours} circuits | bad images | map right | wrong, and nothing said | precision | recall | 1-NN, relative: mean | least |"
+    """The table of one world, row by row."""
+    yield (
+        f"| {world}, {len(seeds)} drives of {tours} circuits | bad images | map right | "
+        "wrong, and nothing said | precision | recall | 1-NN, relative: mean | least |"
+    )
     yield "|---|---|---|---|---|---|---|---|"
     drives = [simulate(World.named(world), tours, seed) for seed in seeds]
     others = [simulate(World.named(world), 3, 1000 + seed) for seed in seeds]
     nobody = np.array([], np.intp)
+    # Accuracies are relative to those of a learner that sees no bad images.
     clean = [
         found(BootstrapLearner(PLAIN, time_limit=SECONDS), drive, nobody, other).accuracy
         for drive, other in zip(drives, others, strict=True)
@@ -159,7 +170,10 @@ def rows(world: str, tours: int, seeds: list[int], only: str) -> Iterator[str]:
             recall = f"{hits / bad_ones:.2f}" if bad_ones else "–"
             relative = [g.accuracy / c for g, c in zip(got, clean, strict=True)]
             silent = sum(not g.right and not g.said for g in got)
-            yield f"| {name} | {kind} | {sum(g.right for g in got)} | {silent} | {precision} | {recall} | {np.mean(relative):.3f} | {min(relative):.3f} |"
+            yield (
+                f"| {name} | {kind} | {sum(g.right for g in got)} | {silent} | {precision} "
+                f"| {recall} | {np.mean(relative):.3f} | {min(relative):.3f} |"
+            )
 
 
 def main() -> None:

@@ -1,9 +1,11 @@
-"""Time and memory of ssh-abduction and of its peers from PyPI, on the same traces, in the same run.
+"""Time and memory of ssh-abduction and its peers from PyPI, on the same traces in the same run.
 
-    python benchmarks/bench.py [--limit S] [--memory MIB] [--only PATTERN] [--tools PATTERN] [--seeds N] [--out RESULTS.json]
+    python benchmarks/bench.py [--limit S] [--memory MIB] [--only PATTERN] [--tools PATTERN]
+                               [--seeds N] [--out RESULTS.json]
 
-Each cell of the table is a process of its own (cell.py). What came of it is stored as JSON, cell by cell, and the tables are printed at
-the end; `python benchmarks/table.py RESULTS.json` prints them again.
+Each cell of the table runs in its own process (cell.py). The results are stored as JSON after
+each cell, and the tables are printed at the end. `python benchmarks/table.py RESULTS.json` prints
+the tables of a stored run.
 """
 
 from __future__ import annotations
@@ -46,13 +48,13 @@ def main() -> None:
         "--only",
         default="",
         metavar="PATTERN",
-        help="instances whose name this regular expression is found in",
+        help="measure only instances that match this regular expression",
     )
     parser.add_argument(
         "--tools",
         default="",
         metavar="PATTERN",
-        help="tools whose name this regular expression is found in",
+        help="measure only tools that match this regular expression",
     )
     parser.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="random traces of each kind (default 1)"
@@ -61,7 +63,7 @@ def main() -> None:
         "--out",
         type=Path,
         metavar="RESULTS.json",
-        help="where to store what came of it (default benchmarks/results/DATE.json)",
+        help="file for the results (default benchmarks/results/DATE.json)",
     )
     options = parser.parse_args()
     today = datetime.date.today().isoformat()
@@ -74,13 +76,15 @@ def main() -> None:
         "seeds": options.seeds,
     }
     results |= {"machine": machine(), "packages": packages(), "cells": []}
+    # Store the results after each cell, so that an interrupted run loses nothing.
     for instance in SUITE.values():
         for tool in TOOLS:
             if re.search(options.only, instance.name) and re.search(options.tools, tool):
                 for seed in range(options.seeds if instance.seeded else 1):
                     cell = run(tool, instance, seed, options.limit, options.memory)
                     print(
-                        f"{instance.name:24} {seed:3} {tool:14} {cell['status']:14} {cell.get('seconds', 0):8.2f} s",
+                        f"{instance.name:24} {seed:3} {tool:14} {cell['status']:14} "
+                        f"{cell.get('seconds', 0):8.2f} s",
                         file=sys.stderr,
                     )
                     results["cells"].append(cell)
@@ -92,7 +96,12 @@ def main() -> None:
 def run(
     tool: str, instance: Instance, seed: int, limit: float, memory: int, clock: str = "wall"
 ) -> dict[str, Any]:
-    """What comes of a tool on a trace: status, seconds by this clock, CPU seconds, peak MiB, states, and whether they are proven to be fewest."""
+    """Measure one tool on one trace, in a process of its own.
+
+    Returns:
+        The cell: status, seconds by this clock, CPU seconds, peak MiB, states, and whether the
+        number of states is proven minimal.
+    """
     cell = {
         "instance": instance.name,
         "theory": "causal" if instance.causal else "full",
@@ -126,6 +135,8 @@ def run(
         process.returncode = os.waitstatus_to_exitcode(status)
     start = said[0] if said else {}
     cell |= {"images": start.get("images"), "true_dstates": start.get("true_dstates")}
+    # The first line says what the trace is, the second one is the result. Without a second line
+    # the process was ended by its time limit, or it crashed.
     if len(said) == 2:
         return {**cell, **said[1]}
     peak = usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
@@ -140,7 +151,7 @@ def run(
 
 
 def store(results: dict[str, Any], path: Path) -> None:
-    """Write the results as JSON, a cell a line."""
+    """Write the results as JSON, with one cell on each line."""
     head, cells = (
         {k: v for k, v in results.items() if k != "cells"},
         ",\n".join(json.dumps(cell) for cell in results["cells"]),
@@ -152,7 +163,7 @@ def store(results: dict[str, Any], path: Path) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """What the times are measured on, without naming it."""
+    """Describe the machine of the measurements without its name."""
     details = Path("/proc/cpuinfo")
     named = re.search(r"model name\s*: (.*)", details.read_text()) if details.exists() else None
     return {
@@ -165,7 +176,7 @@ def machine() -> dict[str, Any]:
 
 
 def packages() -> dict[str, str]:
-    """The versions of what is measured."""
+    """The versions of the measured packages."""
     found = {}
     for name in dict.fromkeys(
         [OURS, "clingo", *(package for peer in PEERS.values() for package in peer.packages)]

@@ -1,8 +1,9 @@
-"""Repeated circuits cost a linear replay: the notched rectangle, from two circuits to 5,000, against solving at once.
+"""Repeated circuits of the notched rectangle: replaying them takes time linear in the steps.
 
     python benchmarks/circuits.py
 
-Times are medians of three runs on this machine; compare the ratios, not the seconds.
+Solves two to 5,000 circuits, and short traces also without prefixes. Times are medians of three
+runs on this machine. Compare the ratios, not the seconds.
 """
 
 from __future__ import annotations
@@ -13,17 +14,18 @@ import time
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.theory import Speedups
 
-AT_ONCE = 48  # steps that are still quickly solved without prefixes
+AT_ONCE = 48  # images; solving longer traces without prefixes takes too long
 
 
 def circuits(steps: int) -> Trace:
+    """The notched rectangle driven round, with so many images."""
     return Trace.from_steps(
         [f"v{i % 4}" for i in range(steps)], [("right", "travel")[i % 2] for i in range(steps - 1)]
     )
 
 
 def median(trace: Trace, theory: Theory, prefixes: bool = True) -> float:
-    """Seconds that solving takes, the median of three runs."""
+    """The median time of three solves, in seconds."""
     seconds = []
     for _ in range(3):
         began = time.perf_counter()
@@ -34,7 +36,8 @@ def median(trace: Trace, theory: Theory, prefixes: bool = True) -> float:
 
 def main() -> None:
     print(
-        f"{'theory':16} {'images':>7} {'prefix':>7} {'s':>8} {'x 2 circuits':>13} {'at once, s':>11}"
+        f"{'theory':16} {'images':>7} {'prefix':>7} {'s':>8} "
+        f"{'x 2 circuits':>13} {'at once, s':>11}"
     )
     for name, theory in (
         ("causal", Theory.causal()),
@@ -48,7 +51,8 @@ def main() -> None:
             base = base or seconds
             whole = f"{median(trace, theory, prefixes=False):.3f}" if steps <= AT_ONCE else "–"
             print(
-                f"{name:16} {steps:7} {solve(trace, theory).prefix:7} {seconds:8.3f} {seconds / base:13.1f} {whole:>11}"
+                f"{name:16} {steps:7} {solve(trace, theory).prefix:7} {seconds:8.3f} "
+                f"{seconds / base:13.1f} {whole:>11}"
             )
 
 

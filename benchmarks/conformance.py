@@ -1,9 +1,11 @@
-"""Small traces: what `solve` takes for all minimal maps of the traces with known results (tests/test_tables.py), here and in another checkout.
+"""Time to find all minimal maps of small traces, here and in another checkout.
 
     python benchmarks/conformance.py [CHECKOUT]
 
-Milliseconds of CPU, the least of five runs of each trace in one process. Two processes take turns, trace by trace, so that what else the machine
-does befalls both alike. A single ratio still is as noisy as the machine, so deciles are shown.
+The traces are those with known results (tests/test_tables.py). Times are CPU milliseconds: the
+minimum of five runs of each trace in one process. With a second checkout, two processes take
+turns trace by trace, so that other load affects both alike. The ratio of one trace is noisy, so
+the deciles of all ratios are printed.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ RUNS = 5
 
 
 def cases() -> list[tuple[Trace, Theory]]:
-    """The small traces of the tables, and the notched rectangle driven round by parts, each under its theories."""
+    """The traces and theories of the tables, and ten parts of the notched rectangle."""
     sys.path.insert(0, str(ROOT / "tests"))
     import test_tables as tables
 
@@ -41,7 +43,7 @@ def cases() -> list[tuple[Trace, Theory]]:
 
 
 def milliseconds(trace: Trace, theory: Theory) -> float:
-    """The least that solving takes."""
+    """The CPU milliseconds of the fastest of five solves."""
     taken = []
     for _ in range(RUNS):
         began = time.process_time()
@@ -51,7 +53,7 @@ def milliseconds(trace: Trace, theory: Theory) -> float:
 
 
 def answer() -> None:
-    """In a process of its own: a file and a theory a line, milliseconds back."""
+    """Serve one process: read a trace file and a theory from each line, print the milliseconds."""
     for line in sys.stdin:
         path, theory = json.loads(line)
         print(milliseconds(Trace.load(path), Theory.from_dict(theory)), flush=True)
@@ -85,12 +87,14 @@ def main(other: str | None = None) -> None:
         child.communicate()
     for path, times in zip(checkouts, zip(*rows, strict=True), strict=True):
         print(
-            f"{len(times)} traces, {path}: median {statistics.median(times):.1f} ms, most {max(times):.1f} ms"
+            f"{len(times)} traces, {path}: median {statistics.median(times):.1f} ms, "
+            f"most {max(times):.1f} ms"
         )
     if other:
         deciles = statistics.quantiles((here / there for here, there in rows), n=10)
         print(
-            f"ratio of each trace: median {deciles[4]:.2f}, for eight of ten {deciles[0]:.2f} to {deciles[-1]:.2f}"
+            f"ratio of each trace: median {deciles[4]:.2f}, for eight of ten "
+            f"{deciles[0]:.2f} to {deciles[-1]:.2f}"
         )
 
 

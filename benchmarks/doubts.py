@@ -1,10 +1,12 @@
-"""Where M chooses too few or too many views, whether anything says so, and what trimmed M chooses: the table of docs/measurements/reproduction.md.
+"""Where M chooses too few or too many views, whether a warning says so, and trimmed M beside it.
 
-    python benchmarks/doubts.py [--seeds 200-204] [--tours 10] [--page docs/measurements/reproduction.md]
-    python benchmarks/doubts.py --tolerances      # how far poses spread, and k, by the tolerance of hill-climbing
+    python benchmarks/doubts.py [--seeds 200-204] [--tours 10]
+                                [--page docs/measurements/reproduction.md]
+    python benchmarks/doubts.py --tolerances      # spread of poses and k by the tolerance
 
-Each row is the notched rectangle with one thing changed: the size of the room, the notch, noise, images that are not medians of nine scans, or images that show
-somebody else. The map is sought from the views alone, for at most two seconds.
+This makes the table of docs/measurements/reproduction.md. Each row is the notched rectangle with
+one change: the size of the room, the notch, the noise, single scans instead of medians of nine, or
+images that show somebody. The map is solved from the views alone, in at most two seconds.
 """
 
 from __future__ import annotations
@@ -48,9 +50,10 @@ DOUBTS = (ImageWarning, RunnerUpWarning, AmbiguousMapWarning)
 class Case:
     """A row of the table.
 
-    noise   standard deviation of a range, in metres
-    single  whether images are single scans, with their lost beams
-    bad     what stands before the laser in some images, and how many these are
+    Attributes:
+        noise: Standard deviation of a range, in metres.
+        single: Whether images are single scans, with their lost beams.
+        bad: What stands in front of the laser in some images, and the number of these images.
     """
 
     name: str
@@ -76,7 +79,7 @@ def cases() -> Iterator[Case]:
 
 
 def room(times: float) -> World:
-    """The room, longer and wider, with the same notch in its wall."""
+    """The notched rectangle enlarged by a factor; the notch keeps its size."""
     walls = WORLD.segments.copy()
     walls[walls > 0] *= times
     x, y = 4 * times - 0.6, 2 * times - 0.6
@@ -88,7 +91,7 @@ def room(times: float) -> World:
 
 
 def corner(side: float) -> World:
-    """A rectangle that lacks a square at one corner."""
+    """A rectangle without a square at one corner."""
     points = np.array([[0, 0], [4 - side, 0], [4 - side, side], [4, side], [4, 2], [0, 2]])
     return replace(WORLD, segments=np.hstack([points, np.roll(points, -1, axis=0)]))
 
@@ -96,7 +99,7 @@ def corner(side: float) -> World:
 def spoilt(
     images: NDArray[np.float64], kind: str, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """The images, some of which show somebody else, and which ones."""
+    """The images with some of them made bad, and the indices of the bad ones."""
     images, which = images.copy(), rng.choice(len(images), count, replace=False)
     for i in which:
         if kind == "random image":
@@ -110,7 +113,7 @@ def spoilt(
 
 
 def driven(case: Case, tours: int, seed: int) -> tuple[Trace, NDArray[np.intp]]:
-    """A trace with its images, and which of these are bad."""
+    """A trace with its images, and the indices of the bad images."""
     laser, rng = Laser(noise=case.noise), np.random.default_rng(seed)
     trace = simulate(case.world, tours, seed, laser=laser)
     images = images_of(trace)
@@ -127,7 +130,14 @@ def driven(case: Case, tours: int, seed: int) -> tuple[Trace, NDArray[np.intp]]:
 
 @dataclass(frozen=True)
 class Found:
-    """k, whether the map is right, whether it would be if the images that are said to be doubtful had the right views, and whether there was a warning."""
+    """The result of clustering and mapping one drive.
+
+    Attributes:
+        k: Number of views.
+        right: Whether the map is true.
+        mended: Whether it is true after the doubtful images got the right views.
+        said: Whether there was a warning.
+    """
 
     k: int
     right: bool
@@ -136,6 +146,7 @@ class Found:
 
 
 def found(trace: Trace, by: str) -> Found:
+    """Cluster the images of a trace by one criterion, solve the map, and judge it."""
     truth = true_dstates(trace)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -177,7 +188,11 @@ def _mended(
 
 
 def rows(seeds: list[int], tours: int) -> Iterator[str]:
-    yield "| the notched rectangle, but | k by M | map right | wrong, and nothing said | right, and doubted | k by trimmed M | map right | with doubtful images mended |"
+    """The table, row by row."""
+    yield (
+        "| the notched rectangle, but | k by M | map right | wrong, and nothing said | "
+        "right, and doubted | k by trimmed M | map right | with doubtful images mended |"
+    )
     yield "|---|---|---|---|---|---|---|---|"
     for case in cases():
         runs = [driven(case, tours, seed)[0] for seed in seeds]
@@ -198,7 +213,12 @@ def rows(seeds: list[int], tours: int) -> Iterator[str]:
 
 
 def tolerances(seeds: list[int], tours: int) -> Iterator[str]:
-    """By the tolerance of hill-climbing, in which the robot stops: the spread of positions about the mean of their dstate (root mean square), and k by M."""
+    """Measure each tolerance of hill-climbing, at which the robot stops.
+
+    Yields:
+        Rows with the root mean square distance of positions from the mean of their dstate, and
+        the k chosen by M.
+    """
     usual = Tolerance()
     yield "| tolerance | spread, mm | k by M |"
     yield "|---|---|---|"
@@ -231,7 +251,7 @@ def main() -> None:
     parser.add_argument(
         "--tolerances",
         action="store_true",
-        help="print the spread of poses by the tolerance of hill-climbing instead",
+        help="print the spread of poses for each tolerance of hill-climbing instead",
     )
     options = parser.parse_args()
     seeds = seeds_from(options.seeds)

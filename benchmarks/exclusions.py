@@ -1,8 +1,10 @@
-"""What it costs and gains to know which pairs of steps are not at one place: mazes with stars, with and without, in turns in one run.
+"""Solving time with and without knowledge of which pairs of steps are at different places.
 
     python benchmarks/exclusions.py [--cells 6] [--steps 400] [--apart 3] [--seeds 5] [--limit S]
 
-Excluded are all pairs of steps that truly are more than so many cells apart. The last column is the ratio of the times, without to with.
+Each maze with stars is solved twice in one run: without and with exclusions. Excluded are all
+pairs of steps whose true cells are more than --apart cells from each other. The last column is
+the time without exclusions divided by the time with them.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from ssh_abduction import Solution, Theory, solve
 
 
 def far(walk: Walk, apart: int) -> list[tuple[int, int]]:
-    """The pairs of steps at cells that are more than so many cells apart, counted along and across."""
+    """The pairs of steps at cells further apart than `apart` (Manhattan distance)."""
     cells = [(state[0], state[1]) for state in walk.truth if isinstance(state, tuple)]
     pairs = combinations(range(len(cells)), 2)
     return [
@@ -29,7 +31,7 @@ def far(walk: Walk, apart: int) -> list[tuple[int, int]]:
 
 
 def timed(walk: Walk, theory: Theory, limit: float) -> tuple[float, Solution]:
-    """Seconds that it takes to find one minimal map, and the solution."""
+    """Find one minimal map. Returns the seconds it took and the solution."""
     began = time.perf_counter()
     solution = solve(walk.trace, theory, max_maps=1, time_limit=limit)
     return time.perf_counter() - began, solution
@@ -48,7 +50,7 @@ def main() -> None:
         type=int,
         default=3,
         metavar="N",
-        help="cells that an excluded pair is apart, at least one more (default 3)",
+        help="exclude pairs of steps that are more than N cells apart (default 3)",
     )
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="mazes (default 5)")
     parser.add_argument(
@@ -56,7 +58,8 @@ def main() -> None:
     )
     options = parser.parse_args()
     print(
-        "| seed | excluded pairs | without: dstates, s | with: dstates, s | truth | without / with |\n|---|---|---|---|---|---|"
+        "| seed | excluded pairs | without: dstates, s | with: dstates, s | truth | "
+        "without / with |\n|---|---|---|---|---|---|"
     )
     ratios = []
     for seed in range(options.seeds):
@@ -70,7 +73,8 @@ def main() -> None:
             for s, t in ((without, plain), (found, excluding))
         ]
         print(
-            f"| {seed} | {len(pairs):,} | {cells[0]} | {cells[1]} | {len(set(walk.truth))} | {plain / excluding:.2f} |",
+            f"| {seed} | {len(pairs):,} | {cells[0]} | {cells[1]} | "
+            f"{len(set(walk.truth))} | {plain / excluding:.2f} |",
             flush=True,
         )
     print(f"\nmedian: {statistics.median(ratios):.2f}")

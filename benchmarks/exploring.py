@@ -1,22 +1,29 @@
-"""How soon does a robot have the true map, and no other? One that does what tells its maps apart, against a random walk, a fixed rule, and AALpy's hW.
+"""Steps until a robot has the true map: an exploring robot beside simpler ways to drive.
 
     python benchmarks/exploring.py --family mazes --cells 3 --seeds 20 --out results.jsonl
     python benchmarks/exploring.py --family plans --only Borchen4,Sabadell1 --out results.jsonl
     python benchmarks/exploring.py --table results.jsonl [--plot docs/figures/exploring.png]
 
-Runs are paired: all begin in the same world and at the same dstate. A robot *has the map* after so many steps if all minimal maps of these steps have the true dstates, all of them, and the true places, if the
-theory has places; and if it has done every travel. Maps that differ in paths alone count as one. For the walks this is sought in the trace afterwards: from the step on at which everything was visited, after
-ever more steps, and then by halving. The explorer also says itself when it is done.
+All strategies begin in the same world at the same dstate. A robot *has the map* after some number
+of steps if all minimal maps of these steps have the true dstates, and the true places if the
+theory has places, and if the robot has done every travel. Maps that differ only in paths count as
+one. For the walks the number is searched afterwards: solve growing prefixes from the step at which
+everything was visited, then halve the interval. The explorer also says itself when it is done.
 
-    explorer       Explorer of ssh_abduction/online/explorer.py
-    random         any action that the robot can do, evenly
-    rule           mazes: looks around at each place, then follows the wall to its right. Plans: the drive of simulator/plan_tours.py, through the door that was passed least often, which knows where the robot is
-    hW             AALpy's learner without resets. Its oracle knows the truth and costs nothing but the steps of a shortest counterexample, and so does an action that cannot be done: so hW is better here than
-                   it could be. It is told views, with stars on plans, learns all links, and has done once its machine predicts the same as the world
+    explorer  Explorer of ssh_abduction/online/explorer.py.
+    random    Any action that the robot can do, drawn uniformly.
+    rule      Mazes: look around at each place, then follow the wall to the right.
+              Plans: the drive of simulator/plan_tours.py, which knows where the robot is and
+              goes through the door that it passed least often.
+    hW        AALpy's learner without resets. Its oracle knows the truth and costs only the steps
+              of a shortest counterexample. An impossible action costs nothing. So hW does better
+              here than it could in reality. It sees views, with stars on plans, and it learns all
+              links. It is done when its machine predicts the same as the world.
 
-The table tells the shortest walk, too, that sees and does everything: what a driver who knew the world could not better.
+The table also has the length of the shortest walk that sees and does everything, as a driver who
+knew the world would choose it.
 
-Theories: mazes topological, with stars; plans causal, with stars that are alike in tolerance.
+Theories: topological with stars for mazes; causal with stars compared by tolerance for plans.
 """
 
 from __future__ import annotations
@@ -50,7 +57,7 @@ Record = dict[str, Any]
 
 
 class World(Protocol):
-    """A world that a robot can be driven in: its states are true dstates."""
+    """A world for a robot to drive in. Its states are the true dstates."""
 
     name: str
     theory: Theory
@@ -64,11 +71,15 @@ class World(Protocol):
     def place(self, state: Any) -> Hashable: ...
 
     def rule(self) -> Iterator[Action]:
-        """A tour by a fixed rule."""
+        """A drive by a fixed rule."""
 
 
 class Maze:
-    """A maze of corridors, of so many cells each way. A dstate is a cell and a heading, a view the openings ahead, right, back and left. The robot turns to any side."""
+    """A square maze of corridors.
+
+    A dstate is a cell and a heading. A view is the openings ahead, right, back and left. The robot
+    can turn to any side.
+    """
 
     theory, margin = Theory.topological(), 4
 
@@ -95,7 +106,7 @@ class Maze:
         return state[:2]
 
     def rule(self) -> Iterator[Action]:
-        """At each place look around, then follow the wall to the right."""
+        """Look around at each place, then follow the wall to the right."""
         state = self.start
         while True:
             yield from [MOVES["right"]] * 4
@@ -108,13 +119,13 @@ class Maze:
 
 
 def ahead(state: tuple[int, int, int], turn: int) -> tuple[int, int]:
-    """The cell that the robot faces once it has turned by so many quarters."""
+    """The cell that the robot faces after it has turned by this many quarter turns."""
     dx, dy = HEADINGS[(state[2] + turn) % 4]
     return state[0] + dx, state[1] + dy
 
 
 class Building:
-    """A floor plan, whose rooms are places."""
+    """A floor plan. Its rooms are places."""
 
     theory, margin = Theory.causal().replace(star="alike"), 0
 
@@ -127,7 +138,10 @@ class Building:
         return state.room
 
     def rule(self) -> Iterator[Action]:
-        """Turn to the door of the room that was passed least often, not the one behind if there is another, and travel through it."""
+        """Travel through the door of the room that was passed least often.
+
+        The robot takes the door behind it only where there is no other.
+        """
         state, passed, came_by = self.start, dict[int, int](), -1
         while True:
             gateways = self._floor.plan.gateways[state.room]
@@ -144,7 +158,7 @@ class Building:
 
 @dataclass
 class Driven:
-    """A robot in a world, and all that it did there."""
+    """A robot in a world, with everything that it did and saw."""
 
     world: World
 
@@ -172,7 +186,7 @@ class Driven:
 
 
 def states_of(world: World) -> dict[Any, dict[Action, Any]]:
-    """All dstates, and where actions lead."""
+    """All dstates, and for each the dstates that its actions lead to."""
     found: dict[Any, dict[Action, Any]] = {}
     left = [world.start]
     while left:
@@ -184,14 +198,14 @@ def states_of(world: World) -> dict[Any, dict[Action, Any]]:
 
 
 def everything(ends: dict[Any, dict[Action, Any]]) -> set[Any]:
-    """What has to be seen and done: all dstates, and all travels."""
+    """What the robot has to see and do: all dstates and all travels."""
     return {*ends} | {
         (state, action.name) for state in ends for action in ends[state] if action.kind == "travel"
     }
 
 
 def shortest(world: World) -> int:
-    """How many actions it takes at least to visit all dstates and do all travels, for a driver who knows the world."""
+    """The length of a shortest walk through all dstates and travels, if the world is known."""
     ends = states_of(world)
     number = {state: n for n, state in enumerate(ends)}
     moves = [
@@ -208,7 +222,7 @@ def shortest(world: World) -> int:
 
 
 def covered_after(robot: Driven) -> int | None:
-    """After how many actions all dstates were visited and all travels done; None if that never was."""
+    """The number of actions until all dstates were visited and all travels done; None if never."""
     ends = states_of(robot.world)
     missing = everything(ends) - {robot.truth[0]}
     for t, action in enumerate(robot.done, 1):
@@ -219,7 +233,7 @@ def covered_after(robot: Driven) -> int | None:
 
 
 def has_map(robot: Driven, actions: int, limit: float) -> bool:
-    """Whether the minimal maps of the first actions are true, and differ in paths at most."""
+    """Whether the minimal maps of the first actions are true and differ only in paths."""
     trace = robot.trace(actions)
     truth = tuple(robot.truth[: actions + 1])
     known = Known("", trace, truth, tuple(map(robot.world.place, truth)))
@@ -232,7 +246,7 @@ def has_map(robot: Driven, actions: int, limit: float) -> bool:
 
 
 def steps_to_map(robot: Driven, limit: float) -> int | None:
-    """After how many actions the robot had the map; None if it never had."""
+    """The number of actions after which the robot had the map; None if it never had it."""
     low = covered_after(robot)
     if low is None:
         return None
@@ -255,7 +269,16 @@ def explorer(
     seconds: float = float("inf"),
     judged: bool = False,
 ) -> Record:
-    """Until it says that it ends; until so many seconds of processor time are spent; or, if it is judged as it drives, until it has the map."""
+    """Run the explorer until it ends.
+
+    Args:
+        world: The world to explore.
+        seed: Not used; all strategies have the same arguments.
+        most: Stop after this many actions.
+        limit: Seconds for a solve.
+        seconds: Stop after this much CPU time.
+        judged: Stop as soon as the robot has the true map.
+    """
     robot, missing = Driven(world), everything(states_of(world))
     found = Explorer(robot, world.theory, margin=world.margin, time_limit=limit)
     began = time.process_time()
@@ -294,7 +317,7 @@ def rule(world: World, seed: int, most: int, limit: float) -> Record:
 
 
 def walked(robot: Driven, actions: Iterator[Action], limit: float) -> Record:
-    """Do these actions, until some time after everything was visited."""
+    """Do these actions, and stop some time after everything was visited."""
     began = time.perf_counter()
     missing = everything(states_of(robot.world))
     after = 0
@@ -312,7 +335,7 @@ def walked(robot: Driven, actions: Iterator[Action], limit: float) -> Record:
 
 
 def learnt(world: World, seed: int, most: int, limit: float) -> Record:
-    """What AALpy's hW takes."""
+    """Run AALpy's hW."""
     from aalpy import SUL, hWOracle, run_hW
 
     ends, chance = states_of(world), random.getstate()
@@ -382,7 +405,7 @@ def learnt(world: World, seed: int, most: int, limit: float) -> Record:
 
 
 class TooLongError(Exception):
-    """So many steps were done that the run is given up."""
+    """The run is given up, as it has done too many steps."""
 
 
 RUN: dict[str, Callable[..., Record]] = {
@@ -409,11 +432,16 @@ def worlds(options: argparse.Namespace) -> Iterator[tuple[World, int]]:
 
 
 def table(records: Sequence[Record]) -> str:
-    """A row for each world, and the medians: steps until the robot has the map, and when the explorer stops. Where it was not driven so long, nothing is said of that."""
+    """Markdown with a row for each world, and the medians.
+
+    A row has the steps until each robot has the map, and when the explorer stops. That column is
+    empty where the explorer was not driven to its end.
+    """
     names = [*dict.fromkeys(record["world"] for record in records)]
     by = {(record["world"], record["strategy"]): record for record in records}
     lines = [
-        "| world | dstates | shortest | explorer | random | rule | hW | explorer / best other | it stops | then |",
+        "| world | dstates | shortest | explorer | random | rule | hW | explorer / "
+        "best other | it stops | then |",
         "|---" * 10 + "|",
     ]
     columns: dict[str, list[float]] = {
@@ -453,8 +481,10 @@ def table(records: Sequence[Record]) -> str:
         for name, values in columns.items()
     }
     lines.append(
-        f"| median of {len(names)} | | {medians['shortest']} | {' | '.join(medians[s] for s in STRATEGIES)} | {statistics.median(columns['ratio']):.2f} | "
-        f"{medians['stopped']} | {'; '.join(f'{ends.count(end)} {end}' for end in dict.fromkeys(ends))} |"
+        f"| median of {len(names)} | | {medians['shortest']} | "
+        f"{' | '.join(medians[s] for s in STRATEGIES)} | "
+        f"{statistics.median(columns['ratio']):.2f} | {medians['stopped']} | "
+        f"{'; '.join(f'{ends.count(end)} {end}' for end in dict.fromkeys(ends))} |"
     )
     return "\n".join(lines)
 
@@ -474,7 +504,7 @@ def _number(steps: float) -> str:
 
 
 def plot(records: Sequence[Record], file: Path) -> None:
-    """A dot for each run, a line for each world."""
+    """Draw a dot for each run and a line for each world."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -521,7 +551,7 @@ def plot(records: Sequence[Record], file: Path) -> None:
         axis.set_yscale("log")
         axis.set_ylim(
             top=max(record["steps"] or 1 for record in records) * 3
-        )  # what never had the map is written above the dots
+        )  # runs that never had the map are counted above the dots
         axis.grid(axis="y", color="0.9")
     axes[0][0].set_ylabel("steps until the map is unique and true")
     figure.tight_layout()
@@ -545,51 +575,51 @@ def main() -> None:
         type=Path,
         default=ROOT.parent / "shared" / "data" / "plans",
         metavar="FOLDER",
-        help="of the plans",
+        help="folder of the plans",
     )
     parser.add_argument(
         "--only",
         default="",
         metavar="NAMES",
-        help="plans whose names have one of these parts; commas between",
+        help="run only plans whose names contain one of these parts, separated by commas",
     )
     parser.add_argument(
         "--strategies",
         default=",".join(STRATEGIES),
         metavar="NAMES",
-        help="which to run; commas between",
+        help="strategies to run, separated by commas",
     )
     parser.add_argument(
         "--most",
         type=int,
         default=20_000,
         metavar="N",
-        help="give up after so many steps (default 20000); explorer 2000",
+        help="give up after this many steps (default 20000; explorer 2000)",
     )
     parser.add_argument(
         "--limit",
         type=float,
         default=3.0,
         metavar="S",
-        help="seconds for a solve, about (default 3)",
+        help="approximate seconds for a solve (default 3)",
     )
     parser.add_argument(
         "--seconds",
         type=float,
         default=float("inf"),
         metavar="S",
-        help="of processor time for a run of the explorer (default: no limit)",
+        help="CPU time for a run of the explorer (default: no limit)",
     )
     parser.add_argument(
         "--judged",
         action="store_true",
-        help="end a run of the explorer once it has the true map, before it says so",
+        help="end a run of the explorer as soon as it has the true map",
     )
     parser.add_argument(
         "--out",
         type=Path,
         metavar="RESULTS.jsonl",
-        help="where to store what came of each run; what is there is not run again",
+        help="file for the results; runs that it contains are not repeated",
     )
     parser.add_argument(
         "--table",
@@ -597,14 +627,13 @@ def main() -> None:
         metavar="RESULTS.jsonl",
         help="print a table of stored results instead",
     )
-    parser.add_argument("--plot", type=Path, metavar="PNG", help="with --table, draw them, too")
+    parser.add_argument("--plot", type=Path, metavar="PNG", help="with --table, also draw them")
     options = parser.parse_args()
     if options.table:
         records = [json.loads(line) for line in options.table.read_text().splitlines()]
         for family in dict.fromkeys(record["family"] for record in records):
-            print(
-                f"\n{family}\n\n{table([record for record in records if record['family'] == family])}"
-            )
+            of_family = [record for record in records if record["family"] == family]
+            print(f"\n{family}\n\n{table(of_family)}")
         if options.plot:
             plot(records, options.plot)
         return

@@ -1,4 +1,4 @@
-"""Traces with faults whose truth is known, by family, and what an explanation of a trace by labels costs.
+"""Families of traces with known faults, and the cost of an explanation of a trace by labels.
 
 >>> case = FAMILIES["rectangle n=400, 4 wrong views"].make(500)
 >>> len(case.walk.trace), len(case.wrong), len(case.jumps)
@@ -22,19 +22,25 @@ from truth import partition
 from ssh_abduction import Theory, Trace
 from ssh_abduction.data import Odometry
 
-PRICE = 1.5  # What a fault of any kind costs, in dstates.
-MARGIN = 5  # No fault is at one of so many first or last steps: it could not be noticed there.
-RARE = 4  # A dstate that is visited so many times, or less often, may be noise.
+PRICE = 1.5  # Cost of a fault of any kind, in dstates.
+MARGIN = 5  # The first and last steps have no faults, as nothing could reveal them there.
+RARE = 4  # A dstate with at most this many visits may be noise.
 NOISE = Odometry(
     along=0.05, across=0.005, heading=0.002
-)  # Of the mazes with displacements: as in truth.py.
+)  # The odometry of the mazes with displacements, as in truth.py.
 
 Faults = frozenset[tuple[int, str]]  # step and kind
 
 
 @dataclass(frozen=True)
 class Case:
-    """A walk whose trace has faults, and the steps at which they are: wrong views, actions that jumped, and wrong stars."""
+    """A walk whose trace has faults.
+
+    Attributes:
+        wrong: Steps with a wrong view.
+        jumps: Steps whose action jumped.
+        misseen: Steps with a wrong star.
+    """
 
     walk: Walk
     wrong: tuple[int, ...] = ()
@@ -48,13 +54,16 @@ class Case:
 
     @property
     def states(self) -> int:
-        """How many true states the walk visits."""
+        """The number of true states that the walk visits."""
         return len(set(self.walk.truth))
 
 
 @dataclass(frozen=True)
 class Family:
-    """Cases of one kind, made from seeds, and the theory that they are solved under. Rows of optional families are measured only where they are asked for."""
+    """Cases of one kind, made from seeds, and the theory to solve them under.
+
+    Optional families are measured only if they are asked for.
+    """
 
     make: Callable[[int], Case]
     theory: Theory
@@ -63,7 +72,7 @@ class Family:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Labels of the steps of a trace, the fewest faults by which they explain it, and what that costs in tenths of dstates."""
+    """Labels of the steps, the fewest faults they need, and their cost in tenths of dstates."""
 
     labels: tuple[Hashable, ...]
     faults: Faults
@@ -71,7 +80,11 @@ class Explanation:
 
     @classmethod
     def of(cls, trace: Trace, labels: Sequence[Hashable]) -> Explanation:
-        """The causal map of these labels: dstates show what is seen there most often, and actions lead where they lead most often."""
+        """The causal map of these labels, with its faults.
+
+        A dstate shows its most frequent view. An action leads to its most frequent end. All else
+        are faults.
+        """
         shows, leads = _read_off(trace, labels)
         misread = {
             (t, "misread")
@@ -94,7 +107,10 @@ class Explanation:
 
 
 def is_true(labels: Sequence[Hashable], faults: Faults, case: Case) -> bool:
-    """Whether these labels are the true ones up to renaming, at all steps but those with a wrong view, and these faults the true ones."""
+    """Whether labels and faults are the true ones.
+
+    Labels are compared up to renaming. Steps with a wrong view are left out.
+    """
     kept = [t for t in range(len(labels)) if t not in case.wrong]
     return faults == case.faults and partition([labels[t] for t in kept]) == partition(
         [case.walk.truth[t] for t in kept]
@@ -116,13 +132,16 @@ def _read_off(
 
 
 def refined(trace: Trace, labels: Sequence[Hashable]) -> Explanation:
-    """The best explanation near these labels: the map that is read off them is laid over the trace anew, with the fewest faults, and read off again, as long as
-    that gets cheaper. Dstates that are hardly ever visited are left out where that is cheaper.
+    """The best explanation near these labels.
+
+    Read the map off the labels, give the steps the labels with the fewest faults in that map, and
+    repeat while the cost falls. Remove rarely visited dstates where that is cheaper.
     """
     best = Explanation.of(trace, labels)
     while True:
         shows, leads = _read_off(trace, best.labels)
         rare = [s for s, visits in Counter(best.labels).items() if visits <= RARE]
+        # Try the map as it is, then without each of its rare dstates.
         tried = (
             Explanation.of(
                 trace, _laid_over(trace, {s: v for s, v in shows.items() if s != out}, leads)
@@ -164,7 +183,7 @@ def _laid_over(
 
 
 def misread(walk: Walk, wrong: int, seed: int) -> Case:
-    """The walk with so many wrong views, each any other view of the trace."""
+    """The walk with wrong views: another view of the trace at `wrong` of its steps."""
     chance = random.Random(f"misread {seed}")
     steps = tuple(sorted(chance.sample(range(MARGIN, len(walk.trace) - MARGIN), wrong)))
     seen, views = list(walk.trace.views), sorted(set(walk.trace.views), key=str)
@@ -174,7 +193,7 @@ def misread(walk: Walk, wrong: int, seed: int) -> Case:
 
 
 def machine(seed: int, *, jumps: bool) -> Case:
-    """A random machine of 5 to 12 states, 3 actions, 4 to 9 views, 200 steps, and one or two faults."""
+    """A random machine of 5 to 12 states and 4 to 9 views, with 1 or 2 faults in 200 steps."""
     chance = random.Random(f"size {seed}")
     states = chance.randint(5, 12)
     views, faults = chance.randint(4, min(9, states)), chance.randint(1, 2)
@@ -192,10 +211,11 @@ def sized(
 
 
 def rectangle_of_five(seed: int, *, steps: int, wrong: int = 0, jumps: int = 0) -> Case:
-    """Round and round a notched rectangle, whose eight states show five views: opposite corners look alike, but one of them, before the turn, shows the notch.
+    """Circuits of a notched rectangle whose eight states show five views.
 
-    The actions of the robot are right and travel by turns, always. Where an action jumps, the robot is further along its circuit, or back, by two states: a jump of
-    half a circuit would look like none until the notch is due.
+    Opposite corners look alike, but one of them shows the notch before the turn. The actions are
+    right and travel in turn. Where an action jumps, the robot is two states further on or back: a
+    jump by half a circuit would not show until the notch is due.
     """
     chance = random.Random(f"rectangle {seed}")
     jumped = tuple(sorted(chance.sample(range(MARGIN, steps - MARGIN), jumps)))
@@ -210,14 +230,14 @@ def rectangle_of_five(seed: int, *, steps: int, wrong: int = 0, jumps: int = 0) 
 
 
 def left_out(walk: Walk, chance: random.Random) -> tuple[Walk, int]:
-    """The walk without one of its steps, as if an action had been doubled; and the step whose action now leads elsewhere."""
+    """The walk without one of its steps, as after a doubled action; and the step that jumps."""
     t = chance.randrange(MARGIN, len(walk.trace) - MARGIN)
     steps = (*walk.trace.steps[:t], *walk.trace.steps[t + 1 :])
     return Walk(replace(walk.trace, steps=steps), (*walk.truth[:t], *walk.truth[t + 1 :])), t - 1
 
 
 def star_turned(walk: Walk, steps: Iterable[int], chance: random.Random) -> Walk:
-    """The walk with wrong stars at these steps: a gateway too many, or one too few."""
+    """The walk with wrong stars at these steps: one gateway is added or removed."""
     changed = list(walk.trace.steps)
     for t in steps:
         openings = list(changed[t].openings or ())
@@ -228,7 +248,7 @@ def star_turned(walk: Walk, steps: Iterable[int], chance: random.Random) -> Walk
 
 
 def tour_of_taylor_hall(seed: int) -> Case:
-    """240 images of the stand-in for Taylor Hall with a wrong view, a wrong star, and an action that was doubled."""
+    """A drive of 240 images in Taylor Hall with a wrong view, a wrong star and a doubled action."""
     chance = random.Random(f"taylor hall {seed}")
     walk, jumped = left_out(taylor_hall(seed), chance)
     case = misread(walk, 1, seed)
@@ -238,7 +258,10 @@ def tour_of_taylor_hall(seed: int) -> Case:
 
 
 def large_maze(seed: int, share: float) -> Case:
-    """A maze of 6 x 6 with stars and displacements, 400 steps: of the views and of the stars this share is wrong, half of it each."""
+    """A walk of 400 steps with stars and displacements in a maze of 6 x 6.
+
+    `share` of the steps have a fault: one half wrong views, the other half wrong stars.
+    """
     chance = random.Random(f"large {seed}")
     walk = maze(6, 6, steps=400, seed=seed, stars=True, follow=True, odometry=NOISE)
     faults = round(share * 400)

@@ -1,7 +1,9 @@
-"""Other programs that explain a trace with faults, each as a function from a case to the labels of its steps.
+"""Other programs that explain a trace with faults: functions from a case to labels of its steps.
 
-Each function is given a case and CPU seconds. It looks at the trace, and of the truth only at what its docstring names. Dstates, links and faults are read off the labels in the same way for
-all of them (`Explanation`): a dstate shows what is seen there most often, and what disagrees is a fault.
+Each function gets a case and a limit in CPU seconds. It reads the trace, and only those parts of
+the truth that its docstring names. Dstates, links and faults are read off the labels in the same
+way for all programs (`Explanation`): a dstate shows its most frequent view, and what disagrees is
+a fault.
 """
 
 from __future__ import annotations
@@ -19,18 +21,18 @@ from numpy.typing import NDArray
 
 from ssh_abduction import Trace
 
-NOISY = 10  # So many merged states one observation in a minority weighs; see `merged`.
-LEAST = 10  # A merge has to score so much.
-CLONES = (2, 3, 4, 6)  # So many clones each view is given in turn; see `cloned`.
-RESTARTS = 5  # Random beginnings of EM for each of these, as it finds the optimum that is next to where it begins.
-ROUNDS = 200  # EM steps from each beginning, at most.
-ENOUGH = 1e-4  # EM ends where a step gains less than this in log-likelihood, per step of the trace.
-PSEUDOCOUNT = 2e-3  # What George et al. add to all counts.
+NOISY = 10  # One minority observation weighs as much as this many merged states; see `merged`.
+LEAST = 10  # The least score of a merge.
+CLONES = (2, 3, 4, 6)  # The numbers of clones of a view that are tried; see `cloned`.
+RESTARTS = 5  # Random starts of EM for each number of clones, as EM finds local optima.
+ROUNDS = 200  # The most EM steps from each start.
+ENOUGH = 1e-4  # EM ends when log-likelihood per step of the trace grows by less than this.
+PSEUDOCOUNT = 2e-3  # Added to all counts, as by George et al.
 
 
 @dataclass(frozen=True)
 class Peer:
-    """A program: what explains the trace in so many CPU seconds, the modules it needs, the package on PyPI they come from, and whether it proves its faults to be fewest."""
+    """A program: its function, what it needs, and whether it proves that its faults are fewest."""
 
     explain: Callable[[Case, float], Explanation]
     modules: tuple[str, ...]
@@ -43,11 +45,13 @@ class Peer:
 
 
 def maxsat(case: Case, seconds: float) -> Explanation:
-    """RC2 (Ignatiev, Morgado & Marques-Silva 2019) in python-sat, given the number of states and the kind of the faults.
+    """RC2 (Ignatiev, Morgado & Marques-Silva 2019) in python-sat.
 
-    Variables: step t is at state s, action a leads from s to x, state s shows view v; each is a function. Where views may be wrong, what a state shows and what is seen
-    there agree unless a soft clause of that step is broken, and links are hard; where actions may jump, the other way round. States are numbered in the order of
-    what they show, as else each machine would be there in all its namings. It proves that no machine with so many states has fewer faults.
+    It is given the number of states and the kind of the faults. Variables: step t is at state s;
+    action a leads from s to x; state s shows view v. Each is a function. If views may be wrong,
+    links are hard constraints, and a soft clause for each step makes the state show the view. If
+    actions may jump, views are hard and links soft. States are ordered by the views they show, to
+    break the symmetry of their names. RC2 proves that no machine of this size has fewer faults.
     """
     from pysat.examples.rc2 import RC2
     from pysat.formula import WCNF, IDPool
@@ -75,6 +79,7 @@ def maxsat(case: Case, seconds: float) -> Explanation:
         one_of([shows(s, v) for v in range(len(views))])
         for action in dict.fromkeys(a.name for a in trace.actions):
             one_of([leads(s, action, x) for x in states])
+    # Order the states by their views.
     for s, (w, v) in product(states[1:], combinations(range(len(views)), 2)):
         formula.append([-shows(s - 1, v), -shows(s, w)])
     for t, view in enumerate(trace.views):
@@ -99,11 +104,13 @@ def maxsat(case: Case, seconds: float) -> Explanation:
 
 
 def merged(case: Case, seconds: float) -> Explanation:
-    """AALpy's general state merging, with a score that tolerates noise, as AALpy lets its users write one. States may have several outcomes of one action.
+    """AALpy's general state merging, with a score that tolerates noise.
 
-    A merge scores one for each state that it saves, as in evidence-driven state merging, and loses for each observation that is not what is seen most often after that action there.
-    Of the scores that were tried on other seeds (AALpy's AIC, its Hoeffding bound, and this one with 3, 5, 10 and 20) this one came nearest to the truth. Its machine is followed
-    along the trace, and refined.
+    AALpy lets its users write a score. A merge scores one for each state it saves, as in
+    evidence-driven state merging. It loses NOISY for each observation that is not the most frequent
+    one after its action. States may have several outcomes of an action. Of the scores that were
+    tried on other seeds (AALpy's AIC, its Hoeffding bound, and NOISY of 3, 5, 10 and 20) this one
+    came nearest to the truth. Its machine is followed along the trace, and the labels are refined.
     """
     from aalpy.learning_algs import run_GSM
     from aalpy.learning_algs.general_passive.DataHandler import CountDataHandler
@@ -125,6 +132,7 @@ def merged(case: Case, seconds: float) -> Explanation:
         )
 
     trace = case.walk.trace
+    # AALpy reads a first output, then pairs of input and output.
     walk = [
         trace.views[0],
         *((action.name, view) for action, view in zip(trace.actions, trace.views[1:], strict=True)),
@@ -145,11 +153,13 @@ def merged(case: Case, seconds: float) -> Explanation:
 
 
 def cloned(case: Case, seconds: float) -> Explanation:
-    """A cloned hidden Markov model (George et al. 2021), from its equations: EM, then Viterbi training, then the most probable clones.
+    """A cloned hidden Markov model (George et al. 2021), written from its equations.
 
-    Each view has the same number of clones, and a clone shows its view for certain; what is learned is the probability that action a leads from one clone to another. A wrong
-    view has a clone like any other, so the labels are refined. Of all numbers of clones and random beginnings the cheapest explanation is taken; none is begun in
-    the second half of its time.
+    EM, then Viterbi training, then the most probable clones. Each view has the same number of
+    clones, and a clone always shows its view. The probabilities of the links between clones are
+    learned. A wrong view has a clone, too, so the labels are refined. The result is the cheapest
+    explanation over all numbers of clones and random starts. No start begins in the second half
+    of the time.
     """
     trace = case.walk.trace
     explanations = []
@@ -164,7 +174,10 @@ def cloned(case: Case, seconds: float) -> Explanation:
 
 
 class Clones:
-    """The messages of a cloned hidden Markov model along one trace. Chances have the shape (actions, views, views, clones, clones): from, and to."""
+    """The messages of a cloned hidden Markov model along one trace.
+
+    Link probabilities have the shape (actions, views from, views to, clones from, clones to).
+    """
 
     def __init__(self, trace: Trace, clones: int) -> None:
         views = {view: i for i, view in enumerate(dict.fromkeys(trace.views))}
@@ -177,6 +190,7 @@ class Clones:
         self.links = [actions[a.name] for a in trace.actions], self.seen[:-1], self.seen[1:]
 
     def trained(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Link probabilities by EM from a random start, then by Viterbi training."""
         chances = _normal(rng.random(self.shape))
         before = -np.inf
         for _ in range(ROUNDS):
@@ -185,6 +199,7 @@ class Clones:
             if likelihood - before < ENOUGH * len(self.seen):
                 break
             before = likelihood
+        # Viterbi training: count only the links of the most probable clones.
         labels: list[tuple[int, int]] = []
         while labels != (labels := self.labels(chances)):
             counts = np.full(self.shape, 1e-9)
@@ -194,7 +209,7 @@ class Clones:
         return chances
 
     def expected(self, chances: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-        """How often each link is expected to be taken (forward and backward messages), and the log-likelihood of the trace."""
+        """The expected counts of links (forward and backward messages), and the log-likelihood."""
         blocks = chances[self.links]
         ahead, behind = np.ones((2, len(self.seen), self.clones)) / self.clones
         likelihood = 0.0
@@ -211,7 +226,7 @@ class Clones:
         return counts, likelihood
 
     def labels(self, chances: NDArray[np.float64]) -> list[tuple[int, int]]:
-        """The most probable clones of all steps, each as a view and the number of its clone."""
+        """The most probable clones of all steps, each as its view and number."""
         blocks = np.log(chances)[self.links]
         spent, came = np.zeros(self.clones), []
         for block in blocks:
@@ -225,7 +240,7 @@ class Clones:
 
 
 def _normal(counts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Counts as probabilities of where an action leads."""
+    """The counts as probabilities of where an action leads."""
     return counts / counts.sum(axis=(2, 4), keepdims=True)
 
 

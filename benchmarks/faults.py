@@ -1,13 +1,16 @@
-"""Are faults found? ssh-abduction beside a MaxSAT solver, state merging that tolerates noise, and a cloned hidden Markov model.
+"""Are faults found? ssh-abduction beside MaxSAT, state merging and a cloned hidden Markov model.
 
-    python benchmarks/faults.py [--only PATTERN] [--solvers PATTERN] [--seeds 20] [--first 500] [--limit S] [--memory MIB] [--out RESULTS.jsonl]
+    python benchmarks/faults.py [--only PATTERN] [--solvers PATTERN] [--seeds 20] [--first 500]
+                                [--limit S] [--memory MIB] [--out RESULTS.jsonl]
     python benchmarks/faults.py --show RESULTS.jsonl
 
-Families are those of fault_cases.py; the optional ones among them are measured only if --only finds them. A cell is one solver on one case, in a process of its own, which ends
-when its CPU seconds are over. What came of it is a line of RESULTS.jsonl, and a cell that is there already is not measured again. The table is printed at the end; --show prints that of
-stored runs, and does nothing else.
+fault_cases.py has the families. Optional families run only if --only matches them. A cell is one
+solver on one case, in its own process, which ends after its CPU seconds. Its result is a line of
+RESULTS.jsonl, and cells in that file are not repeated. The table is printed at the end. With
+--show only the table of a stored run is printed.
 
-CPU seconds are until the answer is there, and proven where it is. Ours is asked twice: which kinds of faults there are it is not told, and it is told, as RC2 always is.
+CPU seconds count until the answer is found, and proven if the solver proves it. ssh-abduction
+runs twice: without and with knowledge of which kinds of faults there are. RC2 always knows it.
 """
 
 from __future__ import annotations
@@ -41,10 +44,10 @@ from ssh_abduction.solver.asp import limits
 
 OURS, TOLD = "ssh-abduction", "ssh-abduction, told the kind"
 SOLVERS = (OURS, TOLD, *PEERS)
-MARGIN = 2.0  # CPU seconds after its own limit at which a solver of ours is ended: time to hand over what it has.
-LISTING = 10.0  # CPU seconds that it has to list other maps as cheap, once its answer is proven. They do not count.
-PATIENCE = 10  # Seconds by the clock that a CPU second may take, where the machine is busy or the solver sleeps.
-AROUND = 120  # Seconds by the clock to load programs and make the trace.
+MARGIN = 2.0  # CPU seconds beyond its limit for our solver to hand over its answer.
+LISTING = 10.0  # CPU seconds to list more optimal maps after the proof; they are not counted.
+PATIENCE = 10  # Wall-clock seconds for each CPU second, as the machine may be busy.
+AROUND = 120  # Wall-clock seconds to load programs and make the trace.
 COLUMNS = (
     "family",
     "solver",
@@ -68,13 +71,13 @@ def main() -> None:
         "--only",
         default="",
         metavar="PATTERN",
-        help="families whose name this regular expression is found in",
+        help="measure only families that match this regular expression",
     )
     parser.add_argument(
         "--solvers",
         default="",
         metavar="PATTERN",
-        help="solvers whose name this regular expression is found in",
+        help="measure only solvers that match this regular expression",
     )
     parser.add_argument(
         "--seeds", type=int, default=20, metavar="N", help="cases of each family (default 20)"
@@ -92,9 +95,7 @@ def main() -> None:
         metavar="MIB",
         help="address space a cell has, in MiB (default 4096)",
     )
-    parser.add_argument(
-        "--out", type=Path, metavar="RESULTS.jsonl", help="where to store what came of it"
-    )
+    parser.add_argument("--out", type=Path, metavar="RESULTS.jsonl", help="file for the results")
     parser.add_argument(
         "--show", type=Path, metavar="RESULTS.jsonl", help="print the table of stored runs"
     )
@@ -105,6 +106,7 @@ def main() -> None:
         if stored and stored.exists()
         else []
     )
+    # Measure the cells that are not stored yet.
     if not options.show:
         done = {(record["family"], record["solver"], record["seed"]) for record in records}
         for name, family in FAMILIES.items():
@@ -127,7 +129,7 @@ def main() -> None:
 
 
 def measured(name: str, solver: str, seed: int, limit: float, memory: int) -> Record:
-    """What comes of a solver on a case: status, CPU seconds, and of its answer what `judged` says."""
+    """Run a solver on a case: status, CPU seconds, and what `judged` says of its answer."""
     record = {"family": name, "solver": solver, "seed": seed, "limit": limit}
     if solver in PEERS and not PEERS[solver].installed:
         return {**record, "status": "not installed"}
@@ -143,7 +145,7 @@ def measured(name: str, solver: str, seed: int, limit: float, memory: int) -> Re
         while receiver.poll(PATIENCE * limit + AROUND):
             answer |= receiver.recv()
         process.kill()
-    except EOFError:  # it has ended
+    except EOFError:  # the process has ended
         pass
     process.join()
     return {
@@ -155,7 +157,7 @@ def measured(name: str, solver: str, seed: int, limit: float, memory: int) -> Re
 
 
 def work(sender: Connection, name: str, solver: str, seed: int, limit: float, memory: int) -> None:
-    """The work of a cell's process: it sends what there is to find, then what it found."""
+    """Run a cell in its process: send the size of the case, then the result."""
     for module in PEERS[solver].modules if solver in PEERS else ():
         importlib.import_module(module)
     case = FAMILIES[name].make(seed)
@@ -175,20 +177,25 @@ def work(sender: Connection, name: str, solver: str, seed: int, limit: float, me
         else:
             vars(limits)["time"] = SimpleNamespace(
                 perf_counter=cpu_seconds
-            )  # the clock that a search looks at
+            )  # a search reads this clock
             end_after(limit + MARGIN, signal.ITIMER_PROF)
             search(
                 sender, case, theory_for(case, FAMILIES[name].theory, told=solver == TOLD), limit
             )
-    except Exception as error:  # whatever a program raises is what came of it
+    except Exception as error:  # any error of a program is its result
         sender.send({"status": "error", "reason": f"{type(error).__name__}: {error}"[:200]})
 
 
 def search(sender: Connection, case: Case, theory: Theory, limit: float) -> None:
-    """Our search: what it found is sent when it is proven, and again when all cheapest maps are listed, for which it has LISTING seconds more."""
+    """Run our search.
+
+    Sends the answer when it is proven, and again when all optimal maps are listed. Listing has
+    LISTING more seconds.
+    """
     began, proven_at = cpu_seconds(), math.inf
 
     def on_progress(progress: Progress) -> None:
+        # The first report after the proof: send the answer, and start the time for listing.
         nonlocal proven_at
         if ours.status is Status.OPTIMAL and ours.best and progress.cost and proven_at == math.inf:
             proven_at = cpu_seconds() - began
@@ -211,13 +218,14 @@ def search(sender: Connection, case: Case, theory: Theory, limit: float) -> None
 
 
 def explained(ssh_map: SSHMap, tenths: int) -> Explanation:
+    """A map as an explanation."""
     return Explanation(
         ssh_map.labels, frozenset((fault.step, fault.kind) for fault in ssh_map.faults), tenths
     )
 
 
 def theory_for(case: Case, theory: Theory, *, told: bool) -> Theory:
-    """The theory without the kinds of faults that are not there, where that is told."""
+    """The theory; if `told`, without the kinds of faults that the case lacks."""
     return (
         theory.replace(misread=PRICE if case.wrong else 0.0, slipped=PRICE if case.jumps else 0.0)
         if told
@@ -226,7 +234,7 @@ def theory_for(case: Case, theory: Theory, *, told: bool) -> Theory:
 
 
 def judged(case: Case, explanations: Sequence[Explanation], proven: bool) -> Record:
-    """How right explanations are, the first of which is the answer; and what that costs in tenths of dstates."""
+    """Compare explanations, the first of which is the answer, with the truth."""
     if not explanations:
         return {}
     first = explanations[0]
@@ -244,7 +252,10 @@ def judged(case: Case, explanations: Sequence[Explanation], proven: bool) -> Rec
 
 
 def accuracy(labels: Sequence[int], truth: Sequence[Hashable]) -> float:
-    """The share of steps with the right label, under the one-to-one assignment of labels to true states that makes it largest (Kuhn 1955)."""
+    """The share of steps with the right label.
+
+    Labels and true states are assigned one to one so that the share is largest (Kuhn 1955).
+    """
     votes = Counter(zip(labels, truth, strict=True))
     names, states = list(dict.fromkeys(labels)), list(dict.fromkeys(truth))
     table = np.array([[votes[name, state] for state in states] for name in names])
@@ -253,23 +264,24 @@ def accuracy(labels: Sequence[int], truth: Sequence[Hashable]) -> float:
 
 
 def true_tenths(case: Case) -> int:
-    """What the truth costs as an explanation: the true states, and as many faults as these need."""
+    """The cost of the truth as an explanation: its states, and the faults these need."""
     if case.misseen:
         return 10 * case.states + round(10 * PRICE) * len(case.faults)
     return Explanation.of(case.walk.trace, case.walk.truth).tenths
 
 
 def contradictions(records: Iterable[Record]) -> list[str]:
-    """Where more than the truth costs is said to be proven the least."""
+    """Answers that are proven minimal but cost more than the truth."""
     return [
-        f"{r['family']}, seed {r['seed']}: {r['solver']} proved {r['tenths'] / 10} to be the least, the truth costs {r['true_tenths'] / 10}"
+        f"{r['family']}, seed {r['seed']}: {r['solver']} proved {r['tenths'] / 10} to "
+        f"be the least, the truth costs {r['true_tenths'] / 10}"
         for r in records
         if r.get("proven") and r["tenths"] > r["true_tenths"]
     ]
 
 
 def table(records: Iterable[Record]) -> str:
-    """A row for each family and solver, in Markdown."""
+    """Markdown with a row for each family and solver."""
     rows: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         rows.setdefault((record["family"], record["solver"]), []).append(record)
@@ -282,7 +294,7 @@ def table(records: Iterable[Record]) -> str:
 
 
 def cells(solver: str, records: Sequence[Record]) -> list[str]:
-    """What a row says of these records of one solver."""
+    """The cells of a row, from the records of one solver."""
     ran = [r for r in records if r["status"] in ("ok", "timeout", "error")]
     if not ran:
         return [records[0]["status"], *["–"] * (len(COLUMNS) - 3)]
@@ -290,6 +302,7 @@ def cells(solver: str, records: Sequence[Record]) -> list[str]:
     def share(key: str) -> str:
         return f"{sum(bool(r.get(key)) for r in ran)} of {len(ran)}"
 
+    # A solver that did not finish counts as infinitely slow, so that medians are right.
     found, faults, named = (sum(r.get(key, 0) for r in ran) for key in ("found", "faults", "named"))
     seconds = [r["cpu"] if r["status"] == "ok" else math.inf for r in ran]
     limit = max(r["limit"] for r in ran)
@@ -308,7 +321,7 @@ def cells(solver: str, records: Sequence[Record]) -> list[str]:
 
 
 def rivals(records: Iterable[Record]) -> str:
-    """In how many cases the answer costs less than the truth, and in how many others it is proven, costs as much, and is not the truth."""
+    """Count answers that cost less than the truth, and wrong proven answers that cost the same."""
     ended = [r for r in records if "tenths" in r]
     cheaper = sum(r["tenths"] < r["true_tenths"] for r in ended)
     ties = sum(r["proven"] and r["tenths"] == r["true_tenths"] and not r["right"] for r in ended)
@@ -316,18 +329,24 @@ def rivals(records: Iterable[Record]) -> str:
 
 
 def cheaper(records: Iterable[Record]) -> str:
-    """The cases in which ours found less than the truth costs, with what both cost, in Markdown."""
+    """Markdown with the cases in which our answer costs less than the truth, and both costs."""
     rows = [
-        f"| {r['family']} | {r['seed']} | {'yes' if r['solver'] == TOLD else 'no'} | {r['states']} + {r['named']} = {r['tenths'] / 10} | "
-        f"{r['true_states']} + {r['faults']} = {r['true_tenths'] / 10} | {'yes' if r['proven'] else 'no'} |"
+        f"| {r['family']} | {r['seed']} | {'yes' if r['solver'] == TOLD else 'no'} | "
+        f"{r['states']} + {r['named']} = {r['tenths'] / 10} | "
+        f"{r['true_states']} + {r['faults']} = {r['true_tenths'] / 10} "
+        f"{'yes' if r['proven'] else 'no'} |"
         for r in records
         if r["solver"] in (OURS, TOLD) and "tenths" in r and r["tenths"] < r["true_tenths"]
     ]
-    head = "| family | seed | told the kind | dstates + faults = cost found | dstates + faults = cost of the truth | proven |\n|---|---|---|---|---|---|"
+    head = (
+        "| family | seed | told the kind | dstates + faults = cost found | dstates + "
+        "faults = cost of the truth | proven |\n|---|---|---|---|---|---|"
+    )
     return "\n".join([head, *rows])
 
 
 def time_of(seconds: float, limit: float) -> str:
+    """Seconds as text, "> limit" if the time ran out."""
     return f"{seconds:.2f}" if seconds < math.inf else f"> {limit:g}"
 
 

@@ -1,8 +1,9 @@
-"""Stars of any number of gateways: tours of worlds with streets at any angles, and whether every minimal map is right.
+"""Stars with any number of gateways: are all minimal maps of tours along any streets right?
 
     python benchmarks/gateways.py [--seeds 3] [--limit S]
 
-A map is right if its dstates are the true ones. Bearings are off by up to `noise` degrees; the seconds are those of the processor.
+Streets meet at any angles. A map is right if its dstates are the true ones. Bearings have errors
+of up to `noise` degrees. Seconds are CPU seconds.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ssh_abduction import solve
 
 
 def cases(seed: int) -> list[tuple[str, nx.Graph, int, float, set[object]]]:
-    """World, its graph, steps, noise, and the places that its views tell."""
+    """For each world: name, graph, steps, noise in degrees, and the places that views reveal."""
     rng = random.Random(seed)
     honeycomb = planar.honeycomb(1, 2)
     return [
@@ -43,7 +44,8 @@ def main() -> None:
     )
     options = parser.parse_args()
     print(
-        "| world | steps | seed | status | dstates, places | truth | right maps | seconds |\n|---|---|---|---|---|---|---|---|"
+        "| world | steps | seed | status | dstates, places | truth | right maps | "
+        "seconds |\n|---|---|---|---|---|---|---|---|"
     )
     for seed in range(options.seeds):
         for name, graph, steps, noise, landmarks in cases(seed):

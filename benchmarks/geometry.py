@@ -1,8 +1,10 @@
-"""What displacements cost, and what they spare: mazes, solved with and without them, in seconds of the processor.
+"""CPU time that displacements cost and save: mazes solved with and without them.
 
-    python benchmarks/geometry.py [--cells 4 6] [--steps 40 150] [--seeds 10] [--first 200] [--limit 60] [--views]
+    python benchmarks/geometry.py [--cells 4 6] [--steps 40 150] [--seeds 10] [--first 200]
+                                  [--limit 60] [--views]
 
-Geometry is what the kind of evidence `displacement` does (which returns are refused, alone and together), the judge's own account of it, and the fit of the maps.
+Geometry is the work of three parts: the evidence `displacement`, which refuses returns alone and
+together; the checker's own geometry; and the fit of the maps.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from ssh_abduction.data import Odometry
 from ssh_abduction.solver import Status
 from ssh_abduction.theory.evidence import displacement
 
-# Where geometry begins: what is called from elsewhere.
+# The functions of geometry that other parts call.
 BEGINS = (
     (displacement.Displacement, "pairs"),
     (displacement.Displacement, "refuse"),
@@ -37,7 +39,7 @@ BEGINS = (
 
 @contextmanager
 def timed() -> Iterator[list[float]]:
-    """Seconds of the processor that pass in geometry, added up in a list of one number."""
+    """Measure the CPU seconds spent in geometry; they are added up in a list of one number."""
     spent, inside = [0.0], [False]
 
     def wrapped(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -49,7 +51,7 @@ def timed() -> Iterator[list[float]]:
                 found = function(*arguments, **named)
                 return (
                     list(found) if hasattr(found, "__next__") else found
-                )  # a generator works when it is asked
+                )  # run generators now, as they would otherwise do their work outside the timer
             finally:
                 spent[0] += time.thread_time() - began
                 inside[0] = False
@@ -63,7 +65,7 @@ def timed() -> Iterator[list[float]]:
 
 
 def measured(trace: Trace, theory: Theory, limit: float) -> tuple[float, float, bool]:
-    """Seconds of the processor, those of them in geometry, and whether the answer is proven."""
+    """CPU seconds, those of them in geometry, and whether the answer is proven."""
     with timed() as spent:
         began = time.process_time()
         solution = solve(trace, theory, time_limit=limit)
@@ -82,14 +84,16 @@ def main() -> None:
     parser.add_argument("--views", action="store_true", help="without stars")
     options = parser.parse_args()
     theory = Theory(star="none") if options.views else Theory.topological()
-    # What is loaded once is no cost of a trace.
+    # Load all modules and programs before the first measurement.
     measured(
         maze(2, 2, steps=8, seed=0, stars=True, follow=True, odometry=Odometry(**NOISE)).trace,
         theory,
         options.limit,
     )
     print(
-        f"| mazes, {'views' if options.views else 'stars'} | proven with, without | CPU s with, without (median) | without / with (median of ratios) | share of geometry: median, most |\n|---|---|---|---|---|"
+        f"| mazes, {'views' if options.views else 'stars'} | proven with, without | CPU "
+        "s with, without (median) | without / with (median of ratios) | share of "
+        "geometry: median, most |\n|---|---|---|---|---|"
     )
     for cells, steps in zip(options.cells, options.steps, strict=True):
         rows = []
@@ -112,9 +116,12 @@ def main() -> None:
         used, plain = zip(*rows, strict=True)
         shares = [inside / seconds for seconds, inside, _ in used]
         print(
-            f"| {cells} x {cells}, {steps} steps, {options.seeds} seeds | {sum(r[2] for r in used)}, {sum(r[2] for r in plain)} "
-            f"| {statistics.median(r[0] for r in used):.2f}, {statistics.median(r[0] for r in plain):.2f} "
-            f"| {statistics.median(b[0] / a[0] for a, b in rows):.2f} | {statistics.median(shares):.2f}, {max(shares):.2f} |",
+            f"| {cells} x {cells}, {steps} steps, {options.seeds} seeds | "
+            f"{sum(r[2] for r in used)}, {sum(r[2] for r in plain)} | "
+            f"{statistics.median(r[0] for r in used):.2f}, "
+            f"{statistics.median(r[0] for r in plain):.2f} | "
+            f"{statistics.median(b[0] / a[0] for a, b in rows):.2f} | "
+            f"{statistics.median(shares):.2f}, {max(shares):.2f} |",
             flush=True,
         )
 

@@ -1,11 +1,17 @@
-"""Markov localisation over all poses: an occupancy grid with a histogram filter, and with particles. What benchmarks/localisation.py is compared with by grid_localisation.py.
+"""Markov localisation over all poses of an occupancy grid, by a histogram filter or by particles.
 
-Written from the books and papers, whose sections are named here:
-  Thrun, Burgard & Fox 2005, Probabilistic Robotics: the beam model (6.3), the histogram filter (8.2), Monte Carlo localisation with random particles (8.3), KLD sampling (8.3.7)
-  Fox, Burgard & Thrun 1999, Markov localization for mobile robots in dynamic environments: expected ranges are looked up in a table that is made beforehand (4.1)
+grid_localisation.py compares these filters with `Localiser`. They are written from the literature:
 
-A pose is a free cell and a heading. The belief is p(pose | all ranges and displacements so far). A displacement moves and blurs it, as its covariance says and as the size of the
-cells demands; an image weighs it by the beam model; and with a small chance the robot is anywhere, as it may have been kidnapped.
+Thrun, Burgard & Fox 2005, Probabilistic Robotics: the beam model (6.3), the histogram filter (8.2),
+Monte Carlo localisation with random particles (8.3), KLD sampling (8.3.7).
+
+Fox, Burgard & Thrun 1999, Markov localization for mobile robots in dynamic environments: a table
+of expected ranges that is made beforehand (4.1).
+
+A pose is a free cell and a heading. The belief is p(pose | all ranges and displacements so far).
+A displacement moves the belief and blurs it by its covariance and the size of the cells. An image
+weighs the belief by the beam model. With a small probability the robot was kidnapped and is
+anywhere.
 """
 
 from __future__ import annotations
@@ -26,23 +32,31 @@ from simulator.world import World
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
-# Expected ranges are stored in centimetres, in two bytes each: the laser's noise is half of that.
+# Expected ranges are stored as centimetres in two bytes. The laser's noise is half a centimetre.
 STEP = 0.01
-# Displacements blur a belief over cells by at least this many cells: a narrower Gaussian is not one on a grid.
+# The least blur of a displacement, in cells, as a grid cannot represent a narrower Gaussian.
 LEAST_BLUR = 0.3
-# A heading at which no pose is more probable than this, as a share of what it is where nothing is known, is not moved: selective updating (Fox, Burgard & Thrun 1999, 4.2).
+# Selective updating (Fox, Burgard & Thrun 1999, 4.2): headings at which all poses are less probable
+# than this share of the uniform probability are not moved.
 IDLE = 0.1
 
 
 @dataclass(frozen=True)
 class BeamModel:
-    """How likely a range is where another one is expected: a mixture of four parts (Probabilistic Robotics, table 6.1). The defaults are those of ROS's AMCL, made to sum to one.
+    """The likelihood of a range, given the expected one: a mixture of four parts.
 
-    hit    the wall that is expected, seen with Gaussian noise of `sigma` metres; what is beyond `reach` reads as `reach`
-    short  something nearer, as a person: exponential, with `rate` a metre, up to the range that is expected
-    lost   nothing comes back, which reads as `reach`
-    any    anything, evenly
-    beams  every so many degrees a beam is used. Neighbouring beams err together, and are left out, as the model takes beams to be independent
+    Probabilistic Robotics, table 6.1. The defaults are those of ROS's AMCL, scaled to sum to one.
+
+    Attributes:
+        hit: Weight of the expected wall, with Gaussian noise.
+        short: Weight of nearer things such as persons: exponential up to the expected range.
+        lost: Weight of a beam that does not return; it reads as `reach`.
+        any: Weight of a uniform range.
+        sigma: Standard deviation of `hit`, in metres.
+        rate: Rate of `short`, per metre.
+        reach: The longest range, in metres. Anything further away reads as this.
+        beams: Use one beam every so many degrees. The model takes beams as independent, but
+            neighbouring beams err together.
     """
 
     hit: float = 0.95
@@ -55,7 +69,12 @@ class BeamModel:
     beams: int = 10
 
     def log_likelihood(self, measured: float | Array, expected: Array) -> Array:
-        """The logarithm of the density of ranges below `reach`, and of the probability of `reach` itself; metres, and arrays that fit each other."""
+        """Log density of ranges below `reach`, log probability of `reach` itself.
+
+        Args:
+            measured: Ranges in metres.
+            expected: Ranges in metres, in a shape that broadcasts with `measured`.
+        """
         z, e = np.broadcast_arrays(np.asarray(measured, float), np.asarray(expected, float))
         total = self.hit + self.short + self.lost + self.any
         nearer = np.maximum(e, STEP)
@@ -77,12 +96,15 @@ class BeamModel:
 class Grid:
     """An occupancy grid, and the ranges that a laser would measure in it.
 
-    resolution  metres of a cell
-    headings    how many headings there are, evenly around; ranges are expected in as many directions
-    origin      x and y of the corner of cell (0, 0)
-    occupied    (rows, columns): walls
-    free        (rows, columns): cells where the robot may be, which are those connected with the one where it is known to start
-    ranges      (free cells, headings): the range that is expected from the middle of a cell in the direction of each heading, turned by half a degree as the beams are; units of STEP
+    Attributes:
+        resolution: Side of a cell, in metres.
+        headings: Number of evenly spaced headings; ranges are expected in as many directions.
+        origin: x and y of the corner of cell (0, 0).
+        occupied: Walls, (rows, columns).
+        free: Cells where the robot may be, (rows, columns). They are connected with its start.
+        ranges: Expected range from the middle of each free cell in the direction of each heading,
+            (free cells, headings), in units of STEP. Directions are turned by half a degree, like
+            the beams.
     """
 
     resolution: float
@@ -96,10 +118,11 @@ class Grid:
     def of(
         cls, world: World, resolution: float = 0.1, headings: int = 72, reach: float = 8.0
     ) -> Grid:
-        """The grid of a world's walls; clutter counts where it stands in the world's file."""
+        """The grid of a world's walls. Clutter stands where the world's file has it."""
         if headings % 72:
             raise ValueError(
-                f"headings: expected a multiple of 72, so that beams are in the directions of headings, got {headings}"
+                f"headings: expected a multiple of 72, so that beams point along headings, "
+                f"got {headings}"
             )
         segments = np.vstack([world.segments, *(item.segments for item in world.clutter)])
         points = np.vstack([_along(s, resolution / 4) for s in segments])
@@ -122,7 +145,7 @@ class Grid:
 
     @cached_property
     def centres(self) -> Array:
-        """The middles of the free cells, (free cells, 2), in metres."""
+        """The middles of the free cells in metres, (free cells, 2)."""
         rows, columns = np.nonzero(self.free)
         return np.asarray(
             (np.column_stack([columns, rows]) + 0.5) * self.resolution + np.array(self.origin),
@@ -131,20 +154,25 @@ class Grid:
 
     @cached_property
     def number(self) -> NDArray[np.int32]:
-        """The number of each free cell, (rows, columns); -1 for the others."""
+        """The number of each free cell, -1 for the others; (rows, columns)."""
         found = np.full(self.free.shape, -1, np.int32)
         found[self.free] = np.arange(self.free.sum())
         return found
 
     @cached_property
     def angles(self) -> Array:
-        """The headings, in radians."""
+        """The headings in radians."""
         return np.asarray(np.arange(self.headings) * (math.tau / self.headings), np.float64)
 
     def likelihoods(
         self, image: Array, model: BeamModel
     ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        """For the beams used their directions against the heading, in headings, (b,); and log p(range | expected) for each expected range in units of STEP, (b, units)."""
+        """Tables to weigh poses by the used beams of an image.
+
+        Returns:
+            The direction of each used beam relative to the heading, in headings, (b,); and
+            log p(range | expected) for each expected range in units of STEP, (b, units).
+        """
         every = model.beams
         used = np.arange(every // 2, len(image), every)
         offsets = np.rint((BEARINGS[used] - math.radians(0.5)) / (math.tau / self.headings)).astype(
@@ -155,7 +183,7 @@ class Grid:
 
 
 def _along(segment: Array, step: float) -> Array:
-    """Points on a segment, at most so far apart."""
+    """Points on a segment, at most `step` apart."""
     start, end = segment[:2], segment[2:]
     count = max(2, math.ceil(float(np.hypot(*(end - start))) / step) + 1)
     return np.asarray(start + np.linspace(0, 1, count)[:, None] * (end - start))
@@ -168,7 +196,10 @@ def _cast(
     headings: int,
     reach: float,
 ) -> NDArray[np.uint16]:
-    """Walks from all free cells at once in each direction, in strides of half a cell, until a cell is occupied."""
+    """The range of each direction from each free cell.
+
+    All cells walk at once, in strides of half a cell, until they meet an occupied cell.
+    """
     rows, columns = np.nonzero(free)
     ranges = np.full((len(rows), headings), round(reach / STEP), np.uint16)
     for h in range(headings):
@@ -198,31 +229,36 @@ class Filter(Protocol):
     """A belief over poses."""
 
     def moved(self, displacement: Sequence[float], covariance: Array) -> None:
-        """Take into account a displacement (dx, dy, dtheta), in metres and radians and in the robot's frame, and its covariance (3, 3)."""
+        """Update the belief with a displacement.
+
+        Args:
+            displacement: (dx, dy, dtheta) in the robot's frame, in metres and radians.
+            covariance: Its covariance, (3, 3).
+        """
 
     def seen(self, image: Array) -> None:
-        """Take into account an image, (180,) metres."""
+        """Update the belief with an image: 180 ranges in metres."""
 
     def best(self) -> Pose:
         """The most probable pose."""
         ...
 
     def mass(self, pose: Sequence[float], near: float, turned: float) -> float:
-        """How probable it is that the robot is within so many metres and radians of a pose."""
+        """The probability that the robot is within `near` metres and `turned` radians of a pose."""
         ...
 
     @property
     def bytes(self) -> int:
-        """Of the belief."""
+        """The size of the belief."""
         ...
 
 
 class Histogram:
     """A probability for each pose of a grid (Probabilistic Robotics, table 8.1).
 
-    slipped      the chance, at each step, that the robot is anywhere, whatever its wheels say
-    probability  (headings, rows, columns)
-
+    Attributes:
+        slipped: Probability at each step that the robot is anywhere, whatever its wheels say.
+        probability: The belief, (headings, rows, columns).
     """
 
     def __init__(self, grid: Grid, model: BeamModel | None = None, slipped: float = 0.01) -> None:
@@ -237,9 +273,11 @@ class Histogram:
         return self.probability.nbytes
 
     def moved(self, displacement: Sequence[float], covariance: Array) -> None:
-        """The belief is moved and blurred by a Gaussian, for each heading by another one. In the frequency domain both are one product, also for parts of a cell.
+        """Move the belief and blur it with a Gaussian, separately for each heading.
 
-        A heading stands for all those in its bin: so the further the robot goes, the more the belief spreads to the side. That errors of heading and position go together within a step is left out.
+        In the frequency domain both are one product, also for parts of a cell. A heading stands for
+        its whole bin, so the belief spreads sideways with the distance. The correlation of errors
+        of heading and position within a step is neglected.
         """
         grid = self.grid
         dx, dy, turned = displacement
@@ -302,18 +340,24 @@ class Histogram:
 
 
 class Particles:
-    """Poses drawn from the belief: Monte Carlo localisation, with the same table of ranges (Probabilistic Robotics, tables 8.2 and 8.4).
+    """Poses drawn from the belief: Monte Carlo localisation (Probabilistic Robotics, 8.2 and 8.4).
 
-    dense    particles for each square metre of free cells where the robot may be anywhere and face anywhere
-    error    KLD sampling keeps as many particles as are needed so that the distance between them and the belief is at most this, with a probability of 99 %; AMCL's default
-    least    particles that are kept in any case: twenty times as many as AMCL keeps, with which more of the poses that look alike were lost
-    slipped  the chance, at each step, that the robot is anywhere: so many of 100 particles are drawn from anywhere at each step. Where these explain an image better than
-             the others, the belief is drawn anew from anywhere, by that image (sensor resetting, Lenser & Veloso 2000)
+    Uses the same table of ranges as `Histogram`.
+
+    Attributes:
+        dense: Particles per square metre of free cells if the robot may be anywhere.
+        error: KLD sampling draws enough particles to be within this distance of the belief with
+            a probability of 99 %. The default is AMCL's.
+        least: The least number of particles. It is twenty times AMCL's, as fewer particles lose
+            poses that look alike.
+        slipped: Probability at each step that the robot is anywhere. At each step this share of
+            the particles is drawn from anywhere. If they explain an image better than the others,
+            the belief is drawn anew by that image (sensor resetting, Lenser & Veloso 2000).
     """
 
     BIN = np.array(
         [0.5, 0.5, math.radians(10)]
-    )  # AMCL's bins of KLD sampling: metres, metres, radians
+    )  # AMCL's bins for KLD sampling: metres, metres, radians
 
     def __init__(
         self,
@@ -333,14 +377,14 @@ class Particles:
 
     def _begin(self) -> None:
         self.poses, self.weights = self._drawn(self.most), np.full(self.most, 1 / self.most)
-        self.fresh = 0  # the last so many particles were drawn from anywhere for this step
+        self.fresh = 0  # number of particles, at the end, drawn from anywhere for this step
 
     @property
     def bytes(self) -> int:
         return self.poses.nbytes + self.weights.nbytes
 
     def _drawn(self, count: int) -> Array:
-        """Poses from anywhere."""
+        """Uniformly drawn poses."""
         cells = self.grid.centres[self.rng.integers(len(self.grid.centres), size=count)]
         return np.column_stack(
             [
@@ -371,7 +415,11 @@ class Particles:
         self._weigh(image)
 
     def _weigh(self, image: Array) -> bool:
-        """Weigh the particles by an image, and say whether those that followed the robot explain it better than those drawn from anywhere."""
+        """Weigh the particles by an image.
+
+        Returns:
+            Whether those that followed the robot explain the image better than the random ones.
+        """
         grid = self.grid
         offsets, logs = grid.likelihoods(image, self.model)
         columns, rows = np.floor((self.poses[:, :2] - grid.origin) / grid.resolution).astype(int).T
@@ -393,7 +441,7 @@ class Particles:
         return float(self.weights[len(weights) - self.fresh :].sum()) <= 0.5
 
     def _resample(self) -> None:
-        """Draw as many particles as KLD sampling asks for, evenly along the weights (tables 4.4 and 8.4)."""
+        """Draw as many particles as KLD sampling needs, evenly by weight (tables 4.4 and 8.4)."""
         bins = len(np.unique(self._bins(self.poses[np.unique(self._chosen(self.most))])))
         self.poses = self.poses[
             self._chosen(min(self.most, max(self.least, _kld(bins, self.error))))
@@ -401,7 +449,7 @@ class Particles:
         self.weights = np.full(len(self.poses), 1 / len(self.poses))
 
     def _bins(self, poses: Array) -> NDArray[np.intp]:
-        """A number for the bin of each pose."""
+        """The number of the bin of each pose."""
         indices = np.floor(poses / self.BIN).astype(np.intp)
         return np.asarray(indices @ (1, 1 << 20, 1 << 40))
 
@@ -410,7 +458,7 @@ class Particles:
         return np.minimum(np.searchsorted(np.cumsum(self.weights), places), len(self.weights) - 1)
 
     def best(self) -> Pose:
-        """The mean of the particles in the bin that has most of the weight."""
+        """The mean of the particles in the bin with the most weight."""
         _, of = np.unique(self._bins(self.poses), return_inverse=True)
         heaviest = of == np.bincount(of, self.weights).argmax()
         x, y, heading = np.average(self.poses[heaviest], axis=0, weights=self.weights[heaviest])
@@ -422,7 +470,11 @@ class Particles:
 
 
 def _kld(bins: int, error: float) -> int:
-    """Particles for so many bins (Probabilistic Robotics, equation 8.12, by Wilson and Hilferty's approximation of chi-square); 2.326 is the normal quantile of 99 %."""
+    """The number of particles for this many bins.
+
+    Probabilistic Robotics, equation 8.12, with Wilson and Hilferty's approximation of chi-square.
+    2.326 is the normal quantile of 99 %.
+    """
     if bins < 2:
         return 0
     part = 2 / (9 * (bins - 1))

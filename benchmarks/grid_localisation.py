@@ -1,17 +1,27 @@
-"""A belief over dstates beside one over all poses of an occupancy grid: memory, time a step, steps until localised, and how often it is right, in the same drives.
+"""Localisation over dstates beside localisation over all poses of an occupancy grid.
 
-    python benchmarks/grid_localisation.py [--part aliasing|clutter|growing] [--seeds 10] [--first 600] [--save JSON] [--plot PNG] [--maps]
+    python benchmarks/grid_localisation.py [--part aliasing|clutter|growing] [--seeds 10]
+                                           [--first 600] [--save JSON] [--plot PNG] [--maps]
     python benchmarks/grid_localisation.py --from JSON [--plot PNG]
 
-prints tables for docs/measurements/localisation.md and draws its picture, which takes all parts; or prints and draws what was saved. A robot of the simulator drives at random for 30 steps; then it is carried to another dstate, and drives for 30 more.
+Compares memory, time per step, steps until localised and accuracy, in the same drives. Prints
+tables for docs/measurements/localisation.md and draws its figure, which needs all parts. With
+--from, prints and draws stored results. A simulated robot drives at random for 30 steps. Then it
+is carried to another dstate and drives for 30 more.
 
-dstates by image, by view  the bootstrap loop has mapped the world from one exploration run, which tries each action at each dstate twice, and Localiser follows the robot in that map by its images
-                           or by the views that they are clustered to. It reads neither odometry nor stars. Never nowhere: like the peers it is told that the robot is in the map, which
-                           is measured where the world has changed
-grid                       a histogram filter over the cells and headings of an occupancy grid, with a beam model (grid_filter.py)
-particles                  Monte Carlo localisation in the same grid, with the same beam model
+    dstates by image, by view
+        The bootstrap loop has mapped the world from one exploration run, which tries each action
+        at each dstate twice. Localiser follows the robot in this map by its images, or by the
+        views they are clustered to. It reads neither odometry nor stars. Like its peers it is
+        told that the robot is in the map. This is measured where the world has changed.
+    grid
+        A histogram filter over cells and headings of an occupancy grid, with a beam model
+        (grid_filter.py).
+    particles
+        Monte Carlo localisation in the same grid, with the same beam model.
 
-Both of the latter are given the true metric map, odometry, and the noise of that odometry. All see the same images, which were taken at dstates. Nothing was tuned on the seeds of the table.
+Grid and particles are given the true metric map, odometry, and the noise of that odometry. All
+see the same images, which were taken at dstates. Nothing was tuned on the seeds of the table.
 """
 
 from __future__ import annotations
@@ -43,13 +53,13 @@ from ssh_abduction.learning.learner import BootstrapLearner
 from ssh_abduction.online.belief import LOCATED
 from ssh_abduction.online.chances import Chances
 
-STEPS = 30  # of each of the two drives of a run
+STEPS = 30  # steps of each of the two drives of a run
 EXPLORED = 2  # exploration tours
-# Somebody is at a dstate if within so many metres and radians of it, of whatever belief over poses.
+# A pose counts as at a dstate within this many metres and radians of it.
 NEAR, FACING = 0.5, math.radians(45)
-# The robot is localised once the belief is sure and right for so many steps on end.
+# The robot is localised once the belief is certain and right for this many steps in a row.
 STAYS = 5
-SECONDS = 60.0  # for finding a map
+SECONDS = 60.0  # time limit for a map
 COARSE, FINE = "grid of 10 cm, 5°", "grid of 2.5 cm, 2.5°"
 
 
@@ -57,11 +67,12 @@ COARSE, FINE = "grid of 10 cm, 5°", "grid of 2.5 cm, 2.5°"
 class Case:
     """A row of a table.
 
-    scene     by seed
-    change    what is done to the world once it is mapped
-    people    the share of images with somebody in front
-    explored  exploration tours
-    fine      also with a fine grid, whose beam model expects less noise
+    Attributes:
+        scene: Makes the scene from a seed.
+        change: Changes the world after it was mapped.
+        people: Share of images with somebody in front.
+        explored: Number of exploration tours.
+        fine: Also measure a fine grid, whose beam model expects less noise.
     """
 
     name: str
@@ -74,7 +85,11 @@ class Case:
 
 @dataclass(frozen=True)
 class Judged:
-    """Of each step whether the most probable place is the true one, and whether some place is said to be certain. Bytes, and CPU seconds: to make the map, and for all steps."""
+    """How well a method followed one drive.
+
+    Has for each step whether the most probable place is the true one, and whether some place is
+    certain. Also has bytes, and the CPU seconds to make the map and for all steps.
+    """
 
     method: str
     right: tuple[bool, ...]
@@ -85,7 +100,7 @@ class Judged:
     following: float
 
     def localised(self, start: int, stop: int) -> int | None:
-        """Steps from `start` until the belief is sure and right, and stays so."""
+        """The number of steps from `start` until the belief is certain and right, and stays so."""
         good = [r and s for r, s in zip(self.right, self.sure, strict=True)][start:stop]
         return first(
             [all(good[i : i + STAYS]) and i + STAYS <= len(good) for i in range(len(good))]
@@ -94,7 +109,10 @@ class Judged:
 
 @dataclass(frozen=True)
 class Drive:
-    """What a robot does and sees, and where it is at each step: the dstate, and the pose. Where it is carried, wheels say what they say of its first action."""
+    """What a robot does and sees, and its true dstate and pose at each step.
+
+    When the robot is carried, its wheels report the displacement of its first action.
+    """
 
     trace: Trace
     odometry: list[tuple[tuple[float, float, float], NDArray[np.float64]]]
@@ -103,6 +121,7 @@ class Drive:
 
     @classmethod
     def of(cls, scene: Scene, case: Case, seed: int) -> Drive:
+        """Simulate two drives at random, and join them."""
         parts = [scene.driven(STEPS, 10 * seed + i, case.change) for i in range(2)]
         images = np.concatenate([images_of(part) for part in parts])
         in_front(images, np.random.default_rng(seed), case.people)
@@ -123,7 +142,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Learnt:
-    """What the bootstrap loop learnt from an exploration run, the true dstates of its steps, and CPU seconds."""
+    """What the bootstrap loop learnt from an exploration run, its true dstates, and CPU seconds."""
 
     learner: BootstrapLearner
     truth: list[str]
@@ -148,7 +167,10 @@ BY_IMAGE, SOMEWHERE, BY_VIEW = (
 
 
 def by_dstates(drive: Drive, learnt: Learnt, method: str) -> Judged:
-    """Localiser in the map that was learnt. A dstate of that map is the true one that most of its images are of."""
+    """Follow a drive with Localiser in the learnt map.
+
+    A dstate of the map counts as the true dstate that most of its images show.
+    """
     images = method != BY_VIEW
     learner, named = learnt.learner, {}
     for x in range(len(learner.map_.dstates)):
@@ -181,6 +203,7 @@ def by_dstates(drive: Drive, learnt: Learnt, method: str) -> Judged:
 
 
 def by_poses(drive: Drive, belief: Filter, method: str, grid: Grid, making: float) -> Judged:
+    """Follow a drive with a filter over poses."""
     right, sure, following, most = [], [], 0.0, 0
     for i, (image, pose) in enumerate(zip(images_of(drive.trace), drive.poses, strict=True)):
         began = process_time()
@@ -205,6 +228,7 @@ def by_poses(drive: Drive, belief: Filter, method: str, grid: Grid, making: floa
 
 
 def run(case: Case, seed: int) -> Iterator[Judged]:
+    """Measure all methods on one drive."""
     scene = case.scene(seed)
     drive = Drive.of(scene, case, seed)
     learnt = Learnt.of(scene, case, seed)
@@ -259,11 +283,11 @@ PARTS: dict[str, list[Case]] = {
 Saved = dict[str, dict[str, list[list[Judged]]]]  # by part and case: of each seed, each method
 
 
-HEAD = """
-{}
-
-| world | belief over | localised after | in | found after being carried | in | right | sure and wrong | map, kB | belief, kB | CPU ms a step | map made in, CPU s |
-|---|---|---|---|---|---|---|---|---|---|---|---|"""
+HEAD = (
+    "\n{}\n\n| world | belief over | localised after | in | found after being carried | in | right "
+    "| sure and wrong | map, kB | belief, kB | CPU ms a step | map made in, CPU s |\n"
+    "|---|---|---|---|---|---|---|---|---|---|---|---|"
+)
 
 
 def measured(parts: Sequence[str], seeds: range, save: str | None) -> Saved:
@@ -279,7 +303,7 @@ def measured(parts: Sequence[str], seeds: range, save: str | None) -> Saved:
 
 
 def maps(parts: Sequence[str], seeds: range) -> None:
-    """Only what the bootstrap loop learns: how many of its maps are the true ones."""
+    """Only run the bootstrap loop, and count its true maps."""
     print("| world | dstates | steps explored | maps that are the true one |\n|---|---|---|---|")
     for case in (case for part in parts for case in PARTS[part] if part != "clutter"):
         learnt = [Learnt.of(case.scene(seed), case, seed) for seed in seeds]
@@ -322,19 +346,26 @@ def cells(runs: Sequence[Judged]) -> list[str]:
         np.mean([s and not r for r, s in zip(judged.right, judged.sure, strict=True)])
         for judged in runs
     ]
+    kilobytes = "{:,.3g}" if runs[0].belief_bytes < 1e5 else "{:,.0f}"
     return [
-        *(cell for steps in (here, there) for cell in (spread([s for s in steps if s is not None], "{:g}"), f"{sum(s is not None for s in steps)} of {len(steps)}")),
+        *(cell for steps in (here, there) for cell in reached(steps)),
         spread([float(np.mean(judged.right)) for judged in runs], "{:.2f}"),
         spread([float(w) for w in wrong], "{:.2f}"),
         spread([judged.map_bytes / 1000 for judged in runs], "{:,.0f}", False),
-        spread([judged.belief_bytes / 1000 for judged in runs], "{:,.3g}" if runs[0].belief_bytes < 1e5 else "{:,.0f}", False),
+        spread([judged.belief_bytes / 1000 for judged in runs], kilobytes, False),
         spread([1000 * judged.following / len(judged.right) for judged in runs], "{:.3g}", False),
         spread([judged.making for judged in runs], "{:.1f}", False),
-    ]  # fmt: skip
+    ]
+
+
+def reached(steps: Sequence[int | None]) -> tuple[str, str]:
+    """The steps until localised, and how many robots were localised."""
+    known = [s for s in steps if s is not None]
+    return spread([float(s) for s in known], "{:g}"), f"{len(known)} of {len(steps)}"
 
 
 def spread(values: Sequence[float], form: str, ranged: bool = True) -> str:
-    """The median, and the range where it is asked for and there is one."""
+    """The median, and the range if it is asked for and not a single value."""
     if not values:
         return "–"
     told = [form.format(v) for v in (float(np.median(values)), min(values), max(values))]
@@ -355,7 +386,7 @@ LOCATING = (
 
 
 def draw(path: str, found: Saved) -> None:
-    """Above, how many of the robots are located where they are, by step. Below, memory and time in mazes of growing size."""
+    """Draw the share of located robots by step, and below it memory and time by size of a maze."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -423,7 +454,7 @@ def main() -> None:
     parser.add_argument(
         "--maps",
         action="store_true",
-        help="only say how many of the maps that are learnt are the true ones",
+        help="only count how many learnt maps are true",
     )
     parser.add_argument("--save", metavar="JSON")
     parser.add_argument("--from", dest="source", metavar="JSON", nargs="+")
@@ -448,7 +479,8 @@ def main() -> None:
     if options.plot:
         if set(found) != set(PARTS):
             parser.error(
-                f"--plot: expected {', '.join(PARTS)}, got {', '.join(found)} only; measure the others, too"
+                f"--plot: expected {', '.join(PARTS)}, got {', '.join(found)} only; "
+                "measure the others, too"
             )
         draw(options.plot, found)
 

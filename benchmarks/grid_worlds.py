@@ -1,4 +1,4 @@
-"""Worlds and drives for grid_localisation.py: streets at right angles, drives at random through them, and what was put there after they were mapped."""
+"""Worlds and drives for grid_localisation.py: streets at right angles, random drives, new boxes."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ from ssh_abduction import Trace
 
 State = tuple[
     object, object, bool
-]  # a place, a street there, and whether the robot faces it or has it behind
-# A robot that drives at random travels so often where it can; else it turns.
+]  # a place, a street there, and whether the robot faces the street or has it behind
+# The share of travels in a random drive where the robot can travel; otherwise it turns.
 TRAVELS = 2 / 3
-# So many times another draw is made where a drive fails, as with a box in the way.
+# The most draws of a drive, as some fail, for example with a box in the way.
 TRIES = 20
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A world, as it is mapped, and the actions that lead from one dstate to another there.
+    """A world as it is mapped, and the actions that lead from one dstate to another.
 
-    moves    by dstate, as the world names it: the actions there, and the dstates that they lead to
-    explore  what the robot does to map it: the dstate where it starts, and its route, which ends there
+    Attributes:
+        moves: For each dstate, by its name in the world: its actions and the dstates they lead to.
+        explore: The exploration: the dstate where the robot starts and ends, and its route.
     """
 
     world: World
@@ -56,7 +57,11 @@ class Scene:
         seed: int,
         change: Callable[[World, np.random.Generator], World] | None = None,
     ) -> Trace:
-        """A drive at random of so many steps from any dstate, in the world as it is or as it was changed. Raises SimulatorError where every draw fails."""
+        """A random drive from a random dstate, in the world as it is or as it was changed.
+
+        Raises:
+            SimulatorError: If every draw fails.
+        """
         for attempt in range(TRIES):
             chance, rng = (
                 random.Random(1000 * seed + attempt),
@@ -75,7 +80,7 @@ class Scene:
                 with warnings.catch_warnings():
                     warnings.simplefilter(
                         "ignore", SimulatorWarning
-                    )  # A drive at random ends anywhere.
+                    )  # a random drive may end anywhere
                     return simulate(
                         change(world, rng) if change else world, 1, int(rng.integers(2**31))
                     )
@@ -85,7 +90,10 @@ class Scene:
 
 
 def of_streets(graph: nx.Graph, start: Leg, reach: float, like: World | None = None) -> Scene:
-    """The scene of a street map whose streets meet at right angles. `like` is a world with the same places, whose walls, clutter and names are taken instead."""
+    """The scene of a street map whose streets meet at right angles.
+
+    `like` is a world with the same places, whose walls, clutter and names are used instead.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.json"
         path.write_text(json.dumps({**drawn(graph, reach, start, route=[]), "angles": "right"}))
@@ -108,7 +116,10 @@ def of_streets(graph: nx.Graph, start: Leg, reach: float, like: World | None = N
 
 
 def _all_moves(moves: dict[str, dict[str, str]], start: str) -> list[str]:
-    """Actions that try each action at each dstate, and lead back to the start: always on to the nearest one that is left."""
+    """Actions that try each action at each dstate and lead back to the start.
+
+    The robot always goes on to the nearest action it has not tried.
+    """
     graph = nx.DiGraph(
         [(a, b, {"action": action}) for a, ways in moves.items() for action, b in ways.items()]
     )
@@ -129,7 +140,7 @@ def _all_moves(moves: dict[str, dict[str, str]], start: str) -> list[str]:
 
 
 def rectangle(depth: float) -> Scene:
-    """The notched rectangle, with a notch of so many metres; there is only the way round."""
+    """The notched rectangle with a notch of this depth in metres, which has only the way round."""
     world = World.named("notched-rectangle")
     walls = world.segments.copy()
     walls[:, 1::2] = np.where(walls[:, 1::2] < 0, -depth, walls[:, 1::2])
@@ -163,7 +174,7 @@ def taylor_hall() -> Scene:
 
 
 def comb(halls: int) -> Scene:
-    """A main hallway with so many side hallways, all alike, 6 m from each other."""
+    """A main hallway with similar side hallways, 6 m apart."""
     at: dict[object, complex] = {f"P{i}": 6.0 * i + 0j for i in range(halls)}
     at |= {f"D{i}": 6.0 * i - 6j for i in range(halls)}
     streets: list[tuple[object, object]] = [(f"P{i}", f"P{i + 1}") for i in range(halls - 1)]
@@ -173,7 +184,10 @@ def comb(halls: int) -> Scene:
 
 
 def ring(marked: bool) -> Scene:
-    """A square of hallways, each of which has two side hallways to the outside; all sides are alike, but that one side hallway is missing where the ring is marked."""
+    """A square of hallways, each with two side hallways to the outside.
+
+    All sides are alike. In a marked ring one side hallway is missing.
+    """
     corners = [0j, 18 + 0j, 18 + 18j, 18j]
     at: dict[object, complex] = {f"C{k}": z for k, z in enumerate(corners)}
     streets: list[tuple[object, object]] = []
@@ -193,7 +207,11 @@ def ring(marked: bool) -> Scene:
 
 
 def maze(size: int, seed: int, cell: float = 5.0) -> Scene:
-    """A maze of so many cells by as many: a random spanning tree of a grid, and each further street by a chance of a tenth. A cell that a street goes straight through is no place."""
+    """A maze of `size` by `size` cells.
+
+    It has the streets of a random spanning tree of the grid, and each other street with a
+    probability of a tenth. A cell on a straight street is not a place.
+    """
     chance = random.Random(seed)
     grid = nx.grid_2d_graph(size, size)
     graph = nx.Graph(
@@ -216,7 +234,7 @@ def maze(size: int, seed: int, cell: float = 5.0) -> Scene:
 
 
 def boxes(count: int) -> Callable[[World, np.random.Generator], World]:
-    """Puts so many boxes along the walls, 0.3 to 0.8 m long and 0.3 m deep."""
+    """Put boxes along the walls, 0.3 to 0.8 m long and 0.3 m deep."""
 
     def changed(world: World, rng: np.random.Generator) -> World:
         walls = world.segments

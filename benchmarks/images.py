@@ -1,9 +1,10 @@
-"""Images: simulated ones a second, clustering with the search for k by M, and nearest-neighbour queries a second.
+"""Images: simulation rate, time of clustering with the search for k by M, and rate of queries.
 
     python benchmarks/images.py [SIZE ...]
 
-Time and peak memory, each in a process of its own, one run, on the machine as it is. Images are of the notched rectangle: from poses near
-its eight dstates ("dstates"), and from poses anywhere ("anywhere"), where there are no clusters to find: the slowest case.
+Prints time and peak memory of one run each, in its own process. Images are of the notched
+rectangle: from poses near its eight dstates ("dstates"), or from uniformly drawn poses
+("anywhere"). The latter have no clusters, which is the slowest case.
 """
 
 from __future__ import annotations
@@ -42,13 +43,14 @@ def ranges(kind: str, count: int, seed: int = 0) -> NDArray[np.float64]:
 
 
 def simulated(world: str) -> None:
-    """Scan from many poses at once, and drive, and print two lines of the table."""
+    """Simulate scans from many poses at once, and a drive. Prints two lines of the table."""
     room, rng = World.named(world), np.random.default_rng(0)
     poses = np.repeat([s.pose for s in room.dstates], 20_000 // len(room.dstates), axis=0)
     began = time.perf_counter()
     Laser().scan(room, poses, rng)
     print(
-        f"{world:18} {len(poses) / (time.perf_counter() - began):9,.0f} images a second, all poses at once",
+        f"{world:18} {len(poses) / (time.perf_counter() - began):9,.0f} images a "
+        "second, all poses at once",
         flush=True,
     )
     began = time.perf_counter()
@@ -60,20 +62,21 @@ def simulated(world: str) -> None:
 
 
 def search(kind: str, count: int) -> None:
-    """Search for k, and print a line of the table."""
+    """Search for k. Prints a line of the table."""
     images = ReciprocalTransformer().fit_transform(ranges(kind, count))
     began = time.perf_counter()
     views = ViewClusterer(k_max=MOST_VIEWS, random_state=0).fit(images)
     seconds = time.perf_counter() - began
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
     print(
-        f"{kind:9} {count:7,} images, k = 2 … {MOST_VIEWS}: {seconds:7.1f} s, peak {peak:6.0f} MB, k = {views.k_}",
+        f"{kind:9} {count:7,} images, k = 2 … {MOST_VIEWS}: {seconds:7.1f} s, peak "
+        f"{peak:6.0f} MB, k = {views.k_}",
         flush=True,
     )
 
 
 def queries(kind: str, count: int) -> None:
-    """Ask for the nearest of `count` images, and print a line of the table."""
+    """Query the nearest of `count` images. Prints a line of the table."""
     images = ReciprocalTransformer().fit_transform(ranges(kind, count + 2_000))
     recogniser = PlaceRecogniser().fit(images[:count], np.arange(count) % 8)
     began = time.perf_counter()

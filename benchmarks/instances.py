@@ -1,4 +1,4 @@
-"""Traces to measure on: random walks in grid mazes and in random Moore machines. The same seed gives the same trace.
+"""Traces to measure: random walks in mazes and in random Moore machines, repeatable by seed.
 
 >>> walk = maze(5, 5, steps=1600, seed=0)
 >>> len(walk.trace), len(set(walk.truth))
@@ -21,7 +21,7 @@ from ssh_abduction.data import Odometry
 
 HEADINGS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # north, east, south, west
 TURNS = {"right": 1, "around": 2, "left": 3}
-# Metres that the cells of a maze are apart.
+# The distance between neighbouring cells of a maze, in metres.
 CELL = 10.0
 
 
@@ -42,7 +42,10 @@ def displaced(
     scale: float = 0.0,
     bend: float = 0.0,
 ) -> Trace:
-    """A trace with the displacements between the true poses of its steps, as an odometry reports them; see simulator.motion.reported."""
+    """The trace with displacements between the true poses, as an odometer reports them.
+
+    See `simulator.motion.reported`.
+    """
     rng = np.random.default_rng(seed)
     moved = [
         reported(between(a, b), odometry, rng, scale=scale, bend=bend) for a, b in pairwise(poses)
@@ -60,7 +63,10 @@ Cell = tuple[int, int]
 def doors_of(
     width: int, height: int, chance: random.Random, loops: float = 0.1
 ) -> set[tuple[Cell, Cell]]:
-    """The corridors of a maze, from cell to cell, each in both directions: a random spanning tree of the grid, and each further wall open by chance."""
+    """The corridors of a maze between cells, each in both directions.
+
+    They are a random spanning tree of the grid. Each other wall is open with probability `loops`.
+    """
     walls = [
         ((x, y), (x + dx, y + dy))
         for x in range(width)
@@ -98,15 +104,25 @@ def maze(
     scale: float = 0.0,
     bend: float = 0.0,
 ) -> Walk:
-    """A random walk of so many actions in a maze of corridors: a random spanning tree of the grid, and each further wall open by chance.
+    """A random walk in a maze of corridors.
 
-    A state is a cell and a heading, a view the openings ahead, right, back and left. Where the way ahead is open the robot
-    travels half of the time; else it turns. It turns around only where it cannot travel. One that follows corridors travels in four of six cases
-    where it can; else it turns to where the way is open to its right or left, and around only in a dead end.
+    A state is a cell and a heading. A view is the openings ahead, right, back and left. Where the
+    way ahead is open the robot travels half of the time; otherwise it turns. It turns around only
+    where it cannot travel.
 
-    odometry     if given, the trace has displacements with this noise; the walk is the same
-    cell         metres from one cell to the next
-    scale, bend  errors of the odometry that repeat, as a share and in radians a metre
+    Args:
+        width: Cells from west to east.
+        height: Cells from south to north.
+        steps: Number of actions.
+        seed: Seed of the maze and the walk.
+        loops: Probability that a wall beyond the spanning tree is open.
+        stars: Whether the trace has stars.
+        follow: Whether the robot follows corridors: it travels in four of six cases where it can.
+            Otherwise it turns to an open way on its right or left, and around only in a dead end.
+        odometry: If given, the trace has displacements with this noise. The walk is the same.
+        cell: Metres from one cell to the next.
+        scale: Systematic error of distances, as a share.
+        bend: Systematic error of headings, in radians per metre.
     """
     chance = random.Random(seed)
     doors = doors_of(width, height, chance, loops)
@@ -150,7 +166,10 @@ def maze(
 
 
 def moore(states: int, views: int, *, steps: int, seed: int, actions: int = 2) -> Walk:
-    """A random walk in a random Moore machine: links and views drawn evenly, save that each view is there and a random tour of all states is possible."""
+    """A random walk in a random Moore machine.
+
+    Links and views are drawn uniformly. Each view occurs, and a random walk can visit all states.
+    """
     chance = random.Random(seed)
     shown = [*range(views), *(chance.randrange(views) for _ in range(states - views))]
     chance.shuffle(shown)
@@ -182,9 +201,12 @@ def faulty_machine(
     jumps: int = 0,
     actions: int = 3,
 ) -> tuple[Walk, tuple[int, ...], tuple[int, ...]]:
-    """A random walk in a random Moore machine, at whose steps some views are wrong; and some actions end anywhere else, and what follows goes on from there.
+    """A random walk in a random Moore machine, with wrong views and with actions that end anywhere.
 
-    Returns the walk, the steps with a wrong view, and those whose action jumped. None of these are the first or last five steps.
+    The walk goes on from where a jump ended. The first and last five steps have no faults.
+
+    Returns:
+        The walk, the steps with a wrong view, and the steps whose action jumped.
     """
     walk = moore(states, views, steps=steps, seed=seed, actions=actions)
     chance = random.Random(f"faults {seed}")
@@ -196,7 +218,7 @@ def faulty_machine(
     truth = [walk.truth[0]]
     for t, action in enumerate(walk.trace.actions):
         there = links.get((truth[-1], action.name))
-        if t in jumped or there is None:  # what the walk never tried leads nowhere new
+        if t in jumped or there is None:  # the walk without faults never tried this action
             there = chance.choice([s for s in shown if s != there])
             links.setdefault((truth[-1], action.name), there)
         truth.append(there)
@@ -213,7 +235,7 @@ def faulty_machine(
 
 
 def rectangle(circuits: int) -> Walk:
-    """The notched rectangle of Kuipers & Beeson (2002), so many times round: eight states, four views."""
+    """Circuits of the notched rectangle of Kuipers & Beeson (2002): eight states, four views."""
     steps = 8 * circuits
     trace = Trace.from_steps(
         [f"v{i % 4}" for i in range(steps + 1)], [("right", "travel")[i % 2] for i in range(steps)]
@@ -222,7 +244,10 @@ def rectangle(circuits: int) -> Walk:
 
 
 def circuits(width: int, height: int, *, rounds: int, seed: int, views: int = 4) -> Walk:
-    """So many times round a block: along each side from place to place, and right at the corners. What is seen is drawn evenly for each state."""
+    """Circuits of a block: from place to place along each side, and right at the corners.
+
+    The view of each state is drawn uniformly.
+    """
     chance = random.Random(seed)
     once = [
         action

@@ -1,10 +1,12 @@
-"""Do limits hold? Traces with flaws, in which most places look new, under limits of time and memory: the worst overshoot of either.
+"""Do limits of time and memory hold? The worst overshoot on traces with flaws.
 
     python benchmarks/limits.py --cases 40 --seed 0 [--python]
 
-Promised: time within 1.2 times the limit and 1 s, start-up included, and memory within 1.2 times the limit and 200 MiB, and valid JSON on the output.
-Every case is a process of its own: the command line, which has a guard that ends it in time whatever clingo is at; or, with --python, `solve` of the
-Python interface, which has none. The same seed gives the same cases; the time that they take depends on what else the machine does.
+Flaws make most places look new. The promise is: at most 1.2 times the time limit and 1 s more,
+including the start; at most 1.2 times the memory limit and 200 MiB more; and valid JSON on the
+output. Each case runs in its own process. By default it is the command line, whose guard ends
+it in time whatever clingo does. With --python it is `solve` of the Python interface, which has no
+guard. The same seed gives the same cases. Their times depend on the load of the machine.
 """
 
 from __future__ import annotations
@@ -29,22 +31,24 @@ from ssh_abduction import Trace
 TIME, MEMORY = (
     (1.2, 1.0),
     (1.2, 200.0),
-)  # times the limit, and seconds or MiB beyond that, that are promised
+)  # the promise: a factor of the limit, and seconds or MiB on top
 PYTHON = """
 import json, sys
 from ssh_abduction import Trace, solve
 from ssh_abduction.theory.theory import PRESETS
 path, theory, limit, memory = sys.argv[1:]
-solution = solve(Trace.load(path), PRESETS[theory](), limit=float(limit), memory=int(memory) or None)
+solution = solve(
+    Trace.load(path), PRESETS[theory](), time_limit=float(limit), memory_limit=int(memory) or None
+)
 print(json.dumps({"status": solution.status.value}))
 sys.exit({"optimal": 0, "feasible": 10, "unsatisfiable": 20, "unknown": 30}[solution.status.value])
 """
-GIVEN_UP = 30.0  # seconds beyond what is promised after which a process is killed
+GIVEN_UP = 30.0  # kill a process this many seconds after the promised time
 CODES = {"optimal": 0, "feasible": 10, "unsatisfiable": 20, "unknown": 30}
 
 
 def aces(circuits: int, seed: int) -> Trace:
-    """A drive like that of the ACES building: corridors, of which most look new, and a few circuits of them."""
+    """A drive like that in the ACES building: circuits of corridors with mostly new views."""
     chance = random.Random(seed)
     corridor = [f"v{chance.randrange(12)}" for _ in range(23)]
     done = [chance.choice(["travel", "travel", "right", "around"]) for _ in corridor]
@@ -68,7 +72,11 @@ FAMILIES: dict[str, tuple[str, Callable[[int, int], Trace]]] = {
 
 
 def flawed(trace: Trace, flaws: int, chance: random.Random) -> Trace:
-    """A trace with so many flaws: a view of another step, a step left out or doubled, an action that another one is taken for."""
+    """A trace with flaws.
+
+    A flaw is the view of another step, a missing or doubled step, or a confused action.
+    """
+    # Draw the kind of each flaw, then its step.
     steps = list(trace.steps)
     for _ in range(flaws):
         t = chance.randrange(1, len(steps) - 1)
@@ -90,7 +98,7 @@ def flawed(trace: Trace, flaws: int, chance: random.Random) -> Trace:
 
 @dataclass(frozen=True)
 class Case:
-    """A trace, and the limits under which it is solved: seconds, and MiB or none."""
+    """A trace and its limits: seconds, and MiB or None."""
 
     family: str
     trace: Trace
@@ -98,7 +106,7 @@ class Case:
     mebibytes: int | None
 
     def command(self, path: Path, *, python: bool) -> list[str]:
-        """What is run."""
+        """The command line of the process."""
         if python:
             return [
                 sys.executable,
@@ -127,11 +135,12 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case.
+    """The result of a case.
 
-    seconds    from the start of the process to its end, and
-    mebibytes  at its peak, each as a share of what is promised
-    status     that was printed, or what was wrong with that
+    Attributes:
+        seconds: Time of the process, as a share of the promised time.
+        mebibytes: Peak memory of the process, as a share of the promised memory.
+        status: The printed status, or what was wrong with the output.
     """
 
     case: Case
@@ -143,7 +152,7 @@ class Outcome:
 def cases(
     count: int, seed: int, longest: int = 2000, seconds: Sequence[float] = (0.5, 1, 2, 5, 10)
 ) -> Iterator[Case]:
-    """So many cases, the families by turns."""
+    """Make cases, taking turns between the families."""
     chance = random.Random(seed)
     families = list(FAMILIES)
     for number in range(count):
@@ -170,6 +179,7 @@ def outcome(case: Case, folder: Path, *, python: bool = False) -> Outcome:
         output.open("wb") as written,
         subprocess.Popen(command, stdout=written, stderr=subprocess.PIPE) as process,
     ):
+        # Poll instead of wait, to sample the memory and to kill a process that hangs.
         ended, peak = False, 0.0
         while not ended:
             peak = max(peak, _peak(process.pid))
@@ -187,7 +197,10 @@ def outcome(case: Case, folder: Path, *, python: bool = False) -> Outcome:
 
 
 def _peak(process: int) -> float:
-    """The most MiB that a process has used so far; 0 where the system does not tell. What it tells at the end counts the process that began this one, too."""
+    """The peak MiB of a running process; 0 where the system does not say.
+
+    The usage that the system reports at the end also includes this parent process.
+    """
     with suppress(OSError, StopIteration), open(f"/proc/{process}/status", "rb") as status:
         return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) / 2**10
     return 0.0
@@ -203,9 +216,10 @@ def _status(output: Path, code: int) -> str:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Markdown: a row for each family."""
+    """Markdown with a row for each family."""
     rows = [
-        f"| traces | cases | {' | '.join(CODES)} | other | time, worst share of what is promised | memory, the same |",
+        f"| traces | cases | {' | '.join(CODES)} | other | time, worst share of what is "
+        "promised | memory, the same |",
         f"|{'---|' * (len(CODES) + 5)}",
     ]
     for family in FAMILIES:
@@ -234,7 +248,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--longest", type=int, default=2000, help="steps of the longest traces")
     parser.add_argument(
-        "--python", action="store_true", help="by the Python interface rather than the command line"
+        "--python", action="store_true", help="use the Python interface, not the command line"
     )
     options = parser.parse_args()
     outcomes = []
@@ -243,7 +257,10 @@ def main() -> None:
             found = outcome(case, Path(folder), python=options.python)
             outcomes.append(found)
             limits = f"{case.seconds} s, {case.mebibytes or 'any'} MiB"
-            told = f"{case.family}, {len(case.trace)} steps, {limits}: {found.status}, {found.seconds:.0%} of the time, {found.mebibytes:.0%} of the memory"
+            told = (
+                f"{case.family}, {len(case.trace)} steps, {limits}: {found.status}, "
+                f"{found.seconds:.0%} of the time, {found.mebibytes:.0%} of the memory"
+            )
             print(told, file=sys.stderr, flush=True)
             if max(found.seconds, found.mebibytes) > 1:
                 case.trace.save(

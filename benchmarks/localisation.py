@@ -1,15 +1,20 @@
-"""Where in a known map is the robot? Kidnapped robots, robots that leave the map, images, and steps a second.
+"""Localisation in a known map: kidnapped robots, robots outside the map, images, and speed.
 
-    python benchmarks/localisation.py [--part kidnapped|nowhere|images|speed] [--seeds 20] [--first 200] [--plot PNG]
+    python benchmarks/localisation.py [--part kidnapped|nowhere|images|speed] [--seeds 20]
+                                      [--first 200] [--plot PNG]
 
-prints tables for docs/measurements/localisation.md, and draws its picture: the first robot in a maze of 5 x 5 that is put into another maze and back. Maps are the true ones of walks, so what is measured is localisation alone. Robots walk at random along the links of the map:
+Prints tables for docs/measurements/localisation.md. With --plot, draws its figure: a robot in a
+maze of 5 x 5 that is put into another maze and back. Maps are the true ones of walks, so only
+localisation is measured. Robots walk at random along the links of the map:
 
-kidnapped  at step 40 of 80 the robot is at some other dstate, and its action is not what brought it there. Some views are wrong, each another one at random
-nowhere    from step 40 to step 69 of 110 the robot is in another world; then it is put back. In the other world there are the same views, or a third of its
-           dstates show a view that the map does not have
-images     a simulated robot learns from some tours, and drives three others; in one image of twenty somebody is in front of the laser. Then it is carried to
-           another place, and then to another building
-speed      CPU seconds, with entropy, verdict and dstate of each step
+    kidnapped  At step 40 of 80 the robot is moved to another dstate, which its action does not
+               explain. Some views are wrong: each is another random view.
+    nowhere    From step 40 to step 69 of 110 the robot is in another world; then it is put back.
+               The other world has the same views, or a third of its dstates show new views.
+    images     A simulated robot learns from some tours and drives three others. In one image in
+               twenty somebody is in front of the laser. Then the robot is carried to another
+               place, and then to another building.
+    speed      CPU seconds, including entropy, verdict and dstate of each step.
 """
 
 from __future__ import annotations
@@ -51,14 +56,14 @@ STEPS = 10_000
 
 @dataclass(frozen=True)
 class Drive:
-    """What a robot saw and did in a map, and the dstate that it was at; None elsewhere."""
+    """What a robot saw and did in a map, and its true dstate; None outside the map."""
 
     trace: Trace
     at: tuple[int | None, ...]
 
 
 def true_map(walk: Walk) -> SSHMap:
-    """The map that the truth makes of a walk."""
+    """The map of a walk by its true states."""
     number: dict[object, int] = {}
     labels = tuple(number.setdefault(x, len(number)) for x in walk.truth)
     views = {label: step.view for label, step in zip(labels, walk.trace, strict=True)}
@@ -71,7 +76,7 @@ def true_map(walk: Walk) -> SSHMap:
 
 
 class Robot:
-    """Walks at random along the links of a map."""
+    """A robot that walks at random along the links of a map."""
 
     def __init__(self, ssh_map: SSHMap, chance: random.Random) -> None:
         self.ssh_map, self.chance = ssh_map, chance
@@ -94,6 +99,7 @@ class Robot:
 
 
 def kidnapped(ssh_map: SSHMap, seed: int, misread: float) -> Drive:
+    """A drive with wrong views in which the robot is moved to another dstate at step KIDNAPPED."""
     chance = random.Random(seed)
     robot = Robot(ssh_map, chance)
     names = sorted({s.view for s in ssh_map.dstates}, key=str)
@@ -104,6 +110,7 @@ def kidnapped(ssh_map: SSHMap, seed: int, misread: float) -> Drive:
         while step == KIDNAPPED and robot.at == led:
             robot.at = robot.anywhere()
         at.append(robot.at)
+    # Replace a share of the views by others.
     views = [ssh_map.dstates[x].view for x in at]
     views = [
         chance.choice([v for v in names if v != view]) if chance.random() < misread else view
@@ -113,6 +120,7 @@ def kidnapped(ssh_map: SSHMap, seed: int, misread: float) -> Drive:
 
 
 def elsewhere(ssh_map: SSHMap, other: SSHMap, seed: int, new: float) -> Drive:
+    """A drive that leaves the map at step LEFT and is put back at step BACK."""
     chance = random.Random(seed)
     robot, stranger = Robot(ssh_map, chance), Robot(other, chance)
     unseen = {s.id for s in other.dstates if chance.random() < new}
@@ -147,8 +155,10 @@ def first(condition: Sequence[bool]) -> int | None:
 
 
 def part_kidnapped(seeds: range) -> None:
+    """Print the table of kidnapped robots."""
     print(
-        "| map | dstates | wrong views | located after | noticed after | found after | found | right | of those located, wrong | collapsed in vain |"
+        "| map | dstates | wrong views | located after | noticed after | found after | "
+        "found | right | of those located, wrong | collapsed in vain |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     for name, make in FAMILIES.items():
@@ -156,6 +166,7 @@ def part_kidnapped(seeds: range) -> None:
         for misread in (0.0, 0.01, 0.05):
             began, noticed, found, sizes = [], [], [], []
             right = steps = sure = wrong = vain = 0
+            # Of each drive: steps until located, until the move is noticed, and until found again.
             for seed, ssh_map in zip(seeds, maps, strict=True):
                 drive = kidnapped(ssh_map, seed, misread)
                 beliefs = list(Localiser(ssh_map).beliefs(drive.trace))
@@ -179,15 +190,19 @@ def part_kidnapped(seeds: range) -> None:
                     for b, step, x in zip(beliefs[:KIDNAPPED], drive.trace, drive.at, strict=False)
                 )
             print(
-                f"| {name} | {median(sizes)} | {misread:.0%} | {median(began)} | {median(noticed)} | {median(found)} | {len(found)} of {len(maps)} | "
-                f"{share(right, steps)} | {share(wrong, sure)} | {vain} of {KIDNAPPED * len(maps)} |",
+                f"| {name} | {median(sizes)} | {misread:.0%} | {median(began)} | "
+                f"{median(noticed)} | {median(found)} | {len(found)} of {len(maps)} | "
+                f"{share(right, steps)} | {share(wrong, sure)} | {vain} of {KIDNAPPED * len(maps)} "
+                "|",
                 flush=True,
             )
 
 
 def part_nowhere(seeds: range) -> None:
+    """Print the table of robots that leave the map."""
     print(
-        "| map | new views there | nowhere after | said so there | said so at home | found after | found |"
+        "| map | new views there | nowhere after | said so there | said so at home | "
+        "found after | found |"
     )
     print("|---|---|---|---|---|---|---|")
     for name, make in FAMILIES.items():
@@ -199,6 +214,7 @@ def part_nowhere(seeds: range) -> None:
                 drive = elsewhere(ssh_map, other, seed, new)
                 beliefs = list(Localiser(ssh_map).beliefs(drive.trace))
                 nowhere = [b.verdict is Verdict.NOWHERE for b in beliefs]
+                # Steps outside the map until the localiser says so, and after it until found.
                 if (when := first(nowhere[LEFT:BACK])) is not None:
                     said.append(when)
                 there += sum(nowhere[LEFT:BACK])
@@ -214,7 +230,9 @@ def part_nowhere(seeds: range) -> None:
                 ) is not None:
                     found.append(again)
             print(
-                f"| {name} | {new:.0%} | {median(said)} | {share(there, (BACK - LEFT) * len(maps))} | {share(home, at_home)} | {median(found)} | {len(found)} of {len(maps)} |",
+                f"| {name} | {new:.0%} | {median(said)} | "
+                f"{share(there, (BACK - LEFT) * len(maps))} | {share(home, at_home)} | "
+                f"{median(found)} | {len(found)} of {len(maps)} |",
                 flush=True,
             )
 
@@ -224,9 +242,11 @@ def walked(trace: Trace) -> Walk:
 
 
 def part_images(seeds: range) -> None:
+    """Print the table of robots that are located by images."""
     warnings.simplefilter("ignore", ImageWarning)
     print(
-        "| world | tours learnt | right: nearest neighbour | localiser | with somebody in front: nearest neighbour | localiser | found after being carried | found | "
+        "| world | tours learnt | right: nearest neighbour | localiser | with somebody "
+        "in front: nearest neighbour | localiser | found after being carried | found | "
         "other building is nowhere: one image | localiser | own images are nowhere |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
@@ -245,9 +265,8 @@ def part_images(seeds: range) -> None:
                 own = simulate(World.named(name), tours=3, seed=1000 + seed)
                 more = simulate(World.named(name), tours=2, seed=2000 + seed)
                 other = simulate(World.named(foreign), tours=1, seed=3000 + seed)
-                skipped = (
-                    len(more) // 3
-                )  # so the robot is carried from its start to where it is after a third of the tours
+                # The robot is carried to where it is after a third of the second drive.
+                skipped = len(more) // 3
                 images = np.concatenate(
                     [images_of(own), images_of(more)[skipped:], images_of(other)]
                 )
@@ -292,7 +311,10 @@ def part_images(seeds: range) -> None:
 def in_front(
     images: NDArray[np.float64], rng: np.random.Generator, share: float = 0.05
 ) -> NDArray[np.bool_]:
-    """Puts somebody in front of the laser in this share of the images, from 0.4 to 0.8 m away, over a sixth of the beams. Returns in which."""
+    """Put somebody in front of the laser in this share of the images.
+
+    The person is 0.4 to 0.8 m away and covers a sixth of the beams. Returns the changed images.
+    """
     front = rng.random(len(images)) < share
     width = images.shape[1] // 6
     for image in (images[i] for i in np.flatnonzero(front)):
@@ -304,7 +326,10 @@ def in_front(
 
 
 def spliced(drives: Sequence[Sequence[Step]], images: NDArray[np.float64]) -> Trace:
-    """One drive after the other, with these images. The robot is carried from one to the next, and takes that for its first travel."""
+    """Join drives with these images into one trace.
+
+    The robot is carried from one drive to the next. It takes that for its first travel.
+    """
     carried = next(
         step.action for step in drives[0] if step.action and step.action.kind == "travel"
     )
@@ -314,6 +339,7 @@ def spliced(drives: Sequence[Sequence[Step]], images: NDArray[np.float64]) -> Tr
 
 
 def part_speed(seeds: range) -> None:
+    """Print the table of steps per second."""
     print("| dstates | views | steps | CPU seconds | steps a second | made in, CPU seconds |")
     print("|---|---|---|---|---|---|")
     for dstates, views in ((100, 10), (1_000, 10), (10_000, 10), (10_000, 1_000), (10_000, 10_000)):
@@ -329,6 +355,7 @@ def part_speed(seeds: range) -> None:
         for _ in range(STEPS - 1):
             actions.append(robot.act())
             seen.append(robot.view)
+        # Building the localiser and following the robot are timed apart.
         trace = Trace.from_steps(seen, actions)  # type: ignore[arg-type]
         began = time.process_time()
         localiser = Localiser(ssh_map)
@@ -337,7 +364,8 @@ def part_speed(seeds: range) -> None:
             _ = belief.entropy, belief.verdict, belief.dstate
         seconds = time.process_time() - made
         print(
-            f"| {dstates:,} | {views:,} | {STEPS:,} | {seconds:.2f} | {STEPS / seconds:,.0f} | {made - began:.2f} |",
+            f"| {dstates:,} | {views:,} | {STEPS:,} | {seconds:.2f} | {STEPS / seconds:,.0f} "
+            f"| {made - began:.2f} |",
             flush=True,
         )
 
@@ -351,11 +379,11 @@ PARTS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--part", choices=PARTS, action="append")
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--first", type=int, default=200)
-    parser.add_argument("--plot")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--part", choices=PARTS, action="append", help="measure only this part")
+    parser.add_argument("--seeds", type=int, default=20, help="runs of each row (default 20)")
+    parser.add_argument("--first", type=int, default=200, help="the first seed (default 200)")
+    parser.add_argument("--plot", metavar="PNG", help="draw the belief of one robot instead")
     options = parser.parse_args()
     if options.plot:
         make = FAMILIES["mazes 5 x 5"]

@@ -1,9 +1,14 @@
-"""Maps of whole logs, beside the skeleton of the metric map, under the same measures: tables in Markdown.
+"""Maps of whole logs beside the skeleton of the metric map, under the same measures.
 
-    python benchmarks/logs.py [LOG ...] [--plans FOLDER] --out rows.jsonl [--runs FOLDER] [--page docs/measurements/logs.md]
+    python benchmarks/logs.py [LOG ...] [--plans FOLDER] --out rows.jsonl [--runs FOLDER]
+                              [--page docs/measurements/logs.md]
 
-With --plans a robot is simulated in each floor plan of a folder, a drive for each seed, and its logs are mapped like others. Each log is mapped by `ssh-abduction map`, and its events and the first of its maps are judged; then by the skeleton of a grid of its scans at their corrected poses, which a robot does not have, without and with nodes at doors, and by that of a grid at the
-poses of its odometry, which is what a robot has that maps nothing. A log NAME.log with NAME.truth.json beside it is a simulated one, and judged by that. Rows that are in the file of rows already are not made again.
+Prints tables in Markdown. With --plans a robot is simulated in each floor plan of a folder, one
+drive for each seed, and these logs are added. `ssh-abduction map` maps each log, and its events
+and its first map are judged. The peers are skeletons of occupancy grids. One grid has the scans at
+their corrected poses, which a robot does not have; its skeleton is judged without and with nodes
+at doors. The other grid has the scans at the poses of the odometry, which any robot has. The truth
+of a simulated log NAME.log is in NAME.truth.json beside it. Rows that are stored are not repeated.
 """
 
 from __future__ import annotations
@@ -32,7 +37,7 @@ from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.maps import maps_of
 
 OURS = "ssh-abduction"
-# By name the poses at which scans are laid into the grid, and whether doors are nodes.
+# For each skeleton: the poses of the scans in the grid, and whether doors are nodes.
 SKELETONS = {
     "skeleton": ("corrected", False),
     "skeleton with doors": ("corrected", True),
@@ -40,11 +45,15 @@ SKELETONS = {
 }
 METHODS = (OURS, *SKELETONS)
 HEAD = (
-    "| log | mapper | places | events | events: precision, recall | passes noticed | accuracy | edges: precision, recall | pairs: joined, returns | pairs: precision, recall | CPU s |",
+    "| log | mapper | places | events | events: precision, recall | passes noticed | "
+    "accuracy | edges: precision, recall | pairs: joined, returns | pairs: precision, "
+    "recall | CPU s |",
     "|---|---|---|---|---|---|---|---|---|---|---|",
 )
 SIMULATED = (
-    "| mapper | logs | mapped | isomorphic | places right | doors noticed | passes noticed | places, median | accuracy, median | edges: precision, recall, medians | pairs: precision, recall, of all logs |",
+    "| mapper | logs | mapped | isomorphic | places right | doors noticed | passes "
+    "noticed | places, median | accuracy, median | edges: precision, recall, medians | "
+    "pairs: precision, recall, of all logs |",
     "|---|---|---|---|---|---|---|---|---|---|---|",
 )
 
@@ -54,13 +63,16 @@ def name_of(log: Path) -> str:
 
 
 def sidecar(log: Path) -> Path | None:
-    """What the simulator wrote beside a log, if it did."""
+    """The truth that the simulator wrote beside a log, if there is one."""
     beside = log.with_name(f"{name_of(log)}.truth.json")
     return beside if beside.exists() else None
 
 
 def driven(plans: Path, seeds: int, runs: Path) -> Iterator[Path]:
-    """A log for each floor plan of a folder and each seed from 1, made unless it is there: rounds of 200 m by the simulator's own odometer."""
+    """A log for each floor plan of a folder and each seed from 1, simulated unless it is there.
+
+    A drive is a round of 200 m with the simulator's own odometer.
+    """
     runs.mkdir(parents=True, exist_ok=True)
     for plan, seed in product(sorted(plans.glob("*.xml")), range(1, seeds + 1)):
         log = runs / f"{plan.stem.removesuffix('_updated')}-{seed}.log"
@@ -90,7 +102,11 @@ def by_skeleton(log: Path, kind: str, doors: bool) -> Events:
 
 
 def by_map(log: Path, runs: Path) -> Events:
-    """The events and the first map of `ssh-abduction map`, which is run unless its folder is there. Raises OSError and ValueError where there is no map."""
+    """The events and the first map of `ssh-abduction map`, which runs unless its folder is there.
+
+    Raises:
+        OSError, ValueError: If there is no map.
+    """
     folder = runs / name_of(log)
     if not (folder / "maps.json").exists():
         command = [
@@ -107,7 +123,7 @@ def by_map(log: Path, runs: Path) -> Events:
         ]
         done = subprocess.run(
             command, check=False, capture_output=True
-        )  # which does not end with 0 where a map is not proven
+        )  # the exit code is not 0 if a map is not proven minimal
         if not (folder / "maps.json").exists():
             raise ValueError(
                 done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
@@ -127,7 +143,7 @@ def row_of(log: Path, method: str, truth: Truth, runs: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         failed = row | {"failed": str(error)}
         trace = runs / name_of(log) / "trace.jsonl"
-        if method == OURS and trace.exists():  # events may be right where no map of them was found
+        if method == OURS and trace.exists():  # judge the events also without a map
             events = Events.of(Trace.load(trace))
             told = judged(replace(events, places=tuple(range(len(events.places)))), truth).to_dict()
             failed |= {
@@ -142,11 +158,12 @@ def shown(*values: float | None) -> str:
 
 
 def lines_of(row: dict[str, Any]) -> Iterator[str]:
-    """A row of the table of real logs, and one more for pairs by relations."""
+    """A row of the table of real logs, and another one for pairs by relations."""
     if "failed" in row:
         came = "{1} of {0}".format(*row["passes"]) if "passes" in row else ""
         found = shown(row["event_precision"], row["event_recall"]) if came else ""
-        yield f"| {row['log']} | {row['method']} | {row['failed']} | {row.get('events', '')} | {found} | {came} | | | | | |"
+        told = f"{row['failed']} | {row.get('events', '')} | {found} | {came}"
+        yield f"| {row['log']} | {row['method']} | {told} | | | | | |"
         return
     pairs, (come, noticed) = row["poses"], row["passes"]
     cells = [
@@ -168,11 +185,13 @@ def lines_of(row: dict[str, Any]) -> Iterator[str]:
     ]
     yield "| " + " | ".join(map(str, cells)) + " |"
     if (pairs := row.get("relations")) is not None:
-        yield f"| by relations | {row['method']} | | | | | | | {pairs['joined']}, {pairs['returns']} | {shown(pairs['precision'], pairs['recall'])} | |"
+        counts = f"{pairs['joined']}, {pairs['returns']}"
+        rates = shown(pairs["precision"], pairs["recall"])
+        yield f"| by relations | {row['method']} | | | | | | | {counts} | {rates} | |"
 
 
 def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
-    """What came of all simulated logs by one method."""
+    """The row of one method over all simulated logs."""
     done = [row for row in rows if "failed" not in row]
     if not done:
         return f"| {method} | {len(rows)} | 0 | 0 | 0 | | | | | | |"
@@ -205,7 +224,11 @@ def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
 
 
 def draw(path: Path, logs: Sequence[Path], runs: Path) -> None:
-    """Draw for each log the grid at the corrected poses with its skeleton (blue squares), and upon it the first map (orange): events, and the places that they are at."""
+    """Draw each log with its skeleton and its first map.
+
+    The grid at the corrected poses and its skeleton have blue squares. The events of the map and
+    their places are orange.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -266,28 +289,28 @@ def main() -> None:
         type=Path,
         required=True,
         metavar="JSONL",
-        help="file of rows, to which new ones are added",
+        help="file of rows; new rows are added",
     )
     parser.add_argument(
         "--runs",
         type=Path,
         default=Path("runs"),
         metavar="FOLDER",
-        help="where map writes a folder for each log, or has written it (default: runs)",
+        help="folder with a folder of results for each log (default: runs)",
     )
     parser.add_argument(
         "--methods",
         nargs="+",
         choices=METHODS,
         default=METHODS,
-        help="which mappers (default: all)",
+        help="mappers to judge (default: all)",
     )
     parser.add_argument(
         "--figure",
         type=Path,
-        help="draw the logs that are given, their skeletons and maps, into this file",
+        help="draw the given logs with their skeletons and maps into this file",
     )
-    parser.add_argument("--page", type=Path, help="write the tables into this page, too")
+    parser.add_argument("--page", type=Path, help="also write the tables into this page")
     options = parser.parse_args()
     rows = (
         [json.loads(line) for line in options.out.read_text().splitlines()]

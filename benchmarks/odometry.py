@@ -1,9 +1,11 @@
-"""Whether the noise that a simulated trace says of its odometry fits the errors that the displacements have: a table in Markdown.
+"""Does the noise that a simulated trace gives for its odometry fit the errors of displacements?
 
     python benchmarks/odometry.py [--seeds 4] [--tours 10] [--worlds notched-rectangle taylor-hall]
 
-Errors are counted in the standard deviations that the trace's odometry says, so their mean should be near 0 and their mean square near 1. They are taken
-against the motion between the true poses, and against that between fixed points: the middle of all poses at a place, of all headings at a dstate.
+Prints a table in Markdown. Errors are in standard deviations of the trace's odometry, so their
+mean should be near 0 and their mean square near 1. They are measured against the motion between
+true poses, and against the motion between fixed points: the mean of all positions at a place and
+of all headings at a dstate.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ def true_poses(trace: Trace) -> list[Pose]:
 
 
 def fixed_points(trace: Trace) -> list[Pose]:
-    """For each step the middle of all poses at its place, with the middle of all headings at its dstate."""
+    """For each step the mean position at its place and the mean heading at its dstate."""
     positions: dict[str, list[Sequence[float]]] = defaultdict(list)
     headings: dict[str, list[float]] = defaultdict(list)
     for step in trace.steps:
@@ -45,7 +47,7 @@ def fixed_points(trace: Trace) -> list[Pose]:
 
 
 def errors(trace: Trace, poses: Sequence[Pose], kind: str) -> list[NDArray[np.float64]]:
-    """The errors of the displacements of all actions of a kind, (3,) each, in standard deviations."""
+    """The errors of all displacements of one kind of action in standard deviations, (3,) each."""
     found = []
     for i, action in enumerate(trace.actions):
         displacement = trace.steps[i + 1].displacement
@@ -73,7 +75,8 @@ def main() -> None:
     )
     options = parser.parse_args()
     print(
-        "| world | action | against | displacements | mean: ahead, left, heading | mean square: ahead, left, heading |\n|---|---|---|---|---|---|"
+        "| world | action | against | displacements | mean: ahead, left, heading | "
+        "mean square: ahead, left, heading |\n|---|---|---|---|---|---|"
     )
     for world in options.worlds:
         traces = [

@@ -1,14 +1,17 @@
-"""How long a robot waits for its map at each step: a walk that explores a 10 x 10 maze with stars.
+"""How long a robot waits for its map at each step of a walk that explores a maze with stars.
 
-    python benchmarks/online.py [--steps 1000] [--limit 0.5] [--size 10] [--seed 0] [--drive 0.05] [--odometry tight|usual]
+    python benchmarks/online.py [--steps 1000] [--limit 0.5] [--size 10] [--seed 0]
+                                [--drive 0.05] [--odometry tight|usual]
 
-Optimal are the steps at which the answer was proven minimal; at the others it was a consistent map and a lower bound. `visited` are the
-dstates of the world that the robot has been in. Between two steps the robot drives for so many seconds, as no robot is faster, which is the
-time in which maps are guessed. At the checkpoints the trace is solved anew, in at most ANEW seconds (`--anew 0` does not).
+At an optimal step the answer was proven minimal; at the others it was a consistent map and a lower
+bound. `visited` is the number of dstates of the world that the robot has been in. Between two
+steps the robot drives for --drive seconds, in which the mapper guesses maps. At the checkpoints
+the trace is also solved from scratch, in at most ANEW seconds (`--anew 0` turns that off).
 
-With `--odometry` each action has a displacement; cells are 10 m apart. `tight` is 5 % along the way, 0.5 % across it and 0.002 rad a metre, and nothing that
-repeats, as in benchmarks/truth.py; `usual` is what odometry is worth where a trace does not say. `true` is the share of steps at which the first map has the
-true labels.
+With --odometry each action has a displacement, and cells are 10 m apart. `tight` is 5 % along
+the way, 0.5 % across it and 0.002 rad per metre, without systematic errors, as in
+benchmarks/truth.py. `usual` is the default of traces. `true` is the share of steps at which the
+first map has the true labels.
 """
 
 from __future__ import annotations
@@ -44,14 +47,14 @@ def percentile(seconds: list[float], share: float) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--size", type=int, default=10)
-    parser.add_argument("--limit", type=float, default=0.5)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--drive", type=float, default=0.05)
-    parser.add_argument("--odometry", choices=NOISE)
-    parser.add_argument("--anew", type=float, default=ANEW)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--steps", type=int, default=1000, help="actions of the robot")
+    parser.add_argument("--size", type=int, default=10, help="cells on a side of the maze")
+    parser.add_argument("--limit", type=float, default=0.5, help="seconds a step may take")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the maze and the walk")
+    parser.add_argument("--drive", type=float, default=0.05, help="seconds between two steps")
+    parser.add_argument("--odometry", choices=NOISE, help="noise of displacements")
+    parser.add_argument("--anew", type=float, default=ANEW, help="seconds to solve from scratch")
     options = parser.parse_args()
     odometry = NOISE.get(options.odometry)
     walk = maze(
@@ -73,8 +76,10 @@ def main() -> None:
     optimal = complete = true = 0
     sizes: list[float] = []
     print(
-        f"{'steps':>6} {'status':10} {'dstates':>8} {'bound':>6} {'visited':>8} {'maps':>5} {'step, ms':>9} {'so far, s':>10} {'anew, s':>8} {'ratio':>7}"
+        f"{'steps':>6} {'status':10} {'dstates':>8} {'bound':>6} {'visited':>8} {'maps':>5} "
+        f"{'step, ms':>9} {'so far, s':>10} {'anew, s':>8} {'ratio':>7}"
     )
+    # The sleep is the drive of the robot; only `observe` is timed.
     for action, step in zip(trace.actions, rest, strict=True):
         time.sleep(options.drive)
         began = time.perf_counter()
@@ -95,15 +100,19 @@ def main() -> None:
             )
             dstates = solution.cost.dstates if solution.cost else 0
             print(
-                f"{solution.steps:6} {solution.status.value:10} {dstates:8} {solution.bound.dstates or 0:6} {visited:8} {solution.count:5} "
-                f"{1000 * seconds[-1]:9.2f} {sum(seconds):10.2f} {anew:8.2f} {anew / seconds[-1]:7.0f}",
+                f"{solution.steps:6} {solution.status.value:10} {dstates:8} "
+                f"{solution.bound.dstates or 0:6} {visited:8} {solution.count:5} "
+                f"{1000 * seconds[-1]:9.2f} {sum(seconds):10.2f} {anew:8.2f} "
+                f"{anew / seconds[-1]:7.0f}",
                 flush=True,
             )
     print(
-        f"{len(seconds)} steps, {mapper.searches} searches: median {1000 * percentile(seconds, 0.5):.2f} ms, "
-        f"99th percentile {1000 * percentile(seconds, 0.99):.0f} ms, most {1000 * max(seconds):.0f} ms; "
-        f"optimal {optimal / len(seconds):.1%}, all minimal maps {complete / len(seconds):.1%}, true {true / len(seconds):.1%}; "
-        f"dstates by visited: median {percentile(sizes, 0.5):.2f}, most {max(sizes):.2f}"
+        f"{len(seconds)} steps, {mapper.searches} searches: median "
+        f"{1000 * percentile(seconds, 0.5):.2f} ms, 99th percentile "
+        f"{1000 * percentile(seconds, 0.99):.0f} ms, most {1000 * max(seconds):.0f} ms; optimal "
+        f"{optimal / len(seconds):.1%}, all minimal maps {complete / len(seconds):.1%}, true "
+        f"{true / len(seconds):.1%}; dstates by visited: median {percentile(sizes, 0.5):.2f}, "
+        f"most {max(sizes):.2f}"
     )
 
 
