@@ -29,6 +29,8 @@ SAID_BY = {
     "ssh_abduction/solver/asp/rules.py": WITH_THEORY,
     "ssh_abduction/data/checks.py": WITH_MAPS,
     "ssh_abduction/cli/batch.py": ("solve",),
+    "ssh_abduction/cli/cluster_jobs.py": ("solve", "map"),
+    "ssh_abduction/cli/run_folders.py": ("map",),
     "ssh_abduction/explain/question.py": ("explain",),
     "ssh_abduction/cli/import_log.py": ("import", "map"),
     "ssh_abduction/cli/front.py": ("solve",),

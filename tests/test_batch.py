@@ -23,8 +23,10 @@ from distributed import Client, LocalCluster
 from worlds import TOURS, drive, rectangle
 
 from ssh_abduction import Theory, Trace
-from ssh_abduction.cli import batch, main, mapping
-from ssh_abduction.cli.batch import Absence, Answer, Question, Stop
+from ssh_abduction.cli import batch, cluster_jobs, main, mapping
+from ssh_abduction.cli.batch import Answer, Question
+from ssh_abduction.cli.cluster_jobs import Absence, answers_on_cluster
+from ssh_abduction.cli.jobs import StopFlag, answers_here
 from ssh_abduction.cli.mapping import MapAnswer, MapQuestion
 from ssh_abduction.solver.asp import workers
 from ssh_abduction.theory import Speedups
@@ -104,7 +106,7 @@ def cluster() -> Iterator[str]:
 @pytest.fixture
 def scheduler(cluster: str, monkeypatch: pytest.MonkeyPatch) -> str:
     """The same, for who waits as long as it takes."""
-    monkeypatch.setattr(batch, "PATIENCE", 600)
+    monkeypatch.setattr(cluster_jobs, "PATIENCE", 600)
     return cluster
 
 
@@ -210,7 +212,7 @@ def test_the_worst_exit_code(
 def test_wrong_choices_are_one_line(
     traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(batch, "PATIENCE", 0.5)
+    monkeypatch.setattr(cluster_jobs, "PATIENCE", 0.5)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         nobody = f"tcp://127.0.0.1:{free.getsockname()[1]}"
@@ -241,7 +243,7 @@ def test_wrong_choices_are_one_line(
 def test_a_scheduler_without_workers(
     traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(batch, "PATIENCE", 2)
+    monkeypatch.setattr(cluster_jobs, "PATIENCE", 2)
     with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
         assert main(["solve", "quick.jsonl", "--scheduler", cluster.scheduler_address]) == 1
     assert re.fullmatch(
@@ -253,8 +255,8 @@ def test_a_scheduler_without_workers(
 def test_a_cluster_whose_workers_are_gone_is_waited_for_as_long_as_the_limit(
     traces: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(batch, "PATIENCE", 0.1)
-    monkeypatch.setattr(batch, "LOOK", 0.0)
+    monkeypatch.setattr(cluster_jobs, "PATIENCE", 0.1)
+    monkeypatch.setattr(cluster_jobs, "LOOK", 0.0)
     monkeypatch.setattr(Client, "wait_for_workers", lambda *_, **__: None)  # there was one
     with LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as cluster:
         address = cluster.scheduler_address
@@ -330,10 +332,10 @@ def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -
 def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler: str) -> None:
     deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
     paths = [f"{name}.jsonl" for name in ("quick", "deadly", "comb", "quick")]
-    stop = Stop()
+    stop = StopFlag()
     for answers in (
-        batch.here(deadly, paths, 2, stop),
-        batch.on_cluster(deadly, paths, scheduler, None, stop),
+        answers_here(deadly, paths, 2, stop),
+        answers_on_cluster(deadly, paths, scheduler, None, stop),
     ):
         lines = {answer.number: answer.line for answer in answers}
         assert sorted(lines) == [*range(len(paths))]
@@ -399,13 +401,15 @@ def test_where_a_worker_is_killed_all_logs_are_mapped_and_none_twice(
 def test_a_worker_stops_when_the_client_goes(traces: Path, scheduler: str) -> None:
     theory = Theory.topological().replace(boundary="none", path_order="partial", prefer=())
     endless = Question(theory, limit=1000, maps=0, memory=None, speedups=Speedups(), json=False)
-    answers = batch.on_cluster(endless, ["quick.jsonl", "slow.jsonl"], scheduler, None, Stop())
+    answers = answers_on_cluster(
+        endless, ["quick.jsonl", "slow.jsonl"], scheduler, None, StopFlag()
+    )
     assert next(answers).number == 0
     time.sleep(0.5)  # the only thread of the worker is at the slow one
     answers.close()
     assert [
         answer.code
-        for answer in batch.on_cluster(QUESTION, ["comb.jsonl"], scheduler, None, Stop())
+        for answer in answers_on_cluster(QUESTION, ["comb.jsonl"], scheduler, None, StopFlag())
     ] == [0]
 
 
@@ -440,7 +444,7 @@ def test_ctrl_c_prints_what_waited_for_its_turn(
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(10)
 
-    monkeypatch.setattr(batch, "here", answers)
+    monkeypatch.setattr(batch, "answers_here", answers)
     assert main(["solve", *["quick.jsonl"] * 5]) == 130
     assert capsys.readouterr() == (
         "first\nthird\nfourth\n",

@@ -11,17 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from ssh_abduction.cli import main, mapping
+from ssh_abduction.cli import main, mapping, run_folders
 from ssh_abduction.cli.import_log import named_after
-from ssh_abduction.cli.mapping import (
-    RUN,
-    MapAnswer,
-    MapQuestion,
-    digest,
-    folders_of,
-    is_done,
-    write_run,
-)
+from ssh_abduction.cli.mapping import MapAnswer, MapQuestion
+from ssh_abduction.cli.run_folders import FILES, RUN, digest, folders_of, is_done, write_run
 
 QUESTION = MapQuestion(None, {}, (None, None, None), None, None, None, None, 300, False)
 LONG = "n" * 251
@@ -165,8 +158,8 @@ def test_an_interrupted_run_is_not_done(tmp_path: Path) -> None:
     log = log_at(tmp_path / "run.log", "x")
     map_in(tmp_path / "whole", log, interrupted=False)
     map_in(tmp_path / "part", log, interrupted=True)
-    assert is_done(tmp_path / "whole", log, QUESTION)
-    assert not is_done(tmp_path / "part", log, QUESTION)
+    assert is_done(tmp_path / "whole", log, QUESTION.settings)
+    assert not is_done(tmp_path / "part", log, QUESTION.settings)
 
 
 @pytest.mark.parametrize("at", range(1, 5))
@@ -175,7 +168,7 @@ def test_a_run_that_could_not_be_written_is_not_done(
 ) -> None:
     """The disk is full at the first, second, … file. What is left of an earlier run does not stand beside what is new."""
     files = [(RUN, b"new"), ("trace.jsonl", b"new"), ("maps.json", b"new"), ("report.html", b"new")]
-    write_run(tmp_path, [(name, b"old") for name in mapping.FILES])
+    write_run(tmp_path, [(name, b"old") for name in FILES])
     written: list[Path] = []
 
     def write(path: Path, data: bytes) -> None:
@@ -184,7 +177,7 @@ def test_a_run_that_could_not_be_written_is_not_done(
             raise OSError(errno.ENOSPC, "No space left on device")
         path.write_bytes(data)
 
-    monkeypatch.setattr(mapping, "write_file", write)
+    monkeypatch.setattr(run_folders, "write_file", write)
     with pytest.raises(OSError, match="No space left on device") as error:
         write_run(tmp_path, files)
     assert error.value.filename == str(written[-1])
@@ -213,8 +206,8 @@ def test_what_cannot_be_written_is_a_line_and_the_other_logs_go_on(
             raise OSError(errno.ENOSPC, "No space left on device")
         path.write_bytes(data)
 
-    monkeypatch.setattr(mapping.batch, "here", here)
-    monkeypatch.setattr(mapping, "write_file", write)
+    monkeypatch.setattr(mapping, "answers_here", here)
+    monkeypatch.setattr(run_folders, "write_file", write)
     assert main(["map", *logs, "-o", str(tmp_path / "runs")]) == 1
     told = capsys.readouterr()
     runs = tmp_path / "runs"

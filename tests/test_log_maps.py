@@ -24,7 +24,8 @@ from perception.readers.logs import read_log
 from perception.readers.scans import Laser, RobotLog, Scan
 from simulator.rounds import record_plan
 from ssh_abduction import AbductionError, Theory
-from ssh_abduction.cli import batch, main
+from ssh_abduction.cli import main
+from ssh_abduction.cli.jobs import StopFlag, answers_here
 from ssh_abduction.cli.mapping import MapQuestion
 from ssh_abduction.cli.simulate import scans_of
 from ssh_abduction.data.odometry import between
@@ -345,7 +346,7 @@ def test_a_process_of_its_own_maps_a_log_and_one_that_is_killed_loses_its_log_al
     question = MapQuestion(None, {}, {}, None, None, None, 1000.0, 1, False)
     small = tmp_path / "small.log"
     small.write_text("\n".join(hall.read_text().splitlines()[:100]) + "\n")
-    (answer,) = batch.here(question, [str(small)], 2, batch.Stop())
+    (answer,) = answers_here(question, [str(small)], 2, StopFlag())
     assert answer.code in (0, 10)
     assert dict(answer.files)["run.json"]
     lost = question.lost(workers.Lost(0, late=False), str(small))

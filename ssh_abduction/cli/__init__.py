@@ -1,8 +1,13 @@
-"""The command line: one module a verb. Maps outcomes to exit codes.
+"""The command line: one module per verb.
 
-0 done, a minimal map was proven | 1 a known error, one line on stderr | 2 wrong usage | 10 a map
-without proof | 20 no map satisfies the axioms, or a checked map breaks one | 30 nothing in time |
-130 interrupted | 143 ended by SIGTERM
+Exit codes:
+    0: Success, or a map that is proven minimal.
+    1: A known error, one line on stderr.
+    2: Wrong usage.
+    10: A map that is not proven minimal.
+    20: No map satisfies the axioms, or a checked map breaks one.
+    30: No map in time.
+    130, 143: Interrupted; ended by SIGTERM.
 """
 
 from __future__ import annotations
@@ -52,9 +57,7 @@ EXIT_ERROR = 1
 MENDS = {
     errno.ENOSPC: "make room",
     errno.ENOENT: "make the folder first",
-    errno.EACCES: "take a place that you may write to",
-    errno.EPERM: "take a place that you may write to",
-    errno.EROFS: "take a place that you may write to",
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "take a place that you may write to"),
     errno.EDQUOT: "make room",
     errno.ENAMETOOLONG: "take a shorter name",
     errno.EEXIST: "take another name",
@@ -77,23 +80,20 @@ VERBS: Mapping[str, tuple[ModuleType, ...]] = {
     "make: simulated robots and the paper's experiments": (simulate, reproduction, examples),
     "about: the axioms, their input, and your shell": (theory, facts, completion),
 }
-FOR_PROGRAMS = (
-    "json",
-    "facts",
-    "dot",
-    "graphml",
-    "svg",
-)  # forms that other programs read, in UTF-8 wherever they are printed
+# Options whose output is for other programs. It is always UTF-8.
+FOR_PROGRAMS = ("json", "facts", "dot", "graphml", "svg")
 
 
 def parser() -> Parser:
-    """The parser of the whole command line."""
+    """Make the parser of the whole command line."""
     top = Parser(
         prog="ssh-abduction",
-        description="From what a robot saw and did, find the map.",
-        epilog="Exit codes: 0 minimal map proven; 1 error; 2 usage; 10 map without proof; 20 no "
-        "map, or a map that breaks an axiom; "
-        "30 nothing in time; 130 interrupted; 143 ended by SIGTERM.",
+        description="Find the topological maps that explain what a robot saw and did.",
+        epilog=(
+            "Exit codes: 0 success, or a map that is proven minimal; 1 error; 2 wrong usage; 10 a "
+            "map that is not proven minimal; 20 no map exists, or a map breaks an axiom; 30 no "
+            "map in time; 130 interrupted; 143 ended by SIGTERM."
+        ),
     )
     top.add_argument("--version", action="version", version=f"%(prog)s {version('ssh-abduction')}")
     verbs = top.add_subparsers(metavar="VERB", dest="verb", required=True)
@@ -109,11 +109,11 @@ def parser() -> Parser:
 
 
 def unwritten(error: OSError, output: object) -> str:
-    """What is said of a file that cannot be written.
+    """The message for a file that cannot be written.
 
     Args:
         error: What the system says.
-        output: What was to be written, for errors that name no file.
+        output: The file, for errors that name none.
     """
     mend = MENDS.get(error.errno or 0, "check the path")
     return (
@@ -122,18 +122,24 @@ def unwritten(error: OSError, output: object) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code. SystemExit, with code 2, for wrong usage."""
+    """Run the command line and return the exit code.
+
+    Args:
+        arguments: The words behind the program's name; those of the process by default.
+
+    Raises:
+        SystemExit: With code 2 for wrong usage.
+    """
     try:
         code = _main(arguments)
     except KeyboardInterrupt:
         return program.interrupted_code()
-    return (
-        program.interrupted_code() if program.raised else code
-    )  # a search may take Ctrl-C for its own end, and its verb goes on
+    # A search may end at Ctrl-C while its verb goes on and returns a code.
+    return program.interrupted_code() if program.raised else code
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The options. argparse takes the -- of --map=-- for the end of all options, and the option is left with an empty list."""
+    """Parse the options, and reject `--map=--`, which argparse reads as an empty list."""
     top = parser()
     options: argparse.Namespace = top.parse_args(arguments)
     for name, value in vars(options).items():
@@ -144,19 +150,18 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def _main(arguments: Sequence[str] | None) -> int:
     if sys.stderr is None:
-        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for as long as the program runs
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - never closed
     options = _parsed(arguments)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal that knows no "→" shows "?"
+            stream.reconfigure(errors="replace")  # a terminal without "→" shows "?"
     for_programs = (
         any(getattr(options, form, False) for form in FOR_PROGRAMS)
         or getattr(options, "output", None) == "-"
     )
     if isinstance(sys.stdout, io.TextIOWrapper) and for_programs:
-        sys.stdout.reconfigure(
-            encoding="utf-8", errors="backslashreplace"
-        )  # what is left is half a character, which JSON writes so
+        # Only surrogates cannot be encoded. JSON writes them as escapes.
+        sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")
     try:
         if sys.stdout is None:
             raise AbductionError(
@@ -180,8 +185,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         print(f"ssh-abduction: {error}", file=sys.stderr)
         return EXIT_ERROR
     except BrokenPipeError:
-        # Whoever read the output has seen enough; what Python still holds back must not raise again
-        # at exit.
+        # The reader has closed the pipe. Text in Python's buffer must not raise again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:

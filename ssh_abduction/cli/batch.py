@@ -1,7 +1,7 @@
-"""ssh-abduction solve TRACE TRACE …: many traces, here or on a Dask cluster, one result a line.
+"""ssh-abduction solve TRACE TRACE …: solve many traces, here or on a Dask cluster.
 
-Results come as they are ready and are printed in the order of the traces. An error is the result of
-its trace, and the others go on.
+Each result is one line. Lines are printed in the order of the traces, as soon as they are ready.
+An error is the result of its trace, and the other traces go on.
 """
 
 from __future__ import annotations
@@ -10,20 +10,17 @@ import argparse
 import contextlib
 import ctypes
 import gc
-import logging
-import re
 import sys
-import time
-import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple
 
 from ssh_abduction.cli import EXIT_ERROR
+from ssh_abduction.cli.cluster_jobs import answers_on_cluster
 from ssh_abduction.cli.guard import Guard
+from ssh_abduction.cli.jobs import StopFlag, answers_here, final_code, in_a_line
 from ssh_abduction.cli.options import theory_of
 from ssh_abduction.cli.outcome import (
     Given,
@@ -40,44 +37,36 @@ from ssh_abduction.cli.outcome import (
     warnings_of,
 )
 from ssh_abduction.cli.text import headline
-from ssh_abduction.data.errors import AbductionError, SolverError, brief, named, printable
+from ssh_abduction.data.errors import AbductionError, SolverError, named
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.explain.no_map import Explanation
-from ssh_abduction.runtime.program import SIGNALLED, interrupted_code
-from ssh_abduction.solver import POLL, Backbone, Search, Solution, Start, workers
-from ssh_abduction.solver import Stop as SearchStop
+from ssh_abduction.runtime.program import SIGNALLED
+from ssh_abduction.solver import Backbone, Search, Solution, Start, Stop, workers
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-if TYPE_CHECKING:
-    from distributed import Client, Future
-
-Task: TypeAlias = tuple[int, str]  # the number of a trace, and its path
-
-PATIENCE = 10  # seconds for a Dask scheduler, and for its first worker, to answer
 KILLED = (
     "process: expected an answer, got killed, as happens when memory runs out; set "
     "--memory-limit, or solve fewer traces at a time"
 )
-LOOK = 1.0  # seconds between two looks at whether the cluster still has a worker
-# times the time limit, and seconds beyond that, or after Ctrl-C, after which a process has no
-# answer: its own guard ends it before
-GUARDED, OVERDUE = (
-    1.2,
-    3.0,
-)
+# A process is lost if it has no answer after GUARDED times its time limit and OVERDUE seconds, or
+# OVERDUE seconds after Ctrl-C. Its own guard ends it earlier, so this is a last resort.
+GUARDED, OVERDUE = 1.2, 3.0
 LATE = (
     "process: expected an answer in time, got none, as happens when memory is swapped; set "
     "--memory-limit, or solve fewer traces at a time"
 )
-LOST = (
-    "scheduler: expected an answer, got disconnected; see whether it still runs, and solve this "
-    "trace again"
-)
 
 
 class Answer(NamedTuple):
-    """The result of one trace: the number of the trace, the line to print, the exit code, and what is to be said on stderr."""
+    """The result of one trace.
+
+    Attributes:
+        number: The number of the trace.
+        line: The line to print.
+        code: The exit code.
+        warnings: Messages for stderr.
+    """
 
     number: int
     line: str
@@ -85,76 +74,18 @@ class Answer(NamedTuple):
     warnings: tuple[str, ...] = ()
 
 
-class Stop:
-    """Whether all is to stop.
-
-    A handler of signals may say so at any time, which an Event of `threading` does not allow.
-    """
-
-    def __init__(self) -> None:
-        self._is_set = False
-
-    def set(self) -> None:
-        self._is_set = True
-
-    def is_set(self) -> bool:
-        return self._is_set
-
-
-def in_a_line(error: Exception) -> str:
-    """What went wrong, in one line."""
-    return printable(
-        " ".join(
-            (
-                str(error)
-                if isinstance(error, AbductionError)
-                else f"{type(error).__name__}: {error}"
-            ).split()
-        )
-    )
-
-
-class Asked(Protocol):
-    """What is asked about each of many files.
-
-    Plain data, as it travels to other processes and machines; so are its answers, which have the
-    number of their file.
-    """
-
-    @property
-    def overdue(self) -> float | None:
-        """Seconds after which a process that was to answer is taken for lost."""
-
-    @property
-    def has_limits(self) -> bool:
-        """Whether it takes a process of its own to answer, as that may have to be ended."""
-
-    @property
-    def limit(self) -> float | None:
-        """Seconds for the search of each file, or None."""
-
-    @property
-    def patience(self) -> float:
-        """Seconds that an answer may take once all is to stop."""
-
-    def load(self, path: str) -> Any:
-        """What goes along to a worker. Whatever it raises is the answer."""
-
-    def answer(self, number: int, path: str, content: Any, given_up: Callable[[], bool]) -> Any:
-        """The answer for a file, read here if its content did not come along."""
-
-    def lost(self, lost: workers.Lost, path: str) -> Any:
-        """The answer for a file whose process ended without one."""
-
-    def failed(self, number: int, path: str, error: Exception) -> Any:
-        """The answer for a file with which something went wrong."""
-
-
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked about each trace: limit, maps, within, memory and speedups as of Search.
+    """What to find out about each trace. It implements `jobs.Asked`.
 
-    Plain data, as it travels to other processes and machines.
+    Attributes:
+        theory: The theory.
+        limit: Seconds for each trace; None for no limit.
+        maps: The number of maps to list at most; 0 for all.
+        memory: MiB for the process; None for no limit.
+        speedups: The speed-ups that are on.
+        json: Whether the line is JSON.
+        within: How many dstates more than the minimum a listed map may have.
     """
 
     theory: Theory
@@ -167,11 +98,11 @@ class Question:
 
     @property
     def has_limits(self) -> bool:
-        """Whether it takes a process of its own to answer, as that may have to be ended."""
+        """Whether each answer needs a process of its own, which can be killed."""
         return self.limit is not None or self.memory is not None
 
     def load(self, path: str) -> Trace:
-        """What goes along to a worker: the trace, so that workers need not share the disk."""
+        """The trace, for a worker that does not share the disk."""
         return Trace.load(path)
 
     def answer(
@@ -181,15 +112,17 @@ class Question:
         trace: Trace | None = None,
         given_up: Callable[[], bool] = lambda: False,
     ) -> Answer:
-        """Solve a trace, read from its file if it did not come along.
+        """Solve one trace. An error becomes the answer.
 
-        Whatever goes wrong is the answer. Stops when it is given up.
+        Args:
+            number: The number of the trace, which the answer repeats.
+            path: The file of the trace.
+            trace: The trace, if it was sent along.
+            given_up: Whether nobody wants the answer any more.
         """
         try:
             return self._solved(number, path, trace or Trace.load(path), given_up)
-        except (
-            Exception
-        ) as error:  # of any kind, such as no memory left: the other traces must not suffer
+        except Exception as error:  # one bad trace must not stop the others
             return self.failed(number, path, error)
 
     def _solved(self, number: int, path: str, trace: Trace, given_up: Callable[[], bool]) -> Answer:
@@ -230,14 +163,13 @@ class Question:
         maps: list[Given],
         given_up: Callable[[], bool],
     ) -> contextlib.AbstractContextManager[object]:
-        """What answers in time, in a process that does nothing else, where the search cannot be ended."""
+        """A guard that ends this process in time, if the process does nothing else."""
 
-        def last_words(why: SearchStop) -> tuple[Answer, int]:
+        def last_words(why: Stop) -> tuple[Answer, int]:
             solution = search.snapshot(why)
             found = [*maps] or ([(ssh_map, None) for ssh_map in solution.maps] if self.json else [])
-            return self._told(
-                number, path, search, solution, found, None, None
-            ), EXIT_ERROR  # of the process, which nobody reads
+            # Nobody reads the exit code of this process.
+            return self._told(number, path, search, solution, found, None, None), EXIT_ERROR
 
         if not workers.serves():
             return contextlib.nullcontext()
@@ -278,16 +210,16 @@ class Question:
 
     @property
     def overdue(self) -> float | None:
-        """Seconds after which a process that was to answer is taken for lost."""
+        """Seconds after which a process without an answer counts as lost; None without a limit."""
         return None if self.limit is None else GUARDED * self.limit + OVERDUE
 
     @property
     def patience(self) -> float:
-        """Seconds that an answer may take once all is to stop."""
+        """Seconds to wait for the answers under way when all work is to stop."""
         return OVERDUE
 
     def lost(self, lost: workers.Lost, path: str) -> Answer:
-        """The answer for a trace whose process ended without one."""
+        """The answer for a trace whose process ended without an answer."""
         return self.failed(lost.number, path, SolverError(LATE if lost.late else KILLED))
 
     def failed(self, number: int, path: str, error: Exception) -> Answer:
@@ -315,7 +247,7 @@ def run(options: argparse.Namespace) -> int:
         )
     speedups = Speedups.without(options.without_speedups)
     if options.scheduler or options.jobs not in (None, 1):
-        speedups = replace(speedups, threads=False)  # the processors have other traces to solve
+        speedups = replace(speedups, threads=False)  # the cores are busy with other traces
     question = Question(
         theory_of(options),
         options.time_limit,
@@ -325,40 +257,24 @@ def run(options: argparse.Namespace) -> int:
         options.json,
         options.within,
     )
-    stop = Stop()
+    stop = StopFlag()
     if options.scheduler is None:
-        answers = here(question, paths, options.jobs or 1, stop)
+        answers = answers_here(question, paths, options.jobs or 1, stop)
     else:
-        answers = on_cluster(question, paths, options.scheduler, options.jobs, stop)
+        answers = answers_on_cluster(question, paths, options.scheduler, options.jobs, stop)
     codes = _printed(answers, len(paths), stop)
-    if stop.is_set():
-        missing = len(paths) - sum(code <= SIGNALLED for code in codes)
-        print(
-            f"ssh-abduction: interrupted: {missing} of {len(paths)} traces not finished",
-            file=sys.stderr,
-        )
-        return interrupted_code()
-    if errors := codes.count(EXIT_ERROR):
-        print(
-            f"ssh-abduction: errors in {errors} of {len(paths)} traces, on their lines",
-            file=sys.stderr,
-        )
-        return EXIT_ERROR
-    return max(codes)
+    return final_code(codes, len(paths), stop, "traces")
 
 
-def _printed(answers: Generator[Answer], total: int, stop: Stop) -> list[int]:
-    """Print the lines of all answers in the order of the traces.
-
-    Returns the codes of those that came.
-    """
-    lines: dict[int, str] = {}  # of answers whose turn has not come
+def _printed(answers: Generator[Answer], total: int, stop: StopFlag) -> list[int]:
+    """Print all lines in the order of the traces. Returns the exit codes of the answers."""
+    lines: dict[int, str] = {}  # the lines that wait for an earlier trace
     codes: list[int] = []
     turn = 0
     with _progress(total) as (say, advance), contextlib.closing(answers):
         try:
             for answer in answers:
-                with on_ctrl_c(stop.set):  # so that no line is lost or cut in two
+                with on_ctrl_c(stop.set):  # Ctrl-C must not lose a line or cut it in two
                     lines[answer.number] = answer.line
                     warn(answer.warnings)
                     codes.append(answer.code)
@@ -370,267 +286,13 @@ def _printed(answers: Generator[Answer], total: int, stop: Stop) -> list[int]:
                     stop.set()
         except KeyboardInterrupt:
             stop.set()
-        for number in sorted(lines):  # where some did not come
+        for number in sorted(lines):  # lines that still wait for an answer that did not come
             say(lines[number])
     return codes
 
 
-def _solved_in_worker(number: int, path: str, question: Asked, given_up: Callable[[], bool]) -> Any:
-    return question.answer(number, path, None, given_up)
-
-
-def here(question: Asked, paths: Sequence[str], jobs: int, stop: Stop) -> Generator[Any]:
-    """Answers from processes of this machine.
-
-    Once it is to stop, those of traces under way, as far as these are.
-
-    A process that is killed loses its trace alone. These processes do not hear Ctrl-C themselves:
-    they are told of it.
-    """
-
-    def end() -> None:
-        if stop.is_set():  # Ctrl-C once more
-            raise KeyboardInterrupt
-        stop.set()
-
-    from joblib import effective_n_jobs
-
-    tasks = [(number, path, question) for number, path in enumerate(paths)]
-    processes = min(effective_n_jobs(jobs), len(paths))
-    with on_ctrl_c(end):
-        for answer in workers.answers(
-            _solved_in_worker, tasks, processes, stop.is_set, question.overdue, question.patience
-        ):
-            if not isinstance(answer, workers.Lost):
-                yield answer
-            elif not stop.is_set():  # one that is given up has no answer, and that is no error
-                yield question.lost(answer, paths[answer.number])
-
-
-def on_cluster(
-    question: Asked, paths: Sequence[str], address: str, jobs: int | None, stop: Stop
-) -> Generator[Any]:
-    """Answers from the workers of a Dask scheduler."""
-    try:
-        from distributed import Client
-    except ImportError:
-        raise AbductionError(
-            "--scheduler: expected the package distributed, got none; pip install "
-            "'ssh-abduction[cluster]'"
-        ) from None
-    if not re.search(r"^inproc:|:\d+$", address):
-        raise AbductionError(
-            "--scheduler: expected an address with a port, such as tcp://host:8786, got "
-            f"{brief(address)}"
-        )
-    logging.getLogger("distributed.client").setLevel(
-        logging.CRITICAL
-    )  # what goes wrong is in the answers
-    warnings.filterwarnings(
-        "ignore", "Sending large graph"
-    )  # a long trace goes to one worker, once
-    try:
-        client = Client(address, timeout=PATIENCE, set_as_default=False)
-    except Exception as error:  # whatever else listens there may answer anything
-        raise AbductionError(
-            f"--scheduler: expected a Dask scheduler at {address}, got none ({error}); start one "
-            "with: dask scheduler"
-        ) from None
-    with client:
-        try:
-            client.wait_for_workers(1, timeout=PATIENCE)
-        except TimeoutError:
-            raise AbductionError(
-                f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask "
-                f"worker {address}"
-            ) from None
-        most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
-        absence = Absence(lambda: len(client.ncores()), question.limit, address)
-        for answer in _answers(
-            question, paths, partial(_on_workers, question, client, most, absence)
-        ):
-            yield answer
-            if stop.is_set():
-                return
-
-
-def _answers(
-    question: Asked,
-    paths: Sequence[str],
-    attempt: Callable[[list[Task], list[Task]], Iterator[Any]],
-) -> Iterator[Any]:
-    """Answers as they are ready, in any order.
-
-    `attempt` yields the answers for some traces, and puts those under way while a process was
-    killed into its second list. Which of them was to blame is not known, so each is solved again,
-    alone: it is the one whose process is killed again.
-    """
-    suspects: list[Task] = []
-    yield from attempt([*enumerate(paths)], suspects)
-    for task in suspects:
-        again: list[Task] = []
-        yield from attempt([task], again)
-        for _ in again:
-            yield question.lost(workers.Lost(task[0], late=False), task[1])
-
-
-class Absence:
-    """How long a cluster has had no worker. Dask itself waits without a word.
-
-    After PATIENCE seconds a warning says so. Where there is a time limit, the wait is too long
-    after so many seconds, or PATIENCE, if that is more.
-
-    Args:
-        workers: Tells how many workers there are.
-        limit: Seconds, or None.
-        address: The address of the scheduler, which the sentences name.
-        clock: Tells the time in seconds.
-    """
-
-    def __init__(
-        self,
-        workers: Callable[[], int],
-        limit: float | None,
-        address: str,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._workers, self._limit, self._clock, self._address = workers, limit, clock, address
-        self._looks_at = self._last_seen = clock()
-        self._warned = False
-
-    @property
-    def sentence(self) -> str:
-        """What is said of it."""
-        seconds = self._clock() - self._last_seen
-        return (
-            f"scheduler: expected a worker, got none for {seconds:.0f} s; start one with: dask "
-            f"worker {self._address}"
-        )
-
-    def is_too_long(self) -> bool:
-        """Look, now and then, whether there is a worker, and warn once if there is none.
-
-        Returns whether nobody should wait any longer.
-        """
-        now = self._clock()
-        if now >= self._looks_at:
-            self._looks_at = now + LOOK
-            with contextlib.suppress(Exception):  # of a scheduler that is gone
-                if self._workers():
-                    self._last_seen, self._warned = now, False
-        absent = now - self._last_seen
-        if absent >= PATIENCE and not self._warned:
-            self._warned = True
-            warn([f"{self.sentence}, or end this with Ctrl-C"])
-        return self._limit is not None and absent >= max(PATIENCE, self._limit)
-
-
-def _on_workers(
-    question: Asked,
-    client: Client,
-    most: int,
-    absence: Absence,
-    tasks: list[Task],
-    killed: list[Task],
-) -> Iterator[Any]:
-    """An attempt on Dask, with so many traces at most sent at a time.
-
-    They are read here: workers need not share the disk.
-
-    This is Dask's own interface, as joblib's backend for Dask waits for ever when a worker is
-    killed.
-    """
-    from distributed import KilledWorker, as_completed
-
-    sent: dict[Future[Any], Task] = {}
-    ready = as_completed(loop=client.loop)
-
-    def received(left: int) -> Iterator[Any]:
-        """Answers, until no more than `left` traces are under way."""
-        while len(sent) > left:
-            if ready.is_empty():  # the scheduler is gone
-                return
-            if not ready.has_ready():
-                if not absence.is_too_long():
-                    time.sleep(POLL)
-                    continue
-                for future, task in sent.items():
-                    future.cancel()
-                    yield question.failed(*task, SolverError(absence.sentence))
-                sent.clear()
-                return
-            future = next(ready)
-            task = sent.pop(future)
-            try:
-                yield future.result()
-            except KilledWorker:
-                killed.append(task)
-            except CancelledError:
-                yield question.failed(*task, SolverError(LOST))
-            except Exception as error:  # of the cluster, as `answer` catches those of the trace
-                mend = "install the same ssh-abduction where the scheduler and its workers run"
-                yield question.failed(
-                    *task,
-                    SolverError(
-                        f"cluster: expected an answer, got {type(error).__name__}: {error}; {mend}"
-                    ),
-                )
-
-    for number, path in tasks:
-        try:
-            if client.status != "running":
-                raise SolverError(LOST)
-            if absence.is_too_long():
-                raise SolverError(absence.sentence)
-            future = client.submit(
-                _on_worker, question, number, path, question.load(path), pure=False
-            )
-        except Exception as error:
-            yield question.failed(number, path, error)
-            continue
-        sent[future] = number, path
-        ready.add(future)
-        yield from received(most - 1)
-    yield from received(0)
-    for task in sent.values():  # Dask says nothing about these once the scheduler is gone
-        yield question.failed(*task, SolverError(LOST))
-
-
-def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
-    """The answer, on a Dask worker.
-
-    A worker runs on when its client has gone, so the search looks now and then whether it has.
-    """
-    from distributed import get_worker
-
-    worker = get_worker()
-    task = worker.state.tasks[worker.get_current_task()]
-
-    def given_up() -> bool:
-        return bool(task.state == "cancelled")
-
-    if not question.has_limits:
-        return question.answer(number, path, content, given_up)
-    # Other traces may be under way in this process, which cannot be ended with one that does not
-    # heed its limits.
-    work = [(number, path, question, content)]
-    answer: Any = next(
-        workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, question.patience)
-    )
-    return question.lost(answer, path) if isinstance(answer, workers.Lost) else answer
-
-
-def _solved_for_cluster(
-    number: int, path: str, question: Asked, content: Any, given_up: Callable[[], bool]
-) -> Any:
-    return question.answer(number, path, content, given_up)
-
-
 def _forget_memory() -> None:
-    """Count the peak of memory anew, after what earlier traces left is given back.
-
-    Where this is not Linux, the peak stays.
-    """
+    """Free the memory of earlier traces and reset the peak. Only Linux can reset it."""
     gc.collect()
     with contextlib.suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
@@ -640,7 +302,7 @@ def _forget_memory() -> None:
 
 @contextlib.contextmanager
 def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], None]]]:
-    """How to print a line, and how to move the bar, which is on stderr if that is a terminal."""
+    """A function that prints a line, and one that moves the progress bar on stderr, if any."""
     if not sys.stderr.isatty():
         yield partial(print, flush=True), lambda: None
         return
@@ -658,7 +320,7 @@ def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], 
         task = progress.add_task("traces", total=total)
 
         def say(line: str) -> None:
-            """Print a line as it is where the bar was, which moves below it: rich would fit it to the width of the terminal."""
+            """Print a line above the bar. rich would wrap it to the width of the terminal."""
             progress.live.transient = True
             progress.stop()
             print(line, flush=True)

@@ -1,4 +1,4 @@
-"""ssh-abduction check TRACE MAPS: do these maps satisfy the axioms?"""
+"""ssh-abduction check MAPS TRACE: check that maps satisfy the axioms."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ EXIT_VIOLATED = 20
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Check maps against a trace and the axioms, without clingo. Which named axiom fails, and "
-        "at which steps?"
+        "Check maps against a trace and the axioms, without clingo. Reports each axiom that a "
+        "map breaks, and the steps where it does."
     )
     parser = verbs.add_parser("check", help="do these maps satisfy the axioms?", description=text)
-    parser.add_argument("maps", help="what solve --json printed, or one saved map")
+    parser.add_argument("maps", help="output of solve --json, or one saved map")
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument(
-        "--bound", action="store_true", help="check the proof that no map has fewer dstates, too"
+        "--bound", action="store_true", help="also check the proof that no map has fewer dstates"
     )
     add_theory(parser, default="the theory of the maps, or topological")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "Without --theory, the theory is the one that the file of maps was solved under; other "
-        "flags are laid over it."
+        "Without --theory, the theory is that of the file of maps. Other flags change single "
+        "choices of it."
     )
 
 
@@ -107,13 +107,18 @@ def _bound(
     solved: Theory,
     broken: bool,
 ) -> bool:
-    """Print what the certificate of the file proves, and what the file says wrongly of itself.
+    """Check the certificate and the other claims of the file, and print the result.
 
-    Says whether all of it holds.
+    Args:
+        trace: The trace.
+        data: The JSON of the file.
+        theory: The theory to check by.
+        doubt: Why clingo's verdict does not count for this trace and theory; None if it does.
+        solved: The theory of the file.
+        broken: Whether some maps break axioms.
 
-    doubt   why clingo's verdict cannot be taken for one on this trace and theory, if so
-    solved  the theory that the file is of
-    broken  whether some maps break axioms
+    Returns:
+        Whether all claims hold.
     """
     fewest = min((len(m.dstates) for m in maps), default=None)
     if RESTS_ON - set(theory.axioms):
@@ -173,7 +178,7 @@ def _bound(
 
 
 def _false_of_maps(data: Mapping[str, Any], maps: Sequence[SSHMap], trace: Trace) -> Iterator[str]:
-    """What the file says wrongly of single maps: their ids, and how well they close."""
+    """The false claims of the file about single maps: their ids, and how well they close."""
     ranking = Ranking(trace)
     for i, (said, ssh_map) in enumerate(zip(data.get("maps", ()), maps, strict=False)):
         if "id" in said and said["id"] != ssh_map.id:
@@ -199,10 +204,7 @@ def _false_of_maps(data: Mapping[str, Any], maps: Sequence[SSHMap], trace: Trace
 
 
 def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
-    """What the file says wrongly of what its maps share.
-
-    Its other claims hold, so that it can be read as a solution.
-    """
+    """The false claims of the file about what its maps share, if its other claims hold."""
     try:
         solution = Solution.from_dict(data, "the file", trace)
     except MapError as error:
@@ -228,7 +230,7 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
 
 
 def _is_near(said: Any, right: Any) -> bool:
-    """Whether numbers that are nested alike are about the same, as machines round differently."""
+    """Whether nested numbers are almost equal: machines round differently."""
     if isinstance(right, Mapping):
         return (
             isinstance(said, Mapping)

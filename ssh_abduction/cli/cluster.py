@@ -1,4 +1,4 @@
-"""ssh-abduction cluster TRACE: images to views."""
+"""ssh-abduction cluster TRACE: cluster images into views."""
 
 from __future__ import annotations
 
@@ -21,12 +21,10 @@ from ssh_abduction.theory.theory import Theory
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Cluster the images of a trace into views, as many as separate best (k by M), and write "
-        "the trace with its views. Where another number "
-    )
-    text += (
-        "of views is about as good, its views are kept beside them, and it is said whether they "
-        "give another map."
+        "Cluster the images of a trace into views, and write the trace with its views. The number "
+        "of views k is the one that separates best (largest M). If another number of views is "
+        "about as good, the trace keeps those views too, and a warning says whether they give "
+        "another map."
     )
     parser = verbs.add_parser("cluster", help="cluster images into views", description=text)
     parser.add_argument("trace", help="trace file with images, or - for standard input")
@@ -49,7 +47,7 @@ def add_parser(verbs: Verbs) -> None:
         "--plot",
         type=picture_file,
         metavar="PNG",
-        help="draw M, and U where the truth is known, against k",
+        help="draw M, and U if the truth is known, against k",
     )
     parser.set_defaults(run=run)
 
@@ -71,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
         ).fit(images)
     except AbductionError as error:
         raise AbductionError(f"{options.trace}: {error}") from None
-    except ValueError as error:  # scikit-learn's own words for what cannot be clustered
+    except ValueError as error:  # scikit-learn says why these images cannot be clustered
         raise AbductionError(
             f"{options.trace}: images: {error}; log more images, or others"
         ) from None
@@ -112,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
     warn_of_doubts(clusterer.labels_, clusterer.confidence_, clusterer.quality_[clusterer.k_])
     warn(doubts(clustered))
     if options.plot:
-        sys.stdout.flush()  # a picture that fails loses nothing of this
+        sys.stdout.flush()  # print first, in case drawing fails
         from ssh_abduction.evaluation.paper.figures import draw_quality
 
         draw_quality(options.plot, clusterer.quality_, uncertainty, clusterer.k_)
@@ -120,7 +118,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def doubts(trace: Trace) -> list[str]:
-    """What is said of the runner-up of a trace that was clustered, if it gives another map: by the default theory, or the causal one where actions have no kind."""
+    """Warnings if the runner-up's views give another map.
+
+    The theory is the default one, or the causal one if actions have no kind.
+    """
     theory = (
         Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()
     )
@@ -136,7 +137,7 @@ def doubts(trace: Trace) -> list[str]:
 
 
 def true_dstates(trace: Trace) -> list[str] | None:
-    """The true dstates, where every step tells one."""
+    """The true dstates; None unless every step has one."""
     found = [
         step.truth.get("dstate") if isinstance(step.truth, dict) else None for step in trace.steps
     ]

@@ -1,4 +1,4 @@
-"""ssh-abduction compare MAPS [OTHER]: what rival maps share, where they differ, and which steps decide."""
+"""ssh-abduction compare MAPS [OTHER]: what rival maps share, and where they differ."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from ssh_abduction.data.map_file import read_json
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison
 
-# Figures of a run that differ from one time to the next though nothing else does.
+# Figures of a run that change each time, even if nothing else does.
 UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
 
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Compare the minimal maps of a trace: what do all of them share, where do they differ, "
-        "and which steps decide between them?"
+        "Compare the minimal maps of a trace. Reports what all of them share, where they "
+        "differ, and which steps decide between them."
     )
     parser = verbs.add_parser(
         "compare", help="what do rival maps share, and where do they differ?", description=text
@@ -31,28 +31,28 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "maps",
         help=(
-            "what solve --json printed, one saved map, or the folder of a run of map; - for "
-            "standard input"
+            "output of solve --json, one saved map, or a folder written by map; - for standard "
+            "input"
         ),
     )
     parser.add_argument(
         "other",
         nargs="?",
         help=(
-            "maps of the same trace to compare with: which maps are in both, and how do the first "
-            "ones differ?"
+            "other maps of the same trace; shows which maps are in both files, and how the first "
+            "maps of the files differ"
         ),
     )
     diff = (
-        "instead, tell two maps apart in words, each by its number, from 1, or its id; with "
-        "OTHER, the second one is of that file"
+        "only describe how two maps differ; each is given by its number, from 1, or its id; "
+        "with OTHER, J is in that file"
     )
     parser.add_argument("--diff", nargs=2, metavar=("I", "J"), help=diff)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "Questions that decide are chosen greedily: none can be left out, but there may be fewer. "
-        "docs/reference/formats.md says what the JSON has."
+        "The questions that decide between the maps are chosen greedily. None can be left "
+        "out, but a shorter list may exist. docs/reference/formats.md describes the JSON."
     )
 
 
@@ -65,14 +65,13 @@ def run(options: argparse.Namespace) -> int:
         within(options.maps),
         within(options.other) if options.other is not None else None,
     )
-    told: dict[str, Any] = {}  # what --json prints
+    told: dict[str, Any] = {}  # the output of --json
     if maps != options.maps and others != options.other:
         told["runs"] = differences(options.maps, options.other)
         if not options.json:
             print("\n".join(_runs(told["runs"], options.maps, options.other)))
-        if not of_one_trace(
-            options.maps, options.other
-        ):  # maps of different traces cannot be compared any further
+        # Maps of different traces have nothing else to compare.
+        if not of_one_trace(options.maps, options.other):
             if options.json:
                 print(json_line(told))
             return 0
@@ -92,12 +91,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def within(name: str) -> str:
-    """The maps of a run, where its folder is named."""
+    """The file of maps in the folder of a run; any other name as it is."""
     return str(Path(name) / "maps.json") if (Path(name) / "run.json").is_file() else name
 
 
 def differences(first: str, other: str) -> dict[str, tuple[Any, Any]]:
-    """What two runs of `map` differ in: each setting and each figure by its name, as it is in the first run, and in the other one."""
+    """The settings and figures that differ between two runs of `map`, with both values."""
     here, there = (_flat(read_json(Path(folder) / "run.json")) for folder in (first, other))
     names = {**here, **there}
     return {
@@ -108,7 +107,7 @@ def differences(first: str, other: str) -> dict[str, tuple[Any, Any]]:
 
 
 def _runs(differing: dict[str, tuple[Any, Any]], first: str, other: str) -> Iterator[str]:
-    """A line for each setting and each figure in which two runs differ."""
+    """One line for each setting and figure that differs between two runs."""
     yield from (
         f"{name}: {brief(a)} in {named(first)}, {brief(b)} in {named(other)}"
         for name, (a, b) in differing.items()
@@ -123,7 +122,7 @@ def of_one_trace(first: str, other: str) -> bool:
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """The values of nested objects, by the names that lead to them."""
+    """The values of nested objects, by their joined names."""
     if not isinstance(value, dict):
         return {name: value}
     return {

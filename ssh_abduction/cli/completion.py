@@ -1,4 +1,4 @@
-"""ssh-abduction completion SHELL: what a shell needs to complete verbs, options and files."""
+"""ssh-abduction completion SHELL: completions of verbs, options and files for a shell."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _all_actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
     """The arguments of a parser and of all verbs below it."""
-    found = list(parser._actions)  # which argparse has no public name for
+    found = list(parser._actions)  # argparse has no public name for these
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for verb in action.choices.values():
@@ -60,7 +60,10 @@ def _all_actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
 
 
 def _file_kind(action: argparse.Action) -> str | None:
-    """Whether an argument is a file or a folder, by its metavar; a positional one that is no number and has no choices is a file."""
+    """Whether an argument is a file or a folder, by its metavar.
+
+    A positional argument is a file unless it is a number or has choices.
+    """
     if action.nargs == 0 or action.choices is not None:
         return None
     if not action.option_strings:

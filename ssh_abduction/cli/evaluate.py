@@ -1,4 +1,4 @@
-"""ssh-abduction evaluate MAPS TRACE: how right are these maps, where the trace has truth?"""
+"""ssh-abduction evaluate MAPS TRACE: compare maps with the truth in the trace."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, MapPairs, VisitsEvaluation
 
 UNKNOWN = "–"
-# Poses and relations of one log judge at least such a share of the pairs alike: else they are of
-# different logs, or one of them is wrong.
+# Poses and relations of one log agree on at least this share of the pairs. If they agree on fewer,
+# they are of different logs, or one of them is wrong.
 ALIKE = 0.9
 PAIRS = (
     "map",
@@ -48,45 +48,45 @@ HEAD = (
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Compare maps with the truth that the steps of the trace tell: which map is the true one, "
-        "and how right are the others?"
+        "Compare maps with the truth in the trace. Reports which map is true, and how far the "
+        "others are from it."
     )
     parser = verbs.add_parser("evaluate", help="how right are these maps?", description=text)
     parser.add_argument(
         "maps",
-        help="what solve --json printed for this trace, or one saved map; - for standard input",
+        help="output of solve --json for this trace, or one saved map; - for standard input",
     )
     parser.add_argument("trace", help="trace file (JSON Lines) with truth")
     parser.add_setting(
         "near",
-        "judge by poses, too, and take poses within this distance for one place (default: 2)",
+        "also judge by poses; poses within this distance count as one place (default: 2)",
         type=float,
         metavar="METRES",
     )
     parser.add_argument(
         "--relations",
         metavar="FILE",
-        help="judge by hand-checked relative poses, too: lines of time1 time2 x y z roll pitch yaw",
+        help="also judge by hand-checked relative poses: lines of time1 time2 x y z roll pitch yaw",
     )
     parser.add_argument(
         "--truth",
         metavar="FILE",
         help=(
-            "judge by the robot's true trajectory, in TUM format: lines of timestamp tx ty tz qx "
+            "judge by the robot's true trajectory in TUM format: lines of timestamp tx ty tz qx "
             "qy qz qw"
         ),
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "Of pairs at the same place, edges and links, the two shares are precision and recall. "
-        "Where steps tell poses and no names, as those "
-        "of an imported log do, visits near each other are judged. docs/reference/formats.md says "
-        "what is counted."
+        "For pairs of steps at one place, edges and links, the two shares are precision and "
+        "recall. If steps have true poses but no true names, as in an imported log, visits "
+        "near each other count as one place. docs/reference/formats.md says what is counted."
     )
 
 
 def run(options: argparse.Namespace) -> int:
+    # Which load scipy.
     from ssh_abduction.evaluation import (
         Relations,
         Trajectory,
@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
         evaluate_visits,
         tells_names,
         told_poses,
-    )  # which load scipy
+    )
     from ssh_abduction.evaluation.pose_truth import NEAR
 
     data = read_maps(options.maps)
@@ -158,7 +158,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _nothing_judged(found: VisitsEvaluation) -> str:
-    """Why no pair of visits was judged, so that no figure says anything."""
+    """Why no pair of visits was judged."""
     why = f"the trace has {counted(found.visits, 'visits')}"
     if found.places.stayed:
         why += (

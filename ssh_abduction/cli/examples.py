@@ -1,4 +1,4 @@
-"""ssh-abduction examples: copies the examples that ship out of the package, so that what the documentation shows can be tried."""
+"""ssh-abduction examples: copy the examples of the package into a folder."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ssh_abduction.data.files import shipped, write_file
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Copy the examples that ship with the package into a folder: traces, programs, and a "
-        "notebook. A file that is there already, and is another one, is left as it is."
+        "Copy the examples of the package into a folder: traces, programs and a notebook. "
+        "Files with other content are not overwritten."
     )
     parser = verbs.add_parser("examples", help="copy the examples into a folder", description=text)
     parser.add_argument(

@@ -1,6 +1,6 @@
-"""ssh-abduction explain TRACE [FIRST SECOND]: why are two steps different dstates, or one?
+"""ssh-abduction explain TRACE [STEP STEP]: why two steps are one dstate or not.
 
-Without steps: why has the trace no map?
+Without steps: why the trace has no map.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Explain why two steps of a trace are different dstates in every map, or one, with the "
-        "axioms that it takes; or else in which maps they are, and what maps of "
-        "the other kind cost. Without steps, explain why the trace has no map, and which one "
-        "observation, if it were wrong, would mend it."
+        "Explain why two steps of a trace are one dstate in every map, or different dstates "
+        "in every map, and name the axioms that force it. If maps differ in this, report "
+        "which maps have it which way, and what each way costs. Without steps, explain why "
+        "the trace has no map, and which single observation could be wrong."
     )
     parser = verbs.add_parser(
         "explain",
@@ -41,7 +41,7 @@ def add_parser(verbs: Verbs) -> None:
         type=int,
         default=(),
         metavar="step",
-        help="two steps, counted from 0; none, to hear why there is no map",
+        help="two steps, counted from 0; leave them out to learn why there is no map",
     )
     parser.add_argument(
         "-n",
@@ -56,13 +56,13 @@ def add_parser(verbs: Verbs) -> None:
         "--time-limit",
         type=float,
         metavar="S",
-        help="stop after S seconds with what is known by then",
+        help="stop after S seconds and print what is known",
     )
     parser.add_argument(
         "--memory-limit",
         type=int,
         metavar="MIB",
-        help="stop when the process has used so much memory",
+        help="stop when the process has used this much memory",
     )
     add_theory(parser)
     parser.epilog = (

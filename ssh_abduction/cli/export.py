@@ -1,4 +1,4 @@
-"""ssh-abduction export MAPS --to FORMAT: a map as a file of another program."""
+"""ssh-abduction export MAPS --to FORMAT: write a map in the format of another program."""
 
 from __future__ import annotations
 
@@ -9,44 +9,41 @@ from ssh_abduction.cli.options import Verbs
 from ssh_abduction.data.errors import MapError
 from ssh_abduction.data.trace import Trace
 
-# As ssh_abduction.output.export has them, which loads networkx, which would delay each verb.
+# Repeats ssh_abduction.output.export, whose import of networkx would delay all verbs.
 FORMATS = ("nav2", "tmap2", "graphml", "dot", "svg", "networkx-json")
 
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Write a map as a file of another program: a route graph of Nav2 (GeoJSON), a topological "
-        "map of LCAS's topological_navigation (tmap2, YAML), GraphML, Graphviz DOT, or JSON of "
-        "networkx."
+        "Write a map in the format of another program: a route graph for Nav2 (GeoJSON), a "
+        "topological map for LCAS's topological_navigation (tmap2, YAML), GraphML, Graphviz "
+        "DOT, SVG, or JSON for networkx."
     )
     parser = verbs.add_parser(
         "export", help="write a map for Nav2, tmap2, GraphML, DOT or networkx", description=text
     )
     parser.add_argument(
-        "maps", help="what solve --json printed, or one saved map; - for standard input"
+        "maps", help="output of solve --json, or one saved map; - for standard input"
     )
     parser.add_argument("--to", required=True, choices=FORMATS, help="the format")
     parser.add_argument(
         "--map",
         default="1",
         metavar="I",
-        help="which map, by its number, from 1, or its id (default: the first)",
+        help="the number of the map, from 1, or its id (default: 1)",
     )
     parser.add_argument(
         "--level",
         choices=("places", "dstates"),
         help=(
-            "what nodes are (default: places for nav2 and tmap2, where the map has any, else "
-            "dstates)"
+            "what a node stands for (default: places for nav2 and tmap2 if the map has places, "
+            "else dstates)"
         ),
     )
     parser.add_argument(
         "--trace",
         metavar="TRACE",
-        help=(
-            "the trace that was mapped, which says how actions turn: for the layout of a map "
-            "without poses"
-        ),
+        help=("the trace that was mapped; its turns help to lay out a map without poses"),
     )
     parser.add_argument(
         "-o",
@@ -59,14 +56,15 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_setting("frame", "the coordinate frame of the positions (default: map)", "map")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "Positions are metres, seen from the first dstate, where the map has poses; else they are "
-        "of a layout, and this is said. docs/reference/formats.md says what each file has."
+        "Positions are in metres from the first dstate if the map has poses. Otherwise they "
+        "come from a layout, and a warning says so. docs/reference/formats.md describes each "
+        "format."
     )
 
 
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.data.map_file import write_map
-    from ssh_abduction.output.export.formats import doubts, export_map  # which loads networkx
+    from ssh_abduction.output.export.formats import doubts, export_map  # loads networkx
     from ssh_abduction.rivals.listing import Listing
 
     listing = Listing.load(options.maps)

@@ -1,4 +1,4 @@
-"""ssh-abduction facts TRACE: the trace as facts for clingo."""
+"""ssh-abduction facts TRACE: print the trace as facts for clingo."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ssh_abduction.theory.settle import settle
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Print a trace and a theory as the facts that the encodings take, and how to run them."
+    text = "Print a trace and a theory as facts for the encodings, with the command that runs them."
     parser = verbs.add_parser("facts", help="print a trace as .lp facts", description=text)
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     add_theory(parser)
@@ -23,7 +23,7 @@ def add_parser(verbs: Verbs) -> None:
 def run(options: argparse.Namespace) -> int:
     trace = Trace.load(options.trace)
     text = encoding.program(settle(trace, theory_of(options)))
-    if sys.stdout.isatty():  # clingo takes a name as it is; a terminal would obey some characters
+    if sys.stdout.isatty():  # escape control characters, which a terminal would obey
         text = "".join(f"{printable(line)}\n" for line in text.rstrip("\n").split("\n"))
     print(text, end="")
     return 0

@@ -17,8 +17,8 @@ from ssh_abduction.theory.theory import Theory
 def run(options: argparse.Namespace) -> int:
     """Print the front.
 
-    Exit code 0 if all of it is proven, 20 if it is proven that there is no map, and else 10, as for
-    solve.
+    Returns:
+        0 if all of it is proven; 20 if it is proven that there is no map; else 10.
     """
     if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
         raise AbductionError(

@@ -1,9 +1,8 @@
-"""The last net under the limits: what is known is printed in time, even while the main thread sits in a call of clingo's that nothing can stop.
+"""A last resort that keeps the limits: it ends the process with what is known so far.
 
-Python runs handlers of signals in the main thread alone, and not before a call of clingo's has
-returned. So a thread of its own looks at the clock and at the memory, and the system tells it of
-signals through a socket. Where a promise is about to be broken, this thread prints what is known,
-and ends the process.
+Python runs signal handlers in the main thread only, and only after a call of clingo has returned.
+So a second thread watches the clock and the memory, and the system reports signals to it through a
+socket. If a limit is about to be broken, this thread prints what is known and ends the process.
 """
 
 from __future__ import annotations
@@ -22,24 +21,27 @@ from typing import Any, NoReturn, Self
 from ssh_abduction.runtime import program
 from ssh_abduction.solver import POLL, Stop, end_all, resident_memory
 
-LATE = (
-    1.1,
-    0.8,
-)  # times the time limit, and seconds beyond that, after which a search is over, whatever it is at
-LARGE = 1.1, 100.0  # times the memory limit, and MiB beyond that
-DEAF = 1.5  # seconds that a search may take to end after Ctrl-C
-PIECE = 2**16  # characters that are printed at a time
+# A search is ended after this many times its time limit, and this many seconds more.
+LATE = 1.1, 0.8
+# A search is ended at this many times its memory limit, and this many MiB more.
+LARGE = 1.1, 100.0
+# A search must end within this many seconds after Ctrl-C.
+DEAF = 1.5
+# Text is printed in pieces of this many characters.
+PIECE = 2**16
 
 
 class Guard:
-    """Ends the process in time. Lasts as long as the `with` block around what is watched.
+    """A context manager that ends the process if the code inside breaks a limit.
 
-    interrupt   makes the search end soon, if it can
-    last_words  tells what is known, given why it is to end: what is still to be printed, and the exit code
-    limit       seconds, or None
-    memory      MiB, or None
-    given_up    whether the answer is no longer wanted
-    print_last  prints the last words; standard output, if not given
+    Args:
+        interrupt: Asks the search to end soon.
+        last_words: Takes the reason for the end. Returns what remains to be printed, and the exit
+            code.
+        limit: Seconds; None for no limit.
+        memory: MiB; None for no limit.
+        given_up: Whether nobody wants the answer any more.
+        print_last: Prints the last words; to standard output by default.
     """
 
     def __init__(
@@ -55,28 +57,16 @@ class Guard:
         self._interrupt, self._last_words, self._given_up = interrupt, last_words, given_up
         self._limit, self._memory = limit, memory
         self._print_last = print_last or _print
-        self._speaking = (
-            threading.RLock()
-        )  # one thread prints at a time; once the last words are said, no other does
+        self._signals, self._printer = _Signals(), _Printer()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
         self._over = threading.Event()
-        self._deaf_at: float | None = None  # when the search should have ended after Ctrl-C
-        self._waited = 0.0  # seconds that whoever reads the output took, which do not count
-        self._writes_since: float | None = (
-            None  # when the piece of text that is being printed was begun
-        )
         self._began = time.monotonic()
-        self._hears: socket.socket | None = None
-        self._before = -1
+        self._deaf_at: float | None = None  # when the search should have ended after Ctrl-C
 
     def __enter__(self) -> Self:
-        if (
-            threading.current_thread() is threading.main_thread()
-        ):  # only the main thread hears of signals
-            self._hears, self._told = socket.socketpair()
-            for end in (self._hears, self._told):
-                end.setblocking(False)
-            self._before = signal.set_wakeup_fd(self._told.fileno(), warn_on_full_buffer=False)
-        self._thread = threading.Thread(target=self._watch, daemon=True)
+        # Python lets only the main thread listen to signals.
+        if threading.current_thread() is threading.main_thread():
+            self._signals.open()
         self._thread.start()
         return self
 
@@ -87,80 +77,54 @@ class Guard:
         trace: TracebackType | None,
     ) -> None:
         self._over.set()
-        self._thread.join()  # for ever, if it is about to end the process
-        if self._hears is not None:
-            signal.set_wakeup_fd(self._before)
-            self._hears.close()
-            self._told.close()
+        self._thread.join()  # does not return if the thread is about to end the process
+        self._signals.close()
 
     def say(self, text: Callable[[], str]) -> None:
-        """Print a text, which is made here, so that the last words know whether it was printed."""
-        with self._speaking:
-            made = text()
-            for start in range(0, len(made), PIECE):
-                self._writes_since = time.monotonic()
-                sys.stdout.write(made[start : start + PIECE])
-                self._waited += time.monotonic() - self._writes_since
-                self._writes_since = None
+        """Make a text and print it. The last words come before it or after it, never between."""
+        self._printer.say(text)
 
     def _watch(self) -> None:
+        """Run in the second thread until the `with` block ends."""
+        speaking = self._printer.speaking
         while not self._over.wait(POLL):
             if self._is_called() and self._deaf_at is None:
                 self._deaf_at = time.monotonic() + DEAF
                 self._interrupt()
             why = self._why()
-            if why is not None and self._speaking.acquire(blocking=False):
+            if why is not None and speaking.acquire(blocking=False):
                 try:
                     if not self._over.is_set():
                         self._end(why)
                 finally:
-                    self._speaking.release()
-            elif self._is_unread():
+                    speaking.release()
+            elif self._is_deaf() and self._printer.is_unread():
                 self._leave(program.interrupted_code())
 
     def _is_called(self) -> bool:
-        """Whether somebody asks for an end."""
-        if self._hears is not None:
-            with suppress(BlockingIOError):
-                heard = [
-                    number
-                    for number in self._hears.recv(64)
-                    if number in (signal.SIGINT, signal.SIGTERM)
-                ]
-                program.heard.extend(
-                    heard
-                )  # as the handler of the main thread has perhaps not run, and will not
-                return bool(heard) or self._given_up()
-        return self._given_up()
+        """Whether the user or the caller asks for an end."""
+        numbers = self._signals.received()
+        # The handler in the main thread may not have run yet, and may never run.
+        program.heard.extend(numbers)
+        return bool(numbers) or self._given_up()
 
     def _why(self) -> Stop | None:
-        now = time.monotonic()
-        if self._deaf_at is not None and now > self._deaf_at:
+        """The limit that is broken; None if all are kept."""
+        if self._is_deaf():
             return "interrupted"
-        if (
-            self._limit is not None
-            and now - self._began - self._waited > LATE[0] * self._limit + LATE[1]
-        ):
+        seconds = time.monotonic() - self._began - self._printer.waited
+        if self._limit is not None and seconds > LATE[0] * self._limit + LATE[1]:
             return "time limit"
         if self._memory is not None and resident_memory() > LARGE[0] * self._memory + LARGE[1]:
             return "memory limit"
         return None
 
-    def _is_unread(self) -> bool:
-        """Whether the program is to end, and prints what nobody reads."""
-        since, now = self._writes_since, time.monotonic()
-        return (
-            self._deaf_at is not None
-            and now > self._deaf_at
-            and since is not None
-            and now > since + DEAF
-        )
+    def _is_deaf(self) -> bool:
+        """Whether the search did not end after Ctrl-C."""
+        return self._deaf_at is not None and time.monotonic() > self._deaf_at
 
     def _end(self, why: Stop) -> None:
-        """Print the last words, and end the process with its helpers.
-
-        What Python and clingo hold is left to the system.
-        """
+        """Print the last words and end the process with its helpers, without any clean-up."""
         self._interrupt()
         code = 1
         try:
@@ -169,8 +133,8 @@ class Guard:
         except BaseException as error:
             with suppress(OSError, ValueError):
                 print(
-                    f"ssh-abduction: {why}: expected to print what is known, got "
-                    f"{type(error).__name__}: {error}",
+                    f"ssh-abduction: {why}: expected to print what is known, "
+                    f"got {type(error).__name__}: {error}",
                     file=sys.stderr,
                     flush=True,
                 )
@@ -180,6 +144,64 @@ class Guard:
     def _leave(self, code: int) -> NoReturn:
         end_all()
         os._exit(code)
+
+
+class _Signals:
+    """Receives SIGINT and SIGTERM while the main thread is busy."""
+
+    def __init__(self) -> None:
+        self._ends: tuple[socket.socket, socket.socket] | None = None
+        self._before = -1  # the file that was told of signals before
+
+    def open(self) -> None:
+        """Begin to listen. Only the main thread may call it."""
+        self._ends = socket.socketpair()
+        for end in self._ends:
+            end.setblocking(False)
+        self._before = signal.set_wakeup_fd(self._ends[1].fileno(), warn_on_full_buffer=False)
+
+    def close(self) -> None:
+        """Stop listening."""
+        if self._ends is not None:
+            signal.set_wakeup_fd(self._before)
+            for end in self._ends:
+                end.close()
+
+    def received(self) -> list[int]:
+        """The signals since the last call."""
+        if self._ends is not None:
+            with suppress(BlockingIOError):
+                return [n for n in self._ends[0].recv(64) if n in (signal.SIGINT, signal.SIGTERM)]
+        return []
+
+
+class _Printer:
+    """Prints to standard output and measures how long its reader takes.
+
+    Attributes:
+        speaking: The lock of the thread that prints. After the last words, no thread gets it.
+        waited: Seconds that the reader of the output took. They do not count as search time.
+    """
+
+    def __init__(self) -> None:
+        self.speaking = threading.RLock()
+        self.waited = 0.0
+        self._writes_since: float | None = None  # when the current piece of text was begun
+
+    def say(self, text: Callable[[], str]) -> None:
+        """Make a text while holding the lock, and print it piece by piece."""
+        with self.speaking:
+            made = text()
+            for start in range(0, len(made), PIECE):
+                self._writes_since = time.monotonic()
+                sys.stdout.write(made[start : start + PIECE])
+                self.waited += time.monotonic() - self._writes_since
+                self._writes_since = None
+
+    def is_unread(self) -> bool:
+        """Whether the reader has not taken the current piece for too long."""
+        since = self._writes_since
+        return since is not None and time.monotonic() > since + DEAF
 
 
 def _print(words: str) -> None:

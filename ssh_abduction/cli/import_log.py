@@ -1,4 +1,4 @@
-"""ssh-abduction import LOG: a robot's log becomes a trace."""
+"""ssh-abduction import LOG: make a trace of a robot's log."""
 
 from __future__ import annotations
 
@@ -16,31 +16,30 @@ if TYPE_CHECKING:
     from perception.readers.scans import RobotLog
 
 
-# Those of perception.readers.logs, which would take long to load before it is known what is asked.
+# Repeats perception.readers.logs, whose import would delay all verbs.
 FORMATS = ("carmen", "g2o", "ros1", "ros2", "mcap")
 PLACES = ("junctions", "doors")
-# What the name of a file ends in that says how it is packed, and then what is in it.
+# Endings of file names: first those of compression, then those of formats.
 ENDINGS = (
     ("gz", "bz2", "xz", "zst", "zstd", "lz4"),
     ("log", "clf", "carmen", "txt", "g2o", "graph", "toro", "bag", "mcap", "db3"),
 )
-# Those of perception.readers.echoes.
+# Repeats perception.readers.echoes.
 MEANINGS = ("free", "unknown")
 
 
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Read a robot's log of laser scans and odometry, find the distinctive places that it "
-        "passed, and write a trace: views, stars, displacements, and the "
-        "actions between. Corrected poses in a log become truth for evaluation; nothing that "
-        "infers reads them."
+        "passed, and write a trace with views, stars, displacements and actions. Corrected "
+        "poses in the log become the truth for evaluate. No other command uses them."
     )
     parser = verbs.add_parser("import", help="make a trace of a robot's log", description=text)
     parser.add_argument(
         "log",
         help=(
-            "CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by "
-            "gzip, bzip2, xz or zstd, too"
+            "CARMEN log, g2o-style log with scans, ROS 1 bag, ROS 2 bag or MCAP; may be "
+            "compressed by gzip, bzip2, xz or zstd"
         ),
     )
     add_output(parser)
@@ -49,57 +48,67 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def add_reading(parser: Parser) -> None:
-    """Add the options that say how a log is read, and at which scale a building is looked at."""
+    """Add the options that say how to read a log, and the scale of the building."""
     group = parser.add_argument_group("reading logs")
     group.add_argument(
-        "--format", choices=FORMATS, help="format of the log (default: guessed from what is in it)"
+        "--format", choices=FORMATS, help="format of the log (default: guessed from its content)"
     )
     group.add_argument(
         "--fov",
         type=partial(_told, "fov"),
         metavar="DEGREES",
-        help="the angle that the beams cover; negative for a laser that hangs upside down "
-        "(default: as the log says, else 180)",
+        help=(
+            "the angle that the laser's beams cover; negative for a laser mounted upside down "
+            "(default: from the log, else 180)"
+        ),
     )
     group.add_argument(
         "--places",
         choices=PLACES,
-        help="what the places are: where ways part or bend (junctions), or the doors that the "
-        "robot drives through (doors) (default: doors where most of its way is wide and often "
-        "leads through doors, and neither gateway nor radius is set; else junctions)",
+        help=(
+            "what counts as a place: points where ways part or bend (junctions), or doors that "
+            "the robot drives through (doors). Default: doors if most of the drive is through "
+            "wide rooms and many doors, and neither gateway nor radius is set; else junctions"
+        ),
     )
     parser.add_setting(
         "scan_topic",
-        "topic of the scans in a bag with several; set it again to read several lasers at once",
+        "topic of the scans, if a bag has several; repeat it to read several lasers at once",
         metavar="TOPIC",
         many=True,
     )
-    parser.add_setting("odom_topic", "topic of the odometry in a bag with several", metavar="TOPIC")
+    parser.add_setting("odom_topic", "topic of the odometry, if a bag has several", metavar="TOPIC")
     parser.add_setting(
         "mount",
-        "where the laser sits on the robot: metres ahead of its middle, metres to the left, and "
-        "degrees to the left of straight ahead (default: as the log says, else 0,0,0)",
+        (
+            "where the laser is on the robot: metres ahead of the centre, metres to the left, and "
+            "degrees to the left of straight ahead (default: from the log, else 0,0,0)"
+        ),
         type=partial(_told, "mount"),
         metavar="X,Y,DEGREES",
     )
     parser.add_setting(
         "no_return",
-        "ranges from here on mean that nothing came back (default: the laser's reach, or a "
-        "shorter range that repeats and is no wall)",
+        (
+            "ranges of at least this mean that the beam hit nothing (default: the laser's maximum "
+            "range, or a shorter range that often repeats and is no wall)"
+        ),
         type=partial(_told, "no_return"),
         metavar="METRES",
     )
     parser.add_setting(
         "zero_is",
-        "what a range of 0, below 0, below the laser's least range, or NaN means: nothing came "
-        "back (free), or nothing is known (unknown) (default: free where the beams beside it "
-        "are long)",
+        (
+            "meaning of a range that is NaN, 0 or less, or below the laser's minimum: the beam "
+            "hit nothing (free), or nothing is known (unknown) (default: free if the neighbouring "
+            "beams are long)"
+        ),
         choices=MEANINGS,
     )
-    parser.add_setting("gateway", "the least width of a gateway", type=metres, metavar="METRES")
+    parser.add_setting("gateway", "the minimum width of a gateway", type=metres, metavar="METRES")
     parser.add_setting(
         "radius",
-        "how far a way out must lead from the middle of a place",
+        "how far from the centre of a place a way out must lead",
         type=metres,
         metavar="METRES",
     )
@@ -117,14 +126,14 @@ def metres(text: str) -> float:
 
 
 def read(path: str, options: argparse.Namespace) -> RobotLog:
-    """A log, as the options say. Raises AbductionError."""
+    """Read a log as the options say. Raises AbductionError."""
     from perception.readers.logs import read_log
 
     return read_log(path, **reading_of(options))
 
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
-    """How a log is to be read, as arguments of `read_log`."""
+    """The arguments of `read_log` that the options ask for."""
     return {
         name: getattr(options, name)
         for name in ("format", "scan_topic", "odom_topic", "fov", "mount", "no_return", "zero_is")
@@ -132,7 +141,7 @@ def reading_of(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _told(field: str, text: str) -> Any:
-    """What the user says of the laser, in a field of `Told`, which knows what it may be."""
+    """The value of a field of `Told`, which checks what the user says about the laser."""
     from perception.readers.echoes import Told
 
     try:
@@ -182,9 +191,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def doors_of(options: argparse.Namespace) -> bool | None:
-    """Whether doors are the places, as asked; None where the log is to tell.
+    """Whether doors are the places; None if the log decides.
 
-    Raises AbductionError for a scale of junctions where doors are asked for.
+    Raises:
+        AbductionError: Doors are asked for together with a scale of junctions.
     """
     if options.places is None:
         return None
@@ -199,7 +209,7 @@ def doors_of(options: argparse.Namespace) -> bool | None:
 
 
 def named_after(path: str) -> str:
-    """The name of a trace that is made of a log, and of the folder of its map: that of the file, without what says how it is written."""
+    """The name of a log without its endings, for its trace and the folder of its map."""
     name = Path(path).name
     if not name.strip("."):
         name = Path(path).resolve().name

@@ -1,4 +1,4 @@
-"""ssh-abduction ladder TRACE: what is each kind of evidence worth?"""
+"""ssh-abduction ladder TRACE: how much each kind of evidence helps."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ HEAD = ("", "minimal maps", "dstates", "places", "paths", "the true one", "accur
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Solve a trace by its views alone, and then with one kind of evidence more on each rung: "
-        "stars, pairs of steps that displacements tell apart, "
-        "sets of two returns, planarity. Says how many minimal maps there are, how large they "
-        "are, and which of them is the true one, where the trace has truth."
+        "Solve a trace by its views alone, then add one kind of evidence on each rung: stars, "
+        "pairs of steps that displacements tell apart, sets of two returns, planarity. "
+        "Reports the number and the size of the minimal maps on each rung, and which of them "
+        "is true, if the trace has truth."
     )
     parser = verbs.add_parser(
         "ladder", help="what is each kind of evidence worth?", description=text
@@ -40,10 +40,10 @@ def add_parser(verbs: Verbs) -> None:
         type=int,
         default=100,
         metavar="N",
-        help="list at most N maps on each rung, 0 for all (default 100)",
+        help="list at most N maps on each rung; 0 for all (default: 100)",
     )
-    parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="for each rung")
-    parser.add_argument("--json", action="store_true", help="print a JSON object a rung")
+    parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="seconds for each rung")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per rung")
     add_theory(parser)
     parser.set_defaults(run=run)
 
@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
     under_way = UnderWay()
 
     def told() -> str:
-        """What is still to be printed: the table, where each rung is not printed as it comes."""
+        """The table, if the rungs were not printed as they came."""
         return "" if options.json else f"{table(HEAD, list(map(_row, rungs)))}\n"
 
     def last_words(_: Stop) -> tuple[str, int]:

@@ -1,4 +1,4 @@
-"""ssh-abduction localise MAPS TRACE: where in a known map was the robot at each step?"""
+"""ssh-abduction localise MAPS TRACE: where in a known map the robot was at each step."""
 
 from __future__ import annotations
 
@@ -28,22 +28,21 @@ NOWHERE = "–"
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Where in a known map was the robot at each step of another trace? Markov localisation: a "
-        "belief over dstates after each step, from a prior that knows nothing. "
-        "A robot that is kidnapped is found again, and one that is nowhere that the map knows is "
-        "said to be nowhere."
+        "Find where in a known map the robot was at each step of another trace. Markov "
+        "localisation computes a belief over dstates after each step. The robot may start "
+        "anywhere, be kidnapped, or leave the map."
     )
     parser = verbs.add_parser(
         "localise", help="where in a known map is the robot?", description=text
     )
     parser.add_argument(
-        "maps", help="what solve --json printed for the trace that was mapped, or one saved map"
+        "maps", help="output of solve --json for the trace that was mapped, or one saved map"
     )
     parser.add_argument(
         "other",
         help=(
-            "trace of a robot in the mapped world, with the same names of views and actions; - "
-            "for standard input"
+            "trace of a robot in the mapped world that uses the same names of views and actions; "
+            "- for standard input"
         ),
     )
     parser.add_argument(
@@ -52,29 +51,29 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "--trace",
         metavar="TRACE",
-        help="the trace that was mapped: estimate probabilities from its steps",
+        help="the trace that was mapped; probabilities are estimated from its steps",
     )
     parser.add_argument(
         "--recogniser",
         metavar="FILE.skops",
-        help="what train wrote for this map: read images instead of views",
+        help="recogniser that train wrote for this map; uses images instead of views",
     )
     said = {
-        "misread": "what is seen is not of the dstate that the robot is at",
-        "slipped": "the action leads elsewhere: it failed, or the robot was kidnapped",
-        "unmapped": "a robot of which nothing is known is at no dstate of the map",
-        "reentered": "a robot that is at no dstate of the map is at one after its next action",
+        "misread": "the robot sees a view or star of another dstate",
+        "slipped": "the action fails, or the robot is kidnapped",
+        "unmapped": "a robot of unknown position is outside the map",
+        "reentered": "a robot outside the map is back on it after its next action",
     }
     for name in CHANCES:
         parser.add_setting(
             name,
-            f"the probability at each step that {said[name]}",
+            f"at each step, the probability that {said[name]}",
             type=float,
             metavar="P",
         )
     parser.add_setting(
         "zero_one",
-        "whether all these probabilities are 0: the map holds without exception",
+        "whether to set all these probabilities to 0, so that the map holds without exception",
         default=False,
         type=true_or_false,
         metavar="true|false",
@@ -83,7 +82,7 @@ def add_parser(verbs: Verbs) -> None:
         "--plot",
         type=picture_file,
         metavar="PNG",
-        help="draw the entropy of the belief, step by step",
+        help="draw the entropy of the belief at each step",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
@@ -108,7 +107,7 @@ def run(options: argparse.Namespace) -> int:
         print(_headline(beliefs))
         print(table(HEAD, [_row(step, belief, trace) for step, belief in enumerate(beliefs)]))
     if options.plot:
-        sys.stdout.flush()  # a picture that fails loses nothing of this
+        sys.stdout.flush()  # print first, in case drawing fails
         from ssh_abduction.evaluation.paper.figures import draw_beliefs
 
         draw_beliefs(options.plot, beliefs)
@@ -116,10 +115,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _localiser(options: argparse.Namespace) -> Localiser:
-    """The localiser that the options ask for.
-
-    Raises AbductionError that names the file that is wrong.
-    """
+    """The localiser that the options ask for. Raises AbductionError that names a wrong file."""
     from ssh_abduction.online.chances import Chances
     from ssh_abduction.online.localiser import Localiser
 
@@ -152,7 +148,7 @@ def _localiser(options: argparse.Namespace) -> Localiser:
 
 
 def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:
-    """At which steps the robot was located, unsure, lost and nowhere, and where the belief collapsed."""
+    """The steps where the robot was located, unsure, lost or outside, or the belief collapsed."""
     steps: dict[str, list[int]] = {}
     for step, belief in enumerate(beliefs):
         steps.setdefault(belief["verdict"], []).append(step)

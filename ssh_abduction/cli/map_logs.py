@@ -1,4 +1,4 @@
-"""ssh-abduction map LOG …: from robots' logs to the maps of their buildings, a folder each."""
+"""ssh-abduction map LOG …: map buildings from robots' logs, each into a folder."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from ssh_abduction.cli.parsing import true_or_false
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "From a robot's log to the minimal maps of the building: trace.jsonl, maps.json, "
-        "page.html, report.html and run.json in a folder. Of several logs each has a folder "
-        "of its own, and its result is a line; what is done already is not done again."
+        "Find the minimal maps of a building from a robot's log. Writes trace.jsonl, "
+        "maps.json, page.html, report.html and run.json into a folder. With several logs, "
+        "each gets its own folder, and its result is one line. Logs that are mapped already "
+        "are skipped."
     )
     parser = verbs.add_parser("map", help="map a building from a robot's log", description=text)
     parser.add_argument(
@@ -21,8 +22,8 @@ def add_parser(verbs: Verbs) -> None:
         nargs="+",
         metavar="log",
         help=(
-            "CARMEN log or g2o-style log with scans, ROS 1 bag, ROS 2 bag, or MCAP; packed by "
-            "gzip, bzip2, xz or zstd, too"
+            "CARMEN log, g2o-style log with scans, ROS 1 bag, ROS 2 bag or MCAP; may be "
+            "compressed by gzip, bzip2, xz or zstd"
         ),
     )
     parser.add_argument(
@@ -31,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
         type=output,
         required=True,
         metavar="FOLDER",
-        help="folder to write; of several logs, the folder of their folders",
+        help="folder to write; each of several logs gets a folder inside it",
     )
     parser.add_argument(
         "-n",
@@ -39,31 +40,33 @@ def add_parser(verbs: Verbs) -> None:
         type=int,
         default=300,
         metavar="K",
-        help="list at most K minimal maps, 0 for all (default: 300)",
+        help="list at most K minimal maps; 0 for all (default: 300)",
     )
     parser.add_argument(
         "--time-limit",
         type=float,
         metavar="S",
         help=(
-            "seconds for the minimal maps (default: what is left of a twentieth of the time that "
-            "the robot drove, and 5 at least)"
+            "seconds for finding minimal maps (default: reading and mapping together take a "
+            "twentieth of the time that the robot drove, but this part gets at least 5)"
         ),
     )
     parser.add_setting(
         "ladder",
-        "whether to work out what each kind of evidence is worth (default: true)",
+        "whether to compute how much each kind of evidence helps (default: true)",
         default=True,
         type=true_or_false,
         metavar="true|false",
     )
-    parser.add_argument("--again", action="store_true", help="do again what is done already")
+    parser.add_argument(
+        "--again", action="store_true", help="map logs again that are mapped already"
+    )
     many = parser.add_argument_group("many logs")
     many.add_argument(
         "--jobs",
         type=int,
         metavar="N",
-        help="map N logs at a time, each in a process; -1 for one a core (default: 1)",
+        help="map N logs at a time, each in its own process; -1 for one per core (default: 1)",
     )
     many.add_argument(
         "--scheduler",
@@ -82,6 +85,6 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.cli import mapping  # which loads what works in other processes
+    from ssh_abduction.cli import mapping  # loads the code for many processes
 
     return mapping.run(options)

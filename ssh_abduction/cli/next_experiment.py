@@ -1,4 +1,4 @@
-"""ssh-abduction next TRACE MAPS: what should the robot do to tell these maps apart?"""
+"""ssh-abduction next MAPS TRACE: what the robot should do to tell these maps apart."""
 
 from __future__ import annotations
 
@@ -23,46 +23,48 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.consequences import Consequence
     from ssh_abduction.rivals.experiment import Experiment, Plan, Untried
 
-# So many columns of a table, and lines of a plan, are shown at most, as more cannot be taken in on
-# a terminal; --json has all.
+# At most this many columns of a table and lines of a plan are printed. --json has all.
 SHOWN_COLUMNS, SHOWN_LINES = 6, 40
-# What the shell is told where a limit ended the search: a plan that may be better, or none at all.
+# Exit codes if a limit ended the search: with a plan that may not be the best, and without a plan.
 EXIT_CUT_SHORT, EXIT_NOTHING = 10, 30
 HOW = {"link": "known", "implied": "implied", "expected": "expected", "open": "open"}
 
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "What to do next, to find out which of these maps is true: from where the robot is now, "
-        "the fewest actions after which they predict something different; of many maps a plan. "
-        "Where the links that all maps know do not tell them apart, the untried action that tells "
-        "most, and the way to it."
+        "Find the fewest actions, from where the robot is now, after which two maps predict "
+        "different views. For more maps, find a plan that depends on what the robot sees. If "
+        "known links cannot tell the maps apart, find the untried action that tells most, and "
+        "the way to it."
     )
     parser = verbs.add_parser(
         "next", help="what should the robot do to tell these maps apart?", description=text
     )
     parser.add_argument(
         "maps",
-        help="what solve --json printed for this trace, or one saved map; - for standard input",
+        help="output of solve --json for this trace, or one saved map; - for standard input",
     )
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument(
-        "--time-limit", type=float, metavar="S", help="stop after S seconds with the plan so far"
+        "--time-limit",
+        type=float,
+        metavar="S",
+        help="stop after S seconds with the best plan so far",
     )
     parser.add_argument(
         "--memory-limit",
         type=int,
         metavar="MIB",
-        help="stop when the process has used so much memory",
+        help="stop when the process has used this much memory",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_theory(parser, default="the theory of the maps, or how the maps read stars")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "The plan for two maps is the shortest one. That for more is greedy, as the best one is "
-        "hard to find (PSPACE-complete: Lee & Yannakakis 1994). "
-        "Exit codes: 0 done; 10 a limit ended the search, and there may be a better plan; 30 no "
-        "plan in time. docs/reference/formats.md says what --json prints."
+        "The plan for two maps is as short as possible. The plan for more maps is greedy, "
+        "because finding the best one is PSPACE-complete (Lee & Yannakakis 1994). Exit codes: "
+        "0 done; 10 a limit ended the search, and a better plan may exist; 30 no plan in "
+        "time. docs/reference/formats.md describes the JSON."
     )
 
 
@@ -83,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
     found = data.get("theory") if isinstance(data, dict) else None
     theory: Theory | None = theory_of(options, None if found is None else Theory.from_dict(found))
     if found is None and options.theory is None and theory == Theory.topological():
-        theory = None  # a saved map does not say under which theory it was made
+        theory = None  # a saved map does not contain its theory
     watch = Watch(options.time_limit, options.memory_limit)
 
     def interrupt() -> None:
@@ -115,7 +117,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _lines(experiment: Experiment) -> Iterator[str]:
-    """What is printed for people."""
+    """The lines to print for people."""
     yield experiment.sentence
     plan = experiment.plan
     if plan.branches:
@@ -147,7 +149,7 @@ def _lines(experiment: Experiment) -> Iterator[str]:
 
 
 def _tree(plan: Plan, indent: str) -> Iterator[str]:
-    """A plan as lines: the actions, and for each thing that may be seen then what is left, and how to go on."""
+    """A plan as lines: the actions, then for each possible view the maps left and the next plan."""
     if plan.branches:
         yield f"{indent}{printable(', '.join(plan.actions))}"
     for branch in plan.branches:
@@ -157,7 +159,7 @@ def _tree(plan: Plan, indent: str) -> Iterator[str]:
 
 
 def _untried(plan: Plan) -> str:
-    """What may be tried where known links tell no more of several rivals."""
+    """Lines about what to try if known links tell no more about several rivals."""
     if len(plan.rivals) == 1 or plan.branches:
         return ""
     if plan.untried is None:
@@ -169,7 +171,7 @@ def _untried(plan: Plan) -> str:
 
 
 def _expected(untried: Untried) -> Iterator[str]:
-    """What rivals say of an untried action."""
+    """What the rivals predict for an untried action."""
     shown = untried.expects[:SHOWN_LINES]
     yield table(
         ["maps", "leads to", "seen there", "which is"],

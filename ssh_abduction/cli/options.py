@@ -1,4 +1,4 @@
-"""Options that several verbs share: the choice of a theory."""
+"""Options that several verbs share, such as those that choose a theory."""
 
 from __future__ import annotations
 
@@ -29,23 +29,25 @@ from ssh_abduction.theory.theory import (
 PRICES = ("misread", "slipped")
 FLAGS = ("star", *PRICES, "rules", *ASSERTIONS)
 
-Verbs = Any  # argparse's type for what add_subparsers returns is private
+Verbs = Any  # the return type of argparse's add_subparsers is private
 
 
 def add_theory(parser: Parser, default: str = "topological") -> None:
-    """Add the options that choose a theory: a preset or a file, and choices laid over it.
+    """Add the options that choose a theory: a preset or a file, and single choices.
 
     Args:
         parser: The parser of a verb.
-        default: What the help says of the theory where none is named.
+        default: What the help calls the theory if none is named.
     """
-    group = parser.add_argument_group("theory", "a preset or a file, and choices laid over it")
+    group = parser.add_argument_group("theory", "A preset or a file, with single choices changed")
     said = helps()
     group.add_argument(
         "--theory",
         metavar="PRESET|FILE",
-        help=f"{', '.join(PRESETS)}; or a .toml file of fields of a theory, or a file of maps, "
-        f"whose theory is taken (default: {default})",
+        help=(
+            f"{', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file of maps, to "
+            f"use their theory (default: {default})"
+        ),
     )
     group.add_argument("--star", choices=CHOICES["star"], help=said["star"])
     for name in PRICES:
@@ -54,7 +56,10 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
         "--rules",
         action="append",
         metavar="FILE",
-        help="add your own rules over the predicates of the encodings; may be given again",
+        help=(
+            "add a file of your own rules, written with the predicates of the encodings; may be "
+            "given again"
+        ),
     )
     for name, text in (
         ("same", "are one dstate"),
@@ -83,7 +88,7 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
 
 
 def helps() -> dict[str, str]:
-    """What the docstring of Theory says of each of its fields."""
+    """The help text of each field of Theory, from its docstring."""
     _, _, attributes = (Theory.__doc__ or "").partition("Attributes:")
     entries = re.findall(r"^ {8}(\w+): (.+(?:\n {12}.+)*)", attributes, re.MULTILINE)
     return {name: " ".join(text.split()).rstrip(".") for name, text in entries}
@@ -102,7 +107,10 @@ def add_output(parser: argparse.ArgumentParser) -> None:
 
 
 def write(trace: Trace, target: str, said: str) -> None:
-    """Write a trace where add_output says, and what is said of it: beside it, where the trace goes to standard output."""
+    """Write a trace to the file of `add_output`, and print a message about it.
+
+    If the trace goes to standard output, the message goes to stderr.
+    """
     if target == "-":
         sys.stdout.writelines(line + "\n" for line in trace.to_lines())
         print(said, file=sys.stderr)
@@ -112,7 +120,7 @@ def write(trace: Trace, target: str, said: str) -> None:
 
 
 def output(text: str) -> str:
-    """A file or folder to write."""
+    """The name of a file or folder to write."""
     if not text or "\0" in text:
         raise argparse.ArgumentTypeError(
             f"expected the name of a file or folder, got {text!r}; name one"
@@ -128,7 +136,7 @@ def seed(text: str) -> int:
 
 
 def picture_file(text: str) -> str:
-    """A file that a figure can be drawn into."""
+    """The name of a file for a figure."""
     if Path(text).suffix.lower() not in (".png", ".pdf", ".svg"):
         raise argparse.ArgumentTypeError(
             f"expected a name that ends in .png, .pdf or .svg, got {text!r}"
@@ -137,10 +145,7 @@ def picture_file(text: str) -> str:
 
 
 def check_picture(file: str | None) -> None:
-    """Whether a picture that is asked for could be drawn, before hours of work.
-
-    Raises AbductionError.
-    """
+    """Check, before hours of work, that a figure can be drawn. Raises AbductionError."""
     if file is None:
         return
     from ssh_abduction.evaluation.paper.figures import require_matplotlib
@@ -149,7 +154,7 @@ def check_picture(file: str | None) -> None:
 
 
 def check_number(number: int | None, maps: Sequence[object], where: str) -> None:
-    """Whether there is such a map, counted from 1. Raises MapError."""
+    """Check that there is a map with this number, counted from 1. Raises MapError."""
     if number is not None and not 1 <= number <= len(maps):
         raise MapError(
             f"{where}: --map: expected 1 to {len(maps)}, got {number}"
@@ -159,7 +164,7 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
 
 
 def in_order(options: argparse.Namespace) -> None:
-    """Swap `maps` and `trace` where the trace was named first, as version 0.1.0 had it, and warn."""
+    """Swap `maps` and `trace` if the trace came first, as in version 0.1.0, and warn."""
     if options.maps == "-" or not _is_trace(options.maps) or _is_trace(options.trace):
         return
     print(
@@ -171,9 +176,14 @@ def in_order(options: argparse.Namespace) -> None:
 
 
 def read_maps(file: str, mend: str = "name the maps first, and then the trace") -> Any:
-    """The JSON in a file of maps. Raises MapError.
+    """The JSON in a file of maps.
 
-    mend  how it is mended if a trace is named instead; else as for a verb that takes the maps first
+    Args:
+        file: The file.
+        mend: What to do if the file is a trace instead; None for verbs that take maps first.
+
+    Raises:
+        MapError: The file holds no maps.
     """
     try:
         return read_json(file)
@@ -195,11 +205,11 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
 
     Args:
         options: The options of a verb with `add_theory`.
-        found: The theory to lay them over where none is named.
+        found: The theory to change if the user names none.
 
     Raises:
         TheoryError: A choice is wrong, or contradicts another one.
-        MapError: The file that --theory names is of no theory.
+        MapError: The file that --theory names holds no theory.
     """
     chosen = choices_of(options)
     named_theory: str | None = options.theory
@@ -229,7 +239,7 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
 
 
 def choices_of(options: argparse.Namespace) -> dict[str, Any]:
-    """What the options say of single fields of a theory, by name, as it was given."""
+    """The fields of a theory that the user set, by name."""
     chosen = {
         f.name: getattr(options, f.name)
         for f in fields(Theory)
@@ -241,15 +251,16 @@ def choices_of(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
-    """The flags that make a command take this theory: the inverse of `theory_of`.
+    """The flags that choose this theory: the inverse of `theory_of`.
 
-    trace  the trace that it is for: what the default theory settles for it needs no flag
+    Args:
+        theory: The theory.
+        trace: Its trace. Fields that the default theory gets from this trace need no flag.
     """
     default = Theory.causal() if theory.level == "causal" else Theory.topological()
     flags = ["--theory", "causal"] if theory.level == "causal" else []
     if trace is not None:
-        # the theory was made for a trace that has what the default asks for; this one may be
-        # another
+        # The theory may have been settled for another trace, with other evidence.
         with suppress(AbductionError):
             default = settle(trace, default).theory
     for field in fields(Theory):

@@ -1,4 +1,4 @@
-"""What the shell is told of a search: its JSON, its exit code, and why there is no map."""
+"""The result of a search for the shell: JSON, the exit code, and why there is no map."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from ssh_abduction.solver import (
 from ssh_abduction.solver import ending as written_ending
 from ssh_abduction.solver import opening as written_opening
 
-# steps of a trace in which noise is sought after Ctrl-C, at most: in 40,000 that takes two seconds
+# After Ctrl-C, only traces of at most this many steps are searched for noise. 40,000 take 2 s.
 SOON = 10_000
 
 Given: TypeAlias = tuple[SSHMap, Cost | None]
 
-LEAST_LEFT = 0.2  # seconds of a time limit, with less of which the runner-up is not looked at
+LEAST_LEFT = 0.2  # seconds that must be left to solve the trace with the runner-up's views
 
 EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, Status.UNKNOWN: 30}
 
 
 def exit_code(solution: Solution) -> int:
-    """What the shell is told of a solution."""
+    """The exit code for a solution."""
     return (
         program.interrupted_code()
         if solution.stopped == "interrupted"
@@ -48,7 +48,7 @@ def exit_code(solution: Solution) -> int:
 
 
 def explained(search: Search) -> Explanation | None:
-    """Why there is no map, if that is so and there is time to find out."""
+    """Why there is no map; None if there is one, or no time to find out."""
     if search.status is not Status.UNSATISFIABLE or search.theory.jumped:
         return None
     try:
@@ -58,23 +58,23 @@ def explained(search: Search) -> Explanation | None:
 
 
 def opening(search: Search) -> dict[str, Any]:
-    """What the JSON of a solution says before its maps."""
+    """The fields of a solution's JSON before its maps."""
     return written_opening(search.theory, len(search.trace), search.limits.within)
 
 
 def told(given: Given) -> dict[str, Any]:
-    """What the JSON of a solution says of a map: also what it costs, where not all maps cost the same."""
+    """The JSON of a map, with its cost if maps of several costs are listed."""
     ssh_map, cost = given
     return written_map(ssh_map, cost)
 
 
 def given_by(search: Search, ssh_map: SSHMap) -> Given:
-    """The map that a search gave last, and what it costs, where not all maps cost the same."""
+    """The map that a search gave last, with its cost if maps of several costs are listed."""
     return ssh_map, search.cost if search.limits.within else None
 
 
 def all_given(solution: Solution) -> list[Given]:
-    """The same of all maps of a solution, in its order."""
+    """All maps of a solution in its order, as `given_by` gives them."""
     return list(zip_longest(solution.maps, solution.costs if solution.within else ()))
 
 
@@ -85,9 +85,14 @@ def ending(
     maps: int,
     backbone: Backbone | None,
 ) -> dict[str, Any]:
-    """What the JSON of a solution says after its maps, of which there were so many: with all warnings, and why there is no map.
+    """The fields of a solution's JSON after its maps, with all warnings.
 
-    backbone  what the minimal maps share, as far as it is known
+    Args:
+        search: The search.
+        solution: The solution.
+        explanation: Why there is no map, if so.
+        maps: The number of maps that were written.
+        backbone: What the minimal maps share, as far as it is known.
     """
     end = written_ending(solution, maps, backbone)
     found = warnings_of(search, solution)
@@ -100,19 +105,18 @@ def ending(
 
 
 def warnings_of(search: Search, solution: Solution) -> list[str]:
-    """What makes the trace suspicious, a sentence each."""
+    """Sentences about what makes the trace suspicious."""
     if solution.stopped == "interrupted" and len(search.trace) > SOON:
         return []
     return [*solution.warnings, *_second_opinion(search, solution)]
 
 
-_second_opinions: WeakKeyDictionary[Search, list[str]] = (
-    WeakKeyDictionary()
-)  # those sought already, as a search is asked for its warnings twice
+# The warnings of a search are needed twice, but computed once.
+_second_opinions: WeakKeyDictionary[Search, list[str]] = WeakKeyDictionary()
 
 
 def _second_opinion(search: Search, solution: Solution) -> list[str]:
-    """What is said of the runner-up's views, where the trace has them, the search came to an end, and there is time left."""
+    """A sentence if the runner-up's views give another map. Needs a search that ended in time."""
     if search not in _second_opinions:
         limit = search.limits.time_limit
         left = None if limit is None else limit - solution.seconds.total
@@ -125,7 +129,7 @@ def _second_opinion(search: Search, solution: Solution) -> list[str]:
 
 
 def warn(warnings: Sequence[str]) -> None:
-    """Say so on stderr."""
+    """Print warnings on stderr."""
     for warning in warnings:
         print(f"ssh-abduction: warning: {warning}", file=sys.stderr)
 
@@ -137,13 +141,16 @@ def dump(value: dict[str, Any]) -> str:
 
 @contextlib.contextmanager
 def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
-    """Ctrl-C and SIGTERM do this, rather than stop the program wherever it is: what was found is still printed. None: nothing, nor in processes that begin.
+    """Do something else on Ctrl-C and SIGTERM than to end the program at once.
 
-    The guard of the whole program hears nothing meanwhile: who takes signals into his own hands
-    needs a guard of his own if he may be deaf.
+    The guard of the whole program receives no signals meanwhile. So code that may not react to
+    `action` needs a guard of its own.
+
+    Args:
+        action: What to do; None to ignore these signals, also in processes that are started.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may handle signals
+        yield  # Python lets only the main thread handle signals
         return
 
     def hear(number: int, _: object) -> None:

@@ -1,4 +1,4 @@
-"""The parser of the command line: verbs in groups, settings by --set NAME=VALUE, and hints for misspelt names."""
+"""The parser of the command line: groups of verbs, settings, and hints for misspelt names."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from typing import Any, NoReturn
 
 from ssh_abduction.data.errors import printable
 
-# Flags of version 0.1.0 whose value is now given in another way. Each still works in this version,
-# with a warning.
+# Flags of version 0.1.0 that have another name now. They still work, with a warning.
 REPLACED = {
     "as": "format",
     "theory-of": "theory",
     "localize": "run",
 }
 OTHER_VERBS = {"localize": "localise"}
-DRAWN = ("dot", "graphml", "svg")  # what `show` drew, which is `export --to` now
+DRAWN = ("dot", "graphml", "svg")  # flags of `show` in version 0.1.0: `export --to` now
 
 
 @dataclass(frozen=True)
@@ -27,12 +26,12 @@ class Setting:
     """A choice that is made by --set NAME=VALUE.
 
     Attributes:
-        name: Its name, with underscores.
-        help: What it means.
-        type: Makes the value of a text. Raises ValueError or argparse.ArgumentTypeError.
-        choices: The texts that are allowed; None if the type decides.
-        metavar: What stands for the value in the help.
-        many: Whether it may be given again, which makes a list.
+        name: The name, with underscores.
+        help: The help text.
+        type: Converts text to a value. Raises ValueError or argparse.ArgumentTypeError.
+        choices: The texts that are allowed; None if `type` decides.
+        metavar: The placeholder for the value in the help.
+        many: Whether it may be repeated. The value is then a list.
     """
 
     name: str
@@ -53,7 +52,7 @@ class Setting:
         return self.type is true_or_false
 
     def read(self, text: str) -> Any:
-        """The value that a text stands for. Raises argparse.ArgumentTypeError."""
+        """Convert text to a value. Raises argparse.ArgumentTypeError."""
         if self.choices and text not in self.choices:
             expected = " or ".join(filter(None, (", ".join(self.choices[:-1]), self.choices[-1])))
             raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
@@ -65,7 +64,7 @@ class Setting:
 
 
 def true_or_false(text: str) -> bool:
-    """The value of a setting that is on or off."""
+    """Convert "true" or "false" to a value."""
     if text not in ("true", "false"):
         raise argparse.ArgumentTypeError(f"expected true or false, got {text!r}")
     return text == "true"
@@ -102,11 +101,11 @@ class _Set(argparse.Action):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser of argparse with settings, groups of verbs, and hints for misspelt names.
+    """An argparse parser with settings, groups of verbs, and hints for misspelt names.
 
     Attributes:
         settings: The settings of this verb, by name.
-        groups: The verbs of this program, by the heading that the help lists them under.
+        groups: The verbs of this program, by the heading in the help.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -115,12 +114,12 @@ class Parser(argparse.ArgumentParser):
         self.groups: dict[str, tuple[str, ...]] = {}
 
     def add_setting(self, name: str, help_text: str, default: Any = None, **details: Any) -> None:
-        """Add a setting, whose value is an attribute of the options like that of a flag.
+        """Add a setting. Its value becomes an attribute of the options.
 
         Args:
-            name: Its name, with underscores.
-            help_text: What it means.
-            default: Its value where it is not given.
+            name: The name, with underscores.
+            help_text: The help text.
+            default: The value if the setting is not given.
             details: Other fields of Setting.
         """
         if not self.settings:
@@ -129,13 +128,13 @@ class Parser(argparse.ArgumentParser):
                 action=_Set,
                 dest=argparse.SUPPRESS,
                 metavar="NAME=VALUE",
-                help="change one of the settings listed below; may be given again",
+                help="change one of the settings that are listed below; may be given again",
             )
         self.settings[name] = Setting(name, help_text, **details)
         self.set_defaults(**{name: default})
 
     def format_help(self) -> str:
-        """The help of argparse, with the settings, and with the verbs in their groups."""
+        """The help of argparse, with the settings and with the verbs in groups."""
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)
@@ -178,9 +177,9 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"{error.message}{hint}") from None
 
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """As argparse does, but errors about unknown options come from the verb.
+        """Parse the words. The verb reports unknown options, not the program.
 
-        Flags of version 0.1.0 are replaced by what they are now. `notes` of the options says so.
+        Flags of version 0.1.0 are replaced by their new form. `options.notes` says so.
         """
         notes: list[str] = []
         words = self._with_replacements(list(sys.argv[1:] if args is None else args), notes)
@@ -194,7 +193,7 @@ class Parser(argparse.ArgumentParser):
         return options
 
     def _with_replacements(self, words: list[str], notes: list[str]) -> list[str]:
-        """The words of a command line, with flags of version 0.1.0 replaced. Notes say by what."""
+        """Replace flags of version 0.1.0. Appends a sentence for each to `notes`."""
         at = next((i for i, word in enumerate(words) if not word.startswith("-")), None)
         if at is None:
             return words
@@ -215,12 +214,12 @@ class Parser(argparse.ArgumentParser):
         return done
 
     def _replacement(self, word: str, rest: list[str], notes: list[str]) -> list[str] | None:
-        """What stands for a flag of version 0.1.0; None if the word is no such flag.
+        """The new form of a flag of version 0.1.0; None for any other word.
 
         Args:
             word: The flag, perhaps with "=VALUE".
-            rest: The words behind it. The value is taken from there if it is not in the word.
-            notes: Takes a sentence for each flag that is replaced.
+            rest: The words behind it. The value is removed from here if `word` does not contain it.
+            notes: Gets a sentence for each flag that is replaced.
         """
         flag, equals, value = word.partition("=")
         name = flag[2:].replace("-", "_")
@@ -256,11 +255,11 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print a message and the usage, and exit with code 2."""
-        super().error(printable(message))  # which repeats what was typed
+        super().error(printable(message))  # the message repeats what the user typed
 
 
 def _exported(words: list[str], at: int, notes: list[str]) -> list[str]:
-    """The `export` command that does what `show --dot`, `--graphml` or `--svg` did."""
+    """The `export` command for `show --dot`, `--graphml` or `--svg` of version 0.1.0."""
     kept, target = [], None
     rest = words[at + 1 :]
     while rest:
@@ -284,6 +283,6 @@ def _note(old: str, new: str) -> str:
 
 
 def _meant(word: object, names: Iterable[str]) -> str:
-    """A question after the name that is nearest to a word, if one is near."""
+    """A question such as "; did you mean star?" if a name is close to the word; else empty."""
     near = difflib.get_close_matches(str(word), list(names), n=1)
     return f"; did you mean {near[0]}?" if near else ""

@@ -13,8 +13,7 @@ from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import AbductionError, brief, named
 
-# a seed takes seconds: more are surely a slip of the hand, and would fill the memory before the
-# first is run
+# A seed takes seconds. More seeds are surely a typing error, and would fill the memory.
 MOST_SEEDS = 10_000
 
 
@@ -79,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
         )
 
         def show(rows: list[dict[str, Any]]) -> None:
-            progress.stop()  # so that the bar is not drawn into the table
+            progress.stop()  # or the bar would be drawn into the table
             _print(options, rows)
             progress.start()
 
@@ -115,7 +114,7 @@ def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
 
 
 def _seeds(text: str) -> list[int]:
-    """0-19 or 1,5,7. Raises AbductionError."""
+    """The seeds in a text such as "0-19" or "1,5,7". Raises AbductionError."""
     try:
         found: list[int] = []
         for part in text.split(","):

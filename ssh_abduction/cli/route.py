@@ -1,4 +1,4 @@
-"""ssh-abduction route MAPS --from A --to B: the actions that lead there, and the views to expect on the way."""
+"""ssh-abduction route MAPS --from A --to B: the shortest route through a map."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from ssh_abduction.data.files import json_line
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "The shortest route through a map: the actions from one dstate or place to another, and "
-        "the views to expect on the way."
+        "Find the shortest route through a map: the actions from one dstate or place to "
+        "another, and the views to expect on the way."
     )
     parser = verbs.add_parser("route", help="which actions lead there?", description=text)
     parser.add_argument(
-        "maps", help="what solve --json printed, or one saved map; - for standard input"
+        "maps", help="output of solve --json, or one saved map; - for standard input"
     )
     parser.add_argument(
         "--from",
         dest="start",
         metavar="A",
         help=(
-            "a dstate by its number, or a place as p3 (default: where the robot was at its last "
-            "step)"
+            "start: the number of a dstate, or a place such as p3 (default: the robot's last "
+            "dstate)"
         ),
     )
     parser.add_argument(
@@ -33,36 +33,36 @@ def add_parser(verbs: Verbs) -> None:
         dest="goal",
         metavar="B",
         required=True,
-        help="a dstate by its number, or a place as p3: any dstate there",
+        help="goal: the number of a dstate, or a place such as p3, which means any dstate there",
     )
     parser.add_argument(
         "--avoid",
         nargs="+",
         action="extend",
         metavar="X",
-        help="dstates, and places as p3, that the route may not touch",
+        help="dstates, and places such as p3, that the route must not visit",
     )
     by = (
-        "what the route has the fewest of: actions or metres, through links that were driven "
-        "before, or places, along the paths of the map, driven that way or not (default: actions)"
+        "what to minimise: actions or metres, over links that were driven before; or places, "
+        "along the paths of the map, even where nobody drove (default: actions)"
     )
     parser.add_argument("--by", choices=("actions", "places", "metres"), default="actions", help=by)
     parser.add_argument(
         "--map",
         default="1",
         metavar="I",
-        help="which map, by its number, from 1, or its id (default: the first)",
+        help="the number of the map, from 1, or its id (default: 1)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "ssh-abduction show lists the dstates and places of a map. docs/reference/formats.md says "
-        "what the JSON has."
+        "ssh-abduction show lists the dstates and places of a map. docs/reference/formats.md "
+        "describes the JSON."
     )
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.online.routes import route, told_action  # which loads networkx
+    from ssh_abduction.online.routes import route, told_action  # loads networkx
     from ssh_abduction.rivals.listing import Listing
 
     listing = Listing.load(options.maps)
@@ -102,5 +102,5 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _names(words: list[str] | None) -> list[str]:
-    """What is avoided: several words, each perhaps of several names with commas between them."""
+    """The names to avoid: a word may hold several, separated by commas."""
     return [name for word in words or () for name in word.split(",") if name]

@@ -1,4 +1,4 @@
-"""ssh-abduction show MAPS: a map as text, or as a graph for other programs."""
+"""ssh-abduction show MAPS: print maps as text."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from ssh_abduction.data.maps import maps_of
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Show maps: dstates, places, paths, links."
+    text = "Print the dstates, places, paths and links of maps."
     parser = verbs.add_parser(
         "show", help="print the dstates, places, paths and links of maps", description=text
     )
-    parser.add_argument("maps", help="what solve --json printed, or one saved map")
+    parser.add_argument("maps", help="output of solve --json, or one saved map")
     parser.add_argument(
         "--map",
         type=int,

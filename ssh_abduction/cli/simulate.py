@@ -1,4 +1,4 @@
-"""ssh-abduction simulate WORLD: drive tours, and log images, actions and odometry at dstates, or scans all along as real robots do."""
+"""ssh-abduction simulate WORLD: drive a robot through a world, and write a trace or a log."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ SHARE: dict[str, Any] = {"type": float, "metavar": "SHARE"}
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Drive tours through a world, and log an image, an action and the odometry at each "
-        "dstate; views are left to cluster. "
-        "Or, with --format, log scans and odometry all along, as real robots do, and write the "
-        "truth about places beside the log."
+        "Drive a robot through a world. Logs an image, an action and the odometry at each "
+        "dstate; run cluster on the result to get views. With --format, logs scans and "
+        "odometry all along the way, like a real robot, and writes the true places to a file "
+        "beside the log."
     )
     parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
     parser.add_argument(
@@ -55,28 +55,35 @@ def add_parser(verbs: Verbs) -> None:
         "--format",
         dest="log",
         choices=("carmen", "bag"),
-        help="write a robot's log instead of a trace: lines of CARMEN, or a bag of ROS "
-        "(.bag, .mcap, or a folder)",
+        help=(
+            "write a robot's log instead of a trace: a CARMEN log, or a ROS bag (.bag, .mcap, or "
+            "a folder)"
+        ),
     )
     parser.add_argument(
         "--tours",
         type=int,
         default=1,
         metavar="N",
-        help="how often the route is driven (default: 1)",
+        help="drive the route N times (default: 1)",
     )
     parser.add_argument("--seed", type=seed, default=0, help="seed of all noise (default: 0)")
     parser.add_argument(
         "--route",
         metavar="ACTIONS",
-        help="another route than the world's; travel, right, left, around with commas",
+        help=(
+            "drive this route instead of the world's: travel, right, left and around, separated "
+            "by commas"
+        ),
     )
     parser.add_argument(
         "--images",
         choices=("ranges", "panoramas"),
         default="ranges",
-        help="log ranges of the laser, or panoramas of a camera that looks all around, which go "
-        "to a file .npz beside the trace (default: ranges)",
+        help=(
+            "log laser ranges, or panoramas of a 360-degree camera, which are written to an .npz "
+            "file beside the trace (default: ranges)"
+        ),
     )
     for name, text, default, details in (
         ("stars", "whether to log the openings at each place", True, FLAG),
@@ -162,7 +169,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _drive(options: argparse.Namespace) -> Drive:
-    """The drive that is to be logged as robots do. Raises AbductionError."""
+    """The drive to write as a robot's log. Raises AbductionError."""
     import math
 
     from simulator.drive import EVERY
@@ -238,7 +245,7 @@ def _write_log(options: argparse.Namespace, drive: Drive) -> int:
 
 
 def scans_of(drive: Drive) -> Iterator[Scan]:
-    """What a robot's log holds of a drive: its scans, with the true poses as the corrected ones."""
+    """The scans of a drive, with the true poses as corrected poses."""
     from perception.readers.scans import Laser, Scan
     from simulator.laser import BEAMS, BEARINGS
 
@@ -255,7 +262,7 @@ def scans_of(drive: Drive) -> Iterator[Scan]:
 
 
 def _camera(options: argparse.Namespace) -> Camera | None:
-    """The camera that was asked for. Raises AbductionError."""
+    """The camera that the options ask for. Raises AbductionError."""
     from simulator.panorama import Camera, Paint
 
     if options.images == "ranges":
@@ -280,7 +287,7 @@ def _camera(options: argparse.Namespace) -> Camera | None:
 
 
 def _with_table(trace: Trace, target: str) -> Trace:
-    """The trace whose panoramas are in a file beside it, which is written."""
+    """Write the panoramas to a file beside the trace. Returns the trace that refers to it."""
     import io
     from dataclasses import replace
     from pathlib import Path

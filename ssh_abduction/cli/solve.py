@@ -1,4 +1,4 @@
-"""ssh-abduction solve TRACE: the minimal maps of a trace. Many traces go to batch.py."""
+"""ssh-abduction solve TRACE: find the minimal maps of a trace. batch.py solves many traces."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ from ssh_abduction.solver import (
 )
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
-# So many maps are compared on the terminal, at most, and so many are put in order in JSON: of more
-# the first ones found are compared, and all are printed as found.
+# At most this many maps are compared on the terminal, and sorted in JSON. If there are more, the
+# first ones are compared, and all are printed as they are found.
 HELD = 1000
-# And maps of so many dstates together, so that they take some 100 MB at most.
+# The maps that are held for sorting have at most this many dstates together, or about 100 MB.
 HELD_DSTATES = 500_000
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Find the minimal maps of a trace, or of many: then the result of each is one line."
+    text = "Find the minimal maps of a trace. With several traces, the result of each is one line."
     parser = verbs.add_parser(
         "solve", help="find the minimal maps of a trace, or of many", description=text
     )
@@ -68,47 +68,48 @@ def add_parser(verbs: Verbs) -> None:
         type=int,
         default=100,
         metavar="K",
-        help="stop after K maps; 0 for all (default: 100)",
+        help="list at most K maps; 0 for all (default: 100)",
     )
     more = (
-        "list maps with up to K dstates more than the least, too: for each number of dstates the "
-        "best (default: 0)"
+        "also list maps with up to K dstates more than the minimum; of each number of "
+        "dstates, only the best maps (default: 0)"
     )
     parser.add_argument("--within", type=int, default=0, metavar="K", help=more)
     parser.add_argument(
         "--json",
         action="store_true",
-        help="print the solution as JSON, map by map as they are found; of many traces, a line each",
+        help="print the solution as JSON; for many traces, one line each",
     )
     front = (
-        "instead, the fewest dstates for 0, 1, … K faults, and the knee, by the causal theory "
-        "(--misread, --slipped: only these kinds)"
+        "report the fewest dstates for 0 to K faults, and the knee, by the causal theory; "
+        "with --misread or --slipped, only faults of these kinds"
     )
     parser.add_argument("--front", type=int, metavar="K", help=front)
     parser.add_argument(
         "--time-limit",
         type=float,
         metavar="S",
-        help="stop after S seconds with the best answer so far",
+        help="stop after S seconds and print the best answer so far",
     )
     parser.add_argument(
         "--memory-limit",
         type=int,
         metavar="MIB",
-        help="stop when the process has used so much memory",
+        help="stop when the process has used this much memory",
     )
     many = parser.add_argument_group(
         "many traces",
-        "With several traces, or one of these, each result is a line, in the order of the traces. "
-        "What goes wrong with a trace is on its line, "
-        "and the others go on. The exit code is 1 if anything went wrong, else the highest of the "
-        "traces' codes. Limits are for each trace, but "
-        "memory is that of the process: what other threads of a Dask worker use counts too, and, "
-        "except on Linux, what traces before used.",
+        (
+            "With several traces, or with one of these options, each result is a line, in the "
+            "order of the traces. An error is printed on the line of its trace, and the other "
+            "traces go on. The exit code is 1 if there was an error, else the highest code of the "
+            "traces. Limits hold for each trace. The memory is that of the whole process: it "
+            "includes other threads of a Dask worker and, except on Linux, earlier traces."
+        ),
     )
     jobs = (
-        "solve N traces at a time, each in a process; -1 for one a core (default: 1; with "
-        "--scheduler, as many as its workers can)"
+        "solve N traces at a time, each in its own process; -1 for one per core (default: 1; "
+        "with --scheduler, as many as its workers can)"
     )
     many.add_argument("--jobs", type=int, metavar="N", help=jobs)
     many.add_argument(
@@ -119,7 +120,7 @@ def add_parser(verbs: Verbs) -> None:
     add_theory(parser)
     parser.add_setting(
         "without_speedups",
-        f"speed-ups to leave out, with commas between: {', '.join(SPEEDUPS)}",
+        f"speed-ups to turn off, separated by commas: {', '.join(SPEEDUPS)}",
         default="",
         metavar="NAMES",
     )
@@ -151,9 +152,8 @@ def run(options: argparse.Namespace) -> int:
                 speedups=Speedups.without(options.without_speedups),
                 on_progress=on_progress,
             )
-            until_printed.enter_context(
-                on_ctrl_c(search.interrupt)
-            )  # half of what is printed would be worth nothing
+            # Half of the output would be useless.
+            until_printed.enter_context(on_ctrl_c(search.interrupt))
             printed = (_Json if options.json else _Text)(search)
             guard = Guard(
                 search.interrupt, printed.last_words, options.time_limit, options.memory_limit
@@ -167,9 +167,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 class _Text:
-    """What is printed of a search for people.
+    """The output of a search for people.
 
-    kept  the first maps; the others are counted and let go
+    Attributes:
+        kept: The first maps. Further maps are only counted.
     """
 
     def __init__(self, search: Search) -> None:
@@ -178,7 +179,7 @@ class _Text:
         self._room = HELD_DSTATES
 
     def searched(self, _: Callable[[Callable[[], str]], None]) -> Explanation | None:
-        """Search, and explain why there is no map, if that is so."""
+        """Search, and explain why there is no map, if so."""
         for ssh_map in self._search:
             if len(self.kept) < HELD and self._room > 0:
                 self.kept.append(ssh_map)
@@ -186,11 +187,11 @@ class _Text:
         return explained(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
-        """All that is to be printed."""
+        """The whole output."""
         return _text(_lines(self._search, solution, explanation, self._search.backbone))
 
     def last_words(self, why: Stop) -> tuple[str, int]:
-        """What is known, where the search cannot be ended in time, and the exit code."""
+        """What is known if the search cannot be stopped in time, and the exit code."""
         solution = self._search.snapshot(why)
         kept = (
             tuple(self.kept) if solution.status is Status.OPTIMAL and self.kept else solution.maps
@@ -202,26 +203,25 @@ class _Text:
 
 
 class _Json:
-    """What is printed of a search for programs: the maps, one a line.
+    """The output of a search for programs: JSON with one map a line.
 
-    They are held until they can be put in order; where they are too many, all are printed as they
-    come.
+    The maps are held to sort them. If there are too many, all are printed as they are found.
     """
 
     def __init__(self, search: Search) -> None:
         self._search = search
         self._held: list[Given] = []
         self._room = HELD_DSTATES
-        self._maps = 0  # that were printed
+        self._maps = 0  # maps that were printed
         self._begun = False
 
     @property
     def kept(self) -> list[SSHMap]:
-        """The maps that are held: all, or none."""
+        """The maps that are held: all maps, or none."""
         return [ssh_map for ssh_map, _ in self._held]
 
     def searched(self, say: Callable[[Callable[[], str]], None]) -> Explanation | None:
-        """Hold the maps, or print them as they are found, and explain why there is none, if that is so."""
+        """Search, and hold the maps or print them. Explain why there is none, if so."""
         say(self._opening)
         for ssh_map in self._search:
             given = given_by(self._search, ssh_map)
@@ -235,7 +235,7 @@ class _Json:
         return explained(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
-        """The maps that are held, and what comes after them."""
+        """The maps that are held, and the end of the JSON."""
         maps = "".join(map(self._line, all_given(solution)))
         return maps + self._end(solution, explanation, self._search.backbone)
 
@@ -249,13 +249,13 @@ class _Json:
         )
 
     def last_words(self, why: Stop) -> tuple[str, int]:
-        """What is missing, with what is known, where the search cannot be ended in time, and the exit code."""
+        """The rest of the JSON if the search cannot be stopped in time, and the exit code."""
         solution = self._search.snapshot(why)
         warn(warnings_of(self._search, solution))
         words = ("" if self._begun else self._opening()) + self._let_go()
         if not self._maps and solution.maps:
             words += self._line((solution.maps[0], None))
-        # The backbone is not asked for, which another thread may be changing.
+        # The backbone is left out: another thread may be changing it.
         return words + self._end(solution, None, None), exit_code(solution)
 
     def _opening(self) -> str:
@@ -263,7 +263,7 @@ class _Json:
         return dump(opening(self._search))[:-1] + ', "maps": ['
 
     def _let_go(self) -> str:
-        """The maps that are held, in the order in which they were found."""
+        """The held maps in the order in which they were found. They are not held any longer."""
         held, self._held = self._held, []
         return "".join(map(self._line, held))
 
@@ -317,7 +317,12 @@ def _lines(
 
 @contextlib.contextmanager
 def _progress(prints_meanwhile: bool) -> Iterator[Any]:
-    """A line on stderr, while solving, if stderr is a terminal, unless it would come between the lines that are printed meanwhile, or of the log."""
+    """Show a line of progress on stderr while solving, if stderr is a terminal.
+
+    Args:
+        prints_meanwhile: Whether output is printed during the search. If it goes to the same
+            terminal, no progress is shown.
+    """
     if (
         not sys.stderr.isatty()
         or (prints_meanwhile and sys.stdout.isatty())
@@ -330,8 +335,7 @@ def _progress(prints_meanwhile: bool) -> Iterator[Any]:
     from rich.spinner import Spinner
 
     status = Spinner("dots", "solving")
-    # Unless told otherwise, rich takes over what is printed to stdout, too: it would go to stderr,
-    # fitted to the terminal's width.
+    # By default rich also redirects stdout to stderr and wraps it to the terminal's width.
     with Live(
         status,
         console=Console(stderr=True),

@@ -18,11 +18,9 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison
     from ssh_abduction.rivals.questions import Matter
 
-# So many pairs of steps are told of, at most, as more cannot be taken in on a terminal.
-SHOWN_PAIRS = 12
-# So many questions of one choice, and so many ways to answer them, are told of, at most.
-SHOWN_QUESTIONS, SHOWN_OPTIONS = 12, 12
-# What differs at one step, and at several.
+# At most this many pairs of steps, questions of a choice, and options of a choice are printed.
+SHOWN_PAIRS = SHOWN_QUESTIONS = SHOWN_OPTIONS = 12
+# What two maps differ in: in singular and plural.
 NOUNS: dict[Matter, tuple[str, str]] = {
     "faults": ("fault", "faults"),
     "dstates": ("dstate", "dstates"),
@@ -33,9 +31,12 @@ NOUNS: dict[Matter, tuple[str, str]] = {
 
 
 def headline(solution: Solution, count: int, explanation: Explanation | None) -> str:
-    """How a search ended, on one line.
+    """One line about how a search ended.
 
-    `count` is how many maps it found, of which the solution need not hold any.
+    Args:
+        solution: The solution.
+        count: The number of maps that the search found. The solution may hold fewer.
+        explanation: Why there is no map, if so.
     """
     if explanation:
         return f"{solution.status.value}: {explanation}"
@@ -84,7 +85,7 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
 
 
 def _levels_above(solution: Solution) -> str:
-    """How many maps cost more than the least, and what they cost."""
+    """The number and the cost of the maps above the minimum."""
     return "".join(
         f"; {level.count} with {', '.join(counted(v, k) for k, v in level.cost.to_dict().items())}"
         for level in solution.levels[1:]
@@ -92,7 +93,10 @@ def _levels_above(solution: Solution) -> str:
 
 
 def by_displacements(solution: Solution) -> Iterator[str]:
-    """What displacements excluded, and how well the maps close by them; nothing where they are not used."""
+    """Lines about displacements: what they excluded, and how well the maps close.
+
+    There are none if displacements are not used.
+    """
     said = solution.evidence.get("displacement")
     if said is None:
         return
@@ -120,7 +124,7 @@ def by_displacements(solution: Solution) -> Iterator[str]:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Columns aligned under a head. What would break the table, or steer the terminal, is escaped."""
+    """A table with aligned columns. Control characters are escaped."""
     cells = [[*head], *([printable(str(cell)) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     return "\n".join(
@@ -131,7 +135,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def describe(ssh_map: SSHMap) -> str:
-    """A map: its paths with their places in order, and its dstates with where they are and where actions lead."""
+    """A map as text: its paths with their places in order, and its dstates with their links."""
     parts = []
     if ssh_map.faults:
         parts.append(
@@ -163,7 +167,7 @@ def describe(ssh_map: SSHMap) -> str:
 
 
 def describe_backbone(backbone: Backbone, trace: Trace) -> str:
-    """For each dstate that all minimal maps have, the steps at it; then the steps that are one dstate, or at one place, in some minimal maps only."""
+    """The steps that are one dstate in all minimal maps, and the pairs that are one in some."""
     steps: dict[int, list[int]] = {}
     for t, number in enumerate(backbone.dstates.always):
         steps.setdefault(number, []).append(t)
@@ -197,9 +201,9 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
 
 
 def compared(found: Comparison) -> Iterator[str]:
-    """What maps differ in, choice by choice, and which questions decide.
+    """Lines about the choices in which maps differ, and the questions that decide between them.
 
-    Nothing where they do not differ.
+    There are none if the maps do not differ.
     """
     number = {question: i for i, question in enumerate(found.deciding, 1)}
     if found.product:
@@ -250,7 +254,7 @@ def compared(found: Comparison) -> Iterator[str]:
 
 
 def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
-    """The dstates of steps 48 and 51; the paths of step 66."""
+    """Words for what differs, such as "the dstates of steps 48 and 51; the paths of step 66"."""
     shown = {
         sort: steps
         for sort, steps in differing.items()
@@ -268,10 +272,10 @@ def _numbered(numbers: Sequence[int], count: int) -> str:
 
 
 def told_steps(steps: Sequence[int]) -> str:
-    """step 40; steps 12–15 and 40."""
+    """Words for steps, such as "step 40" or "steps 12–15 and 40"."""
     return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"
 
 
 def course(path: int | None, direction: int | None) -> str:
-    """A path and the direction along it: 2+ or 2-."""
+    """A path and a direction along it, such as "2+" or "2-"."""
     return "" if path is None else f"{path}{'+' if direction == 1 else '-'}"

@@ -1,4 +1,4 @@
-"""ssh-abduction theory: every axiom, and the presets that have it."""
+"""ssh-abduction theory: list the axioms, and the presets that include them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,7 @@ from ssh_abduction.theory.theory import PRESETS
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = (
-        "List every axiom: name, sentence, source, and which presets have it, without and with "
-        "stars in the trace."
-    )
+    text = "List every axiom with its name, sentence and source, and the presets that include it."
     parser = verbs.add_parser("theory", help="list the axioms", description=text)
     parser.set_defaults(run=run)
 

@@ -1,4 +1,4 @@
-"""ssh-abduction train, learning-curve, recognise: the map's labels teach a recogniser, which then knows a dstate from one image."""
+"""ssh-abduction train, learning-curve, tell-apart and recognise: learn dstates from images."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     train.set_defaults(run=run_train)
     text = (
-        "Recognition rate by 10-fold cross-validation, against the number of images, on the "
-        "labels that a map gives."
+        "Compute the recognition rate for growing numbers of images, by 10-fold "
+        "cross-validation on the labels that a map gives."
     )
     curve = verbs.add_parser(
         "learning-curve",
@@ -50,11 +50,13 @@ def add_parser(verbs: Verbs) -> None:
     curve.add_argument("--json", action="store_true", help="print JSON")
     curve.set_defaults(run=run_learning_curve)
     text = (
-        "Say by which beams two dstates differ that look alike: by default, each pair of dstates "
-        "that share a view."
+        "Find the beams that differ between two dstates that look alike: by default, for each "
+        "pair of dstates with the same view."
     )
     apart = verbs.add_parser(
-        "tell-apart", help="which beams tell dstates apart that share a view", description=text
+        "tell-apart",
+        help="find the beams that tell apart dstates with the same view",
+        description=text,
     )
     apart.add_argument(
         "--dstates",
@@ -81,8 +83,8 @@ def add_parser(verbs: Verbs) -> None:
             help="take the I-th map, from 1 (default: the labels all maps agree on)",
         )
     text = (
-        "Say of each image of a trace at which dstate it was taken, or that it was taken nowhere "
-        "that the recogniser knows."
+        "Find the dstate where each image of a trace was taken, or nowhere if the recogniser "
+        "does not know it."
     )
     recognise = verbs.add_parser(
         "recognise", help="recognise dstates from images", description=text
@@ -106,7 +108,7 @@ def pair(text: str) -> tuple[int, int]:
 
 
 def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
-    """The images of a trace and their labels, where these are sure, and a recogniser for such images, which has not learnt yet."""
+    """The images of a trace with reliable labels, the labels, and an untrained recogniser."""
     from perception.recognition import recogniser
 
     images, labels, _, features = _mapped(options)
@@ -114,7 +116,7 @@ def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
 
 
 def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
-    """The images and their labels, the map whose labels they are, and what makes features of the images."""
+    """The images, their labels, the map that the labels come from, and the maker of features."""
     from perception.appearance import features_of
     from perception.images import images_of
     from ssh_abduction.learning.learner import labels_of

@@ -1,4 +1,4 @@
-"""How much a command tells on stderr: -q, -v, and now and then a line of progress where stderr is no terminal."""
+"""The options -q and -v, and lines of progress on stderr."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from collections.abc import Iterator
 from ssh_abduction.data.errors import printable
 from ssh_abduction.runtime.logs import PACKAGE, PROGRESS
 
-# Seconds between two lines of progress, and before the first one: a log is to be read, and most
-# commands are done by then.
+# Seconds before the first line of progress, and between two lines. Most commands end earlier.
 EVERY = 10.0
 LEVELS = {1: logging.INFO, 2: logging.DEBUG}
 
 
 def add_verbosity(parser: argparse.ArgumentParser) -> None:
-    """Add -q and -v to a parser, before or behind the verb."""
+    """Add -q and -v to a parser. They may stand before or behind the verb."""
     told = parser.add_argument_group("messages").add_mutually_exclusive_group()
-    none = argparse.SUPPRESS  # else the verb's own would replace what stands before the verb
+    none = argparse.SUPPRESS  # a default of the verb would overwrite a flag before the verb
     told.add_argument(
         "-q",
         "--quiet",
@@ -41,10 +40,12 @@ def add_verbosity(parser: argparse.ArgumentParser) -> None:
 
 @contextlib.contextmanager
 def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
-    """Tell as much as the options ask for, while a command runs.
+    """Log on stderr, while a command runs, as much as the options ask for.
 
-    for_programs  whether what it prints is read by programs: then nothing is told now and then
-    where stdout and stderr go to one file
+    Args:
+        options: The options, with those of `add_verbosity`.
+        for_programs: Whether other programs read the output. Then there are no lines of progress
+            if stdout and stderr are one file.
     """
     verbose = getattr(options, "verbose", 0)
     if getattr(options, "quiet", False):
@@ -76,14 +77,14 @@ def _handled(log: logging.Logger, handler: logging.Handler, level: int) -> Itera
 
 
 def _is_one_file() -> bool:
-    """Whether stdout and stderr go to one file or pipe, so that lines of progress would come between the lines of an answer."""
+    """Whether stdout and stderr are one file, where lines of progress would mix with the answer."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         return os.path.samestat(os.fstat(sys.stdout.fileno()), os.fstat(sys.stderr.fileno()))
     return False
 
 
 class _Told(logging.Handler):
-    """Prints each record with the seconds since the command began, and the module that it comes from."""
+    """Prints each record with its module and the seconds since the command began."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -109,7 +110,6 @@ class _NowAndThen(logging.Handler):
 
 
 def _say(text: str) -> None:
-    with contextlib.suppress(
-        OSError, ValueError
-    ):  # whoever reads the log may leave: the command goes on
+    # Whoever reads the log may leave: the command goes on.
+    with contextlib.suppress(OSError, ValueError):
         print(f"ssh-abduction: {printable(text)}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""ssh-abduction view MAPS [TRACE]: rival maps on one page in the browser."""
+"""ssh-abduction view MAPS [TRACE]: show rival maps on one page in the browser."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ ASSUMING = (
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Show maps in the browser, on one page: what all share, where they differ, each map, two "
-        "side by side, and what happened at each step."
+        "Show maps in the browser, on one page: what all maps share, where they differ, each "
+        "map alone, two maps side by side, and what happened at each step."
     )
     parser = verbs.add_parser("view", help="see rival maps in the browser", description=text)
     parser.add_argument(
-        "maps", help="what solve --json printed, or one saved map; - for standard input"
+        "maps", help="output of solve --json, or one saved map; - for standard input"
     )
     parser.add_argument(
         "trace",
         nargs="?",
-        help="the trace that was mapped: for its actions and laser images, and for --serve",
+        help="the trace that was mapped; adds actions and laser images, and is needed for --serve",
     )
     parser.add_argument(
-        "-o", "--output", metavar="FILE", help="write the page to this file, and do not open it"
+        "-o", "--output", metavar="FILE", help="write the page to this file and do not open it"
     )
     localised = (
-        "also replay this run of a robot, with the belief where it may be at each step, in each "
-        "rival. It may be TRACE itself. It is localised by its views, or as "
-        "--belief says"
+        "also replay this run, a trace, with the belief about the robot's position at each "
+        "step in each map. It may be TRACE itself. It is localised by its views, or by "
+        "--belief"
     )
     parser.add_argument("--run", dest="followed", metavar="RUN", help=localised)
     parser.add_argument(
         "--belief",
         metavar="FILE",
-        help="what localise --json printed of the run of --run, or of TRACE",
+        help="output of localise --json for the run of --run, or for TRACE",
     )
     serve = (
-        "serve the page on this computer alone, so that it can explain, and solve again under "
-        "what is assumed; needs TRACE. Ctrl-C ends it"
+        "serve the page, on this computer only, so that it can explain, and solve again with "
+        "assumptions; needs TRACE. Ctrl-C ends it"
     )
     parser.add_argument("--serve", action="store_true", help=serve)
     parser.add_argument(
@@ -62,11 +62,11 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         default=30.0,
         metavar="S",
-        help="with --serve, seconds for an answer (default: 30)",
+        help="with --serve, the seconds for each answer (default: 30)",
     )
     parser.add_setting(
         "port",
-        "with --serve, the port (default: any that is free)",
+        "with --serve, the port (default: any free port)",
         0,
         type=int,
         metavar="N",
@@ -80,15 +80,15 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.set_defaults(run=run)
     parser.epilog = (
-        "The page is one file that loads nothing from elsewhere. Without --serve it says which "
-        "commands answer its questions."
+        "The page is one file that works without a network. Without --serve, it shows the "
+        "commands that answer its questions."
     )
 
 
 def run(options: argparse.Namespace) -> int:
     from ssh_abduction.data.map_file import read_json
     from ssh_abduction.data.trace import Trace
-    from ssh_abduction.page.content import Called, content_of  # which loads numpy
+    from ssh_abduction.page.content import Called, content_of  # loads numpy
     from ssh_abduction.page.html import Page
     from ssh_abduction.rivals.listing import Listing
     from ssh_abduction.theory.theory import Theory
@@ -137,14 +137,17 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
-    """What the page knows without a server of what assumptions cost: texts, and by pairs of steps the number of the text for one dstate, and for different ones."""
+    """What the page can say about the cost of assumptions without a server.
+
+    Returns:
+        The texts, and for each pair of steps the numbers of the texts for one dstate and for
+        different dstates.
+    """
     from ssh_abduction.page.assumed import assumptions
 
     try:
         known = assumptions(listing, trace, theory, ASSUMING)
-    except (
-        AbductionError
-    ):  # the file was made with a theory that does not suit this trace: then nobody can say
+    except AbductionError:  # the theory of the file does not suit this trace
         known = {}
     texts = list(
         dict.fromkeys(text for told in known.values() for text in (told["same"], told["different"]))
@@ -158,7 +161,7 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
 
 
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
-    """The run that is localised, if one was asked for. Raises AbductionError."""
+    """The localised run that the options ask for. Raises AbductionError."""
     from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.replays import Run
 
@@ -258,7 +261,7 @@ def _serve(
             server.serve_forever()
         except KeyboardInterrupt:
             if program.heard[-1:] != [signal.SIGTERM]:
-                program.raised.clear()  # Ctrl-C is how a page is closed
+                program.raised.clear()  # Ctrl-C is the normal way to end the server
         finally:
             end_all()
     return 0

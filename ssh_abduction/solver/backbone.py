@@ -256,9 +256,8 @@ class _Reasoning:
                 head = heads.setdefault(known.always[c], c)
                 if head != c:
                     yield sort, firsts[head], firsts[c], False
-                if sort == "paths" and ((c, c) in known.together) != (
-                    c in known.unnamed
-                ):  # whether it is along a path
+                # Whether it is along a path.
+                if sort == "paths" and ((c, c) in known.together) != (c in known.unnamed):
                     yield sort, firsts[c], firsts[c], c in known.unnamed
             for c, d in combinations(heads.values(), 2):
                 if (c, d) not in known.together and (

@@ -66,9 +66,8 @@ class NearMinimal:
         assert count is not None
         least = minimal[self._task.theory.priorities.index(count)]
         self.engine.grow(len(self._task.trace))
-        for number in range(
-            least + 1, min(least + within, len(self._task.trace)) + 1
-        ):  # there are no more of anything than there are steps
+        # There are no more of anything than there are steps.
+        for number in range(least + 1, min(least + within, len(self._task.trace)) + 1):
             self.engine.ask_for(number, count)
             known = Known(self._task.theory)
             found = Prefixes(

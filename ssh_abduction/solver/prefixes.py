@@ -130,9 +130,8 @@ class Prefixes:
                 self._known.keep(
                     replace(minimal, map=self._whole(minimal.map, replayed)), replayed.labels
                 )
-            if (
-                self._known.best is not None and self._known.cost <= minimal.cost
-            ):  # a map of the whole trace, as cheap as any of the prefix
+            # A map of the whole trace, as cheap as any of the prefix.
+            if self._known.best is not None and self._known.cost <= minimal.cost:
                 self._known.status = Status.OPTIMAL
                 return
             size = self.engine.next_size(len(replayed.labels))

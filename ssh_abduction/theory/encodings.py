@@ -10,13 +10,14 @@ from pathlib import Path
 
 from ssh_abduction.data.files import shipped
 
+# Each needs those before it; files that are added come after them, by name.
 FIRST = (
     "causal",
     "topological",
     "boundary",
     "star",
     "gateways",
-)  # each needs those before it; files that are added come after them, by name
+)
 _AXIOM = re.compile(
     r"^% @axiom\((?P<name>\w+)\) (?:(?P<sentence>.+?) \[(?P<source>[^\]]+)\](?: if "
     r"(?P<when>.+))?|(?P<alone>.+))$"

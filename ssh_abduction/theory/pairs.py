@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
 
-Earlier: TypeAlias = Mapping[
-    int, frozenset[int]
-]  # for a step, the earlier steps with which it makes a pair
+# For a step, the earlier steps with which it makes a pair.
+Earlier: TypeAlias = Mapping[int, frozenset[int]]
 
 
 @dataclass(frozen=True)

@@ -168,10 +168,11 @@ def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozense
 
 
 CAUSAL = frozenset({"functional_view", "deterministic"})
+# A dstate has one observation, one place, and one course.
 ONE_OF_EACH = CAUSAL | {
     "one_place",
     "one_course",
-}  # a dstate has one observation, one place, and one course
+}
 TRAVELS_AND_TURNS = CAUSAL | {
     "one_place",
     "turn_stays",

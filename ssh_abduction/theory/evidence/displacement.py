@@ -170,12 +170,10 @@ class Returns:
         self.reckoning: Reckoning = reckoning or Reckoning(
             trace, before.reckoning if before else None
         )
-        self._accepted: dict[_Course, Together] = (
-            dict(before._accepted) if before else {}
-        )  # the last one last
-        self._refused: list[frozenset[Equality]] = (
-            list(before._refused) if before else []
-        )  # sets of two returns, the last one last
+        # The last one last.
+        self._accepted: dict[_Course, Together] = dict(before._accepted) if before else {}
+        # Sets of two returns, the last one last.
+        self._refused: list[frozenset[Equality]] = list(before._refused) if before else []
         self._pairs: Pairs | None = before._pairs if before else None
         self._likely: int | None = before._likely if before else None
         if before and (self._pairs is not None or self._likely is not None):
@@ -289,9 +287,8 @@ class Returns:
         drifts = [
             number for number, unlikely in enumerate(self.reckoning.unlikely) if unlikely <= most
         ]
-        for numbers in filter(
-            None, (drifts[:1], drifts[1:])
-        ):  # most true returns close without a drift, and most false ones with none
+        # Most true returns close without a drift, and most false ones with none.
+        for numbers in filter(None, (drifts[:1], drifts[1:])):
             refused = np.ones(len(first), dtype=bool)
             for part in _parts(len(first), AT_A_TIME // max(len(numbers), 1)):
                 i, j = first[part], last[part]

@@ -297,9 +297,8 @@ class Reckoning:
             loops.part[since].tolist(),
         )
         found, shift = [], begin
-        for t in range(
-            start - shift, len(part)
-        ):  # the beginning never goes back, as the heading gets no better
+        # The beginning never goes back, as the heading gets no better.
+        for t in range(start - shift, len(part)):
             here = begin - shift
             while (
                 part[here] < part[t]

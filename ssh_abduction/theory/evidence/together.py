@@ -131,9 +131,8 @@ class Together:
         inverse = alone.inverse[later]
         gathered = self._loops(self._number).of_ends(end) @ inverse.T
         before = np.arange(end + 1)[:, None] < first
-        gathered = np.where(
-            before, gathered[first, np.arange(len(later))], gathered
-        )  # what comes before a loop is no part of it
+        # What comes before a loop is no part of it.
+        gathered = np.where(before, gathered[first, np.arange(len(later))], gathered)
         share = (
             gathered[rows[earlier, 1]]
             - gathered[rows[earlier, 0]]
@@ -171,10 +170,11 @@ class Together:
         """By how much the chi-square of each set is above the threshold, for one drift; 0 where it is not."""
         alone, rows, loops = self._of_each(number), self.rows, self._loops(number)
         squares = alone.square[later] + alone.square[earlier]
+        # Of what both loops share.
         begin, stop = (
             np.maximum(rows[earlier, 0], rows[later, 0]),
             rows[earlier, 1],
-        )  # of what both loops share
+        )
         gathered = loops.of_ends(end)
         share = self._largest_share(alone, later, gathered[stop] - gathered[begin])
         excess = np.zeros(len(later))

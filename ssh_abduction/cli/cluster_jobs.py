@@ -1,0 +1,250 @@
+"""Answer a question about many files on the workers of a Dask scheduler."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import re
+import time
+import warnings
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import CancelledError
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from ssh_abduction.cli.jobs import Asked, StopFlag
+from ssh_abduction.cli.outcome import warn
+from ssh_abduction.data.errors import AbductionError, SolverError, brief
+from ssh_abduction.solver import POLL, workers
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+Task: TypeAlias = tuple[int, str]  # the number of a file, and its path
+PATIENCE = 10  # seconds to wait for a Dask scheduler, and for its first worker
+LOOK = 1.0  # seconds between two checks that the cluster still has a worker
+LOST = (
+    "scheduler: expected an answer, got disconnected; see whether it still runs, and solve this "
+    "trace again"
+)
+
+
+def answers_on_cluster(
+    question: Asked, paths: Sequence[str], address: str, jobs: int | None, stop: StopFlag
+) -> Generator[Any]:
+    """Yield answers from the workers of a Dask scheduler, as they are ready.
+
+    Args:
+        question: The question.
+        paths: The files.
+        address: The address of the scheduler, with a port.
+        jobs: The number of files that are sent at a time; None or -1 for twice the number of
+            cores of the cluster.
+        stop: Set to stop early.
+
+    Raises:
+        AbductionError: The package `distributed`, the scheduler or its workers are missing.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise AbductionError(
+            "--scheduler: expected the package distributed, got none; pip install "
+            "'ssh-abduction[cluster]'"
+        ) from None
+    if not re.search(r"^inproc:|:\d+$", address):
+        raise AbductionError(
+            "--scheduler: expected an address with a port, such as tcp://host:8786, got "
+            f"{brief(address)}"
+        )
+    # The answers report errors. The warning about large graphs does not apply: each file is sent
+    # to one worker, once.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "Sending large graph")
+    try:
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
+    except Exception as error:  # another program at this address may answer anything
+        raise AbductionError(
+            f"--scheduler: expected a Dask scheduler at {address}, got none ({error}); start one "
+            "with: dask scheduler"
+        ) from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError:
+            raise AbductionError(
+                f"--scheduler: expected a worker, got none in {PATIENCE} s; start one with: dask "
+                f"worker {address}"
+            ) from None
+        most = jobs if jobs is not None and jobs > 0 else max(1, 2 * sum(client.ncores().values()))
+        absence = Absence(lambda: len(client.ncores()), question.limit, address)
+        for answer in _answers(
+            question, paths, partial(_on_workers, question, client, most, absence)
+        ):
+            yield answer
+            if stop.is_set():
+                return
+
+
+def _answers(
+    question: Asked,
+    paths: Sequence[str],
+    attempt: Callable[[list[Task], list[Task]], Iterator[Any]],
+) -> Iterator[Any]:
+    """Yield answers in any order, and find out which file kills its worker.
+
+    If a worker is killed, `attempt` puts all files that were under way there into its second list.
+    Each of them is then solved again alone. A file is to blame if its worker is killed again.
+    """
+    suspects: list[Task] = []
+    yield from attempt([*enumerate(paths)], suspects)
+    for task in suspects:
+        again: list[Task] = []
+        yield from attempt([task], again)
+        for _ in again:
+            yield question.lost(workers.Lost(task[0], late=False), task[1])
+
+
+class Absence:
+    """How long a cluster has had no worker. Dask itself would wait for ever.
+
+    A warning comes after PATIENCE seconds. With a time limit, the wait ends after that limit, but
+    not before PATIENCE seconds.
+
+    Args:
+        workers: Counts the workers.
+        limit: The time limit in seconds; None for no limit.
+        address: The address of the scheduler, for messages.
+        clock: The time in seconds.
+    """
+
+    def __init__(
+        self,
+        workers: Callable[[], int],
+        limit: float | None,
+        address: str,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._workers, self._limit, self._clock, self._address = workers, limit, clock, address
+        self._looks_at = self._last_seen = clock()
+        self._warned = False
+
+    @property
+    def sentence(self) -> str:
+        """The message about the absence."""
+        seconds = self._clock() - self._last_seen
+        return (
+            f"scheduler: expected a worker, got none for {seconds:.0f} s; start one with: dask "
+            f"worker {self._address}"
+        )
+
+    def is_too_long(self) -> bool:
+        """Check for workers now and then. Returns whether to stop waiting."""
+        now = self._clock()
+        if now >= self._looks_at:
+            self._looks_at = now + LOOK
+            with contextlib.suppress(Exception):  # the scheduler may be gone
+                if self._workers():
+                    self._last_seen, self._warned = now, False
+        absent = now - self._last_seen
+        if absent >= PATIENCE and not self._warned:
+            self._warned = True
+            warn([f"{self.sentence}, or end this with Ctrl-C"])
+        return self._limit is not None and absent >= max(PATIENCE, self._limit)
+
+
+def _on_workers(
+    question: Asked,
+    client: Client,
+    most: int,
+    absence: Absence,
+    tasks: list[Task],
+    killed: list[Task],
+) -> Iterator[Any]:
+    """Yield the answers for some tasks, with at most `most` of them on the cluster at a time.
+
+    Files are read here, so that workers need not share the disk. Tasks whose worker was killed
+    are appended to `killed`. This uses Dask directly, because joblib's backend for Dask hangs when
+    a worker is killed.
+    """
+    from distributed import KilledWorker, as_completed
+
+    sent: dict[Future[Any], Task] = {}
+    ready = as_completed(loop=client.loop)
+
+    def received(left: int) -> Iterator[Any]:
+        """Yield answers until at most `left` tasks are under way."""
+        while len(sent) > left:
+            if ready.is_empty():  # the scheduler is gone
+                return
+            if not ready.has_ready():
+                if not absence.is_too_long():
+                    time.sleep(POLL)
+                    continue
+                for future, task in sent.items():
+                    future.cancel()
+                    yield question.failed(*task, SolverError(absence.sentence))
+                sent.clear()
+                return
+            future = next(ready)
+            task = sent.pop(future)
+            try:
+                yield future.result()
+            except KilledWorker:
+                killed.append(task)
+            except CancelledError:
+                yield question.failed(*task, SolverError(LOST))
+            except Exception as error:  # an error of the cluster: `answer` catches all others
+                mend = "install the same ssh-abduction where the scheduler and its workers run"
+                yield question.failed(
+                    *task,
+                    SolverError(
+                        f"cluster: expected an answer, got {type(error).__name__}: {error}; {mend}"
+                    ),
+                )
+
+    for number, path in tasks:
+        try:
+            if client.status != "running":
+                raise SolverError(LOST)
+            if absence.is_too_long():
+                raise SolverError(absence.sentence)
+            future = client.submit(
+                _on_worker, question, number, path, question.load(path), pure=False
+            )
+        except Exception as error:
+            yield question.failed(number, path, error)
+            continue
+        sent[future] = number, path
+        ready.add(future)
+        yield from received(most - 1)
+    yield from received(0)
+    for task in sent.values():  # tasks that were under way when the scheduler was lost
+        yield question.failed(*task, SolverError(LOST))
+
+
+def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
+    """Answer on a Dask worker, and stop if the client goes away."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    task = worker.state.tasks[worker.get_current_task()]
+
+    def given_up() -> bool:
+        return bool(task.state == "cancelled")
+
+    if not question.has_limits:
+        return question.answer(number, path, content, given_up)
+    # A task that breaks its limits is killed with its process. So it gets a process of its own:
+    # other tasks may run in this one.
+    work = [(number, path, question, content)]
+    answer: Any = next(
+        workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, question.patience)
+    )
+    return question.lost(answer, path) if isinstance(answer, workers.Lost) else answer
+
+
+def _solved_for_cluster(
+    number: int, path: str, question: Asked, content: Any, given_up: Callable[[], bool]
+) -> Any:
+    return question.answer(number, path, content, given_up)

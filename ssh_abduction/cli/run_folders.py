@@ -1,0 +1,209 @@
+"""The folders of mapped logs: which log has which folder, and which are done.
+
+A run is done if its run.json is there, and does not say that the run was interrupted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import unicodedata
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ssh_abduction.cli.import_log import named_after
+from ssh_abduction.cli.outcome import warn
+from ssh_abduction.data.errors import AbductionError, named
+from ssh_abduction.data.files import write_file
+
+RUN = "run.json"  # written last: it marks a run as finished
+FILES = ("trace.jsonl", "maps.json", "page.html", "report.html", RUN)
+LONGEST = 255  # bytes of the name of a folder, at most
+DIGITS = 8  # of a log's digest, appended to its name if another log has the same name
+
+
+def write_run(folder: Path, files: Sequence[tuple[str, bytes]]) -> None:
+    """Write the files of a run into its folder, and make the folder if it is missing.
+
+    run.json is removed first and written last, so it never lies beside files of another run.
+
+    Raises:
+        OSError: A file cannot be written. The error names that file.
+    """
+    if not files:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    given = dict(files)
+    for name in (RUN, *(name for name in FILES if name not in given)):
+        (folder / name).unlink(missing_ok=True)
+    for name in sorted(given, key=lambda name: name == RUN):
+        try:
+            write_file(folder / name, given[name])
+        except OSError as error:
+            error.filename = str(folder / name)  # the error may name the draft, or no file
+            raise
+
+
+def check_folder(folder: Path) -> None:
+    """Check, before hours of work, that a folder can be made and written.
+
+    Raises:
+        AbductionError: It cannot.
+    """
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise AbductionError(
+            f"{named(str(folder))}: expected a folder to write, got a file: {named(str(there))}; "
+            "name another one"
+        )
+    if not os.access(there, os.W_OK):
+        raise AbductionError(
+            f"{named(str(folder))}: expected a folder that can be written, got no permission in "
+            f"{named(str(there))}; name another one"
+        )
+
+
+def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict[str, str]]:
+    """Choose a folder for each log, and find logs with the same content.
+
+    - A log that has a run in `folder` keeps the folder of that run.
+    - A single new log gets `folder` itself; several get folders in it, named after the logs.
+    - If that folder holds the run of another log, or two logs have one name, a part of the
+      digest of the log is appended.
+
+    So the order of the logs does not matter.
+
+    Args:
+        logs: The paths of the logs.
+        folder: The output folder.
+
+    Returns:
+        The folder of each log, and for each log that is left out, the log with the same content.
+    """
+    contents = {path: _content(path) for path in dict.fromkeys(logs)}
+    runs = _runs_in(folder)
+    owners = {_key(place) for places in runs.values() for place in places}
+    new = {
+        (_key(folder / named_after(path)), content)
+        for path, content in contents.items()
+        if content and content not in runs
+    }
+    # A log that cannot be read, or only once, does not count: the other logs get the plain names.
+    named_so = Counter(key for key, _ in new)
+    found: dict[str, Path] = {}
+    same: dict[str, str] = {}
+    for path in sorted(contents, key=lambda path: (named_after(path), path)):
+        content, plain = contents[path], folder / named_after(path)
+        wished = folder if len(contents) == 1 else plain
+        if content in runs:
+            places = runs[content]
+            place = wished if wished in places else places[0]
+        else:
+            digits = content or hashlib.sha256(os.fsencode(os.path.abspath(path))).hexdigest()
+            longer = folder / f"{_cut(plain.name)}-{digits[:DIGITS]}"
+            choices = [
+                *([folder] if wished == folder else []),
+                *([plain] if content and named_so[_key(plain)] == 1 else []),
+                longer,
+            ]
+            place = next((one for one in choices if _key(one) not in owners), folder / digits)
+            if place != wished and content:
+                why = (
+                    "has the map of another log"
+                    if _key(wished) in owners
+                    else "is the name of several logs"
+                )
+                warn(
+                    [
+                        f"{named(path)}: its folder is {named(str(place))}, as "
+                        f"{named(str(wished))} {why}"
+                    ]
+                )
+        other = next((one for one, taken in found.items() if _key(taken) == _key(place)), None)
+        if other is None:
+            found[path] = place
+        else:
+            same[path] = other
+    return {path: found[path] for path in contents if path in found}, same
+
+
+def is_done(folder: Path, path: str, settings: dict[str, Any]) -> bool:
+    """Whether a folder holds a finished run of this log with these settings."""
+    run = _run_in(folder)
+    content = run.get("digest")
+    return bool(
+        run.get("settings") == json.loads(json.dumps(settings))
+        and not run.get("interrupted")
+        and content is not None
+        and content == _content(path)
+    )
+
+
+def digest(path: str) -> str | None:
+    """A SHA-256 digest of a log; for a folder, of the names and contents of its files.
+
+    Returns:
+        The digest; None for a pipe, which can be read only once.
+
+    Raises:
+        LogError: The log cannot be unpacked.
+    """
+    from perception.readers.lines import opened
+
+    whole = hashlib.sha256()
+    file = Path(path)
+    if file.is_dir():
+        for part in sorted(file.rglob("*")):
+            whole.update(os.fsencode(f"{part.relative_to(file)}\0"))
+            if part.is_file():
+                with part.open("rb") as content:
+                    whole.update(hashlib.file_digest(content, "sha256").digest())
+    elif file.is_file() or not file.exists():
+        with opened(path) as content:
+            for block in iter(partial(content.read, 2**20), b""):
+                whole.update(block)
+    else:
+        return None
+    return whole.hexdigest()
+
+
+def _runs_in(folder: Path) -> dict[str, list[Path]]:
+    """The folders that hold runs, by the digest of the log: `folder` and its subfolders."""
+    found: dict[str, list[Path]] = {}
+    with suppress(OSError):
+        for place in (folder, *sorted(one for one in folder.iterdir() if one.is_dir())):
+            content = _run_in(place).get("digest")
+            if isinstance(content, str):
+                found.setdefault(content, []).append(place)
+    return found
+
+
+def _run_in(folder: Path) -> dict[str, Any]:
+    """The content of run.json in a folder; empty if there is none that can be read."""
+    with suppress(OSError, ValueError, RecursionError):
+        run = json.loads((folder / RUN).read_text(encoding="utf-8"))
+        return run if isinstance(run, dict) else {}
+    return {}
+
+
+def _content(path: str) -> str | None:
+    """The digest of a log; None if it cannot be read, or only once."""
+    with suppress(OSError, AbductionError):
+        return digest(path)
+    return None
+
+
+def _key(folder: Path) -> str:
+    """A key that is equal for names that some file systems do not tell apart."""
+    return unicodedata.normalize("NFC", os.path.abspath(folder)).casefold()
+
+
+def _cut(name: str) -> str:
+    """The start of a name that leaves room for a part of a digest."""
+    room, encoded = LONGEST - DIGITS - 1, os.fsencode(name)
+    return os.fsdecode(encoded[:room]) if len(encoded) > room else name
