@@ -154,7 +154,8 @@ def _tree(plan: Plan, indent: str) -> Iterator[str]:
         yield f"{indent}{printable(', '.join(plan.actions))}"
     for branch in plan.branches:
         rest = branch.plan
-        yield f"{indent}  {printable(str(branch.seen))}: {_told_rivals(rest.rivals)}{_untried(rest)}"
+        left = f"{_told_rivals(rest.rivals)}{_untried(rest)}"
+        yield f"{indent}  {printable(str(branch.seen))}: {left}"
         yield from _tree(rest, f"{indent}    ")
 
 
