@@ -34,8 +34,11 @@ TUTORIALS = sorted(
 )
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCKS = {page: re.findall(r"```(\w*)\n(.*?)```", page.read_text(), re.DOTALL) for page in PAGES}
-# How links of the README begin, which PyPI shows, too: what follows is the path of a file in this checkout.
-ABSOLUTE = r"https://(?:github\.com/ssh-abduction/ssh-abduction/(?:blob|tree)|raw\.githubusercontent\.com/ssh-abduction/ssh-abduction)/main/"
+# How links of the README begin. A path in this checkout follows.
+PROJECT = r"ssh-abduction/ssh-abduction"
+ABSOLUTE = (
+    rf"https://(?:github\.com/{PROJECT}/(?:blob|tree)|raw\.githubusercontent\.com/{PROJECT})/main/"
+)
 
 FILES = [
     path
@@ -71,7 +74,14 @@ CODES = {1: ": error:", 20: "unsatisfiable: ", 30: "OPTIMUM FOUND"}  # the last 
 
 @dataclass(frozen=True)
 class Block:
-    """Lines that a page shows, and what it says that they print; None where it does not say. Of lines that are not run `why` says why."""
+    """Lines that a page shows.
+
+    Attributes:
+        language: sh or python.
+        lines: The lines.
+        output: What the page says that they print; None if it does not say.
+        why: Why the lines are not run; empty if they are.
+    """
 
     language: str
     lines: str
@@ -80,7 +90,10 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    """The blocks of a page in Python and for the shell. The output is a block without a language behind them."""
+    """The blocks of a page in Python and for the shell.
+
+    The output is the block without a language that follows.
+    """
     found = re.findall(
         r"(?:<!-- not run: (.+?) -->\n)?```(\w*)\n(.*?)```", page.read_text(), re.DOTALL
     )
@@ -121,7 +134,10 @@ def run(block: Block) -> tuple[str, int]:
 
 
 def run_line(line: str) -> int:
-    """Run a line of a shell, and print what it prints; returns the exit code. Our own command is run in this process, which saves the time to load all."""
+    """Run a line of a shell, print what it prints, and return the exit code.
+
+    Our own command runs in this process, which saves the time to load everything.
+    """
     line = line if "<<" in line else re.sub(r"\s+# .*", "", line).rstrip()
     command, pipe, reader = line.partition(" | ")
     command, _, target = command.partition(" > ")
@@ -145,12 +161,13 @@ def printed(command: str) -> tuple[str, int]:
     return out.getvalue(), code
 
 
-OFTEN = "ssh-abduction solve examples/aces3-route.jsonl -n 0 --json"  # how many blocks begin, with the same answer
+# Many blocks begin with this line, which has the same answer each time.
+OFTEN = "ssh-abduction solve examples/aces3-route.jsonl -n 0 --json"
 printed_often = cache(printed)
 
 
 def shell(lines: str, given: str = "") -> int:
-    """Run lines in a process of their own, in which python is this one, and print what they print; returns the exit code."""
+    """Run lines in a process, with this python; print what they print, and return the exit code."""
     lines = re.sub(
         r"(?<![\w/-])ssh-abduction(?= )", f"{shlex.quote(sys.executable)} -m ssh_abduction", lines
     )
@@ -166,7 +183,11 @@ def shell(lines: str, given: str = "") -> int:
 
 
 def without_seconds(text: str) -> str:
-    """Without what depends on how fast the machine is: how long it took, and of how many steps clingo was told, as other engines take over after some time."""
+    """The text without what depends on the speed of the machine.
+
+    These are seconds, and the number of steps that clingo needed, because other engines take over
+    after some time.
+    """
     return re.sub(
         r"\d+\.\d+ s\b", "_ s", re.sub(r"\d+ of (\d+ steps given to clingo)", r"_ of \1", text)
     )
@@ -261,7 +282,8 @@ def test_every_file_it_names_exists(page: Path) -> None:
     text = page.read_text()
     linked = [page.parent / name for name in re.findall(r"\]\(([^)#:]+)\)", text)]
     whole = [ROOT / name for name in re.findall(ABSOLUTE + r"([\w./-]+\w)", text)]
-    folders = r"(?<![\w./-])(?:benchmarks|docs|encodings|examples|perception|simulator|ssh_abduction|tests)/[\w./-]+\w"
+    tops = "benchmarks|docs|encodings|examples|perception|simulator|ssh_abduction|tests"
+    folders = rf"(?<![\w./-])(?:{tops})/[\w./-]+\w"
     said = [ROOT / name for name in re.findall(folders, text)]
     for path in (*linked, *whole, *said):
         assert path.exists(), path

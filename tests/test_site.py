@@ -1,4 +1,4 @@
-"""The site of docs/: docstrings are shown as they were meant, links lead somewhere, and nothing is loaded from elsewhere."""
+"""The site of docs/: links lead somewhere, and nothing is loaded from elsewhere."""
 
 from __future__ import annotations
 
@@ -12,34 +12,14 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 
-FIELDS = """What it is.
 
-id, name  of the thing, or None
-heading   degrees, clockwise
-          from ahead
-All of it may be None.
-
-Parameters
-----------
-maps  of one trace
-
-Raises MapError where  there is none.
-
->>> 1 + 1
-2"""
-
-
-def test_lists_of_fields_and_examples_keep_their_lines() -> None:
-    assert docstrings.as_markdown(FIELDS).split("\n\n") == [
-        "What it is.",
-        "`id`, `name`\n:   of the thing, or None",
-        "`heading`\n:   degrees, clockwise from ahead",
-        "All of it may be None.",
-        "**Parameters**",
-        "`maps`\n:   of one trace",
-        "Raises MapError where  there is none.",
-        "```pycon\n>>> 1 + 1\n2\n```",
-    ]
+def test_examples_are_blocks_of_code() -> None:
+    assert docstrings.with_fences("It adds.\n\n>>> 1 + 1\n2\n\nArgs:\n    x: A number.") == (
+        "It adds.\n\n```pycon\n>>> 1 + 1\n2\n```\n\nArgs:\n    x: A number."
+    )
+    assert docstrings.with_fences("Example:\n    >>> 1\n    1") == (
+        "Example:\n    ```pycon\n    >>> 1\n    1\n    ```"
+    )
 
 
 @pytest.mark.parametrize(
@@ -80,16 +60,27 @@ def test_all_names_that_pages_import_have_a_page() -> None:
     assert ours == set()
 
 
-SOUND = '<a id="top" href="#top"></a><a href="b.html#there"></a><link rel="stylesheet" href="s.css"><a href="https://pypi.org/"></a>'
+SOUND = (
+    '<a id="top" href="#top"></a><a href="b.html#there"></a>'
+    '<link rel="stylesheet" href="s.css"><a href="https://pypi.org/"></a>'
+)
+FILES_OF_PROJECT = "https://github.com/ssh-abduction/ssh-abduction/blob/main"
 BROKEN = {
     '<a href="c.html"></a>': "a.html: links c.html, which is no file of the site",
     '<a href="b.html#here"></a>': "a.html: links b.html#here, but that page has no such anchor",
-    '<a href="https://github.com/ssh-abduction/ssh-abduction/blob/main/no.lp"></a>': "a.html: links https://github.com/ssh-abduction/ssh-abduction/blob/main/no.lp, "
-    "which is not in the repository",
-    '<script src="https://unpkg.com/x.js"></script>': "a.html: loads https://unpkg.com/x.js from elsewhere",
-    '<link rel="stylesheet" href="//fonts.example/f.css">': "a.html: loads //fonts.example/f.css from elsewhere",
+    f'<a href="{FILES_OF_PROJECT}/no.lp"></a>': (
+        f"a.html: links {FILES_OF_PROJECT}/no.lp, which is not in the repository"
+    ),
+    '<script src="https://unpkg.com/x.js"></script>': (
+        "a.html: loads https://unpkg.com/x.js from elsewhere"
+    ),
+    '<link rel="stylesheet" href="//fonts.example/f.css">': (
+        "a.html: loads //fonts.example/f.css from elsewhere"
+    ),
     '<img src="no.png">': "a.html: loads no.png, which is no file of the site",
-    '<p style="background: url(https://x.example/y.png)"></p>': "a.html: loads https://x.example/y.png from elsewhere",
+    '<p style="background: url(https://x.example/y.png)"></p>': (
+        "a.html: loads https://x.example/y.png from elsewhere"
+    ),
 }
 
 

@@ -1,8 +1,11 @@
-"""Checks the site that mkdocs built: links and anchors lead somewhere, and no page loads anything from elsewhere.
+"""Checks the site that mkdocs built.
+
+Links and anchors must lead somewhere, and no page may load anything from elsewhere.
 
     python website/check.py site
 
-Links to files of the repository on GitHub are checked in this checkout. What is wrong is printed, a line each, and the exit code is then 1.
+Links to files of the repository on GitHub are checked in this checkout. Each problem is printed on
+a line. The exit code is 1 if there is any.
 """
 
 from __future__ import annotations
@@ -20,7 +23,8 @@ ROOT = Path(__file__).parent.parent
 ON_GITHUB = re.compile(
     r"https://github\.com/ssh-abduction/ssh-abduction/(?:blob|tree|raw)/main/([^#?]*)"
 )
-# Attributes whose address a browser fetches when it shows a page. Of `link` it fetches all but what only names another page.
+# Attributes whose address a browser fetches when it shows a page. Of `link` it fetches all but
+# what only names another page.
 FETCHED = {
     "script": ("src",),
     "img": ("src", "srcset"),

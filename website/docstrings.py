@@ -1,13 +1,7 @@
-"""Docstrings of this project as Markdown: lists of fields become definition lists, and examples become blocks of code.
+"""Puts the examples of docstrings into blocks of code.
 
-A list of fields is a paragraph like this one, in which each name is followed by two spaces or more and what it means, and a meaning may go on
-in lines that are indented:
-
-    place, path  None where the theory has none
-    heading      degrees, clockwise from the heading
-                 of the first dstate
-
-In plain Markdown its lines would flow together.
+Docstrings are in Google's style, which mkdocstrings reads. In plain Markdown a paragraph that
+begins with `>>>` would be a quotation.
 """
 
 from __future__ import annotations
@@ -17,37 +11,18 @@ from typing import Any
 
 from griffe import Extension, Object
 
-FIELD = re.compile(r"(\S+(?:, \S+)*) {2,}(\S.*)")
-NAME = re.compile(r"[A-Za-z_]\w*")
+EXAMPLE = re.compile(r"^( *)>>> .*(?:\n\1.*\S.*)*", re.MULTILINE)
 
 
-def as_markdown(docstring: str) -> str:
-    return "\n\n".join(
-        _paragraph(paragraph) for paragraph in re.split(r"\n\s*\n", docstring.strip("\n"))
-    )
+def with_fences(docstring: str) -> str:
+    """The docstring with each example as a block of code, indented like the example."""
+    return EXAMPLE.sub(lambda found: f"{found[1]}```pycon\n{found[0]}\n{found[1]}```", docstring)
 
 
-def _paragraph(paragraph: str) -> str:
-    lines = paragraph.split("\n")
-    if lines[0].startswith(">>> "):
-        return "\n".join(("```pycon", *lines, "```"))
-    if len(lines) > 1 and set(lines[1]) == {"-"}:  # a heading as numpy has them
-        return f"**{lines[0]}**\n\n{_paragraph(chr(10).join(lines[2:]))}"
-    fields: list[list[str]] = []
-    for number, line in enumerate(lines):
-        if fields and line.startswith("  "):
-            fields[-1].append(line.strip())
-        elif found := FIELD.fullmatch(line):
-            names, meaning = found.groups()
-            fields.append([NAME.sub(lambda name: f"`{name[0]}`", names) + "\n:   " + meaning])
-        else:
-            return "\n\n".join((*map(" ".join, fields), "\n".join(lines[number:])))
-    return "\n\n".join(map(" ".join, fields))
-
-
-class FieldLists(Extension):
+class Examples(Extension):
     """Rewrites each docstring that griffe has read."""
 
     def on_object(self, *, obj: Object, **_: Any) -> None:
+        """Fence the examples of one docstring."""
         if obj.docstring is not None:
-            obj.docstring.value = as_markdown(obj.docstring.value)
+            obj.docstring.value = with_fences(obj.docstring.value)

@@ -1,4 +1,6 @@
-"""Draws the pictures of docs/explanation/how.md into docs/figures, from one simulated drive and one example.
+"""Draws the pictures of docs/explanation/how.md into docs/figures.
+
+They show one simulated drive and one example.
 
 python website/figures.py
 """
@@ -41,7 +43,7 @@ STAGES = (("drive", "images"), ("cluster", "views"), ("solve", "map"), ("train",
 
 
 def loop() -> str:
-    """The four stages in a row, with what flows from one to the next, and back from the last to the first."""
+    """The four stages in a row, with what flows between them, and back to the first."""
     parts = []
     for i, (stage, made) in enumerate(STAGES):
         x = 20 + 170 * i
@@ -55,9 +57,18 @@ def loop() -> str:
     parts.append(
         '<text x="360" y="112" class="made">the robot knows its places, and drives on</text>'
     )
-    style = "text{font:13px sans-serif;text-anchor:middle}.made{font-style:italic;fill:#555}.flow{fill:none;stroke:#555;stroke-width:1.5;marker-end:url(#end)}"
-    head = '<marker id="end" markerWidth="8" markerHeight="8" refX="6" refY="4" orient="auto"><path d="M0,0 L7,4 L0,8 z" fill="#555"/></marker>'
-    return f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 720 140" width="720"><style>{style}</style><defs>{head}</defs>{"".join(parts)}</svg>'
+    style = (
+        "text{font:13px sans-serif;text-anchor:middle}.made{font-style:italic;fill:#555}"
+        ".flow{fill:none;stroke:#555;stroke-width:1.5;marker-end:url(#end)}"
+    )
+    head = (
+        '<marker id="end" markerWidth="8" markerHeight="8" refX="6" refY="4" orient="auto">'
+        '<path d="M0,0 L7,4 L0,8 z" fill="#555"/></marker>'
+    )
+    return (
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 720 140" width="720">'
+        f"<style>{style}</style><defs>{head}</defs>{''.join(parts)}</svg>"
+    )
 
 
 def folded() -> SSHMap:

@@ -1,6 +1,7 @@
-"""What mkdocs does beside the pages of docs/: the README is the first page, links to files of the repository lead to GitHub, and each public name has a page.
+"""Adds to the site of docs/ what mkdocs does not do by itself.
 
-Pages of docs/ are read on GitHub, too, so their links are relative. A link that leaves docs/ leads nowhere on the site; here it becomes one to GitHub.
+The README becomes the first page, and each public name gets a page. GitHub shows the pages of
+docs/, too, so their links are relative. Links that leave docs/ become links to GitHub here.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ ROOT = Path(__file__).parent.parent
 GITHUB = "https://github.com/ssh-abduction/ssh-abduction"
 RAW = "https://raw.githubusercontent.com/ssh-abduction/ssh-abduction"
 
-# The public names by theme: all that `ssh_abduction` exports, and what else the pages import, with the module that has it.
+# The public names by theme: all that `ssh_abduction` exports, and what else the pages import, with
+# the module that has it.
 THEMES: dict[str, tuple[str, ...]] = {
     "From a trace to its maps": ("solve", "Trace", "Theory", "Solution", "SSHMap", "map_log"),
     "Is a map right?": ("check", "evaluate"),
@@ -98,7 +100,7 @@ THEMES: dict[str, tuple[str, ...]] = {
 
 
 def full(name: str) -> str:
-    """Where a name of THEMES is imported from, with it."""
+    """The full path of a name of THEMES."""
     return (
         name
         if name.split(".", maxsplit=1)[0] in ("perception", "simulator")
@@ -112,13 +114,17 @@ def named(path: str) -> Any:
 
 
 def page_of(path: str) -> str:
-    """The page of a name, by its path. Functions and classes have folders of their own: `route` and `Route` are one file on some systems."""
+    """The page of a name, by its path.
+
+    Functions and classes have separate folders, because `route` and `Route` are one file on some
+    systems.
+    """
     kind = "classes" if isclass(named(path)) else "functions"
     return f"reference/{kind}/{path.rpartition('.')[2]}.md"
 
 
 def themes() -> dict[str, tuple[str, ...]]:
-    """Where the names of each theme are imported from, with them. What is exported and has no theme yet comes last."""
+    """The full paths of the names of each theme. Exported names without a theme come last."""
     more = tuple(
         name
         for name in ssh_abduction.__all__
@@ -143,7 +149,7 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 
 
 def home() -> str:
-    """The README as the first page: what it links on GitHub is here."""
+    """The README as the first page. Its links to docs/ on GitHub lead to the site."""
     text = (ROOT / "README.md").read_text()
     text = re.sub(rf"{GITHUB}/blob/main/docs/|{RAW}/main/docs/", "", text)
     return text.replace("# ssh-abduction\n", "---\nhide: [navigation]\n---\n\n# ssh-abduction\n", 1)
@@ -153,7 +159,7 @@ def index() -> str:
     lines = [
         "# Reference",
         "",
-        "Each public name has a page. What has no module before it is imported from `ssh_abduction`.",
+        "Each public name has a page. Import a name without a module from `ssh_abduction`.",
         "",
     ]
     for theme, paths in themes().items():
@@ -184,7 +190,9 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 def to_github(markdown: str, uri: str) -> str:
     """The text of a page, in which links to files outside docs/ lead to GitHub.
 
-    uri  of the page, from docs/ on
+    Args:
+        markdown: The text.
+        uri: The path of the page, from docs/ on.
     """
 
     def mended(link: re.Match[str]) -> str:
