@@ -36,7 +36,7 @@ from ssh_abduction.rivals.questions import Matter, Question
 from ssh_abduction.rivals.table import Table
 from ssh_abduction.solver import find_backbone
 from ssh_abduction.solver import search as searching
-from ssh_abduction.solver.engines import framed, name_search
+from ssh_abduction.solver.engines import framed_paths, name_search
 from ssh_abduction.solver.map_list import Priced
 from ssh_abduction.solver.sharing import Backbone, Sharing
 
@@ -406,7 +406,7 @@ def test_the_order_of_a_complete_list_is_the_same_with_any_number_of_threads(
             given.append(threads)
             control.configuration.solve.parallel_mode = f"{threads},compete"  # type: ignore[union-attr]
 
-        for module in (framed, name_search):
+        for module in (framed_paths, name_search):
             monkeypatch.setattr(module, "give_threads", give)
         solution = solve(maze(5, 5, steps=100, seed=1, stars=True).trace, max_maps=None)
         assert solution.complete

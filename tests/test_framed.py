@@ -25,11 +25,19 @@ from ssh_abduction.solver.asp.facts import paths_lp, sides_lp, visits_lp
 from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines import base as engine
-from ssh_abduction.solver.engines import framed, transitive, visit_program
+from ssh_abduction.solver.engines import (
+    framed,
+    framed_guess,
+    framed_paths,
+    transitive,
+    visit_program,
+)
 from ssh_abduction.solver.engines import paths as paths_module
 from ssh_abduction.solver.engines import visit_labels as same
 from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.engines.framed import FramedEngine
+from ssh_abduction.solver.engines.framed_guess import GuessBeside
+from ssh_abduction.solver.engines.framed_paths import FramedPaths
 from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
 from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import OPEN, VisitLabels
@@ -102,9 +110,9 @@ class Before(Beside):
         self._thread.join()
 
 
-def always_named_at(engine: FramedEngine, dstates: int) -> NearbySearch | None:
+def always_proved(beside: GuessBeside, dstates: int) -> NearbySearch | None:
     """The search beside, also where the other one has come to its end, as it soon does on a short trace."""
-    return engine._named if engine._named and engine._named.bound == dstates else None
+    return beside.search if beside.search and beside.search.bound == dstates else None
 
 
 def plainly_charted(
@@ -132,14 +140,18 @@ def test_lists_the_maps_of_the_plain_encoding(
         "TRY_CONFLICTS": data.draw(st.sampled_from([0, same.TRY_CONFLICTS]), label="tries"),
         "FAILED_TRIES": data.draw(st.sampled_from([1, same.FAILED_TRIES]), label="failed tries"),
     }
-    sought = {
-        "BETTERING": data.draw(st.sampled_from([0, framed.BETTERING]), label="bettering"),
-        "CLASHES": data.draw(st.sampled_from([1, framed.CLASHES]), label="clashes"),
-        "MANY_PAIRS": data.draw(st.sampled_from([5, framed.MANY_PAIRS]), label="many pairs"),
-        "GUESSES": data.draw(st.sampled_from([1, framed.GUESSES]), label="guesses"),
-        "GUESS_FIRST": data.draw(st.sampled_from([-1.0, framed.GUESS_FIRST]), label="patience"),
-        "SOON": data.draw(st.sampled_from([-1.0, framed.SOON]), label="soon"),
-        "MANY_DSTATES": data.draw(st.sampled_from([0, framed.MANY_DSTATES]), label="many dstates"),
+    fitted = {
+        "BETTERING": data.draw(st.sampled_from([0, framed_paths.BETTERING]), label="bettering"),
+        "CLASHES": data.draw(st.sampled_from([1, framed_paths.CLASHES]), label="clashes"),
+        "MANY_DSTATES": data.draw(st.sampled_from([0, framed_paths.MANY_DSTATES]), label="many"),
+    }
+    many_pairs = data.draw(st.sampled_from([5, framed.MANY_PAIRS]), label="many pairs")
+    soon = data.draw(st.sampled_from([-1.0, framed.SOON]), label="soon")
+    guessed = {
+        "GUESSES": data.draw(st.sampled_from([1, framed_guess.GUESSES]), label="guesses"),
+        "GUESS_FIRST": data.draw(
+            st.sampled_from([-1.0, framed_guess.GUESS_FIRST]), label="patience"
+        ),
     }
     processors = data.draw(st.booleans(), label="processors")
     off = off - {"names"} | {"processes"}  # in which nothing would be patched
@@ -150,7 +162,9 @@ def test_lists_the_maps_of_the_plain_encoding(
         prefixes,
         patch.multiple(same, **cores),
         patch.object(transitive, "AT_A_TIME", at_a_time),
-        patch.multiple(framed, **sought),
+        patch.multiple(framed_paths, **fitted),
+        patch.multiple(framed_guess, **guessed),
+        patch.multiple(framed, MANY_PAIRS=many_pairs, SOON=soon),
         patch.object(paths_module, "SECONDS", 0.0),
         patch.object(
             annealing, "ANNEALED", ((0.5, data.draw(st.integers(1, 20), label="sweeps")),)
@@ -185,13 +199,15 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     with (
         patch.object(choosing, "FEW_STEPS", 0),
-        patch.multiple(framed, SOON=-1.0, Beside=Before, MANY_DSTATES=sweeps % 2),
+        patch.object(framed, "SOON", -1.0),
+        patch.object(framed_guess, "Beside", Before),
+        patch.object(framed_paths, "MANY_DSTATES", sweeps % 2),
         patch.object(same, "FIRST_PAIRS", 5 * (sweeps % 3)),
         patch.object(paths_module, "SECONDS", 0.0),
         patch.object(annealing, "ANNEALED", ((0.5, sweeps),)),
         patch.object(sampling, "LAST", 2),
         patch.object(engine.Task, "has_processors", True),
-        patch.object(FramedEngine, "_named_at", always_named_at),
+        patch.object(GuessBeside, "proved", always_proved),
         patch.object(FramedEngine, "_charted", plainly_charted),
     ):
         search = Search(trace, theory, max_maps=None, speedups=Speedups.without("processes"))
@@ -234,9 +250,10 @@ def test_names_list_all_ways_to_be_at_the_fewest_dstates(side: int, steps: int, 
         walk.trace, Theory.topological(), max_maps=None, speedups=Speedups.without("annealed")
     )
     with (
-        patch.multiple(framed, SOON=-1.0, Beside=Before),
+        patch.object(framed, "SOON", -1.0),
+        patch.object(framed_guess, "Beside", Before),
         patch.object(engine.Task, "has_processors", True),
-        patch.object(FramedEngine, "_named_at", always_named_at),
+        patch.object(GuessBeside, "proved", always_proved),
     ):
         found = solve(walk.trace, Theory.topological(), max_maps=None)
     assert found.status is Status.OPTIMAL
@@ -442,7 +459,7 @@ def test_what_is_not_told_beforehand_is_found() -> None:
     expected = solve(walk.trace, Theory.topological(), max_maps=None)
     for off, kind, asked in (
         ("", FramedSides, "say_of_path"),
-        ("sides", FramedEngine, "_clashing"),
+        ("sides", FramedPaths, "clashing"),
     ):
         finding = patch.object(kind, asked, autospec=True, side_effect=getattr(kind, asked))
         with patch.object(FramedEngine, "_charted", plainly_charted), finding as found:
@@ -473,7 +490,7 @@ def test_sides_and_streets_say_the_same(theory: Theory) -> None:
         labels = engine._visits.fewest()
         assert labels
         chart = engine._chart
-        control = engine._paths.control(chart)
+        control = engine._fitting.paths.control(chart)
         control.add("base", [], paths_lp.settled_labels(enumerate(labels)))
         control.ground([("base", []), ("contrary", [])])
         contrary, _ = next(
@@ -762,7 +779,7 @@ def test_what_is_told_of_loose_dstates_holds_in_each_map(
         labels = node_labels(ssh_map, chart)
         loosened = numbered(data.draw(loosened_labels(labels)))
         loose = [node for node in range(len(labels)) if loosened.count(loosened[node]) == 1]
-        told = asked._paths.told(chart, loosened, loose)
+        told = asked._fitting.paths.told(chart, loosened, loose)
         assert told is not None
         apart, one = told
         place = {s.id: s.place for s in ssh_map.dstates}
@@ -790,7 +807,7 @@ def test_any_guess_is_merged_to_a_map(
     apart = chart.apart()
     start = guess[: len(chart.seen)]
     labels = (
-        asked._paths.labels_near(chart, apart, start)
+        asked._fitting.paths.labels_near(chart, apart, start)
         if told
         else merged_near(apart, chart.links, start)
     )
@@ -800,10 +817,10 @@ def test_any_guess_is_merged_to_a_map(
     assert not any(
         apart[i, j] for i in range(len(labels)) for j in range(i) if labels[i] == labels[j]
     )
-    singles = asked._paths.has_separate(chart, labels)
+    singles = asked._fitting.paths.has_separate(chart, labels)
     if singles or not told:
-        with patch.object(framed, "MANY_DSTATES", 100):
-            assert (asked._some_paths(labels) is not None) >= singles
+        with patch.object(framed_paths, "MANY_DSTATES", 100):
+            assert (asked._fitting.some(chart, labels) is not None) >= singles
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -816,7 +833,7 @@ def test_a_true_guess_stays_as_it_is(seed: int) -> None:
     apart = chart.apart()
     assert merged_near(apart, chart.links, truth) == truth
     some = [-1 if 20 <= node < 60 else label for node, label in enumerate(truth)]
-    assert asked._paths.labels_near(chart, apart, some) == truth
+    assert asked._fitting.paths.labels_near(chart, apart, some) == truth
 
 
 @pytest.mark.parametrize(("size", "steps", "seed"), [(5, 300, 0), (6, 300, 2)])
@@ -824,7 +841,7 @@ def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, s
     """Where the causal axioms do not show that they are two, but paths do."""
     walk = maze(size, size, steps=steps, seed=seed, stars=True)
     asked = framed_engine(walk.trace, Theory.topological())
-    chart, known = asked._chart, asked._paths
+    chart, known = asked._chart, asked._fitting.paths
     truth = numbered([walk.truth[chart.node_of.index(node)] for node in range(len(chart.seen))])
     apart = chart.apart()
     nodes = np.array(truth)
@@ -871,10 +888,10 @@ def test_a_guess_begins_sooner_under_a_short_limit(
         asked.asker.watch.shorten(limit)
     with (
         patch.object(engine.Task, "has_processors", True),
-        patch.object(FramedEngine, "_search_beside") as begun,
+        patch.object(GuessBeside, "begin") as begun,
         patch.object(Watch, "elapsed", lambda _: waited),
     ):
-        assert not asked._should_interrupt()
+        assert not asked._soon_maps.should_interrupt()
     assert begun.called == begins
 
 
@@ -886,7 +903,7 @@ def test_labels_that_take_too_long_to_try_are_left() -> None:
 
     def known() -> tuple[list[Found], bool | None]:
         found = []
-        tries = asked._known_if_it_has_paths(labels)
+        tries = asked._soon_maps.known_if_it_has_paths(labels)
         while True:
             try:
                 found.append(next(tries))
@@ -895,8 +912,8 @@ def test_labels_that_take_too_long_to_try_are_left() -> None:
 
     asked._visits.known = None
     asked.asker.watch.shorten(50.0)
-    with patch.object(FramedEngine, "_paths_found_soon", lambda *_: None):
-        with patch.object(FramedEngine, "_preparing", 100.0):
+    with patch.object(FramedPaths, "found_soon", lambda *_: None):
+        with patch.object(FramedPaths, "preparing", 100.0):
             assert known() == ([], None)
         assert asked._visits.known is None
         found, fits = known()
@@ -923,9 +940,9 @@ def test_a_guess_with_wrong_travels_leads_to_a_map_with_streets(loops: float, mo
         patch.object(annealing, "ANNEALED", ((0.5, 100),)),
         patch.object(paths_module, "attempts", counted),
     ):
-        labels = asked._paths.guessed_labels(chart, Watch())
+        labels = asked._fitting.paths.guessed_labels(chart, Watch())
     assert failed[0] > 0
-    assert asked._paths.has_separate(chart, labels)
+    assert asked._fitting.paths.has_separate(chart, labels)
     assert len(set(labels)) < most * len(set(walk.truth))
 
 
@@ -941,7 +958,8 @@ def test_a_guess_leaves_a_small_map_when_time_is_over() -> None:
         return OPEN
 
     with (
-        patch.multiple(framed, GUESS_FIRST=-1.0, SOON=-1.0),
+        patch.object(framed, "SOON", -1.0),
+        patch.object(framed_guess, "GUESS_FIRST", -1.0),
         patch.object(engine.Task, "has_processors", False),
         patch.object(VisitLabels, "fewest", interrupted),
     ):

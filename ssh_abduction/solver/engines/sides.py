@@ -1,7 +1,9 @@
-"""What order and sides demand of visits that are one, where places have frames: said only of the paths that an answer contradicts.
+"""Order and sides of visits that are one, for the engine with frames.
 
-To say it of a path takes a rule for each two visits that may be one. In a world half explored the causal axioms allow fewer dstates than order and
-sides do, in thousands of ways, and to forbid these one by one does not end; but few paths show nearly all of that.
+The axioms are told only of the paths that an answer contradicts (sides_framed.lp). To tell them of
+a path takes a rule for each two visits that may be one. In a world half explored the causal axioms
+allow fewer dstates than order and sides do, in thousands of ways, and to forbid these one by one
+does not end. But few paths show nearly all of that.
 """
 
 from __future__ import annotations
@@ -22,17 +24,17 @@ class FramedSides:
 
     def __init__(self, theory: Theory, asker: Asker) -> None:
         self._theory, self._asker = theory, asker
-        self.begin()
+        # The program parts of sides_framed.lp that were told, with their arguments.
+        self._said: dict[tuple[str, tuple[int, ...]], None] = {}
+        self._batch = -1
 
     def begin(self) -> None:
         """The control is a new one, which knows nothing."""
-        self._said: dict[
-            tuple[str, tuple[int, ...]], None
-        ] = {}  # program parts of sides_framed.lp, and their arguments
+        self._said = {}
         self._batch = -1
 
     def extend(self, batch: int) -> None:
-        """Clingo was told of more visits, in this batch: what was said of paths is said of these, too."""
+        """Tell what was told of paths also of the visits of a new batch."""
         self._batch = batch
         if self._said:
             paths = [
@@ -49,9 +51,16 @@ class FramedSides:
         labels: Sequence[int],
         standing: Mapping[int, tuple[int, int]],
     ) -> bool:
-        """Say what order and sides demand of a path that these labels contradict. False if all such paths have been told of.
+        """Tell clingo of a path that these labels contradict.
 
-        standing  the visit and slot of some node at each dstate, as far as clingo knows of any
+        Args:
+            paths: The axioms of places and paths.
+            chart: The nodes.
+            labels: The dstate of each node.
+            standing: The visit and slot of some node at each dstate, as far as clingo knows any.
+
+        Returns:
+            Whether there was such a path that clingo was not told of.
         """
         contrary, twice = next(
             self._asker.answers(
@@ -71,7 +80,11 @@ class FramedSides:
         return False
 
     def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides_framed.lp, unless it was before. Returns whether it was not."""
+        """Ground a part of sides_framed.lp, unless that was done before.
+
+        Returns:
+            Whether it was grounded now.
+        """
         if (part, arguments) in self._said:
             return False
         control, batches = self._asker.control, range(self._batch + 1)
