@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -83,11 +83,17 @@ def room(times: float) -> World:
     walls = WORLD.segments.copy()
     walls[walls > 0] *= times
     x, y = 4 * times - 0.6, 2 * times - 0.6
-    dstates = tuple(
-        replace(s, pose=(x if s.pose[0] > 2 else 0.6, y if s.pose[1] > 1 else 0.6, s.pose[2]))
-        for s in WORLD.dstates
+
+    def moved(at: Sequence[float]) -> tuple[float, float]:
+        return x if at[0] > 2 else 0.6, y if at[1] > 1 else 0.6
+
+    return replace(
+        WORLD,
+        segments=walls,
+        start=(x, y, 0.0),
+        dstates=tuple(replace(s, pose=(*moved(s.pose), s.pose[2])) for s in WORLD.dstates),
+        places={name: moved(at) for name, at in WORLD.places.items()},
     )
-    return replace(WORLD, segments=walls, start=(x, y, 0.0), dstates=dstates)
 
 
 def corner(side: float) -> World:

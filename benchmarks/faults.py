@@ -333,7 +333,7 @@ def cheaper(records: Iterable[Record]) -> str:
     rows = [
         f"| {r['family']} | {r['seed']} | {'yes' if r['solver'] == TOLD else 'no'} | "
         f"{r['states']} + {r['named']} = {r['tenths'] / 10} | "
-        f"{r['true_states']} + {r['faults']} = {r['true_tenths'] / 10} "
+        f"{r['true_states']} + {r['faults']} = {r['true_tenths'] / 10} | "
         f"{'yes' if r['proven'] else 'no'} |"
         for r in records
         if r["solver"] in (OURS, TOLD) and "tenths" in r and r["tenths"] < r["true_tenths"]

@@ -1,4 +1,4 @@
-"""What benchmarks have in common that write the rows of a table into a page of the documentation."""
+"""Helpers for benchmarks that write the rows of a table into a page of the documentation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def seeds_from(text: str) -> list[int]:
-    """The seeds from the first to the last one, written as 300-309; or the one seed.
+    """The seeds of a range such as 300-309, or the one seed.
 
     >>> seeds_from("300-302"), seeds_from("7")
     ([300, 301, 302], [7])
@@ -18,9 +18,13 @@ def seeds_from(text: str) -> list[int]:
 
 
 def print_rows(rows: Iterable[str], page: Path | None, begin: str) -> None:
-    """Print the rows as they come, and let them replace those of a page, where one is given.
+    """Print the rows as they come, and replace those of a page if one is given.
 
-    begin  a regular expression for how the first row to be replaced begins; an empty line ends the last one
+    Args:
+        rows: The lines of the table.
+        page: The page, or None.
+        begin: Regular expression for the beginning of the first row to replace. The last one is
+            followed by an empty line.
     """
     lines = []
     for line in rows:

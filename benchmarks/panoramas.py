@@ -1,10 +1,11 @@
-"""The bootstrap loop on panoramas of the simulated worlds: which features and which clusterings suit them. The tables and the figure of docs/measurements/panoramas.md.
+"""Bootstrap learning on simulated panoramas: which features and which clusterings suit them.
 
     python benchmarks/panoramas.py [--seeds 300-302] [--page docs/measurements/panoramas.md]
     python benchmarks/panoramas.py --figure docs/figures/panoramas.png
 
-A drive is clustered (k by M, at most 24), mapped from the views alone for at most two seconds, and its recogniser is asked for the dstates of a second drive, at other hours. Each
-seed has its own drive, noise and textures.
+Makes the tables and the figure of docs/measurements/panoramas.md. A drive is clustered (k by M, at
+most 24) and mapped from the views alone, in at most two seconds. Its recogniser is tested on a
+second drive at other hours. Each seed has its own drive, noise and textures.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ from ssh_abduction.learning.learner import (
 Pixels = NDArray[np.float64]
 SECONDS, MOST_VIEWS = 2.0, 24
 DOUBTS = (ImageWarning, RunnerUpWarning, AmbiguousMapWarning)
-# Hours at which a drive begins and ends, and those of the drive that is asked for.
+# The first and last hour of the drive to learn from, and of the drive to recognise.
 LIGHTS = {"lamps": ((20.0, 20.0), (20.0, 20.0)), "a day": ((7.0, 19.0), (18.0, 8.0))}
 TEXTURES = {"unique": False, "repeated": True}
 TOURS = {"notched rectangle": 8, "Taylor Hall": 4, "maze": 4}
@@ -86,14 +87,17 @@ def world(name: str) -> World:
 
 
 def of_each_image(pixels: Pixels) -> Pixels:
-    """Each colour of each image less its mean, over its standard deviation."""
+    """Each colour of each image, standardised to mean 0 and standard deviation 1."""
     images = pixels.reshape(len(pixels), -1, 3)
     made = (images - images.mean(axis=1, keepdims=True)) / images.std(axis=1, keepdims=True)
     return made.reshape(len(pixels), -1)
 
 
 def gradients(pixels: Pixels) -> Pixels:
-    """Histograms of oriented gradients (Dalal and Triggs 2005) of grey panoramas: of 8 directions, in cells of 6 x 12 pixels, each normalised."""
+    """Histograms of oriented gradients (Dalal and Triggs 2005) of grey panoramas.
+
+    There are 8 directions, in normalised cells of 6 x 12 pixels.
+    """
     grey = pixels.reshape(-1, 24, 180, 3).mean(axis=3)
     up, along = (
         np.gradient(grey, axis=1),
@@ -111,7 +115,7 @@ def gradients(pixels: Pixels) -> Pixels:
 
 
 class Whitened(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Raw pixels, whitened by principal components: as many as hold 95 % of the variance."""
+    """Raw pixels, whitened by the principal components that hold 95 % of the variance."""
 
     def fit(self, X: Pixels, y: Any = None) -> Whitened:
         self.mean_ = X.mean(axis=0)
@@ -143,17 +147,22 @@ CLUSTERERS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Found:
-    """What one drive came to.
+    """The result of one drive.
 
-    k            views
-    quality      M
-    purity       U: 1 where each dstate has one view
-    distinct     views by dstates: below 1 dstates share views, above it they have several
-    right        whether the map has the true dstates
-    said         whether there was a warning, or no map
-    doubted      whether a warning said that images are doubtful, views overlap, or another number of views gives another map; not that a map was not proven in time, which depends on the machine
-    recognised   the share of the images of the second drive whose true dstate the nearest image of the first drive has, by its true dstates: what the features are worth, whatever the map
-    by_map       the same by the labels of the map, as the recogniser that the loop has learnt answers, labels and true dstates one to one; 0 where there is no map
+    Attributes:
+        k: Number of views.
+        quality: M.
+        purity: U, which is 1 if each dstate has one view.
+        distinct: Views by dstates. Below 1 dstates share views; above 1 they have several.
+        right: Whether the map has the true dstates.
+        said: Whether there was a warning, or no map.
+        doubted: Whether a warning said that images are doubtful, views overlap, or another number
+            of views gives another map. Warnings about unproven maps do not count, as they depend
+            on the machine.
+        recognised: Share of images of the second drive whose nearest image of the first drive has
+            the same true dstate. It measures the features, whatever the map.
+        by_map: Share of these images that the learnt recogniser labels correctly, with labels and
+            true dstates matched one to one; 0 without a map.
     """
 
     k: int
@@ -168,7 +177,10 @@ class Found:
 
 
 class Rotated(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """The features, rotated into as many dimensions as there are images. Distances are what they were, and k-means is some ten times as fast."""
+    """Features rotated into as many dimensions as there are images.
+
+    Distances stay the same, and k-means is about ten times as fast.
+    """
 
     def __init__(self, features: Any = None) -> None:
         self.features = features
@@ -180,12 +192,16 @@ class Rotated(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def transform(self, X: Pixels) -> Pixels:
-        """What of other images is across the space of the first ones adds the same to all distances to these."""
+        """Project images onto the space of the first ones.
+
+        The part of an image outside this space adds the same to all its distances, so it is
+        dropped.
+        """
         return np.asarray((self.features.transform(X) - self.mean_) @ self.axes_.T)
 
 
 def drives(name: str, light: str, texture: str, seed: int) -> tuple[Trace, Trace]:
-    """A drive to learn from, and one to be asked for."""
+    """A drive to learn from, and a drive to recognise."""
     camera = Camera(paint=Paint(seed, TEXTURES[texture]))
     first, second = (replace(camera, hours=hours) for hours in LIGHTS[light])
     return simulate(world(name), TOURS[name], seed, camera=first), simulate(
@@ -194,6 +210,7 @@ def drives(name: str, light: str, texture: str, seed: int) -> tuple[Trace, Trace
 
 
 def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
+    """Learn from one drive, recognise another, and judge both."""
     truth, asked_truth = true_dstates(learnt), true_dstates(asked)
     made = Rotated(FEATURES[features])
     learner = BootstrapLearner(
@@ -240,7 +257,7 @@ def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
 
 
 def named(labels: NDArray[np.intp], truth: NDArray[Any]) -> dict[int, str]:
-    """The true dstate of each label, one to one, so that most labels are right."""
+    """The true dstate of each label, matched one to one so that most labels are right."""
     of_label, of_name = np.unique(labels), np.unique(truth)
     counts = np.array(
         [[np.sum((labels == label) & (truth == name)) for name in of_name] for label in of_label]
@@ -258,6 +275,7 @@ def measured(job: tuple[str, str, str, int], pairs: list[tuple[str, str]]) -> li
 
 
 def cells(results: list[Found]) -> str:
+    """The cells of a row, from the results of its drives."""
     ks = sorted({r.k for r in results})
     qualities = [r.quality for r in results]
     wrong_silently = sum(not r.right and not r.said for r in results)
@@ -277,11 +295,14 @@ def cells(results: list[Found]) -> str:
     )
 
 
-HEAD = "k by M | M | U | views by dstates | map right | wrong, and nothing said | right, and doubted | recognised, by truth | by the map"
+HEAD = (
+    "k by M | M | U | views by dstates | map right | wrong, and nothing said | right, and "
+    "doubted | recognised, by truth | by the map"
+)
 
 
 def tables(seeds: list[int], workers: int) -> Iterator[tuple[str, str]]:
-    """The names of tables, and their lines: features in all worlds, then clusterings over a day."""
+    """Names and lines of the tables: features in all worlds, then clusterings over a day."""
     by_k_means = [(features, "k-means") for features in FEATURES]
     others = [
         ("PanoramaTransformer", clusterer) for clusterer in CLUSTERERS if clusterer != "k-means"
@@ -292,7 +313,8 @@ def tables(seeds: list[int], workers: int) -> Iterator[tuple[str, str]]:
     rows: dict[tuple[str, str], list[Found]] = {}
     yield (
         "features",
-        f"| world | light | textures | features | {HEAD} |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        f"| world | light | textures | features | {HEAD} "
+        "|\n|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     )
     with ProcessPoolExecutor(workers) as pool:
         for group in [
@@ -320,6 +342,7 @@ def tables(seeds: list[int], workers: int) -> Iterator[tuple[str, str]]:
 
 
 def figure(path: Path, seed: int = 1) -> None:
+    """Draw some panoramas."""
     import matplotlib as mpl
 
     mpl.use("Agg")

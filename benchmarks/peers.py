@@ -1,7 +1,8 @@
-"""Other programs that find small Moore machines, each as a function from a trace to the machine that it finds.
+"""Other programs that find small Moore machines: functions from a trace to the machine they find.
 
-The causal theory asks for the smallest deterministic Moore machine that explains one trace, and so do these. Each function is given
-the whole trace and nothing of ours, and says in its docstring how the trace is put to the program, and what its answer means.
+The causal theory asks for the smallest deterministic Moore machine that explains a trace, and so do
+these programs. Each function gets the whole trace and nothing of ours. Its docstring says how the
+program is given the trace, and what its answer means.
 """
 
 from __future__ import annotations
@@ -20,19 +21,19 @@ from ssh_abduction import Trace
 
 
 class NotApplicableError(Exception):
-    """The program cannot be asked this; the message says why."""
+    """The program cannot solve this instance; the message says why."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """A Moore machine: where it starts, where an action leads, and what a state shows."""
+    """A Moore machine: its start, the ends of actions, and the view of each state."""
 
     start: Any
     follow: Callable[[Any, str], Any]
     shows: Callable[[Any], Any]
 
     def states(self, trace: Trace) -> int | None:
-        """How many states it goes through when it does the actions of the trace, or None where it does not show the views of the trace."""
+        """The number of states that the trace visits; None if the views differ from its views."""
         state, visited = self.start, set()
         for step in trace:
             if self.shows(state) != step.view:
@@ -45,7 +46,7 @@ class Machine:
 
 @dataclass(frozen=True)
 class Peer:
-    """A program: what finds the machine, the modules it needs, the packages on PyPI they come from, and whether it proves its machine minimal."""
+    """A program: its function, what it needs, and whether it proves its machine minimal."""
 
     find: Callable[[Trace], Machine]
     modules: tuple[str, ...]
@@ -58,14 +59,16 @@ class Peer:
 
 
 class Words:
-    """A trace as labelled words over the letters "0", "1", …, for learners of DFAs, which tell accepted words from rejected ones.
+    """A trace as labelled words over the letters "0", "1", …, for learners of DFAs.
 
-    The views are numbered. What was done up to a step is a word, accepted where the lowest bit of the view's number is 1. Each
-    further bit is asked for by a letter of its own: what was done, then that letter, is accepted where the bit is 1.
+    Such learners get accepted and rejected words. The views are numbered. The actions up to a step
+    are a word. It is accepted if the lowest bit of the view's number is 1. Each further bit has its
+    own letter: the actions followed by this letter are accepted if the bit is 1.
 
-    The smallest DFA has as many states as the smallest Moore machine. From a DFA: the states that the trace visits, each with the
-    bits it answers, are a Moore machine. From a Moore machine: accept by the lowest bit, and let a question lead to any state that
-    accepts or to any that rejects; as soon as there are two views there are both.
+    The smallest DFA has as many states as the smallest Moore machine. From a DFA to a machine: take
+    the states that the trace visits, each with the bits it answers. From a machine to a DFA: accept
+    by the lowest bit, and let the letter of a bit lead to any accepting or any rejecting state.
+    Both exist as soon as there are two views.
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -84,7 +87,7 @@ class Words:
         )
 
     def __len__(self) -> int:
-        """How many steps the trace has."""
+        """The number of steps of the trace."""
         return len(self._numbers)
 
     def at(self, step: int) -> Iterator[tuple[list[str], bool]]:
@@ -97,7 +100,7 @@ class Words:
     def machine(
         self, start: Any, follow: Callable[[Any, str], Any], accepts: Callable[[Any], bool]
     ) -> Machine:
-        """The Moore machine that a DFA over these letters is."""
+        """The Moore machine of a DFA over these letters."""
 
         def shows(state: Any) -> Any:
             number = sum(
@@ -112,7 +115,10 @@ class Words:
 
 
 def plain(trace: Trace) -> Machine:
-    """plain.lp in clingo, with more and more states, from as many as there are views: the first machine is the smallest."""
+    """plain.lp in clingo, with a growing number of states, so the first machine is the smallest.
+
+    The number begins with that of the views.
+    """
     import clingo
 
     views, actions = (
@@ -139,11 +145,13 @@ def plain(trace: Trace) -> Machine:
 
 
 def dfainductor(trace: Trace) -> Machine:
-    """DFA-Inductor: SAT, with more and more states, from as many as there are views: the first DFA is the smallest.
+    """DFA-Inductor: SAT with a growing number of states, so the first DFA is the smallest.
 
-    The trace is given as `Words`. Breadth-first symmetry breaking and no inconsistency graph, as by default. Counterexamples are
-    given by tens, the first ones first, from a start of 100 steps: on long traces that is much faster than all words at once. They
-    are made when asked for, as all words together would have a length of the square of the trace's.
+    The number begins with that of the views. The trace is given as `Words`. By default it breaks
+    symmetries breadth-first and uses no inconsistency graph. Counterexamples are added ten at a
+    time, the first ones first, to a start of 100 steps. On long traces this is much faster than all
+    words at once. Words are made when needed, as their total length is quadratic in that of the
+    trace.
     """
     from dfainductor.algorithms.searchers import LSUS
     from dfainductor.examples import BaseExamplesProvider
@@ -205,9 +213,10 @@ def dfainductor(trace: Trace) -> Machine:
 
 
 def z3gi(trace: Trace) -> Machine:
-    """z3gi: SMT, with more and more states, from as many as there are views: the first DFA is the smallest.
+    """z3gi: SMT with a growing number of states, so the first DFA is the smallest.
 
-    The trace is given as `Words`, all at once, in the encoding with a node a word and without quantifiers, its fastest here.
+    The number begins with that of the views. The trace is given as `Words`, all at once, in the
+    encoding with a node per word and without quantifiers, which is its fastest here.
     """
     import z3
     from z3gi.encoders import expressive
@@ -216,7 +225,7 @@ def z3gi(trace: Trace) -> Machine:
     words = Words(trace)
     sys.setrecursionlimit(
         max(sys.getrecursionlimit(), 10 * len(words))
-    )  # it reads a word letter by letter, each in a call of its own
+    )  # it reads a word by one nested call for each letter
     encoder = expressive.Encoder(quantifiers=False)
     sample = Sample(encoder)
     for t in range(len(words)):
@@ -236,7 +245,10 @@ def z3gi(trace: Trace) -> Machine:
 
 
 def rpni(trace: Trace) -> Machine:
-    """AALpy's RPNI: merges states where that is possible, first come first served. The machine explains the trace, but need not be the smallest."""
+    """AALpy's RPNI: merge states where possible, in order.
+
+    The machine explains the trace but need not be the smallest.
+    """
     from aalpy.learning_algs import run_RPNI
 
     done = tuple(action.name for action in trace.actions)
@@ -248,7 +260,10 @@ def rpni(trace: Trace) -> Machine:
 
 
 def gsm(trace: Trace) -> Machine:
-    """AALpy's general state merging, by evidence: the merge that joins most comes first. The machine explains the trace, but need not be the smallest."""
+    """AALpy's general state merging by evidence: the merge that joins most comes first.
+
+    The machine explains the trace but need not be the smallest.
+    """
     from aalpy.learning_algs import run_GSM
     from aalpy.learning_algs.general_passive.GsmNode import GsmNode
     from aalpy.learning_algs.general_passive.ScoreFunctionsGSM import (
@@ -261,7 +276,8 @@ def gsm(trace: Trace) -> Machine:
         *((action.name, view) for action, view in zip(trace.actions, trace.views[1:], strict=True)),
     ]
     score = SimpleScoreCalculation(GsmNode.deterministic_compatible, EDSM_score())
-    with warnings.catch_warnings(action="ignore"):  # that not all actions were tried in all states
+    # Ignore the warning that not all actions were tried in all states.
+    with warnings.catch_warnings(action="ignore"):
         return _of_aalpy(run_GSM([walk], score_calc=score, data_format="io_traces"))
 
 

@@ -1,6 +1,7 @@
-"""Street maps in the plane, with streets at any angles: a robot drives through them, and sees the bearings of the gateways.
+"""Street maps in the plane, with streets at any angles, and drives of a robot through them.
 
-A world is a graph of networkx whose nodes have a position `at`, as complex numbers with x to the right and y up; its edges are straight streets.
+The robot sees the bearings of gateways. A world is a networkx graph whose nodes have a position
+`at`: a complex number, with x to the right and y up. Edges are straight streets.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ import networkx as nx
 from ssh_abduction import Trace
 from ssh_abduction.data.trace import Action
 
-STRAIGHT = 20.0  # degrees: two streets that are at most so far from one line are one path
+STRAIGHT = 20.0  # degrees; two streets within this of one line are one path
 
 
 @dataclass(frozen=True)
 class Tour:
-    """What a robot saw and did, and where it was: the place and the direction that it faced, for each step."""
+    """What a robot saw and did, and its place and direction at each step."""
 
     trace: Trace
     truth: tuple[tuple[object, int], ...]
@@ -34,7 +35,7 @@ class Tour:
 
     @property
     def places(self) -> int:
-        """How many places were visited."""
+        """The number of visited places."""
         return len({place for place, _ in self.truth})
 
 
@@ -61,7 +62,7 @@ def hexagon() -> nx.Graph:
 
 
 def honeycomb(rows: int, columns: int) -> nx.Graph:
-    """Junctions of three streets, 120 degrees from each other."""
+    """Junctions of three streets, 120 degrees apart."""
     graph = nx.hexagonal_lattice_graph(rows, columns)
     nx.set_node_attributes(
         graph, {node: complex(*pos) for node, pos in graph.nodes(data="pos")}, "at"
@@ -70,7 +71,7 @@ def honeycomb(rows: int, columns: int) -> nx.Graph:
 
 
 def triangles(rows: int, columns: int) -> nx.Graph:
-    """A lattice of triangles: junctions of up to six streets, 60 degrees from each other."""
+    """A lattice of triangles: junctions of up to six streets, 60 degrees apart."""
     graph = nx.triangular_lattice_graph(rows, columns)
     nx.set_node_attributes(
         graph, {node: complex(*pos) for node, pos in graph.nodes(data="pos")}, "at"
@@ -79,7 +80,7 @@ def triangles(rows: int, columns: int) -> nx.Graph:
 
 
 def wheel(spokes: int) -> nx.Graph:
-    """A hub with so many spokes, and a ring road around it."""
+    """A hub with spokes, and a ring road around it."""
     rim = {k: cmath.rect(1, 2 * math.pi * k / spokes) for k in range(spokes)}
     return world(
         {"hub": 0j, **rim}, [("hub", k) for k in rim] + [(k, (k + 1) % spokes) for k in rim]
@@ -87,13 +88,16 @@ def wheel(spokes: int) -> nx.Graph:
 
 
 def junction(*directions: float) -> nx.Graph:
-    """A hub, and a dead end in each of these directions, in degrees."""
+    """A hub with a dead end in each of these directions, in degrees."""
     ends = {k: cmath.rect(1, math.radians(d)) for k, d in enumerate(directions)}
     return world({"hub": 0j, **ends}, [("hub", k) for k in ends])
 
 
 def scattered(places: int, rng: random.Random) -> nx.Graph:
-    """Places anywhere, and streets between them at any angles that are at least 40 degrees apart at each place; no two streets cross."""
+    """Places at random positions with streets between them, of which no two cross.
+
+    At each place the streets are at least 40 degrees apart.
+    """
     from scipy.spatial import Delaunay
 
     while True:
@@ -114,7 +118,10 @@ def scattered(places: int, rng: random.Random) -> nx.Graph:
 
 
 def _crowded(graph: nx.Graph, place: object) -> bool:
-    """Whether two directions at a place, of streets or straight opposite of them, are hard to tell apart."""
+    """Whether two directions at a place are hard to tell apart.
+
+    Counts the directions of streets and their opposites.
+    """
     ways = [_direction(graph, place, there) for there in graph[place]]
     for i, a in enumerate(ways):
         for b in ways[:i]:
@@ -131,7 +138,7 @@ def _direction(graph: nx.Graph, here: object, there: object) -> float:
 
 
 def _aligned(graph: nx.Graph, place: object, facing: float) -> float:
-    """The direction of a robot that has come to a place, and turns to the street that goes straight on, if there is one."""
+    """The direction of a robot that arrives at a place and faces the street ahead, if any."""
     return next(
         (
             way
@@ -153,11 +160,21 @@ def drive(
     unseen: bool = False,
     landmarks: Container[object] = (),
 ) -> Tour:
-    """A tour of so many steps: at each place the robot goes on along a street that it has been along least often. Its views are the bearings of the gateways, to ten degrees.
+    """A tour of so many steps.
 
-    noise      degrees that each bearing of a star may be off
-    unseen     whether gateways behind the robot are not observed; each is then logged where it is, but as unknown
-    landmarks  places that the views tell, too
+    At each place the robot takes a street that it has used least often. Its views are the bearings
+    of the gateways, rounded to ten degrees.
+
+    Args:
+        graph: The world.
+        start: The place where the robot starts.
+        towards: The place that it faces.
+        steps: Number of actions.
+        rng: Source of random choices.
+        noise: Largest error of a bearing in a star, in degrees.
+        unseen: Whether gateways behind the robot are not observed. They are logged where they are,
+            but as unknown.
+        landmarks: Places that the views reveal, too.
     """
     here, facing = start, _direction(graph, start, towards)
     views: list[str] = []

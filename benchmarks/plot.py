@@ -1,8 +1,8 @@
-"""How time grows with the steps of a trace and with the dstates of its map, from a stored run.
+"""Draw how time grows with the steps of a trace and the dstates of its map, from a stored run.
 
     python benchmarks/plot.py RESULTS.json [PICTURE]
 
-The picture is docs/figures/growth.png where none is named.
+The default picture is docs/figures/growth.png.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from matplotlib import pyplot as plt
 from matplotlib.lines import Line2D
 
 PICTURE = Path(__file__).parent.parent / "docs" / "figures" / "growth.png"
-STYLES = {  # Okabe and Ito's colours, and shapes, so that neither is needed alone
+STYLES = {  # Okabe and Ito's colours and different markers, so that either is enough
     "ssh-abduction": ("#000000", "o", "ssh-abduction"),
     "plain.lp": ("#D55E00", "s", "plain.lp"),
     "dfainductor": ("#0072B2", "^", "dfainductor"),
@@ -31,7 +31,7 @@ STYLES = {  # Okabe and Ito's colours, and shapes, so that neither is needed alo
     "RPNI": ("#E69F00", "v", "RPNI, not minimal"),
     "GSM": ("#CC79A7", "P", "GSM, not minimal"),
 }
-PANELS = (  # what is along the axis, the families of instances on it, and the numbers that it shows
+PANELS = (  # label of the axis, families of instances, and the range of numbers
     (
         "steps",
         "images",
@@ -52,7 +52,7 @@ PANELS = (  # what is along the axis, the families of instances on it, and the n
         (10, 20, 50, 100, 200),
     ),
 )
-STEP_UP = 1.35  # how far apart the tools are drawn that are over the limit
+STEP_UP = 1.35  # factor between the heights of tools that are over the limit
 
 
 def draw(results: dict[str, Any], picture: Path) -> None:
@@ -109,7 +109,10 @@ def draw(results: dict[str, Any], picture: Path) -> None:
 
 
 def curve(results: dict[str, Any], pattern: str, tool: str, size: str) -> list[tuple[float, float]]:
-    """The size and the median time of each instance of a family: images, or states, as proven, or else as the world has them."""
+    """The size and median time of each instance of a family.
+
+    The size is the number of images, or of states: the proven number, else that of the world.
+    """
     points = []
     for name, by_tool in instances(results).items():
         if re.fullmatch(pattern, name) and any("seconds" in cell for cell in by_tool.get(tool, [])):

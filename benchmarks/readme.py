@@ -1,4 +1,4 @@
-"""Writes the tables of a stored run into docs/measurements/performance.md.
+"""Write the tables of a stored run into docs/measurements/performance.md.
 
     python benchmarks/readme.py RESULTS.json             # of bench.py
     python benchmarks/readme.py RESULTS.json pruning     # of pruning.py
@@ -26,7 +26,7 @@ PAGES = {
 
 
 def block(name: str, results: dict[str, Any], path: Path) -> str:
-    """What stands between the markers of a table: the table, what it was measured on, and where it is stored."""
+    """The text between the markers of a table: the table, its machine, and where it is stored."""
     machine, versions = (
         results["machine"],
         ", ".join(f"{package} {number}" for package, number in results["packages"].items()),
@@ -35,7 +35,8 @@ def block(name: str, results: dict[str, Any], path: Path) -> str:
     source = os.path.relpath(path, PAGES[name].parent).replace(os.sep, "/")
     stored = f"From [`{path.relative_to(ROOT).as_posix()}`]({source}).\n"
     if name == "pruning":
-        return f"{pruning.table(results)}\n\n{measured}, {results['seeds']} seeds where no other number is named. {stored}"
+        seeds = f"{results['seeds']} seeds where no other number is named"
+        return f"{pruning.table(results)}\n\n{measured}, {seeds}. {stored}"
     limits = f"{results['limit']:g} s and {results['memory']:,} MiB a cell"
     seeds = (
         "one trace of each kind"
@@ -49,7 +50,7 @@ def block(name: str, results: dict[str, Any], path: Path) -> str:
 
 
 def _narrow(table: str) -> str:
-    """The table without the spaces that align its columns: these make up a third of it, and its lines are too long to be read as text."""
+    """The table without the spaces that align its columns, which are a third of it."""
     return re.sub(" {2,}", " ", re.sub("-{3,}", "--", table))
 
 

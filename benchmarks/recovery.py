@@ -1,12 +1,20 @@
-"""What one fault does to a robot that drives: how soon it is certain of its map again, and whether that is right.
+"""What one fault does to a driving robot: steps until its map is certain again, and right.
 
-    python benchmarks/recovery.py [--only PATTERN] [--seeds 20] [--first 800] [--limit 0.5] [--out RESULTS.jsonl]
+    python benchmarks/recovery.py [--only PATTERN] [--seeds 20] [--first 800] [--limit 0.5]
+                                  [--out RESULTS.jsonl]
 
-Each run has one fault, at a step drawn evenly but for the first and last five. Steps are counted from the one at which it shows: that with the wrong view, or the first one after the jump.
-Noticed is the first step at which the mapper says that something broke; certain again is the first one at which it is certain after that. A map is right if it has the true dstates and links, as far as
-they can be reached from where the robot is, and the robot where it truly is. The fault is found where the labels of all steps but those with a wrong view, and the fault, are the true ones
-(fault_cases.py), in the first map, or in one of the minimal maps: which of two actions in a row slipped often nothing ever tells. Between two steps the robot drives, in which time a trace is solved that takes longer than a step may. "Truth dearer" counts the runs in which the true map and fault cost
-more than the least. CPU milliseconds are those of `observe`.
+Each run has one fault, at a random step that is not among the first or last five. Steps count from
+where the fault shows: at the wrong view, or at the first step after the jump.
+
+*Noticed* is the first step at which the mapper says that something broke. *Certain again* is the
+first step after that at which it is certain. A map is right if it has the true dstates and links
+that can be reached from the robot, and the robot's true dstate. The fault is *found* if the fault
+and all labels are the true ones, except the label of a wrong view (fault_cases.py), in the first
+map or in one of the minimal maps. Often nothing tells which of two actions in a row slipped.
+
+Between two steps the robot drives. In this time the mapper goes on with a solve that a step did
+not finish. "Truth dearer" counts the runs in which the truth costs more than the minimum. CPU
+milliseconds are those of `observe`.
 """
 
 from __future__ import annotations
@@ -57,14 +65,14 @@ Record = dict[str, Any]
 
 
 def machine(seed: int, *, wrong: int = 0, jumps: int = 0) -> Case:
-    """A random machine of 5 to 12 states, 3 actions, 4 to 9 views, 200 steps, and one fault."""
+    """A random machine of 5 to 12 states and 4 to 9 views, with one fault in 200 steps."""
     chance = random.Random(f"recovery {seed}")
     states = chance.randint(5, 12)
     return sized(seed, states, chance.randint(4, min(9, states)), 200, wrong=wrong, jumps=jumps)
 
 
 def corridor(seed: int, steps: int = 30) -> Case:
-    """Up and down a corridor of four places with stars; one star is wrong."""
+    """Up and down a corridor of four places with stars, one of which is wrong."""
     chance = random.Random(f"corridor {seed}")
     openings = [(1, 0, 0, 0), (1, 0, 1, 0), (1, 0, 1, 0), (0, 0, 1, 0)] * 2
     actions = ["travel", "travel", "travel", "around"] * 2
@@ -104,7 +112,7 @@ def main() -> None:
         "--only",
         default="",
         metavar="PATTERN",
-        help="families whose name this regular expression is found in",
+        help="run only families that match this regular expression",
     )
     parser.add_argument(
         "--seeds", type=int, default=20, metavar="N", help="runs of each family (default 20)"
@@ -127,7 +135,7 @@ def main() -> None:
         help="seconds the robot drives between two steps (default 0.05)",
     )
     parser.add_argument(
-        "--out", type=Path, metavar="RESULTS.jsonl", help="where to store what came of each run"
+        "--out", type=Path, metavar="RESULTS.jsonl", help="file for the result of each run"
     )
     options = parser.parse_args()
     print(f"| {' | '.join(('trace', *COLUMNS))} |\n{'|---' * (len(COLUMNS) + 1)}|")
@@ -146,7 +154,7 @@ def main() -> None:
 
 
 def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int = 0) -> Record:
-    """What the mapper says on its way through a trace with one fault."""
+    """Follow a mapper through a trace with one fault."""
     trace = case.walk.trace
     shown = min([*case.wrong, *case.misseen, *(t + 1 for t in case.jumps)])
     mapper = OnlineMapper(trace.views[0], theory, star=trace.steps[0].star, time_limit=limit)
@@ -154,7 +162,7 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
     right_again = False
     milliseconds = []
     for t, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True), 1):
-        if mapper.solution.stopped == "time limit":  # else nothing goes on meanwhile
+        if mapper.solution.stopped == "time limit":  # otherwise no solve is unfinished
             time.sleep(drive)
         began = time.process_time()
         solution = mapper.observe(action, trace.views[t], star=step.star)
@@ -191,7 +199,7 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
 
 
 def is_right(case: Case, theory: Theory, ssh_map: SSHMap) -> bool:
-    """Whether a map of the first steps predicts from there what the true one does."""
+    """Whether a map of the first steps predicts what the true map does from there."""
     truth = true_map(case, theory, len(ssh_map.labels))
     return (
         Rival.of(ssh_map, case.walk.trace, theory).future()
@@ -200,14 +208,14 @@ def is_right(case: Case, theory: Theory, ssh_map: SSHMap) -> bool:
 
 
 def true_map(case: Case, theory: Theory, steps: int) -> SSHMap:
-    """The true map of so many first steps, and its faults."""
+    """The true map of the first steps, with its faults."""
     trace = case.walk.trace
     faults = [(t, kind) for t, kind in case.faults if t + (kind == "slipped") < steps]
     return answer_maps.faulty_map(case.walk.truth[:steps], trace.prefix(steps), faults, theory)
 
 
 def cells(records: Sequence[Record]) -> list[str]:
-    """What the table says of the runs of a family."""
+    """The cells of a row, from the runs of a family."""
     sure, others = (
         [r for r in records if r["certain_before"] is before] for before in (True, False)
     )
@@ -226,7 +234,8 @@ def cells(records: Sequence[Record]) -> list[str]:
         steps_of(others_again),
         f"{sum(record['right_again'] for record in records)} of {len(again) + len(others_again)}",
         f"{sum(record['right'] for record in records)} of {len(records)}",
-        f"{sum(record['found'][:1] == [True] for record in records)}, {sum(any(record['found']) for record in records)}",
+        f"{sum(record['found'][:1] == [True] for record in records)}, "
+        f"{sum(any(record['found']) for record in records)}",
         str(sum(record["dearer"] for record in records)),
         f"{statistics.median(spent):.2f}, {statistics.mean(spent):.1f}, {max(spent):.0f}",
     ]

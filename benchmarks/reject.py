@@ -1,9 +1,10 @@
-"""How often displacements refuse a true map: routes through mazes, with the default noise of odometry, and the true map of each tested.
+"""How often displacements refuse a true map: routes through mazes with the default odometry noise.
 
     python benchmarks/reject.py [--routes 1000] [--cells 4] [--steps 40] [--first 0]
 
-A row for each `reject`, the chance, at most, that a true map is refused. In the first column of shares the noise is white, and the model has no errors that repeat; in the second one a scale
-and a drift of heading are drawn for each route, with the standard deviations that the model has for them.
+A row for each `reject`, the highest probability that a true map is refused. The first column of
+shares has white noise, and a model without systematic errors. The second one has a scale and a
+drift of heading, drawn for each route with the standard deviations of the model.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ MODEL = Odometry()
 
 
 def true_map(walk: Walk) -> SSHMap:
-    """The true map of a walk, as far as displacements are about it: dstates and their places."""
+    """The dstates and places of the true map of a walk; displacements need no more."""
     number: dict[object, int] = {}
     labels = tuple(number.setdefault(state, len(number)) for state in walk.truth)
     places: dict[object, int] = {}
@@ -34,7 +35,7 @@ def true_map(walk: Walk) -> SSHMap:
 
 
 def walks(cells: int, steps: int, seed: int) -> Iterator[Walk]:
-    """The route of one seed, with white noise, and with errors that repeat."""
+    """The route of one seed with white noise, and with systematic errors."""
     rng = np.random.default_rng(seed)
     scale, bend = rng.normal(0.0, MODEL.scale), rng.normal(0.0, MODEL.bend)
     white = replace(MODEL, scale=0.0, bend=0.0)
@@ -68,11 +69,12 @@ def main() -> None:
     for seed in range(options.first, options.first + options.routes):
         for column, walk in enumerate(walks(options.cells, options.steps, seed)):
             for line, reject in enumerate(REJECTS):
-                if not is_refused(walk, reject):  # a smaller share refuses less
+                if not is_refused(walk, reject):  # then a smaller share does not refuse it either
                     break
                 refused[line, column] += 1
     print(
-        f"| `reject` | white noise only | with {100 * MODEL.scale:g} % scale and {np.degrees(MODEL.bend):.1g} degrees a metre |\n|---|---|---|"
+        f"| `reject` | white noise only | with {100 * MODEL.scale:g} % scale and "
+        f"{np.degrees(MODEL.bend):.1g} degrees a metre |\n|---|---|---|"
     )
     for reject, counts in zip(REJECTS, refused / options.routes, strict=True):
         print(f"| {reject:g} | {counts[0]:.3f} | {counts[1]:.3f} |")

@@ -1,10 +1,16 @@
-"""What people use for topological maps of metric ones: the skeleton of the free space of an occupancy grid, pruned, as a graph.
+"""The usual topological map of a metric one: the pruned skeleton of the free space, as a graph.
 
     python benchmarks/skeleton.py LOG [LOG ...] -o FOLDER [--poses corrected|odometry] [--doors]
 
-draws for each log the grid, the graph and the way of the robot. All scans are laid into the grid at their poses: at the corrected ones, which the robot did not have, or at those of the odometry. The skeleton (Zhang & Suen 1984,
-scikit-image) of the cells where a robot fits has branches to every niche; one that ends within the circle around its junction that touches the nearest wall, or hardly beyond it, is cut off, as is usual (Thrun 1998, "Learning metric-topological maps";
-Shaked & Bruckstein 1998, "Pruning medial axes"). Junctions in one open space, nearer to each other than to the walls, are one node. Nodes are junctions and dead ends, and with --doors also doors. All lengths are in metres, and the same for all logs.
+Draws for each log the occupancy grid, the graph and the way of the robot. All scans are put into
+the grid at their poses: the corrected ones, which the robot did not have, or those of the odometry.
+
+The skeleton of the cells where a robot fits (Zhang & Suen 1984, scikit-image) has branches to every
+niche. A branch is cut off if it ends near the circle around its junction that touches the nearest
+wall, as is usual (Thrun 1998, "Learning metric-topological maps"; Shaked & Bruckstein 1998,
+"Pruning medial axes"). Junctions in one open space, nearer to each other than to the walls, are one
+node. Nodes are junctions and dead ends, and with --doors also doors. All lengths are in metres, and
+the same for all logs.
 """
 
 from __future__ import annotations
@@ -26,47 +32,54 @@ from perception.readers.scans import Pose, RobotLog
 from simulator.motion import moved
 
 Array = NDArray[np.float64]
-CELL = 0.1  # metres a side
-FARTHEST = (
-    12.0  # Beams are laid into the grid so far: beyond that they diverge, and leave cells out.
-)
-WALL = 0.2  # The share of the beams at a cell that have to end there for a wall.
-LEAST = 2  # So many beams have to have passed a cell that is free.
-RADIUS = 0.25  # of the robot
-SPECK = 0.3  # square metres: smaller obstacles, and smaller holes in what was seen, are noise
-SPUR = 1.0  # A branch that ends is kept where it is so much longer than the distance of its junction from the walls.
-DOOR = 0.75  # A door is where the walls are nearer than this on both sides, and nowhere nearer within 2 m along the way,
-WIDER = 1.4  # and so many times farther within 2 m both ways.
+CELL = 0.1  # side of a cell
+FARTHEST = 12.0  # Ignore beams beyond this, as they are so far apart that they skip cells.
+WALL = 0.2  # A cell is a wall if at least this share of its beams end there.
+LEAST = 2  # A free cell was passed by at least this many beams.
+RADIUS = 0.25  # Radius of the robot.
+SPECK = 0.3  # Smaller obstacles, and smaller holes in the seen space, are noise; square metres.
+SPUR = 1.0  # Keep a dead end that is this much longer than its junction's distance from the walls.
+# A door is a narrowest point within 2 m along the way, with walls nearer than DOOR on both sides.
+# Within 2 m in both directions the walls are at least WIDER times as far away.
+DOOR = 0.75
+WIDER = 1.4
 REACH = 1.5  # The robot passes a node within this, or within the node's distance from the walls.
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """What all scans say of each cell: 1 free, 0 wall, NaN not seen. (rows, columns); row 0 is at the least y.
+    """What all scans say of each cell: 1 free, 0 wall, NaN not seen.
 
-    origin  x and y of the lower left corner
+    Attributes:
+        cells: (rows, columns); row 0 has the least y.
+        origin: x and y of the lower left corner.
     """
 
     cells: Array
     origin: tuple[float, float]
 
     def at(self, points: Array) -> NDArray[np.int_]:
-        """The row and column of each point, (n, 2)."""
+        """The row and column of each point; points are (n, 2)."""
         return np.floor((points[:, ::-1] - self.origin[::-1]) / CELL).astype(int)
 
     def points(self, cells: NDArray[Any]) -> Array:
-        """The middle of each cell, (n, 2): x and y, of rows and columns."""
+        """The middle x and y of each cell, (n, 2), from rows and columns."""
         return (np.asarray(cells, dtype=float)[:, ::-1] + 0.5) * CELL + self.origin
 
 
 def poses_of(log: RobotLog, kind: str) -> list[Pose]:
-    """The poses of all scans, corrected or by odometry. Raises ValueError where there are none."""
+    """The poses of all scans, corrected or by odometry.
+
+    Raises:
+        ValueError: If the log has none.
+    """
     if kind == "odometry":
         return [scan.odometry for scan in log.scans]
     poses = [scan.corrected for scan in log.scans if scan.corrected is not None]
     if len(poses) < len(log):
         raise ValueError(
-            f"{log.source}: expected corrected poses, got {len(poses)} for {len(log)} scans; take --poses odometry"
+            f"{log.source}: expected corrected poses, got {len(poses)} for {len(log)} scans; "
+            "take --poses odometry"
         )
     return poses
 
@@ -95,7 +108,7 @@ def grid_of(log: RobotLog, poses: Sequence[Pose]) -> Grid:
         np.add.at(wall, number((x, y) + ranges[near, None] * rays[near]), 1)
         before = along[None, :] < np.minimum(ranges, FARTHEST)[:, None] - CELL
         points = (x, y) + along[None, :, None] * rays[:, None, :]
-        clear[np.unique(number(points[before]))] += 1  # each scan says once that a cell is free
+        clear[np.unique(number(points[before]))] += 1  # a scan counts once for each free cell
     cells = np.full(rows * columns, np.nan)
     cells[clear >= LEAST] = 1.0
     cells[wall > WALL / (1 - WALL) * clear] = 0.0
@@ -108,18 +121,22 @@ def grid_of(log: RobotLog, poses: Sequence[Pose]) -> Grid:
 
 
 def free_space(grid: Grid, poses: Sequence[Pose]) -> tuple[NDArray[np.bool_], Array]:
-    """The cells where a robot fits that has been at these poses; and how many metres each cell is from what was not seen to be free, specks aside."""
+    """The cells where a robot fits that has been at these poses, and the clearance of each cell.
+
+    The clearance is the distance in metres from the nearest cell not seen to be free, without
+    specks.
+    """
     seen = _without_specks(~_without_specks(grid.cells != 1.0))
     clear = distance_transform_edt(seen) * CELL
     parts, _ = label(binary_opening(clear >= RADIUS))
     rows, columns = grid.at(np.array(poses)[:, :2]).T
     at = np.bincount(parts[rows, columns], minlength=2)
-    at[0] = 0  # where the robot stood, it may have touched what is drawn as a wall
+    at[0] = 0  # the robot may have stood in cells that are drawn as a wall
     return np.asarray(parts == at.argmax()), clear
 
 
 def _without_specks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The parts of a mask that are no specks."""
+    """The mask without its parts that are specks."""
     parts, _ = label(mask)
     large = np.bincount(parts.ravel()) * CELL**2 >= SPECK
     large[0] = False
@@ -128,14 +145,21 @@ def _without_specks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A graph in metric space. Nodes have `at`, (x, y), and `clear`, their distance from the walls; edges `way`, (n, 2) points, and `metres`."""
+    """A graph in metric space.
+
+    Nodes have `at`, (x, y), and `clear`, their distance from the walls. Edges have `way`, (n, 2)
+    points, and `metres`.
+    """
 
     grid: Grid
     free: NDArray[np.bool_]
     graph: nx.MultiGraph
 
     def events(self, poses: Sequence[Pose]) -> list[tuple[int, int]]:
-        """Where the robot passed nodes, in order: the scan that was nearest, and the node. Of two nodes within reach it passes the nearer one."""
+        """The nodes that the robot passed, in order, each with the nearest scan.
+
+        Of two nodes within reach the robot passes the nearer one.
+        """
         nodes = sorted(self.graph)
         at = np.array([self.graph.nodes[n]["at"] for n in nodes])
         reach = np.maximum(REACH, [self.graph.nodes[n]["clear"] for n in nodes])
@@ -143,7 +167,7 @@ class Skeleton:
         nearest = distance.argmin(axis=1)
         within = distance.min(axis=1) <= reach[nearest]
         passed: list[tuple[int, int]] = []
-        last = -1  # the scan at which the robot was last within reach of the last node
+        last = -1  # the latest scan within reach of the last node
         for scan in np.flatnonzero(within):
             number = int(nearest[scan])
             if (
@@ -160,7 +184,7 @@ class Skeleton:
 
 
 def skeleton_of(log: RobotLog, poses: Sequence[Pose], *, doors: bool = False) -> Skeleton:
-    """The pruned skeleton of the free space that a log shows at these poses; with nodes at doors, too, where these are asked for."""
+    """The pruned skeleton of the free space of a log, optionally with nodes at doors."""
     from skimage.morphology import skeletonize
 
     grid = grid_of(log, poses)
@@ -180,7 +204,10 @@ def skeleton_of(log: RobotLog, poses: Sequence[Pose], *, doors: bool = False) ->
 
 
 def _pixels(thin: NDArray[np.bool_]) -> nx.Graph:
-    """The cells of a skeleton that touch each other; of three that touch at a corner only the two straight joints are kept."""
+    """The graph of touching cells of a skeleton.
+
+    Of three cells that touch at a corner only the two straight joints are kept.
+    """
     graph = nx.Graph()
     cells = {(int(r), int(c)) for r, c in np.argwhere(thin)}
     graph.add_nodes_from(cells)
@@ -200,7 +227,10 @@ def _pixels(thin: NDArray[np.bool_]) -> nx.Graph:
 
 
 def _chains(pixels: nx.Graph) -> nx.MultiGraph:
-    """Junctions and ends of a graph of cells, joined by the chains of cells between them. A ring without a junction has one at one of its cells."""
+    """Junctions and ends of a graph of cells, joined by the chains of cells between them.
+
+    A ring without a junction gets a node at one of its cells.
+    """
     ends = [cell for cell, degree in pixels.degree if degree != 2]
     ends += [
         min(ring)
@@ -215,7 +245,7 @@ def _chains(pixels: nx.Graph) -> nx.MultiGraph:
             way = [end, first]
             while way[-1] not in known:
                 way.append(next(cell for cell in pixels[way[-1]] if cell != way[-2]))
-            if (way[0], way[1]) <= (way[-1], way[-2]):  # each chain is found from both ends
+            if (way[0], way[1]) <= (way[-1], way[-2]):  # keep one of the two directions
                 _join(graph, way)
     return graph
 
@@ -230,7 +260,10 @@ def _join(graph: nx.MultiGraph, cells: Sequence[tuple[int, int]]) -> None:
 
 
 def _prune(graph: nx.MultiGraph) -> None:
-    """Cut off branches that hardly leave the circle of their junction, the shortest first, and join what is left where a junction is none any more."""
+    """Cut off branches that hardly leave the circle of their junction, the shortest first.
+
+    Edges are joined at nodes that are no longer junctions.
+    """
     while True:
         branches = []
         for end in graph:
@@ -247,7 +280,7 @@ def _prune(graph: nx.MultiGraph) -> None:
 
 
 def _straighten(graph: nx.MultiGraph, node: Any) -> None:
-    """Take out a node that is no junction any more, as two different edges end there."""
+    """Remove a node that is no longer a junction, if two different edges end there."""
     if graph.degree(node) == 2 and graph.number_of_edges(node, node) == 0:
         (_, _, one), (_, _, other) = graph.edges(node, data=True)
         to = one["cells"] if one["cells"][-1] == node else one["cells"][::-1]
@@ -257,7 +290,10 @@ def _straighten(graph: nx.MultiGraph, node: Any) -> None:
 
 
 def _merged(graph: nx.MultiGraph) -> nx.MultiGraph:
-    """Junctions that lie within each other's circle are one node, at the one that is farthest from the walls."""
+    """The graph with junctions merged that lie within each other's circle.
+
+    A merged node is at the junction farthest from the walls.
+    """
     near = nx.Graph()
     near.add_nodes_from(graph)
     for a, b, data in graph.edges(data=True):
@@ -284,7 +320,10 @@ def _merged(graph: nx.MultiGraph) -> nx.MultiGraph:
 
 
 def _with_doors(graph: nx.MultiGraph, clear: Array) -> nx.MultiGraph:
-    """The graph with a node at each door: a place along an edge that is the narrowest one far and wide, as critical points of Voronoi graphs are."""
+    """The graph with a node at each door: a narrowest point along an edge.
+
+    Critical points of Voronoi graphs are defined in the same way.
+    """
     within = round(2.0 / CELL)
     opened = nx.MultiGraph()
     opened.add_nodes_from(graph.nodes(data=True))
@@ -310,7 +349,7 @@ def _with_doors(graph: nx.MultiGraph, clear: Array) -> nx.MultiGraph:
 
 
 def lay(axes: Any, skeleton: Skeleton, poses: Sequence[Pose]) -> None:
-    """Draw the grid, the way of the robot and the graph; nodes that it passed are filled."""
+    """Draw the grid, the way of the robot and the graph. Nodes that the robot passed are filled."""
     grid = skeleton.grid
     rows, columns = grid.cells.shape
     shown = np.where(
@@ -343,7 +382,7 @@ def lay(axes: Any, skeleton: Skeleton, poses: Sequence[Pose]) -> None:
 
 
 def draw(path: Path, skeleton: Skeleton, poses: Sequence[Pose], title: str) -> None:
-    """Draw the grid, the way of the robot and the graph, with its nodes by number."""
+    """Draw the grid, the way of the robot and the graph with its numbered nodes into a file."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -366,7 +405,7 @@ def main() -> None:
     parser.add_argument("logs", nargs="+", metavar="LOG")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--poses", choices=("corrected", "odometry"), default="corrected")
-    parser.add_argument("--doors", action="store_true", help="have nodes at doors, too")
+    parser.add_argument("--doors", action="store_true", help="add nodes at doors")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     for name in options.logs:
@@ -374,8 +413,10 @@ def main() -> None:
         poses = poses_of(log, options.poses)
         skeleton = skeleton_of(log, poses, doors=options.doors)
         events = skeleton.events(poses)
-        text = f"{Path(name).name.partition('.')[0]}: {len(skeleton.graph)} nodes, {len({node for _, node in events})} of them passed, {len(events)} times"
-        draw(options.output / f"{Path(name).name.partition('.')[0]}.png", skeleton, poses, text)
+        stem, passed = Path(name).name.partition(".")[0], len({node for _, node in events})
+        nodes = len(skeleton.graph)
+        text = f"{stem}: {nodes} nodes, {passed} of them passed, {len(events)} times"
+        draw(options.output / f"{stem}.png", skeleton, poses, text)
         print(text)
 
 

@@ -1,8 +1,9 @@
-"""Worlds drawn from street maps: walls along both sides of each street, and the true dstates. Run, it simulates such worlds and maps them: a table in Markdown.
+"""Worlds drawn from street maps: walls along both sides of each street, and the true dstates.
 
     python benchmarks/streets.py [--seeds 20] [--tours 2]
 
-A street map is a graph of networkx whose nodes have a position `at`, as in planar.py.
+Simulates drives in such worlds, maps them, and prints a table in Markdown. A street map is a
+networkx graph whose nodes have a position `at`, as in planar.py.
 """
 
 from __future__ import annotations
@@ -30,16 +31,20 @@ from ssh_abduction import solve
 from ssh_abduction.evaluation import evaluate
 
 Leg = tuple[object, object]  # a place, and the next one along a street
-STRAIGHT = 20.0  # degrees: two streets that are at most so far from one line are one path
+STRAIGHT = 20.0  # degrees; two streets within this of one line are one path
 
 
 def drawn(
     graph: nx.Graph, reach: float, start: Leg, route: list[str] | None = None, name: str = "streets"
 ) -> dict[str, Any]:
-    """The world, as its file has it: streets are 2 `reach` wide, and end `reach` behind a dead end.
+    """The world in the form of its file.
 
-    start  the place where the robot starts, and the one that it faces
-    route  None for one along all streets, both ways
+    Args:
+        graph: The street map.
+        reach: Half the width of a street, and its length beyond a dead end; metres.
+        start: The place where the robot starts, and the one that it faces.
+        route: The robot's actions; None for a tour of all streets in both directions.
+        name: The name of the world.
     """
     ways = {(a, b): _way(graph, a, b) for a, b in graph.edges} | {
         (b, a): _way(graph, b, a) for a, b in graph.edges
@@ -70,7 +75,11 @@ def _pose(graph: nx.Graph, place: object, way: complex) -> list[float]:
 
 
 def _polygons(graph: nx.Graph, ways: dict[Leg, complex], reach: float) -> list[list[complex]]:
-    """The walls: who walks along them has the street at the right, goes to the next place, and there turns to the next street counter-clockwise of where they came from."""
+    """The outlines of the walls.
+
+    An outline keeps the street on its right. At each place it turns to the next street
+    counter-clockwise of the one it came along.
+    """
     left = set(ways)
     found = []
     while left:
@@ -94,7 +103,7 @@ def _polygons(graph: nx.Graph, ways: dict[Leg, complex], reach: float) -> list[l
                     at - reach * back + reach * 1j * back,
                     at - reach * back - reach * 1j * back,
                 ]
-            else:  # the corner between the street that we came by, and the next one counter-clockwise of it
+            else:  # the corner between this street and the next one counter-clockwise
                 a, b = reach * 1j * back, -reach * 1j * way
                 turn = (back.conjugate() * way).imag
                 along = ((b - a).conjugate() * way).imag / turn if abs(turn) > 1e-6 else 0.0
@@ -106,7 +115,11 @@ def _polygons(graph: nx.Graph, ways: dict[Leg, complex], reach: float) -> list[l
 
 
 def _dstates(graph: nx.Graph, ways: dict[Leg, complex]) -> list[dict[str, Any]]:
-    """A dstate faces a street, or has it behind where no street is opposite. A path goes on through opposite streets."""
+    """The dstates of the world.
+
+    A dstate faces a street, or has one behind it if no street is opposite. A path goes on through
+    opposite streets.
+    """
     course: dict[Leg, tuple[int, int]] = {}
     for leg in ways:
         if leg not in course:
@@ -144,7 +157,7 @@ def _back(leg: Leg) -> Leg:
 
 
 def _straight_on(ways: dict[Leg, complex], leg: Leg) -> list[Leg]:
-    """A leg, and those that lead straight on from it; once round, if they lead back to it."""
+    """A leg and those that lead straight on from it, at most once round."""
     legs = [leg]
     while (onward := _opposite(ways, _back(legs[-1]))) not in (None, leg):
         assert onward is not None
@@ -153,7 +166,7 @@ def _straight_on(ways: dict[Leg, complex], leg: Leg) -> list[Leg]:
 
 
 def _opposite(ways: dict[Leg, complex], leg: Leg) -> Leg | None:
-    """The leg that leaves a place opposite to another one."""
+    """The leg that leaves a place opposite to another leg."""
     for other, way in ways.items():
         if (
             other[0] == leg[0]
@@ -165,7 +178,10 @@ def _opposite(ways: dict[Leg, complex], leg: Leg) -> Leg | None:
 
 
 def round_trip(graph: nx.Graph, start: Leg) -> list[str]:
-    """Actions that lead along all streets, both ways, and back to the start: always on to the nearest way that is left."""
+    """Actions that lead along all streets in both directions and back to the start.
+
+    The robot always goes on to the nearest street that is left.
+    """
     moves = _moves(
         {(a, b): _way(graph, a, b) for edge in graph.edges for a, b in (edge, edge[::-1])}
     )
@@ -189,7 +205,7 @@ def round_trip(graph: nx.Graph, start: Leg) -> list[str]:
 
 
 def _moves(ways: dict[Leg, complex]) -> nx.DiGraph:
-    """The dstates, (place, street, whether it is ahead), and the actions that lead from one to another."""
+    """The dstates (place, street, whether it is ahead), and the actions between them."""
     moves: nx.DiGraph = nx.DiGraph()
     facing = {(*leg, True): way for leg, way in ways.items()}
     facing |= {(*leg, False): -way for leg, way in ways.items() if _opposite(ways, leg) is None}
@@ -217,7 +233,7 @@ def _moves(ways: dict[Leg, complex]) -> nx.DiGraph:
 
 
 def turning(*turns: float) -> nx.Graph:
-    """Streets one after another, each turned to the left against the one before by so many degrees."""
+    """A chain of streets, each turned to the left of the one before by these degrees."""
     at, heading, found = 0j, 10.0, {0: 0j}
     for k, turn in enumerate((0.0, *turns), 1):
         heading += turn
@@ -227,7 +243,7 @@ def turning(*turns: float) -> nx.Graph:
 
 
 def hub(*directions: float) -> nx.Graph:
-    """A hub, and dead ends in these directions, in degrees; each somewhat farther than the one before."""
+    """A hub with dead ends in these directions, in degrees, each longer than the one before."""
     graph = planar.junction(*directions)
     for k in range(len(directions)):
         graph.nodes[k]["at"] *= 6 + 0.7 * k
@@ -235,7 +251,7 @@ def hub(*directions: float) -> nx.Graph:
 
 
 def ring(graph: nx.Graph, size: float) -> nx.Graph:
-    """A street map, so many times as large."""
+    """A street map, enlarged by a factor."""
     for place in graph:
         graph.nodes[place]["at"] *= size
     return graph
@@ -283,7 +299,8 @@ def main() -> None:
     )
     options = parser.parse_args()
     print(
-        "| world | steps | driven | dstates and places right | and paths | the only minimal map | seconds: simulate, solve |\n|---|---|---|---|---|---|---|"
+        "| world | steps | driven | dstates and places right | and paths | the only "
+        "minimal map | seconds: simulate, solve |\n|---|---|---|---|---|---|---|"
     )
     for world in _worlds(options.reach):
         driven = places = paths = alone = 0
@@ -315,7 +332,8 @@ def main() -> None:
         seconds = f"{simulating / max(driven, 1):.1f}, {solving / max(driven, 1):.1f}"
         steps = options.tours * len(world.route)
         print(
-            f"| {world.name} | {steps} | {driven} of {options.seeds} | {places} | {paths} | {alone} | {seconds} |",
+            f"| {world.name} | {steps} | {driven} of {options.seeds} | {places} | "
+            f"{paths} | {alone} | {seconds} |",
             flush=True,
         )
 

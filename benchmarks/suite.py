@@ -1,4 +1,7 @@
-"""What is measured: traces by name, each with the theory that it is solved under. "full" is the topological theory, else it is the causal one."""
+"""The measured instances: traces by name, each with its theory.
+
+Names that begin with "full" have the topological theory; all others have the causal one.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,10 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 @dataclass(frozen=True)
 class Instance:
-    """A trace to solve: `walk` makes it from a seed, which `seeded` says matters. `star` is that of a topological theory."""
+    """A trace to solve: `walk` makes it from a seed, which is ignored unless `seeded`.
+
+    `star` is the star of a topological theory.
+    """
 
     name: str
     walk: Callable[[int], Walk]
@@ -36,13 +42,16 @@ class Instance:
 
 
 def aces3() -> Walk:
-    """The route that a robot drove through the ACES building."""
+    """The route of a real robot through the ACES building."""
     trace = Trace.load(EXAMPLES / "aces3-route.jsonl")
     return Walk(trace, ())
 
 
 def taylor_hall(seed: int) -> Walk:
-    """Ten tours of the stand-in for Taylor Hall: 240 images, clustered into views. Made in a process of its own, whose memory does not count."""
+    """Ten tours of the stand-in for Taylor Hall: 240 images, clustered into views.
+
+    It is made in another process, so that its memory does not count.
+    """
     with ProcessPoolExecutor(1, get_context("spawn")) as process:
         return process.submit(_taylor_hall, seed).result()
 
@@ -109,7 +118,7 @@ SUITE = {
 }
 SMALL = _maze(
     2, 60, full=True
-)  # what the full theory's plain encoding can still do: for ablation.py
+)  # instances that the full theory's plain encoding can solve: for ablation.py
 # Where a map with frames is sought:
 BARE = Instance(
     "full maze 3x3 n=400, loops, no stars", lambda seed: maze(3, 3, steps=400, seed=seed, loops=0.5)

@@ -2,7 +2,7 @@
 
     python benchmarks/table.py RESULTS.json
 
-Time and memory of all tools, then the size of what our solver grounds.
+Time and memory of all tools, then the size of our ground program.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 OURS = "ssh-abduction"
-WITHOUT = " without "  # between that and the speed-ups that are off
+WITHOUT = " without "  # between the name of our tool and the disabled speed-ups
 MARKS = "¹²³⁴⁵⁶⁷⁸⁹"
 
 Cells: TypeAlias = Sequence[dict[str, Any]]
 
 
 def times(results: dict[str, Any]) -> str:
-    """Time and memory of each tool on each instance, and the ratio of each peer's time to ours."""
+    """Time and memory of each tool on each instance, and each peer's time divided by ours."""
     tools = list(dict.fromkeys(cell["tool"] for cell in results["cells"] if cell["tool"] != OURS))
     reasons: list[str] = []
     rows = []
@@ -59,7 +59,7 @@ def times(results: dict[str, Any]) -> str:
 
 
 def grounding(results: dict[str, Any]) -> str:
-    """How large our ground program is for each instance, and how the time is shared between grounding, solving and the rest."""
+    """The size of our ground program, and the time for grounding, solving and the rest."""
     rows = []
     for name, by_tool in instances(results).items():
         cells = [cell for cell in by_tool.get(OURS, []) if cell.get("rules") is not None]
@@ -93,7 +93,7 @@ def grounding(results: dict[str, Any]) -> str:
 
 
 def contradictions(results: dict[str, Any]) -> list[str]:
-    """Where an answer is wrong: it fails its check, or one tool found fewer states than another proved possible."""
+    """Wrong answers: failed checks, or fewer states than another tool proved possible."""
     found = [
         f"{c['instance']}, seed {c['seed']}: {c['tool']}: {c['reason']}"
         for c in results["cells"]
@@ -104,13 +104,14 @@ def contradictions(results: dict[str, Any]) -> list[str]:
             proven = low["dstates"] if low.get("proven") else low.get("bound") or 0
             if high["seed"] == low["seed"] and (high.get("dstates") or math.inf) < proven:
                 found += [
-                    f"{name}, seed {low['seed']}: {low['tool']} proved {proven} states, {high['tool']} found {high['dstates']}"
+                    f"{name}, seed {low['seed']}: {low['tool']} proved {proven} states, "
+                    f"{high['tool']} found {high['dstates']}"
                 ]
     return found
 
 
 def instances(results: dict[str, Any]) -> dict[str, dict[str, list[dict[str, Any]]]]:
-    """The cells by instance and tool: one a seed."""
+    """The cells by instance and tool, one for each seed."""
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for cell in results["cells"]:
         found.setdefault(cell["instance"], {}).setdefault(cell["tool"], []).append(cell)
@@ -118,14 +119,14 @@ def instances(results: dict[str, Any]) -> dict[str, dict[str, list[dict[str, Any
 
 
 def median_seconds(cells: Cells) -> float:
-    """Seconds, the median over the seeds; infinite where that seed was not solved within the limit."""
+    """The median seconds over the seeds; seeds that hit the limit count as infinite."""
     return statistics.median(
         cell["seconds"] if cell["status"] == "ok" else math.inf for cell in cells
     )
 
 
 def dstates(cells: Cells) -> str:
-    """The fewest dstates, the median over the seeds: known where that is proven, else from a lower bound to the best found."""
+    """The median of the fewest dstates over the seeds: exact if proven, otherwise bound to best."""
     known = {cell["seed"]: cell["dstates"] for cell in cells if cell.get("proven")}
     if known:
         return f"{statistics.median(known.values()):,g}"
@@ -147,7 +148,7 @@ def dstates(cells: Cells) -> str:
 
 
 def _peer(cells: Cells, ours: Cells, limit: float, reasons: list[str]) -> str:
-    """Time, memory and ratio of a peer, and how many states its machine has where it does not prove that no smaller one is there."""
+    """Time, memory and ratio of a peer, and the states of its machine if not proven minimal."""
     if not any("seconds" in cell for cell in cells):
         return "–" + _mark(cells, reasons)
     there, here = median_seconds(cells), median_seconds(ours) if ours else math.inf
@@ -186,10 +187,10 @@ def _memory(cells: Cells) -> str:
 
 
 def _mark(cells: Cells, reasons: list[str]) -> str:
-    """The mark of a note that says why there is no answer; the note is added where it is new."""
+    """The mark of the note that says why there is no answer. A new note is added to `reasons`."""
     reason = next((cell["reason"] for cell in cells if cell.get("reason")), "").removesuffix(
         ": "
-    )  # an error may say nothing
+    )  # an error may have no message
     if reason and reason not in reasons:
         reasons.append(reason)
     return MARKS[reasons.index(reason) % len(MARKS)] if reason else ""
@@ -200,7 +201,7 @@ def _duration(seconds: float) -> str:
 
 
 def _figures(number: float) -> str:
-    """Two significant figures; whole numbers from ten on."""
+    """Two significant figures, and whole numbers from ten on."""
     return (
         f"{number:,.0f}"
         if number >= 9.95

@@ -1,13 +1,15 @@
-"""Are the minimal maps true? Families of traces whose truth is known, with displacements: each is solved, and a table in Markdown says what came out.
+"""Are the minimal maps true? Families of traces with displacements and known truth.
 
     python benchmarks/truth.py --family mazes [--cells 4] [--steps 40] [--seeds 10] [--stars]
     python benchmarks/truth.py --family plans --folder ../shared/data/plans [--steps 100]
     python benchmarks/truth.py --family aces3 [--seeds 10] [--stars]
     python benchmarks/truth.py --family taylor-hall [--seeds 20] [--stars]
 
-A map is true if its labels are the true dstates up to renaming, and its places the true places. Flags of the noise are the fields of Odometry: the noise that is drawn, and that the trace
-says it has; in Taylor Hall the robot has its own. `--scale-error` and `--bend-error` add errors that repeat. With `--set displacement=none` the solver is not told of
-displacements. Seeds begin at `--first`. A row for each trace, and the sum below.
+Prints a table in Markdown with a row for each trace, and the sum below. A map is true if its labels
+are the true dstates up to renaming, and its places are the true places. The flags of the noise are
+the fields of Odometry. They set both the noise that is drawn and the noise that the trace declares;
+in Taylor Hall the robot has its own. `--scale-error` and `--bend-error` add systematic errors. With
+`--displacement none` the solver ignores displacements. Seeds begin at --first.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from ssh_abduction.data.odometry import NUMBERS
 from ssh_abduction.solver import Status, find_backbone
 
 ROOT = Path(__file__).parent.parent
-# What the noise is unless a flag says otherwise: 5 % along the way, 0.5 % across it, and 0.002 rad of heading in a metre.
+# The default noise: 5 % along the way, 0.5 % across it, and 0.002 rad of heading per metre.
 NOISE = {
     "along": 0.05,
     "across": 0.005,
@@ -49,7 +51,7 @@ NOISE = {
     "offset": 0.0,
     "facing": 0.0,
 }
-# The layout of the ACES3 route: three columns and three rows of places, by their x and y in metres.
+# The layout of the ACES3 route: x and y of three columns and three rows of places, in metres.
 COLUMNS, ROWS = (-20.0, -1.0, 22.5), (-0.5, -19.0, -39.0)
 ACES3 = {
     name: (COLUMNS[i % 3], ROWS[i // 3])
@@ -60,7 +62,7 @@ COMPASS = {"E": 0.0, "N": math.pi / 2, "W": math.pi, "S": -math.pi / 2}
 
 @dataclass(frozen=True)
 class Known:
-    """A trace, and for each step the true dstate and the true place."""
+    """A trace, with the true dstate and place of each step."""
 
     name: str
     trace: Trace
@@ -70,7 +72,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise that is drawn, and the errors that repeat: a share, and radians a metre."""
+    """The random noise, and the systematic errors: a share, and radians per metre."""
 
     odometry: Odometry
     scale: float = 0.0
@@ -78,13 +80,13 @@ class Noise:
 
 
 def partition(names: Sequence[Hashable]) -> tuple[int, ...]:
-    """Names numbered by first visit: two namings of the steps are one up to renaming if these are equal."""
+    """The names, numbered by first visit. Names that differ only by renaming get equal numbers."""
     numbers: dict[Hashable, int] = {}
     return tuple(numbers.setdefault(name, len(numbers)) for name in names)
 
 
 def is_true(ssh_map: SSHMap, known: Known) -> bool:
-    """Whether the labels of a map are the true dstates, and the places of its labels, if it has any, the true places, both up to renaming."""
+    """Whether the labels of a map, and the places of the labels if any, are true up to renaming."""
     places = [ssh_map.dstates[label].place for label in ssh_map.labels]
     return partition(ssh_map.labels) == partition(known.dstates) and (
         not ssh_map.places or partition(places) == partition(known.places)
@@ -92,6 +94,7 @@ def is_true(ssh_map: SSHMap, known: Known) -> bool:
 
 
 def mazes(cells: int, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
+    """Random walks in mazes."""
     for seed in seeds:
         walk = maze(
             cells,
@@ -130,7 +133,10 @@ def aces3(seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
 
 
 def taylor_hall(tours: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
-    """Tours of Taylor Hall, with the robot's own odometry. Each is simulated in a process of its own, whose memory does not count."""
+    """Tours of Taylor Hall with the robot's own odometry.
+
+    Each is simulated in another process, so that its memory does not count.
+    """
     for seed in seeds:
         with ProcessPoolExecutor(1, get_context("spawn")) as process:
             trace = process.submit(
@@ -155,7 +161,7 @@ def drive(tours: int, seed: int, body: Body) -> Trace:
 
 
 def told(name: str, trace: Trace) -> Known:
-    """A trace whose steps tell their true dstate and place."""
+    """A trace whose steps contain their true dstate and place."""
     return Known(
         name,
         trace,
@@ -164,7 +170,11 @@ def told(name: str, trace: Trace) -> Known:
 
 
 def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
-    """A row of the table, whether all minimal maps are true and proven minimal, and the seconds that it took."""
+    """Solve a trace.
+
+    Returns:
+        A row of the table; whether all minimal maps are true and proven minimal; and the seconds.
+    """
     began = time.perf_counter()
     solution = solve(known.trace, theory, time_limit=limit)
     seconds = time.perf_counter() - began
@@ -179,14 +189,18 @@ def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
     more = "" if solution.complete else " or more, all alike" if all_true else " or more"
     listed = f"{sum(right)} of {len(right)}{more}"
     return (
-        f"| {known.name} | {len(known.trace)} | {truth} | {solution.status.value} | {cost} | {listed} | {seconds:.2f} |",
+        f"| {known.name} | {len(known.trace)} | {truth} | {solution.status.value} | {cost} | "
+        f"{listed} | {seconds:.2f} |",
         all_true,
         seconds,
     )
 
 
 def share_all(solution: Solution) -> bool:
-    """Whether all minimal maps, of which only some are listed, have the same dstates and the same places: then they differ in paths alone."""
+    """Whether all minimal maps, listed or not, have the same dstates and the same places.
+
+    Then they differ only in paths.
+    """
     if solution.status is not Status.OPTIMAL:
         return False
     shared = find_backbone(solution)
@@ -201,7 +215,8 @@ def share_all(solution: Solution) -> bool:
 def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
     """Solve each trace, print a row for each, and return the sum."""
     print(
-        "| trace | steps | true dstates, places | status | dstates, places, paths | true maps | s |\n|---|---|---|---|---|---|---|",
+        "| trace | steps | true dstates, places | status | dstates, places, paths | "
+        "true maps | s |\n|---|---|---|---|---|---|---|",
         flush=True,
     )
     found = []
@@ -211,7 +226,8 @@ def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
         found.append((right, seconds))
     if not found:
         return "no traces"
-    return f"all minimal maps are true: {sum(right for right, _ in found)} of {len(found)}; median {statistics.median(s for _, s in found):.2f} s"
+    right, median = sum(right for right, _ in found), statistics.median(s for _, s in found)
+    return f"all minimal maps are true: {right} of {len(found)}; median {median:.2f} s"
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -223,7 +239,7 @@ def arguments() -> argparse.ArgumentParser:
         "--seeds",
         type=int,
         metavar="N",
-        help="traces; of each plan (default 10; plans 1, taylor-hall 20)",
+        help="number of traces, for plans of each plan (default 10; plans 1, taylor-hall 20)",
     )
     parser.add_argument(
         "--first", type=int, default=0, metavar="SEED", help="the first seed (default 0)"
@@ -242,44 +258,44 @@ def arguments() -> argparse.ArgumentParser:
         type=Path,
         default=ROOT.parent / "shared" / "data" / "plans",
         metavar="FOLDER",
-        help="of the plans",
+        help="folder of the plans",
     )
     parser.add_argument(
         "--limit", type=float, default=60, metavar="S", help="seconds for each (default 60)"
     )
-    parser.add_argument("--stars", action="store_true", help="the solver is told of stars, too")
+    parser.add_argument("--stars", action="store_true", help="give the solver stars, too")
     parser.add_argument(
-        "--causal", action="store_true", help="the causal theory: dstates alone have to be true"
+        "--causal", action="store_true", help="use the causal theory, and judge only dstates"
     )
     for name in ("displacement", "boundary", "prefer"):
-        parser.add_argument(f"--{name}", metavar="CHOICE", help=f"of the theory's field {name}")
+        parser.add_argument(f"--{name}", metavar="CHOICE", help=f"the theory's field {name}")
     for name in NUMBERS:
         parser.add_argument(
             f"--{name}",
             type=float,
             default=NOISE[name],
             metavar="X",
-            help=f"of Odometry (default {NOISE[name]})",
+            help=f"the field of Odometry (default {NOISE[name]})",
         )
     parser.add_argument(
         "--scale-error",
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="all ways are reported longer by this (default 0)",
+        help="report all ways longer by this share (default 0)",
     )
     parser.add_argument(
         "--bend-error",
         type=float,
         default=0.0,
         metavar="DEGREES",
-        help="drift of the heading in each metre (default 0)",
+        help="drift of the heading per metre (default 0)",
     )
     return parser
 
 
 def chosen(options: argparse.Namespace) -> Iterator[Known]:
-    """The traces that are asked for."""
+    """The traces that the options ask for."""
     noise = Noise(
         Odometry(**{name: getattr(options, name) for name in NUMBERS}),
         options.scale_error,

@@ -1,9 +1,12 @@
-"""Which places a robot really visited, and how right the events of a mapper are: those of a trace, or those of a skeleton.
+"""Which places a robot really visited, and how right the events of a mapper are.
 
     python benchmarks/visited.py TRACE --log LOG [--truth drive.json] [-o named.jsonl]
 
-An event is a visit as a mapper has it: a scan, and the place where the mapper says that it was taken. Truth comes of the poses that somebody corrected, or of the simulator, which writes
-what it knows beside a log (format ssh-drive). With -o the trace is written with the names of the true places, so that `ssh-abduction evaluate maps.json named.jsonl` can name dstates, places and paths.
+An event is a visit according to a mapper: a scan, and the place where the mapper says that it was
+taken. The mapper is a trace or a skeleton. The truth comes from corrected poses, or from the
+file that the simulator writes beside a log (format ssh-drive). With -o the trace is written with
+the names of the true places. Then `ssh-abduction evaluate maps.json named.jsonl` can name dstates,
+places and paths.
 """
 
 from __future__ import annotations
@@ -36,15 +39,15 @@ from ssh_abduction.evaluation import (
 from ssh_abduction.evaluation.pose_truth import NEAR
 
 Array = NDArray[np.float64]
-# A robot visits a place when it comes so near to it, in metres. In ACES3, anything from 1.5 to 6 m makes the same 15 visits.
+# A robot visits a place within this many metres. In ACES3, 1.5 to 6 m give the same 15 visits.
 REACH = 3.0
-# Where a door is nearer than this, in metres, an event is at the door.
+# An event is at a door within this many metres.
 DOOR = 1.0
-# Events at no known place are at one place if they are on the average within this, in metres.
+# Events at no known place are one place if their average distance is below this, in metres.
 APART = 2.0
-# A robot has left a place when it is so far from it, in metres: where it swerves in a rotunda it has not.
+# A robot has left a place at this distance, in metres. Swerving in a rotunda is not leaving.
 AWAY = 5.0
-# ACES3: three corridors along x, and three along y, in metres of the corrected poses. Each crossing is a place.
+# ACES3: the corridors along y and along x, in metres of the corrected poses. Crossings are places.
 ACES_COLUMNS, ACES_ROWS = (-20.0, -1.0, 22.5), (-0.5, -19.0, -39.0)
 ACES_NAMES = ("NW", "N", "NE"), ("W", "C", "E"), ("SW", "S", "SE")
 ACES_ROUTE = ["N", "NE", "E", "SE", "S", "SW", "W", "NW", "N", "C", "S", "C", "W", "C", "E"]
@@ -63,13 +66,16 @@ class Visit:
 class Truth:
     """What is known of a log, for evaluation only.
 
-    poses     (n, 3): where each scan was taken; metres and radians
-    visits    to the places that a mapper should find, in order; empty where nobody knows which these are
-    doorways  the doors that the robot drove through, in order, where nobody knows which other places a mapper should find: in and out by one door is one
-    doors     where the doors are: x and y by name
-    rooms     the room in which each scan was taken; empty where nobody knows
-    grid      whether places are at crossings of the grid of ACES3, whose corridors are the true paths
-    times     of the scans, in seconds, and relative poses between times that were checked by hand, where there are any
+    Attributes:
+        poses: Where each scan was taken, (n, 3), in metres and radians.
+        visits: The visits of places that a mapper should find, in order; empty if unknown.
+        doorways: The doors that the robot drove through, in order, if other places are unknown.
+            Going in and out by one door counts once.
+        doors: x and y of each door, by name.
+        rooms: The room of each scan; empty if unknown.
+        grid: Whether places are the crossings of ACES3, whose corridors are the true paths.
+        times: Times of the scans, in seconds.
+        relations: Relative poses between times that were checked by hand, if there are any.
     """
 
     poses: Array
@@ -83,7 +89,11 @@ class Truth:
 
     @staticmethod
     def of_aces(poses: Array) -> Truth:
-        """The 15 visits of ACES3. Raises ValueError where the corrected poses do not pass the places in the order that the log is known for."""
+        """The 15 visits of ACES3.
+
+        Raises:
+            ValueError: If the corrected poses do not pass the places in the known order.
+        """
         places = {
             name: (x, y)
             for y, names in zip(ACES_ROWS, ACES_NAMES, strict=True)
@@ -92,13 +102,14 @@ class Truth:
         visits = visits_of(places, poses)
         if (route := [visit.place for visit in visits]) != ACES_ROUTE:
             raise ValueError(
-                f"expected the route {' '.join(ACES_ROUTE)}, got {' '.join(route)}; give the corrected poses of ACES3"
+                f"expected the route {' '.join(ACES_ROUTE)}, got {' '.join(route)}; "
+                "give the corrected poses of ACES3"
             )
         return Truth(poses, visits, grid=True)
 
     @staticmethod
     def load(path: Path) -> Truth:
-        """What the simulator wrote beside a log."""
+        """The file that the simulator wrote beside a log."""
         told = json.loads(path.read_text())
         poses = np.array(told["poses"])
         doors = {name: door["at"] for name, door in told.get("doors", {}).items()}
@@ -115,7 +126,10 @@ class Truth:
         )
 
     def matched(self, scans: Sequence[int]) -> list[int | None]:
-        """For each event the visit that it is at; of several events at one visit, the one nearest to its middle. None where it is at none."""
+        """The visit of each event, or None.
+
+        Of several events at one visit the one nearest to its middle counts.
+        """
         found: list[int | None] = [None] * len(scans)
         for number, visit in enumerate(self.visits):
             middle = (visit.first + visit.last) / 2
@@ -125,7 +139,11 @@ class Truth:
         return found
 
     def names(self, scans: Sequence[int], poses: Array | None = None) -> list[str]:
-        """The true place at which each of these scans was taken, or which it shows at this pose: that of the visit; else a door; else one that is named after the room, with others near it."""
+        """The true place of each of these scans, or the one it shows at this pose.
+
+        It is that of the visit, else a door. Otherwise it is named after the room, together with
+        events nearby.
+        """
         named: list[str | None] = [
             next((v.place for v in self.visits if v.first <= scan <= v.last), None)
             for scan in scans
@@ -154,7 +172,10 @@ class Truth:
 def visits_of(
     places: Mapping[str, Sequence[float]], poses: Array, reach: float = REACH
 ) -> tuple[Visit, ...]:
-    """The stays within reach of places, (x, y) by name, of a robot that was at these poses. Between two stays at one place the robot comes to another."""
+    """The stays of a robot within reach of places, given as (x, y) by name.
+
+    Between two stays at one place the robot visits another place.
+    """
     visits: list[Visit] = []
     for scan, (x, y, _) in enumerate(poses.tolist()):
         place = min(places, key=lambda name: math.dist(places[name], (x, y)))
@@ -165,7 +186,11 @@ def visits_of(
 
 
 def doorways_of(crossings: Sequence[Mapping[str, Any]], poses: Array) -> tuple[Visit, ...]:
-    """The doors that a robot at these poses drove through, from the last scan within DOOR before it to the last one within DOOR behind it; in and out by one door is one."""
+    """The doors that a robot at these poses drove through.
+
+    A stay begins with the last scan within DOOR in front of the door, and ends with the last one
+    within DOOR behind it. Going in and out by one door counts once.
+    """
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
     found: list[Visit] = []
     for crossing in crossings:
@@ -184,9 +209,11 @@ def doorways_of(crossings: Sequence[Mapping[str, Any]], poses: Array) -> tuple[V
 class Events:
     """The events of a mapper, in order.
 
-    scans   at which the robot passed
-    places  at which of the mapper's places; None where it does not say
-    poses   where that is in truth, (n, 3), as the mapper sees it from the robot at that scan; None: where the robot was
+    Attributes:
+        scans: The scan of each event.
+        places: The mapper's place of each event; None if the mapper does not say.
+        poses: The true pose of each event as the mapper sees it from the robot, (n, 3). None: the
+            pose of the robot.
     """
 
     scans: tuple[int, ...]
@@ -195,7 +222,7 @@ class Events:
 
     @staticmethod
     def of(trace: Trace, ssh_map: SSHMap | None = None) -> Events:
-        """The visits of a trace that was made of a log, and where a map has them."""
+        """The visits of a trace that was made from a log, and the places that a map gives them."""
         starts = [t for t in range(len(trace)) if t == 0 or trace.actions[t - 1].kind != "turn"]
         places = [
             None if ssh_map is None else ssh_map.dstates[ssh_map.labels[t]].place for t in starts
@@ -210,9 +237,10 @@ class Events:
 
 
 def passes(events: Events, truth: Truth) -> tuple[int, int]:
-    """How often the robot came back to where it had an event, or would have one, and how often it had an event there then.
+    """How often the robot came back to where it had an event, and how often it had an event then.
 
-    It comes back if it is within NEAR of the event after it was farther than AWAY. An event is there if it is at a scan since then.
+    It comes back if it is within NEAR of the event after it was farther away than AWAY. An event
+    counts if its scan is later than that.
     """
     where = truth.poses[list(events.scans)] if events.poses is None else events.poses
     come = noticed = 0
@@ -229,12 +257,15 @@ def passes(events: Events, truth: Truth) -> tuple[int, int]:
 class Figures:
     """How right a mapper is.
 
-    nodes      how many places it has, of those that were visited
-    precision, recall  of events: of its events, the share that is a true visit; of the true visits, or else of the doors driven through, the share that has an event. None where these are not known
-    passes     how often the robot came back to where an event is, and how often there is an event then
-    named      accuracy, edges and pairs by the names of the true places, in the terms of `evaluate`
-    posed      pairs of events by poses, in the terms of `evaluate`
-    related    the same by hand-checked relations, where there are any
+    Attributes:
+        nodes: Number of its places that were visited.
+        precision: Share of its events that are true visits; None if unknown.
+        recall: Share of the true visits, or else of the doors driven through, that have an event;
+            None if unknown.
+        passes: How often the robot came back to an event, and how often there is an event then.
+        named: Accuracy, edges and pairs by the names of the true places, as in `evaluate`.
+        posed: Pairs of events by poses, as in `evaluate`.
+        related: Pairs of events by hand-checked relations, if there are any.
     """
 
     nodes: int
@@ -248,7 +279,10 @@ class Figures:
 
     @property
     def isomorphic(self) -> bool:
-        """Whether its places are what was visited: they are told apart rightly, and each event is a true visit and the other way round, as far as true visits are known."""
+        """Whether its places are the visited ones, as far as true visits are known.
+
+        Places are told apart correctly, and events and true visits correspond.
+        """
         return (
             bool(self.named.maps[0].places_right)
             and self.precision in (None, 1.0)
@@ -256,7 +290,7 @@ class Figures:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures under short names, None where they cannot be said."""
+        """The figures under short names; None if unknown."""
         named, row = (
             self.named.maps[0],
             {
@@ -281,7 +315,7 @@ class Figures:
 
 
 def judged(events: Events, truth: Truth) -> Figures:
-    """How right these events are."""
+    """Compare events with the truth."""
     hits = sum(visit is not None for visit in truth.matched(events.scans))
     noticed = sum(
         any(door.first <= scan <= door.last for scan in events.scans) for door in truth.doorways
@@ -289,7 +323,7 @@ def judged(events: Events, truth: Truth) -> Figures:
     names = truth.names(events.scans, events.poses)
     poses = truth.poses[list(events.scans)] if events.poses is None else events.poses
     numbers = {place: i for i, place in enumerate(dict.fromkeys(events.places))}
-    # A trace of places alone, and a map of it in which each place has one dstate. So accuracy is that of places.
+    # In this trace and map each place has one dstate, so accuracy is that of places.
     steps = [
         Step(
             "v",
@@ -320,7 +354,10 @@ def judged(events: Events, truth: Truth) -> Figures:
 
 
 def with_names(trace: Trace, truth: Truth) -> Trace:
-    """The trace with the true place of each step as its truth; in ACES3 with its heading, path and direction, too, where the step has a pose."""
+    """The trace with the true place of each step as its truth.
+
+    In ACES3 also with its heading, path and direction, if the step has a pose.
+    """
     told = told_poses(trace)
     scans = [int(step.extra["scan"]) for step in trace.steps]
     names = truth.names(
@@ -351,9 +388,11 @@ def with_names(trace: Trace, truth: Truth) -> Trace:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("trace", metavar="TRACE", help="what import made of the log")
+    parser.add_argument("trace", metavar="TRACE", help="the trace that import made from the log")
     parser.add_argument("--log", type=Path, help="the log, whose corrected poses are the truth")
-    parser.add_argument("--truth", type=Path, help="what the simulator wrote beside the log")
+    parser.add_argument(
+        "--truth", type=Path, help="the file that the simulator wrote beside the log"
+    )
     parser.add_argument("-o", "--output", help="write the trace with the names of the true places")
     options = parser.parse_args()
     trace = Trace.load(options.trace)
@@ -365,17 +404,20 @@ def main() -> None:
         events.scans, poses, truth.names(events.scans, poses), matched, strict=True
     ):
         print(
-            f"scan {scan:4}  ({x:6.1f}, {y:6.1f}, {math.degrees(heading):4.0f})  {name}{'' if visit is not None or not truth.visits else '  no visit'}"
+            f"scan {scan:4}  ({x:6.1f}, {y:6.1f}, {math.degrees(heading):4.0f})  "
+            f"{name}{'' if visit is not None or not truth.visits else '  no visit'}"
         )
     figures = judged(events, truth)
     if truth.visits:
         missed = [visit.place for number, visit in enumerate(truth.visits) if number not in matched]
         print(
-            f"{len(matched)} events, precision {figures.precision:.2f}, recall {figures.recall:.2f}; missed: {' '.join(missed) or 'none'}"
+            f"{len(matched)} events, precision {figures.precision:.2f}, recall "
+            f"{figures.recall:.2f}; missed: {' '.join(missed) or 'none'}"
         )
     if truth.doorways:
         print(
-            f"{len(matched)} events; an event or more at {figures.recall:.0%} of {len(truth.doorways)} doors driven through"
+            f"{len(matched)} events; an event or more at {figures.recall:.0%} of "
+            f"{len(truth.doorways)} doors driven through"
         )
     print(
         "came back {} times to where an event is, and noticed it {} times".format(*figures.passes)
@@ -385,7 +427,10 @@ def main() -> None:
 
 
 def truth_of(log: Path, truth: Path | None = None) -> Truth:
-    """The truth of a log: what the simulator says, or its corrected poses; of ACES3 also the visits to its nine places, of Freiburg the relations beside it."""
+    """The truth of a log: the simulator's file, or corrected poses.
+
+    For ACES3 also the visits to its nine places, for Freiburg the relations beside it.
+    """
     if truth is not None:
         return Truth.load(truth)
     read = read_log(str(log))

@@ -1,9 +1,11 @@
-"""Another world than robots: a maze of a text adventure. All rooms look alike, and passages twist, so that north and then south
-does not lead back. The player has dropped three things to tell rooms apart. The same solver finds the smallest maze that explains
-what the player typed and read.
+"""The map of a world without robots: a maze in a text adventure.
 
-    python examples/adventure.py            solves the logged game, and compares the map with the maze
-    python examples/adventure.py --play F   plays the game again and writes its trace to F
+    python examples/adventure.py            solves the logged game, and compares map and maze
+    python examples/adventure.py --play F   plays the game again, and writes its trace to F
+
+All rooms look alike, and passages twist: north and then south does not lead back. The player has
+dropped three things to tell rooms apart. The same solver finds the smallest maze that explains
+what the player typed and read.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from ssh_abduction.output import to_networkx
 HERE = Path(__file__).parent
 COMPASS = ("north", "south", "east", "west")
 ALIKE = "You are in a maze of twisty little passages, all alike."
-ROOMS = {  # what lies there, and the rooms that the passages lead to
+ROOMS = {  # the thing in each room, and the rooms that its passages lead to
     0: ("A lantern is here.", (1, 3, 2, 0)),
     1: ("", (4, 0, 1, 5)),
     2: ("A sword is here.", (3, 5, 0, 2)),
@@ -31,7 +33,7 @@ ROOMS = {  # what lies there, and the rooms that the passages lead to
 
 
 def play(commands: int, seed: int) -> Trace:
-    """A player who wanders at random."""
+    """Play a game: the player wanders at random."""
     choose = random.Random(seed)
     room, read, typed = 0, [], []
     for i in range(commands + 1):
@@ -43,7 +45,7 @@ def play(commands: int, seed: int) -> Trace:
 
 
 def maze() -> nx.MultiDiGraph:
-    """The maze as the graph that a map of it should be."""
+    """The maze as the graph that its map should be."""
     graph = nx.MultiDiGraph()
     for room, (thing, exits) in ROOMS.items():
         graph.add_node(room, view=f"{ALIKE} {thing}".strip())
@@ -59,7 +61,8 @@ def main() -> None:
     trace = Trace.load(HERE / "adventure.jsonl")
     solution = solve(trace, Theory.causal())
     print(
-        f"{len(trace)} texts read, {len(set(trace.views))} of them different: {solution.cost.dstates} rooms, {solution.count} minimal map(s)"
+        f"{len(trace)} texts read, {len(set(trace.views))} of them different: "
+        f"{solution.cost.dstates} rooms, {solution.count} minimal map(s)"
     )
     for ssh_map in solution.maps:
         same = nx.is_isomorphic(

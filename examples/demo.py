@@ -1,4 +1,9 @@
-"""Solve the route that a robot drove through the ACES building, print its minimal maps and what tells them apart, draw one. Then map a house from a robot's log."""
+"""Solve the route of a real robot in the ACES building, then map a house from a robot's log.
+
+    python examples/demo.py [FOLDER]
+
+Prints the minimal maps of the route and what tells them apart, and draws one of them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +24,8 @@ def main() -> None:
     cost = solution.cost
     print(f"{trace.name}: {len(trace)} images, {len(set(trace.views))} views")
     print(
-        f"fewest: {cost.dstates} dstates, {cost.places} places, {cost.paths} paths; {solution.count} minimal maps, {solution.seconds.total:.2f} s"
+        f"fewest: {cost.dstates} dstates, {cost.places} places, {cost.paths} paths; "
+        f"{solution.count} minimal maps, {solution.seconds.total:.2f} s"
     )
     for i, ssh_map in enumerate(solution.maps):
         violations = check(trace, ssh_map, theory)

@@ -1,16 +1,24 @@
-"""Map many drives under many theories, and collect what came out: worlds or floor plans x tours x theories x rungs of the ladder.
+"""Map many drives under many theories, and collect the results in one table.
 
     python examples/sweep.py out --worlds doors curved --seeds 2
     python examples/sweep.py out --worlds plans/*.xml --seeds 5 --scheduler tcp://host:8786
 
-Each drive is simulated once, as a log. Each theory maps all logs with one call of `ssh-abduction map`, which can use the workers of a Dask cluster, and which does not do again what is done: so a sweep that was stopped is
-begun once more. One line for each solve goes to rows.jsonl: the maps themselves, and each rung of the ladder. Then a table is printed: of the drives, how many have a map, and how many only one; and of the pairs of
-visits that the first maps have at one place, and of those that truly are, which shares are the same pairs.
+The sweep covers worlds or floor plans x drives x theories x rungs of the ladder. Each drive is
+simulated once, as a log. For each theory one call of `ssh-abduction map` maps all logs. It can use
+the workers of a Dask cluster, and it does not repeat finished runs. So start a stopped sweep again.
+rows.jsonl gets a line for each solve: the maps, and each rung of the ladder. Then a table is
+printed. It counts the drives that have a map, and those that have only one. It gives precision and
+recall of pairs of visits that the first maps have at one place.
 
-*On a hundred machines,* as a plan that nobody has run yet: 17 floor plans x 5 tours x 9 theories x 5 rungs are 3,825 solves in 765 runs. A drive of 200 m through a plan takes 28 s of processor time, of 1.0 to 1.7 MB of
-log, nearly all of it for what is seen rather than for maps (8 runs, two plans), and two minutes if all solves take as long as they may. So it is six hours for one processor, 25 at most, and two to eight minutes for a hundred machines of two. A scheduler runs on one of them
-(`dask scheduler`), and on each of the others `dask worker tcp://host:8786 --nworkers 2 --nthreads 1 --memory-limit 8GiB`. Logs travel to the workers, and folders come back, so no disk is shared. A worker that is killed loses the run
-that it was at, which another one does; a run that kills its worker twice is an error on its line. What comes back is 130 kB a run on the average (31 runs of six worlds and plans; 370 at most), so 100 MB in all.
+*A hundred machines*, a plan that nobody has run yet: 17 floor plans x 5 drives x 9 theories x 5
+rungs are 3,825 solves in 765 runs. A drive of 200 m through a plan takes 28 s of CPU time, for a
+log of 1.0 to 1.7 MB, nearly all of it for perception (8 runs, two plans). It takes two minutes if
+all solves use their time limit. That is 6 to 25 hours on one processor, and two to eight minutes on
+a hundred machines with two. One machine runs the scheduler (`dask scheduler`), and each other one
+runs `dask worker tcp://host:8786 --nworkers 2 --nthreads 1 --memory-limit 8GiB`. Logs travel to the
+workers, and folders come back, so no disk is shared. If a worker is killed, another one does its
+run. A run that kills two workers becomes an error on its line. A run returns 130 kB on average (31
+runs of six worlds and plans; 370 kB at most), so 100 MB in all.
 """
 
 from __future__ import annotations
@@ -29,10 +37,10 @@ from ssh_abduction.solver import Solution
 
 Row = dict[str, Any]
 
-# What is solved for each drive and theory; None where the drive could not be mapped.
+# The rung of a row; None if the drive could not be mapped.
 RUNGS = ("maps", "views", "+ star", "+ pairs", "+ geometry", "+ planarity", None)
 INTERRUPTED = 130  # the exit code after Ctrl-C
-# What each theory is asked with. Where none is named, it is the one that suits the building, with what is said laid over it.
+# The options of each theory. Without --theory they change the theory that suits the building.
 THEORIES = {
     "as it suits": [],
     "stars and sides": ["--theory", "topological"],
@@ -50,9 +58,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Map many drives under many theories.")
     parser.add_argument("folder", type=Path)
     parser.add_argument(
-        "--worlds", nargs="+", required=True, help="worlds that ship, world files, or floor plans"
+        "--worlds",
+        nargs="+",
+        required=True,
+        help="names of built-in worlds, world files, or floor plans",
     )
-    parser.add_argument("--seeds", type=int, default=5, help="so many drives through each")
+    parser.add_argument("--seeds", type=int, default=5, help="number of drives through each world")
     parser.add_argument("--theories", nargs="+", choices=THEORIES, default=list(THEORIES))
     parser.add_argument(
         "--time-limit", default="30", help="seconds for the maps of a log (default: 30)"
@@ -64,7 +75,8 @@ def main() -> None:
     names = [Path(world).name.partition(".")[0] for world in options.worlds]
     if len(set(names)) < len(names):
         parser.error(
-            "--worlds: expected worlds with different names, as logs and folders are named after them"
+            "--worlds: expected worlds with different names, as logs and folders are "
+            "named after them"
         )
     tours = [
         drive(world, seed, options.folder)
@@ -80,7 +92,7 @@ def main() -> None:
         runs = options.folder / theory.replace(", ", "-").replace(" ", "-")
         folder = (
             runs if len(logs) > 1 else runs / logs[0].stem
-        )  # a log that stands alone has the folder that is named
+        )  # a single log is mapped into the named folder itself
         code = shell(
             [
                 "map",
@@ -109,7 +121,10 @@ def main() -> None:
 
 
 def drive(world: str, seed: int, folder: Path) -> Path:
-    """The log of a drive, made unless it is there. Where the robot cannot drive there, it is not there afterwards."""
+    """The path of the log of a drive, which is simulated unless it is there.
+
+    There is no such file if the robot cannot drive in this world.
+    """
     log = folder / "logs" / f"{Path(world).name.partition('.')[0]}-{seed}.log"
     if not log.exists():
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -118,7 +133,7 @@ def drive(world: str, seed: int, folder: Path) -> Path:
 
 
 def rows_of(theory: str, run: Path) -> list[Row]:
-    """A row for the maps of a run, which says how right the first one is, and one for each rung of its ladder."""
+    """A row for the first map of a run, and one for each rung of its ladder."""
     if not (run / "run.json").exists():
         return [{"log": run.name, "theory": theory, "rung": None, "status": "error"}]
     told = json.loads((run / "run.json").read_text(encoding="utf-8"))
@@ -140,7 +155,10 @@ def rows_of(theory: str, run: Path) -> list[Row]:
 
 
 def pairs_of(run: Path) -> dict[str, int] | None:
-    """Of the pairs of visits of a run: how many its first map has at one place, how many of these are, and how many are in truth. None where it has no map."""
+    """Counts of pairs of visits at one place: in the first map, right ones, and true ones.
+
+    None if the run has no map.
+    """
     maps = Solution.load(run / "maps.json").maps[:1]
     places = evaluate_visits(maps, Trace.load(run / "trace.jsonl")).maps[0].places if maps else None
     return (
@@ -150,7 +168,9 @@ def pairs_of(run: Path) -> dict[str, int] | None:
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
     """A line for each theory and rung."""
-    yield f"{'theory':<22}{'rung':<14}{'drives':>7}{'mapped':>8}{'unique':>8}{'places':>8}{'precision':>11}{'recall':>8}"
+    yield (
+        f"{'theory':<22}{'rung':<14}{'drives':>7}{'mapped':>8}{'unique':>8}{'places':>8}{'precision':>11}{'recall':>8}"
+    )
     theories = [*dict.fromkeys(row["theory"] for row in rows)]
     for theory, rung in sorted(
         {(row["theory"], row["rung"]) for row in rows},
@@ -168,7 +188,10 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
             sum(found[name] for found in pairs) for name in ("joined", "right", "returns")
         )
         precision, recall = (f"{right / n:.2f}" if n else "" for n in (joined, returns))
-        yield f"{theory!s:<22}{rung or 'error':<14}{len(some):>7}{len(costs):>8}{unique:>8}{places:>8}{precision:>11}{recall:>8}"
+        yield (
+            f"{theory!s:<22}{rung or 'error':<14}{len(some):>7}{len(costs):>8}{unique:>8}"
+            f"{places:>8}{precision:>11}{recall:>8}"
+        )
 
 
 if __name__ == "__main__":
