@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from ssh_abduction.data.odometry import Odometry
 from ssh_abduction.data.trace import STANDARD_ACTIONS, Action, Trace
 from ssh_abduction.theory.encodings import axioms
+from ssh_abduction.theory.fields import COUNTS, Count
 from ssh_abduction.theory.rules import Rules
-from ssh_abduction.theory.theory import COUNTS, Count, Theory
+from ssh_abduction.theory.theory import Theory
 
 ACTIONS = (*STANDARD_ACTIONS.values(), Action("creep", "travel"), Action("veer", "turn", "right"))
 # Few openings, so that stars often agree: all alike, a straight street, a corner, a dead end, a tee.

@@ -23,8 +23,9 @@ from ssh_abduction.solver.asp.facts.answer_maps import causal_map
 from ssh_abduction.solver.fit import _Problem, fit
 from ssh_abduction.solver.ranking import noise_warning, units_warning
 from ssh_abduction.theory.evidence import pairs_of
-from ssh_abduction.theory.evidence.displacement import Displacement, Returns
+from ssh_abduction.theory.evidence.displacement import Displacement
 from ssh_abduction.theory.evidence.loops import Loops
+from ssh_abduction.theory.evidence.returns import Returns
 from ssh_abduction.theory.settle import settle
 
 ROOM = 10.0  # metres from corner to corner
@@ -247,8 +248,8 @@ def test_kilometres_are_noticed() -> None:
         return replace(trace, steps=tuple(steps), odometry=replace(WHITE, **noise))
 
     said = "the odometry tells no travel from standing still: the longest displacement of one is 0.01 m, and its noise about 0.1 m; "
-    assert (solve(scaled(0.001)).odometry_warning or "").startswith(said)
-    assert "the longest displacement of one is 0 m" in (solve(scaled(0.0)).odometry_warning or "")
+    assert (solve(scaled(0.001)).support.odometry_warning or "").startswith(said)
+    assert "the longest displacement of one is 0 m" in (solve(scaled(0.0)).support.odometry_warning or "")
     assert units_warning(scaled(0.001, position=0.001)) is None
     assert units_warning(trace) is None
     assert units_warning(trace.without_displacements()) is None

@@ -14,7 +14,8 @@ from ssh_abduction import solve
 from ssh_abduction.checker.checker import check
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import Status, choosing, prefixes
-from ssh_abduction.theory.theory import Count, Theory
+from ssh_abduction.theory.fields import Count
+from ssh_abduction.theory.theory import Theory
 
 LIMIT = 100  # seconds: a search that does not end is a failure, not a hang
 

@@ -17,7 +17,8 @@ from typing import Any
 
 from ssh_abduction.data.errors import brief, is_whole
 from ssh_abduction.data.maps import SSHMap
-from ssh_abduction.theory.theory import COUNTS, Theory
+from ssh_abduction.theory.fields import COUNTS
+from ssh_abduction.theory.theory import Theory
 
 STATUSES = ("optimal", "feasible", "unsatisfiable", "unknown")
 # Why a search may have been stopped.

@@ -16,14 +16,9 @@ from ssh_abduction.cli.parsing import Parser, true_or_false
 from ssh_abduction.data.errors import AbductionError, MapError, TheoryError, brief, named
 from ssh_abduction.data.map_file import read_json
 from ssh_abduction.data.trace import Trace
+from ssh_abduction.theory.fields import ASSERTIONS, CHOICES
 from ssh_abduction.theory.settle import settle
-from ssh_abduction.theory.theory import (
-    ASSERTIONS,
-    CHOICES,
-    PRESETS,
-    SETTLED,
-    Theory,
-)
+from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
 
 # The fields of a theory that have a flag of their own. The others are settings.
 PRICES = ("misread", "slipped")

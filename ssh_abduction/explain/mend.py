@@ -14,8 +14,9 @@ from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.question import Question
 from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Status, Stop
+from ssh_abduction.theory.fields import ASSERTIONS
 from ssh_abduction.theory.settle import settle
-from ssh_abduction.theory.theory import ASSERTIONS, Theory, checked_theory
+from ssh_abduction.theory.theory import Theory, checked_theory
 
 NEW_VIEW = "a view never seen"
 # Share of the time that is left for each search of the whole trace.

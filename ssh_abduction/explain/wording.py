@@ -12,7 +12,7 @@ from ssh_abduction.explain.no_map import why_apart
 from ssh_abduction.explain.piece import Piece
 from ssh_abduction.solver import facts
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.theory import EXCUSED
+from ssh_abduction.theory.fields import EXCUSED
 
 # Axioms that the action before a step breaks.
 OF_ACTIONS = EXCUSED["slipped"] | {"branch_side"}

@@ -22,8 +22,9 @@ from ssh_abduction.data.star import Star
 from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.solver import observation
 from ssh_abduction.theory.evidence.alike import are_alike
+from ssh_abduction.theory.fields import IN_TOLERANCE
 from ssh_abduction.theory.settle import settle
-from ssh_abduction.theory.theory import IN_TOLERANCE, Theory
+from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.int32]
 Row: TypeAlias = tuple[int, ...]

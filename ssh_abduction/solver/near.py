@@ -24,7 +24,8 @@ from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
 from ssh_abduction.solver.prefixes import Prefixes
 from ssh_abduction.solver.values import Status
-from ssh_abduction.theory.theory import Count, Theory
+from ssh_abduction.theory.fields import Count
+from ssh_abduction.theory.theory import Theory
 
 
 class NearMinimal:

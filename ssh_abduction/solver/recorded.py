@@ -11,7 +11,8 @@ from ssh_abduction.data.fields import FieldReader
 from ssh_abduction.solver.sharing import Backbone
 from ssh_abduction.solver.steps.certificate import Basis, Certificate
 from ssh_abduction.solver.values import Bound, Cost, Effort, Grounding, Level, Seconds
-from ssh_abduction.theory.theory import COUNTS, Theory
+from ssh_abduction.theory.fields import COUNTS
+from ssh_abduction.theory.theory import Theory
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """Which axioms hold, where they are written, and which speed-ups they allow."""
 
+from ssh_abduction.theory.fields import CAUSAL, CHOICES, COUNTS, Count
 from ssh_abduction.theory.speedups import Speedups
-from ssh_abduction.theory.theory import CAUSAL, CHOICES, COUNTS, PRESETS, Count, Theory
+from ssh_abduction.theory.theory import PRESETS, Theory
 
 __all__ = ["CAUSAL", "CHOICES", "COUNTS", "PRESETS", "Count", "Speedups", "Theory"]

@@ -1,4 +1,4 @@
-"""Where the axioms are: finds the `.lp` files, and reads from their comments what each axiom says and when it holds."""
+"""Finds the `.lp` files, and reads from their comments what each axiom says and when it holds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ssh_abduction.data.files import shipped
 
-# Each needs those before it; files that are added come after them, by name.
+# Each file needs those before it. Files that users add come after them, sorted by name.
 FIRST = (
     "causal",
     "topological",
@@ -31,12 +31,13 @@ _WITH = re.compile(r"^% @with (?P<names>.+)$")
 class Axiom:
     """One axiom.
 
-    name        as in `violation(name,…)`
-    sentence    what it says
-    source      where it is from
-    level       the name of its encoding
-    subject     the choices of a theory without which there is nothing that the axiom speaks of (`% @when`)
-    conditions  all choices that switch it on: those, and the ones after `if`
+    Attributes:
+        name: The name, as in `violation(name,…)`.
+        sentence: What it says.
+        source: Where it comes from.
+        level: The name of its encoding.
+        subject: Conditions on a theory without which the axiom has no subject (`% @when`).
+        conditions: All conditions that switch it on: those, and the ones behind `if`.
     """
 
     name: str
@@ -51,14 +52,14 @@ class Axiom:
         return all(_holds(condition, choices) for condition in self.conditions)
 
     def has_subject_in(self, choices: Mapping[str, object]) -> bool:
-        """Whether a theory with these fields speaks of what the axiom is about."""
+        """Whether a theory with these fields has the subject of the axiom."""
         return all(_holds(condition, choices) for condition in self.subject)
 
 
 def _holds(condition: str, choices: Mapping[str, object]) -> bool:
-    """Whether a condition holds:
+    """Whether a condition holds.
 
-    `field=value|value`, `field`, `field|field` (any of these fields), or `not field`.
+    Its form is `field=value|value`, `field`, `field|field` (any of these), or `not field`.
     """
     if "=" in condition:
         field, values = condition.split("=")
@@ -69,22 +70,19 @@ def _holds(condition: str, choices: Mapping[str, object]) -> bool:
 
 
 def folder() -> Path:
-    """The folder of the encodings: inside the installed package, or beside it in a checkout."""
+    """The folder of the encodings, in the installed package or beside it in a checkout."""
     return shipped("encodings")
 
 
 def path(name: str) -> str:
-    """The path of the encoding `name`, for clingo to load: one of the readable ones, or of the fast ones."""
+    """The path of an encoding, readable or fast."""
     readable = folder() / f"{name}.lp"
     return str(readable if readable.exists() else folder() / "fast" / f"{name}.lp")
 
 
 @cache
 def levels() -> tuple[str, ...]:
-    """The encodings that hold axioms, in the order to load them.
-
-    They are found in the folder, so a file that is put there is one of them.
-    """
+    """The encodings with axioms, in the order to load them, also those that users add."""
     found = [
         file.stem
         for file in folder().glob("*.lp")
@@ -97,7 +95,7 @@ def levels() -> tuple[str, ...]:
 
 @cache
 def axioms() -> tuple[Axiom, ...]:
-    """Every axiom of every level, in the order of the files."""
+    """All axioms, in the order of the files."""
     return tuple(
         axiom
         for level in levels()
@@ -106,7 +104,7 @@ def axioms() -> tuple[Axiom, ...]:
 
 
 def axioms_in(text: str, level: str) -> list[Axiom]:
-    """The axioms that the comments of an encoding name."""
+    """The axioms in the comments of an encoding."""
     found: list[Axiom] = []
     subject: tuple[str, ...] = ()
     for line in _unwrapped(text):
@@ -142,7 +140,10 @@ def _unwrapped(text: str) -> list[str]:
 
 
 def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
-    """The encodings that a theory with these fields needs, in the order to load them: those of its axioms, axioms that it leaves out (`without`) among them."""
+    """The encodings that a theory with these fields needs, in the order to load them.
+
+    An axiom that is left out (`without`) still needs its encoding.
+    """
     return tuple(
         level
         for level in levels()
@@ -152,10 +153,10 @@ def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
 
 @cache
 def paths(name: str) -> tuple[str, ...]:
-    """The paths of all files that make the encoding `name`: its own, and before it those that it shares with another one, as `% @with` says at its head.
+    """The files of an encoding: those that it shares (`% @with` at its head), then its own.
 
-    Clingo's `#include` is not used for that, as it prefers a file of the working directory which
-    happens to have the same name.
+    Clingo's `#include` is not used, because it prefers a file of that name in the working
+    directory.
     """
     own = path(name)
     return (*(path(shared) for shared in _said(own, _WITH)), own)
@@ -163,14 +164,14 @@ def paths(name: str) -> tuple[str, ...]:
 
 @cache
 def keeps(*names: str) -> frozenset[str]:
-    """The axioms that these fast encodings say at their heads that they keep, together and with the files that they share."""
+    """The axioms that these fast encodings keep, as they and the files they share say."""
     return frozenset(
         axiom for name in names for file in paths(name) for axiom in _said(file, _KEEPS)
     )
 
 
 def _said(file: str, head: re.Pattern[str]) -> list[str]:
-    """The names in all lines of a file that have such a head."""
+    """The names in all lines of a file that begin with `head`."""
     lines = Path(file).read_text(encoding="utf-8").splitlines()
     return [
         name for line in lines if (match := head.match(line)) for name in match["names"].split()

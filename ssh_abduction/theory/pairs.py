@@ -1,4 +1,4 @@
-"""What is known of pairs of steps before any map is sought."""
+"""What is known about pairs of steps before the search."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
 
-# For a step, the earlier steps with which it makes a pair.
+# For each step, the earlier steps of its pairs.
 Earlier: TypeAlias = Mapping[int, frozenset[int]]
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """What is known of pairs of steps before any map is sought.
+    """What is known about pairs of steps before the search.
 
     Each mapping leads from a step to earlier steps.
 
-    apart      they are not one dstate; these include all pairs that are not at one place
-    elsewhere  they are not at one place
-    one        they are one dstate
+    Attributes:
+        apart: They are different dstates. This includes all pairs of `elsewhere`.
+        elsewhere: They are at different places.
+        one: They are one dstate.
     """
 
     apart: Earlier = field(default_factory=dict)
@@ -32,13 +33,13 @@ class Pairs:
         elsewhere: Iterable[tuple[int, int]] = (),
         one: Iterable[tuple[int, int]] = (),
     ) -> Pairs:
-        """Pairs whose steps may come in any order."""
+        """Make a value of pairs whose steps come in any order."""
         away = list(elsewhere)
         return Pairs(_earlier([*apart, *away]), _earlier(away), _earlier(one))
 
     @staticmethod
     def joined(several: Sequence[Pairs]) -> Pairs:
-        """What several kinds of evidence say together."""
+        """The knowledge of several kinds of evidence together."""
         if len(several) <= 1:
             return several[0] if several else NO_PAIRS
         return Pairs(
@@ -53,15 +54,18 @@ class Pairs:
 
     @cached_property
     def asked_for(self) -> frozenset[int]:
-        """The steps about which something is known once they are there."""
+        """The steps that end a pair."""
         return frozenset((*self.apart, *self.one))
 
     def allow(
         self, step: int, labels: Sequence[int], place_of: Sequence[int | None] | None = None
     ) -> bool:
-        """Whether a step may be at the dstate that `labels` gives it, by what is known of this step and earlier ones.
+        """Whether a step may have its label, by its pairs with earlier steps.
 
-        place_of  the place of each dstate, where that is known
+        Args:
+            step: The step.
+            labels: The dstate of each step.
+            place_of: The place of each dstate, if known.
         """
         if step not in self.asked_for:
             return True
@@ -77,7 +81,7 @@ class Pairs:
         )
 
     def broken_by(self, labels: Sequence[int]) -> list[tuple[int, int]]:
-        """The pairs of these first steps whose labels contradict what is known: the same label where they are apart, or different ones where they are one."""
+        """The pairs of the first steps that their labels contradict."""
         size = len(labels)
         wrong = [(i, t) for i, t in pairs_in(self.apart) if t < size and labels[i] == labels[t]]
         return wrong + [
@@ -86,12 +90,12 @@ class Pairs:
 
 
 def pairs_in(earlier: Earlier) -> list[tuple[int, int]]:
-    """The pairs of a mapping: the earlier step, and the later one."""
+    """The pairs of a mapping, the earlier step first."""
     return [(i, t) for t, others in earlier.items() for i in others]
 
 
 def _united(several: Sequence[Earlier]) -> Earlier:
-    """All pairs of these mappings."""
+    """The union of these mappings."""
     first, *rest = several
     united = dict(first)
     for earlier in rest:
@@ -101,7 +105,7 @@ def _united(several: Sequence[Earlier]) -> Earlier:
 
 
 def _earlier(pairs: Iterable[tuple[int, int]]) -> dict[int, frozenset[int]]:
-    """For the later step of each pair, the earlier ones."""
+    """The earlier steps, by the later step of each pair."""
     found: dict[int, set[int]] = {}
     for i, j in pairs:
         found.setdefault(max(i, j), set()).add(min(i, j))

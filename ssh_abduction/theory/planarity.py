@@ -1,4 +1,6 @@
-"""Whether edges between places can be drawn in the plane without a crossing, where it is known in part how they lie around a place.
+"""Whether edges between places can be drawn in the plane without a crossing.
+
+The order of the edges around a place may be known in part.
 
 >>> three_edges = [("a", "b"), ("a", "b"), ("a", "b")]
 >>> can_be_drawn(three_edges, lambda place, ends: True)
@@ -6,10 +8,10 @@ True
 >>> is_planar({"a": (0, 2, 4), "b": (5, 3, 1)}), is_planar({"a": (0, 2, 4), "b": (1, 3, 5)})
 (True, False)
 
-Edge number e has two ends, 2e and 2e + 1. The ends around each place, clockwise, make a *rotation
-system*. Its faces are traced by going along an edge and leaving by the next end around the place.
-It is the one of a drawing in the plane without crossings exactly if V - E + F = 2 for each
-connected part (Euler; Edmonds 1960; Mohar & Thomassen, Graphs on Surfaces, 2001, chapter 3).
+Edge e has the two ends 2e and 2e + 1. The ends around each place, clockwise, make a *rotation
+system*. To trace a face, go along an edge and leave by the next end around the place. A drawing in
+the plane without crossings has this rotation system exactly if V - E + F = 2 for each connected
+part (Euler; Edmonds 1960; Mohar & Thomassen, Graphs on Surfaces, 2001, chapter 3).
 """
 
 from __future__ import annotations
@@ -27,10 +29,11 @@ Step = TypeVar("Step")
 
 
 def is_planar(around: Mapping[Place, Ends]) -> bool:
-    """Whether a rotation system is one of the plane.
+    """Whether a rotation system can be drawn in the plane.
 
-    around  for each place, the ends of edges around it, clockwise, from any end on; each edge has
-    both ends in it
+    Args:
+        around: For each place, the ends of edges around it, clockwise from any end. It contains
+            both ends of each edge.
     """
     places = [place for place, ends in around.items() if ends]
     edges = sum(len(around[place]) for place in places) // 2
@@ -38,7 +41,7 @@ def is_planar(around: Mapping[Place, Ends]) -> bool:
 
 
 def _faces(around: Mapping[Place, Ends]) -> int:
-    """How many faces a rotation system has, not counting those around places without edges."""
+    """The number of faces of a rotation system, without those around places without edges."""
     following = {
         end: ends[i - len(ends) + 1] for ends in around.values() for i, end in enumerate(ends)
     }
@@ -53,7 +56,7 @@ def _faces(around: Mapping[Place, Ends]) -> int:
 
 
 def _parts(around: Mapping[Place, Ends]) -> int:
-    """How many connected parts there are, not counting places without edges."""
+    """The number of connected parts, without places that have no edges."""
     place_of = {end: place for place, ends in around.items() for end in ends}
     parts = 0
     left = set(place_of.values())
@@ -70,12 +73,13 @@ def _parts(around: Mapping[Place, Ends]) -> int:
 def can_be_drawn(
     edges: Sequence[tuple[Place, Place]], allows: Callable[[Place, Ends], bool]
 ) -> bool:
-    """Whether there is an order of the ends around each place in which the edges do not cross.
+    """Whether the ends around each place have an order in which the edges do not cross.
 
-    edges   the two places that each one joins
-    allows  whether some ends may lie around a place in this order, clockwise, from any of them on.
-        What it allows of some ends it allows of fewer of them, and it
-            allows some order of all ends that has an allowed order of some in it.
+    Args:
+        edges: The two places of each edge.
+        allows: Whether some ends may lie around a place in this clockwise order, starting from
+            any of them. A part of an allowed order must be allowed. An allowed order of some ends
+            must be a part of an allowed order of all ends.
     """
     place_of = [place for edge in edges for place in edge]
     if not all(allows(place, ()) for place in set(place_of)):
@@ -91,7 +95,7 @@ def can_be_drawn(
 
 
 def _on_rings(place_of: Sequence[Place]) -> set[int]:
-    """The edges that are left when dead ends are taken away one after another: a dead end can be drawn wherever its edge has to begin."""
+    """The edges without dead ends: a dead end fits in wherever its edge begins."""
     ends_at: dict[Place, set[int]] = {}
     for end, place in enumerate(place_of):
         ends_at.setdefault(place, set()).add(end)
@@ -106,7 +110,7 @@ def _on_rings(place_of: Sequence[Place]) -> set[int]:
 
 
 def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
-    """The clockwise orders of some ends that are allowed, the first one first."""
+    """The allowed clockwise orders of some ends, the first end first."""
     orders: list[Ends] = [()]
     for end in ends:
         longer = (
@@ -121,7 +125,7 @@ def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
 def _one_place_more(
     drawn: dict[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
 ) -> Iterator[dict[Place, Ends]]:
-    """The ways to draw one more place, one that is joined to those drawn if there is any: that with the fewest ways, so that what is certain comes first."""
+    """The ways to draw one more place: a neighbour of a drawn place that has the fewest ways."""
     near = {
         place_of[end ^ 1]: None
         for ends in drawn.values()
@@ -146,16 +150,17 @@ def _one_place_more(
 def _leaves_room(
     drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
 ) -> bool:
-    """Whether places are drawn so that each connected part of the others can lie in one face.
+    """Whether each connected part of the other places fits into one face of the drawing.
 
-    Such a part is drawn as one place, with the ends that lead to it in the order in which that face
-    meets them.
+    Such a part counts as one place. Its ends are in the order in which the face meets them.
     """
     part = _parts_of_rest(drawn, orders, place_of)
     following = {
         end: ends[i - len(ends) + 1] for ends in drawn.values() for i, end in enumerate(ends)
     }
-    met: dict[Place, list[int]] = {}  # for each part, the ends in it, as one face meets them
+    met: dict[
+        Place, list[int]
+    ] = {}  # the ends of each part, in the order in which a face meets them
     left = set(following)
     while left:
         here = start = left.pop()
@@ -182,7 +187,7 @@ def _leaves_room(
 def _parts_of_rest(
     drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
 ) -> dict[Place, Place]:
-    """For each place that is not drawn, one that stands for the connected part that it is in."""
+    """For each place that is not drawn, one place that stands for its connected part."""
     part: dict[Place, Place] = {}
     for first in orders:
         queue = [] if first in drawn or first in part else [first]
@@ -204,9 +209,9 @@ def _parts_of_rest(
 def has_way(
     start: State, steps: Sequence[Step], ways: Callable[[State, Step], Iterator[State]]
 ) -> bool:
-    """Whether all steps can be gone from a start, each in one of its ways.
+    """Whether all steps can be done from a start, each in one of its ways.
 
-    It is a depth-first search, without recursion as there may be many steps.
+    A depth-first search without recursion, as there may be many steps.
     """
     gone: list[Iterator[State]] = []
     state = start

@@ -1,8 +1,10 @@
-"""A user's own rules, written over the predicates of the encodings, as part of a theory.
+"""A user's own rules, written with the predicates of the encodings.
 
->>> from ssh_abduction.theory.rules import Rules >>> rules = Rules("own.lp", "% @axiom(brief) No
-dstate is seen again later.\\n#program step(t).\\nviolation(brief,t) :- same(I,t), t > 9.") >>>
-[axiom.sentence for axiom in rules.axioms] ['No dstate is seen again later.']
+>>> from ssh_abduction.theory.rules import Rules
+>>> text = "% @axiom(brief) No dstate is seen again later.\\n#program step(t)."
+>>> rules = Rules("own.lp", text + "\\nviolation(brief,t) :- same(I,t), t > 9.")
+>>> [axiom.sentence for axiom in rules.axioms]
+['No dstate is seen again later.']
 """
 
 from __future__ import annotations
@@ -17,30 +19,33 @@ from ssh_abduction.data.errors import TheoryError, brief, is_writable
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.theory.encodings import Axiom, axioms_in
 
-# Bytes that a file of rules may have: a device that never ends is refused before it fills the
-# memory.
+# Bytes that a file of rules may have at most. This refuses devices that never end.
 LARGEST = 2**24
-# What may hold any character outside of a block comment, or opens one; the group is what rules
-# cannot have: other characters than ASCII, and scripts, in which % is no comment.
+# Outside of block comments: strings, line comments and the start of a block comment, which may hold
+# any character. The group matches what rules must not have: a character that is not ASCII, and
+# scripts, in which % starts no comment.
 _OUTSIDE = re.compile(r'"(?:\\["\\n]|[^"\\\n])*"|%\*|%[^\n]*|([^\x01-\x7f]|#script\b)')
-# What opens and closes block comments, which nest, and hides both.
+# Inside of block comments, which nest: their start and end, and line comments, which hide both.
 _INSIDE = re.compile(r"%\*|\*%|%[^\n]*")
 
 
 @dataclass(frozen=True)
 class Rules:
-    """A file of rules: its name, for messages, and its text.
+    """A file of rules.
 
-    `ssh_abduction.solver.asp.rules` says whether clingo can read it.
+    `ssh_abduction.solver.asp.rules` checks that clingo can read it. A byte order mark is dropped,
+    and each line ends in a line feed.
 
-    A byte order mark is dropped, and each line ends in a line feed.
+    Attributes:
+        name: The name of the file, for messages.
+        text: Its content.
     """
 
     name: str
     text: str = field(repr=False)
 
     def __post_init__(self) -> None:
-        """Raises TheoryError for a text that clingo's lexer cannot take: it aborts the process, or ends without a word where a null character is."""
+        """Raise TheoryError for text that makes clingo's lexer abort the process or end early."""
         if not isinstance(self.name, str) or not isinstance(self.text, str):
             raise TheoryError(
                 f"rules: expected a name and a text, got {brief(self.name)} and "
@@ -75,12 +80,16 @@ class Rules:
 
     @property
     def axioms(self) -> tuple[Axiom, ...]:
-        """The axioms that comments `% @axiom(name) sentence` name."""
+        """The axioms in comments `% @axiom(name) sentence`."""
         return tuple(axioms_in(self.text, self.name))
 
     @classmethod
     def of(cls, value: Any) -> Rules:
-        """Rules, a path of a file, or what `to_dict` made of rules. Raises TheoryError."""
+        """Make Rules of Rules, of the path of a file, or of the output of `to_dict`.
+
+        Raises:
+            TheoryError: The file cannot be read, or has wrong characters.
+        """
         if isinstance(value, Rules):
             return value
         if (
@@ -107,9 +116,10 @@ class Rules:
 
     @classmethod
     def all_of(cls, value: Any) -> tuple[Rules, ...]:
-        """Rules in a list, or a single one; paths as text may have commas between.
+        """Make Rules of a list, or of one entry. A text may hold several paths with commas.
 
-        Raises TheoryError.
+        Raises:
+            TheoryError: An entry is wrong.
         """
         if isinstance(value, str):
             value = [part.strip() for part in value.split(",") if part.strip()]
@@ -124,7 +134,7 @@ class Rules:
 
 
 def _stray(text: str) -> int:
-    """Where the first character that is not ASCII is outside of quotes and comments, or the first script; -1 where there is none."""
+    """The position of the first forbidden character or script; -1 if there is none."""
     depth = at = 0
     while found := (_INSIDE if depth else _OUTSIDE).search(text, at):
         if found.re is _OUTSIDE and found[1]:

@@ -1,4 +1,4 @@
-"""A theory, settled for one trace.
+"""Settle a theory for one trace: replace each `auto` by the choice that fits the trace.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.theory.settle import settle
@@ -16,22 +16,22 @@ from typing import Literal, TypeAlias
 from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.trace import Trace, checked_trace
 from ssh_abduction.theory.evidence import Displacement, Evidence, evidence_of
+from ssh_abduction.theory.fields import choice
 from ssh_abduction.theory.pairs import Pairs
-from ssh_abduction.theory.theory import Theory, checked_theory, choice
+from ssh_abduction.theory.theory import Theory, checked_theory
 
 Star: TypeAlias = Literal["auto", "none", "alike", "pattern", "frame", "gateways"]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A trace and the theory that was settled for it. Whoever works on a trace is given this value.
+    """A trace and the theory that is settled for it. All code that works on a trace gets it.
 
     Attributes:
         trace: The trace.
         theory: The theory, with `star`, `displacement`, `prefer` and `returns` settled.
-        evidence: The kinds of evidence that take part, made for this theory. They remember what
-            they
-            worked out about the trace.
+        evidence: The kinds of evidence that this theory uses. They remember what they computed
+            about the trace.
     """
 
     trace: Trace
@@ -40,21 +40,21 @@ class Problem:
 
     @classmethod
     def of(cls, trace: Trace, theory: Theory) -> Problem:
-        """The problem of a theory that is settled for a trace already."""
+        """The problem of a theory that is settled for the trace already."""
         return cls(trace, theory, evidence_of(theory))
 
     @cached_property
     def pairs(self) -> Pairs:
-        """What the evidence that nothing excuses says of pairs of steps."""
+        """What the evidence that cannot be excused says about pairs of steps."""
         hard = self.theory.hard
         return Pairs.joined([e.pairs(self.trace) for e in self.evidence if e.axiom in hard])
 
     def changed(self, trace: Trace | None = None, theory: Theory | None = None) -> Problem:
-        """Another trace or settled theory, with what is known about this one.
+        """A problem with another trace or settled theory, which keeps what is known.
 
         Args:
             trace: Another trace, such as this one with more steps, or a part of it.
-            theory: Another theory, which is settled for that trace.
+            theory: Another theory that is settled for that trace.
         """
         theory = theory or self.theory
         return Problem(trace or self.trace, theory, evidence_of(theory, self.evidence))
@@ -80,7 +80,7 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
     displacement = theory.displacement
     if displacement == "auto":
         displacement = "use" if trace.has_displacements else "none"
-    # Once returns are counted, this may be a part of a trace, which need not have displacements.
+    # If returns are counted, this may be a part of a trace, perhaps one without displacements.
     if displacement == "use" and not trace.has_displacements and not theory.returns:
         mend = f"add them to the steps, or take {choice('displacement', 'none')}"
         raise TheoryError(
@@ -107,7 +107,7 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
 
 
 def count_returns(problem: Problem) -> int:
-    """How many returns of a trace may be true, rounded up to a power of two; 0 if none are used."""
+    """The number of returns that may be true, rounded up to a power of two; 0 if none are used."""
     displacement = displacement_of(problem)
     return displacement.count_returns(problem.trace) if displacement else 0
 

@@ -1,9 +1,9 @@
-"""What makes solving fast, and for which theories: the one table that decides.
+"""The table of speed-ups: what each one does, and for which theories it holds.
 
-Users add axioms and evidence, and speed-ups rest on the axioms that they were made for. So a
-speed-up names the axioms that it rests on, which no one may have given up, and the axioms that it
-keeps: it is on for a theory only if it keeps all that the theory demands. What it does not know
-switches it off, so that an axiom that is added is obeyed everywhere.
+Users may add axioms and evidence, but a speed-up is made for certain axioms. So each speed-up names
+the axioms that it rests on, which the theory must not give up, and the axioms that it keeps. It is
+on for a theory only if it keeps all that the theory demands. An axiom that it does not know
+switches it off. So axioms that users add are always obeyed.
 
 >>> from ssh_abduction import Theory
 >>> from ssh_abduction.theory.speedups import Speedups
@@ -22,7 +22,8 @@ from typing import Final
 from ssh_abduction.data.errors import SolverError, brief
 from ssh_abduction.data.words import shortly
 from ssh_abduction.theory import encodings
-from ssh_abduction.theory.theory import EXCUSED, Theory, checked_theory
+from ssh_abduction.theory.fields import EXCUSED
+from ssh_abduction.theory.theory import Theory, checked_theory
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,7 @@ class Speedups:
 
     @classmethod
     def without(cls, names: str | Iterable[str]) -> Speedups:
-        """All speed-ups but these. Raises SolverError."""
+        """All speed-ups except these. Raises SolverError."""
         if not isinstance(names, Iterable):
             raise SolverError(
                 f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(names)}"
@@ -71,7 +72,7 @@ class Speedups:
         return cls(**dict.fromkeys(off, False))
 
     def that_hold_for(self, theory: Theory) -> Speedups:
-        """Those of these speed-ups that hold for a theory, whose star is settled, by the table."""
+        """Those of these speed-ups that hold for a theory with settled star."""
         theory = checked_theory(theory)
         valid = {speedup.switch for speedup in TABLE if speedup.holds_for(theory)}
         return replace(self, **{name: False for name in SPEEDUPS if name not in valid})
@@ -94,15 +95,16 @@ SPEEDUPS = tuple(f.name for f in fields(Speedups))
 class Speedup:
     """One row of the table.
 
-    name      what it is called; several rows may have one switch, but each has its own name
-    switch    the field of `Speedups` that turns it on or off
-    sentence  what it does
-    suits     whether it is made for a theory
-    rests_on  axioms that it needs: none of them may be left out or be excused, unless the theory
-        has nothing that they speak of
-    keeps     the axioms for which it is exact: it neither loses maps that satisfy them, nor lets
-        maps pass that do not. EVERY, where each further axiom
-              only takes maps away, or every map is checked anyway
+    Attributes:
+        name: Its own name.
+        switch: The field of `Speedups` that turns it on. Several rows may share a switch.
+        sentence: What it does.
+        suits: Whether it is made for a theory.
+        rests_on: Axioms that it needs. The theory must enforce each of them that it has a subject
+            for.
+        keeps: The axioms for which it is exact: it loses no map that satisfies them, and lets no
+            other map pass. EVERY if any further axiom only removes maps, or if every map is
+            checked anyway.
     """
 
     name: str
@@ -113,7 +115,7 @@ class Speedup:
     keeps: Callable[[], frozenset[str]] | None
 
     def holds_for(self, theory: Theory) -> bool:
-        """Whether it changes no answer of a theory whose star is settled."""
+        """Whether it changes no answer for a theory with settled star."""
         return (
             self.suits(theory)
             and not self.rests_on & theory.given_up
@@ -129,12 +131,12 @@ def _any_theory(theory: Theory) -> bool:
 
 
 def _knows_views(theory: Theory) -> bool:
-    """Whether the views of all steps are known, so that two of them are the same or different."""
+    """Whether the views of all steps are known."""
     return not theory.unknown_views
 
 
 def _keeps_headings(theory: Theory) -> bool:
-    """Whether a dstate has one heading, if it has any."""
+    """Whether a dstate has at most one heading."""
     return theory.star != "frame" or "one_heading" in theory.hard
 
 
@@ -163,7 +165,7 @@ def _has_bare_places(theory: Theory) -> bool:
 
 
 def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozenset[str]]:
-    """What the heads of these fast encodings say that they keep, read when it is first asked for, and what Python code keeps beside them."""
+    """The axioms that these fast encodings and the Python code around them keep."""
     return lambda: encodings.keeps(*names) | frozenset(and_also)
 
 
@@ -210,8 +212,8 @@ GATEWAYS = frozenset(
     }
 )
 NOTHING: frozenset[str] = frozenset()
-# The axioms that a map of a trace still satisfies when it is cut to some first steps, and that
-# speak of nothing but links, observations and pairs of steps.
+# Axioms about links, observations and pairs of steps only. A map that satisfies them still does so
+# when it is cut to its first steps.
 SURVIVE_A_CUT = FRAMES | {
     "next_place",
     "all_on_paths",
@@ -227,8 +229,8 @@ SURVIVE_A_CUT = FRAMES | {
     "one_star",
     "one_pose",
 }
-# Kinds of evidence that say nothing but which steps are not one dstate, or not at one place, and
-# which labels go not together.
+# Kinds of evidence that only say which steps are different dstates or at different places, and
+# which labels contradict each other.
 PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "planar")
 
 TABLE = (
@@ -396,7 +398,7 @@ TABLE = (
 
 
 def row(name: str) -> Speedup:
-    """A row of the table, by its name."""
+    """The row with this name."""
     return next(speedup for speedup in TABLE if speedup.name == name)
 
 

@@ -15,7 +15,7 @@ from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.solver.engines.doubts import Doubt, Doubts
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
-from ssh_abduction.theory.theory import Count
+from ssh_abduction.theory.fields import Count
 
 # A prefix grows by this factor at least, so that there are few of them.
 GROWTH = 1.25

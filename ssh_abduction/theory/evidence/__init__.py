@@ -1,6 +1,6 @@
-"""What is known besides views and actions.
+"""Kinds of evidence: what is known besides views and actions.
 
-A kind of evidence is a module of this folder, and an encoding of the same name.
+A kind of evidence is a module of this folder and an encoding of the same name.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.theory.evidence import pairs_of
@@ -8,9 +8,9 @@ A kind of evidence is a module of this folder, and an encoding of the same name.
 >>> pairs_of(trace, Theory(different=[(0, 2)])).apart
 {2: frozenset({0})}
 
-`KINDS` lists the kinds; nothing else knows them by name. What a kind says of pairs of steps is
-wired in where engines make the domains of their variables (`Pairs`), so that evidence makes solving
-faster. What it finds out only once there is a map is asked by one loop (`refuse`).
+`KINDS` lists the kinds. No other code knows them by name. What a kind knows about pairs of steps
+(`Pairs`) prunes the domains of all engines, so evidence makes solving faster. What a kind can check
+only on a whole map (`refuse`) is asked after each answer.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ __all__ = [
 
 
 def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidence, ...]:
-    """Make the kinds of evidence that take part in a theory.
+    """Make the kinds of evidence that a theory uses.
 
     Args:
         theory: The settled theory.
-        known: Evidence that was made before. What it remembers about traces is taken over.
+        known: Evidence that was made before. What it remembers about traces is kept.
     """
     made = [kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms]
     before = {type(evidence): evidence for evidence in known}
@@ -62,9 +62,15 @@ def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidenc
 def said_by(
     kinds: Iterable[Evidence], trace: Trace, refused: Mapping[str, int]
 ) -> dict[str, dict[str, int]]:
-    """For each kind of evidence that takes part, how many pairs of steps of a trace it excludes, and how many sets of equalities it refused.
+    """What each kind of evidence excluded.
 
-    refused  how many sets, by the name of the kind; 0 for those that are not there
+    Args:
+        kinds: The evidence.
+        trace: The trace.
+        refused: The number of refused sets of equalities, by the name of the kind.
+
+    Returns:
+        By the name of the kind, the number of excluded pairs of steps and of refused sets.
     """
     return {
         kind.name: {
@@ -76,7 +82,7 @@ def said_by(
 
 
 def pairs_of(trace: Trace, theory: Theory) -> Pairs:
-    """What all evidence says of pairs of steps of a trace that nothing excuses."""
+    """What the evidence that cannot be excused says about pairs of steps."""
     return Pairs.joined(
         [evidence.pairs(trace) for evidence in evidence_of(theory) if evidence.axiom in theory.hard]
     )

@@ -1,4 +1,7 @@
-"""What stars say of dstates alone: a dstate has one star, so steps whose stars are not alike are not one dstate. It needs neither places nor right angles."""
+"""Stars as evidence about dstates alone: steps whose stars differ are different dstates.
+
+This needs neither places nor right angles.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +18,14 @@ from ssh_abduction.theory.pairs import Pairs
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
-_Seen = tuple[str | None, Star]  # a view, or None where views say nothing of dstates, and a star
+_Seen = tuple[str | None, Star]  # a star, and its view; None if views say nothing about dstates
 
 
 @dataclass(frozen=True)
 class Alike:
-    """Stars that are told apart without being turned.
+    """Stars that are compared without being turned.
 
-    Steps of different views are not one dstate anyway, so they are no pairs.
+    Steps with different views are different dstates anyway, so they give no pairs.
     """
 
     name: ClassVar[str] = "alike"
@@ -53,7 +56,7 @@ class Alike:
 
 @lru_cache(maxsize=8)
 def _pairs(seen: tuple[_Seen, ...]) -> Pairs:
-    """The pairs of steps that see the same view, and stars that are not alike."""
+    """The pairs of steps with the same view, but stars that are not alike."""
     steps: dict[str | None, dict[Star, list[int]]] = {}
     apart: dict[int, frozenset[int]] = {}
     for t, (view, star) in enumerate(seen):
@@ -68,20 +71,21 @@ def _pairs(seen: tuple[_Seen, ...]) -> Pairs:
 
 @lru_cache(maxsize=2**16)
 def are_alike(one: Star, other: Star) -> bool:
-    """Whether two stars may show the same gateways to a robot that has not turned: each that is seen in one star is a gateway of the other, and no two are one.
+    """Whether two stars may show the same gateways to a robot that has not turned.
 
-    Gateways that were not observed may be there or not. It is enough to pair the gateways seen in
-    one star, and those seen in the other (Mendelsohn & Dulmage 1958).
+    Each gateway that is seen in one star must be a gateway of the other, and no two the same one.
+    Gateways that were not observed may be there or not. It is enough to pair the seen gateways of
+    each star (Mendelsohn & Dulmage 1958).
     """
     return _pairable(one, other) and _pairable(other, one)
 
 
 def _pairable(one: Star, other: Star) -> bool:
-    """Whether each gateway that is seen in one star can be paired with a gateway of the other, in tolerance."""
-    partner: dict[int, int] = {}  # for a gateway of the other star, that of the one
+    """Whether each gateway seen in one star can be paired with one of the other, in tolerance."""
+    partner: dict[int, int] = {}  # gateways of `one`, by their partner in `other`
 
     def pair(k: int, tried: set[int]) -> bool:
-        """Find a partner for gateway k, and others for those whose partners it takes."""
+        """Find a partner for gateway k, and another one for the gateway that it takes it from."""
         here = one.gateways[k]
         for j, there in enumerate(other.gateways):
             if (

@@ -1,4 +1,4 @@
-"""What a person says of steps: that two are one dstate, that two are not, or that two are not even at one place."""
+"""What a person asserts: that two steps are one dstate, different dstates, or different places."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Asserted:
     """The fields `same`, `different` and `elsewhere` of a theory.
 
-    Pairs with a step that the trace does not have (yet) say nothing.
+    Pairs with a step that the trace does not have yet say nothing.
     """
 
     name: ClassVar[str] = "asserted"

@@ -1,60 +1,42 @@
-"""What odometry says: a dstate has one pose, a place one position, and the displacements of the trace agree with that within their covariance.
+"""Displacements as evidence: a dstate has one pose, and a place one position.
 
 A *return* is a pair of visits that a map takes for one place, or a pair of steps that it takes for
-one dstate. By the displacements between, the loop from one to the other closes off by something;
-how likely that is, its covariance says (`theory/loops.py`). The axiom `one_pose` is that no set of
-at most `joint` returns is refused.
+one dstate. The displacements between the two steps make a loop. The loop fails to close by some
+distance, and the covariance says how likely that is (`loops.py`). The axiom `one_pose` demands that
+no set of at most `joint` returns is refused.
 
-*One return* says nothing of any other, so it is known before the search which ones are refused:
-they are pairs of steps that are not at one place, or not one dstate, and prune the domains of every
-engine.
+*One return* does not depend on others. So the search knows beforehand which returns are refused:
+pairs of steps at different places, or of different dstates. They prune the domains of all engines.
 
-*Two returns* are tested together if both are of the first steps of visits, and their loops share
-displacements. What is refused is looked for in each answer.
+*Two returns* are tested together if both are between first steps of visits, and their loops share
+displacements. Each answer is checked for refused sets.
 
-*How often a true map is refused.* Each return is tested, and a true map has many. So a return is
-refused at a p-value that is half of `reject` shared among all returns which may be true, and a set
-of two at the other half shared among all sets of two of these: then a true map is refused with a
-probability of `reject` at most. A return may be true if it does not look false; of the true ones,
-half have a p-value above one half (Storey 2002, "A direct approach to false discovery rates"), so
-there are about twice as many as have that. The number is rounded up to a power of two: while a
-robot drives, what is refused stays so until there are twice as many.
+*How often a true map is refused.* A true map has many returns, and each is tested. So half of
+`reject` is shared among all returns that may be true, and the other half among all sets of two.
+Then a true map is refused with probability `reject` at most. Half of the true returns have a
+p-value above one half (Storey 2002, "A direct approach to false discovery rates"), so about twice
+as many returns as that may be true. The number is rounded up to a power of two, so that it seldom
+changes while a robot drives.
 """
 
 from __future__ import annotations
 
-import math
-from bisect import bisect
-from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from operator import is_
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, ClassVar
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
-from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.evidence.protocol import Equality
-from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
+from ssh_abduction.theory.evidence.returns import Returns
+from ssh_abduction.theory.pairs import Pairs
 
 if TYPE_CHECKING:
-    from ssh_abduction.theory.evidence.loops import Reckoning, Steps
-    from ssh_abduction.theory.evidence.together import Mask, Together
     from ssh_abduction.theory.theory import Theory
 
-# The first steps and the last ones of returns, of places (True) and of dstates (False).
-_Tested: TypeAlias = "dict[bool, tuple[Steps, Steps]]"
 
-# So many loops are worked on in one go: their sums take some hundred megabytes.
-AT_A_TIME = 200_000
-# So many maps of one trace that were accepted are remembered, as they may be asked about again, or
-# go on as the trace grows; and so many sets that were refused, as the next maps mostly have them,
-# too.
-REMEMBERED = 64
-# The traces whose returns a kind of evidence remembers.
-KEPT = 8
+KEPT = 8  # traces whose returns are remembered
 
 
 @dataclass(frozen=True)
@@ -74,8 +56,8 @@ class Displacement:
     @classmethod
     def of(cls, theory: Theory) -> Displacement:
         topological, hard = theory.level == "topological", theory.hard
-        # Where displacements may be wrong, each pair of steps is excused by what lies between its
-        # own steps: so it does not stand for others of its visits.
+        # If displacements may be wrong, a pair is excused by a wrong displacement between its own
+        # steps. So it says nothing about other steps of the same visits.
         turns_stay = "turn_stays" in hard and not theory.jumped
         return cls(
             theory.reject,
@@ -103,17 +85,17 @@ class Displacement:
         return replace(self, known=known.known)
 
     def count_returns(self, trace: Trace) -> int:
-        """How many returns of a trace may be true, rounded up to a power of two.
+        """The number of returns that may be true, rounded up to a power of two.
 
-        The length of the trace does not limit the number.
+        The length of the trace does not limit it.
         """
         return replace(self, returns=0).returns_of(trace).count()
 
     def returns_of(self, trace: Trace) -> Returns:
-        """The returns that a trace may have, made when they are first asked for.
+        """The returns of a trace, made when they are first needed.
 
-        The last few traces are remembered, as several parts of a search ask for them. If a trace
-        has grown, the returns of its first steps are taken over.
+        The last few traces are remembered, because several parts of a search need them. If a trace
+        has grown, the returns of its first steps are kept.
         """
         kept = list(self.known)
         for known in kept:
@@ -124,7 +106,7 @@ class Displacement:
         )
         reckoning = next((known.reckoning for known in kept if known.trace is trace), None)
         found = Returns(self, trace, before, reckoning)
-        with suppress(ValueError):  # another thread was faster
+        with suppress(ValueError):  # another thread may have removed it
             if before is not None:
                 self.known.remove(before)
             elif len(kept) >= KEPT:
@@ -139,7 +121,7 @@ def jumped(ssh_map: SSHMap) -> tuple[int, ...]:
 
 
 def _has_grown(before: Trace, trace: Trace) -> bool:
-    """Whether a trace is another one, and perhaps some more steps."""
+    """Whether a trace is an earlier one, perhaps with more steps."""
     last = len(before) - 1
     if last >= len(trace) or before.odometry != trace.odometry:
         return False
@@ -147,457 +129,3 @@ def _has_grown(before: Trace, trace: Trace) -> bool:
     if (old.view, old.displacement, old.covariance) != (new.view, new.displacement, new.covariance):
         return False
     return all(map(is_, before.steps[:last], trace.steps[:last]))
-
-
-class Returns:
-    """The returns that a trace may have, and which of them are refused."""
-
-    def __init__(
-        self,
-        evidence: Displacement,
-        trace: Trace,
-        before: Returns | None = None,
-        reckoning: Reckoning | None = None,
-    ) -> None:
-        """Nothing is tested yet, but what was tested before.
-
-        before     the returns of the first steps, if these are known
-        reckoning  that of the trace, if it is known
-        """
-        from ssh_abduction.theory.evidence.loops import Reckoning  # loads numpy
-
-        self.evidence, self.trace = evidence, trace
-        self.reckoning: Reckoning = reckoning or Reckoning(
-            trace, before.reckoning if before else None
-        )
-        # The last one last.
-        self._accepted: dict[_Course, Together] = dict(before._accepted) if before else {}
-        # Sets of two returns, the last one last.
-        self._refused: list[frozenset[Equality]] = list(before._refused) if before else []
-        self._pairs: Pairs | None = before._pairs if before else None
-        self._likely: int | None = before._likely if before else None
-        if before and (self._pairs is not None or self._likely is not None):
-            since = len(before.trace)
-            tested = self._tested(since)
-            if self._pairs is not None:
-                self._pairs = Pairs.joined([self._pairs, self._pairs_of(tested, since)])
-            if self._likely is not None:
-                self._likely += self._likely_among(tested)
-
-    @property
-    def pairs(self) -> Pairs:
-        """The pairs of steps that are not at one place, or not one dstate."""
-        if self._pairs is None:
-            self._pairs = self._pairs_of(self._tested())
-        return self._pairs
-
-    def count(self) -> int:
-        """How many returns may be true, rounded up to a power of two; so many as have a p-value above one half, twice."""
-        if self._likely is None:
-            self._likely = self._likely_among(self._tested())
-        return 1 << max(2 * self._likely - 1, 0).bit_length()
-
-    @cached_property
-    def arrivals(self) -> list[int]:
-        """The first step of each visit: where the robot came to a place.
-
-        Where it is not known which actions are turns, each step is a visit.
-        """
-        return [0, *(t for t, action in enumerate(self.trace.actions, 1) if action.kind != "turn")]
-
-    def _tested(self, since: int = 0) -> _Tested:
-        """The returns that end at a step from `since` on and about which displacements say something: those of places (True), and those of dstates (False)."""
-        views: dict[object, list[int]] = defaultdict(list)
-        for t, step in enumerate(self.trace.steps):
-            views[step.view if self.evidence.has_one_view else None].append(t)
-        places = [self.arrivals] if self.evidence.has_places else []
-        return {
-            True: self._loops_within(places, since),
-            False: self._loops_within(list(views.values()), since),
-        }
-
-    def _loops_within(self, groups: Sequence[Sequence[int]], since: int = 0) -> tuple[Steps, Steps]:
-        """All loops between two steps of one group about which displacements say something, and which end at a step from `since` on."""
-        import numpy as np
-
-        begins = self.reckoning.begins
-        found: list[tuple[Steps, Steps]] = []
-        for group in groups:
-            if group[-1] < since:
-                continue
-            steps = np.asarray(group)
-            new = np.arange(np.searchsorted(steps, since), len(steps))
-            starts = np.searchsorted(steps, begins[steps[new]])
-            counts = new - starts
-            last = np.repeat(new, counts)
-            first = (
-                np.arange(len(last))
-                - np.repeat(np.cumsum(counts) - counts, counts)
-                + np.repeat(starts, counts)
-            )
-            found.append((steps[first], steps[last]))
-        empty = np.zeros(0, dtype=int)
-        return np.concatenate([empty, *(i for i, _ in found)]), np.concatenate(
-            [empty, *(j for _, j in found)]
-        )
-
-    def _pairs_of(self, tested: _Tested, since: int = 0) -> Pairs:
-        """The pairs of steps that are told apart by these returns, as they are refused alone.
-
-        They are all, or those that end at the steps which are new.
-        """
-        far, other = (self._refused_among(*tested[places], places) for places in (True, False))
-        known = self._pairs or NO_PAIRS
-        elsewhere = Pairs.joined([known, Pairs.of(elsewhere=far)]).elsewhere
-        return Pairs.of([*other, *self._steps_of_visits(elsewhere, since)], far)
-
-    def _likely_among(self, tested: _Tested) -> int:
-        """How many of these returns have a p-value above one half."""
-        from scipy.special import gammainccinv
-
-        from ssh_abduction.theory.evidence.loops import chi_squares
-
-        loops, likely = self.reckoning.loops_of_unknown_drift(), 0
-        for places, (first, last) in tested.items():
-            half = 2 * gammainccinv((2 if places else 3) / 2, 0.5)
-            for part in _parts(len(first)):
-                squares = chi_squares(*loops.closings(first[part], last[part]))
-                likely += int((squares[0 if places else 1] < half).sum())
-        return likely
-
-    def threshold(self, freedom: int, together: bool) -> float:
-        """The chi-square above which a return, or a set of two together, is refused.
-
-        freedom  its degrees of freedom
-        """
-        from scipy.special import gammainccinv
-
-        share = self.evidence.reject / (2 if self.evidence.joint > 1 else 1)
-        returns = max(self.evidence.returns, 1)
-        tests = returns * (returns - 1) / 2 if together else returns
-        return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
-
-    def _refused_among(self, first: Steps, last: Steps, places: bool) -> list[tuple[int, int]]:
-        """Which of these returns are refused alone: those that close badly whatever drift the heading has."""
-        import numpy as np
-
-        from ssh_abduction.theory.evidence.loops import chi_squares
-
-        most, which = self.threshold(2 if places else 3, together=False), 0 if places else 1
-        drifts = [
-            number for number, unlikely in enumerate(self.reckoning.unlikely) if unlikely <= most
-        ]
-        # Most true returns close without a drift, and most false ones with none.
-        for numbers in filter(None, (drifts[:1], drifts[1:])):
-            refused = np.ones(len(first), dtype=bool)
-            for part in _parts(len(first), AT_A_TIME // max(len(numbers), 1)):
-                i, j = first[part], last[part]
-                closings = self.reckoning.closings(
-                    np.repeat(numbers, len(i)), np.tile(i, len(numbers)), np.tile(j, len(numbers))
-                )
-                squares = chi_squares(*closings)[which].reshape(len(numbers), len(i))
-                unlikely = np.array([self.reckoning.unlikely[number] for number in numbers])
-                refused[part] = (squares + unlikely[:, None] > most).all(0)
-            first, last = first[refused], last[refused]
-        return list(zip(first.tolist(), last.tolist(), strict=True))
-
-    def _steps_of_visits(self, elsewhere: Earlier, since: int) -> Iterator[tuple[int, int]]:
-        """The pairs of steps that show the same view, in visits that are not at one place.
-
-        Steps that show different views are apart anyway.
-
-        elsewhere  the first steps of visits that are not at one place
-        since      only pairs whose later step is this one or one that follows
-        """
-        if not self.evidence.turns_stay:
-            return
-        end = dict(zip(self.arrivals, [*self.arrivals[1:], len(self.trace)], strict=True))
-        views = self.trace.views
-        for j, others in elsewhere.items():
-            for t in range(max(j, since), end[j]):
-                yield from (
-                    (s, t) for i in others for s in range(i, end[i]) if views[s] == views[t]
-                )
-
-    def _returns_of(
-        self, labels: tuple[int, ...], places: tuple[int | None, ...], since: int = 0
-    ) -> Steps:
-        """The returns of a map about which displacements say something and that end at a step from `since` on, as rows by last step: pairs of visits that
-        begin at one place, or at one dstate.
-
-        labels  the dstate of each step
-        places  the place of each dstate
-        """
-        return self._returns_among(labels, [places[label] for label in labels], since)
-
-    def _returns_among(
-        self, labels: Sequence[int], places: Sequence[int | None], since: int = 0
-    ) -> Steps:
-        """The same, where `places` has the place of each step."""
-        import numpy as np
-
-        at_dstate: dict[int, list[int]] = defaultdict(list)
-        at_place: dict[int | None, list[int]] = defaultdict(list)
-        for t in self.arrivals:
-            if t < len(labels):
-                at_dstate[labels[t]].append(t)
-                at_place[places[t]].append(t)
-        at_place.pop(None, None)
-        found = []
-        for groups, one_dstate in ((at_dstate, True), (at_place, False)):
-            first, last = self._loops_within(list(groups.values()), since)
-            found.append(np.stack([first, last, np.full(len(first), one_dstate)], axis=1))
-        rows = np.concatenate(found)
-        ordered: Steps = rows[np.argsort(rows[:, 1], kind="stable")]
-        return ordered
-
-    def refused_together(self, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        """Two returns of a map that are refused together: those of a map that was asked about before, or those that are most clearly; None where no two are.
-
-        since  the map of the steps before this one is known to be a map of these: only returns that
-        end later are asked about
-        """
-        import numpy as np
-
-        labels, places = ssh_map.labels, tuple(s.place for s in ssh_map.dstates)
-        course = _Course.of(labels, places)
-        if course in self._accepted:
-            return None
-        if (
-            known := next(
-                (found for found in reversed(self._refused) if _hold(found, labels, places)), None
-            )
-        ) is not None:
-            return known
-        before = self._accepted.pop(_Course.of(labels[:since], places), None)
-        rows = self._returns_of(labels, places, since if before else 0)
-        if before:
-            rows = np.concatenate([before.rows, rows])
-        together = self._together(rows, before)
-        worst = together.worst(rows[:, 1] >= since if since else self._is_new(rows))
-        if worst is not None:
-            refused = frozenset(
-                Equality(int(i), int(j), "dstate" if one_dstate else "place")
-                for i, j, one_dstate in worst
-            )
-            self._refused = [*self._refused[-REMEMBERED:], refused]
-            return refused
-        self._accepted[course] = together
-        if len(self._accepted) > REMEMBERED:
-            del self._accepted[next(iter(self._accepted))]
-        return None
-
-    def refused_at(
-        self, labels: Sequence[int], places: Sequence[int | None], step: int
-    ) -> frozenset[Equality] | None:
-        """The two returns that are refused together most clearly, though none is alone, and the later of which ends at this step; None where no two are.
-
-        labels, places  the dstate and the place of each step, which need not be those of a map
-        """
-        alone = self.pairs
-        rows = self._returns_among(labels[: step + 1], places)
-        refused = [
-            i in (alone.apart if one_dstate else alone.elsewhere).get(j, ())
-            for i, j, one_dstate in rows.tolist()
-        ]
-        rows = rows[[not is_refused for is_refused in refused]]
-        worst = self._together(rows).worst(rows[:, 1] == step)
-        if worst is None:
-            return None
-        return frozenset(
-            Equality(int(i), int(j), "dstate" if one_dstate else "place")
-            for i, j, one_dstate in worst
-        )
-
-    def refused_alone_at(
-        self, labels: Sequence[int], places: Sequence[int | None], step: int
-    ) -> list[Equality]:
-        """The returns that are refused alone and end at this step, where `labels` and `places` have the dstate and the place of each step."""
-        elsewhere = [
-            Equality(i, step, "place")
-            for i in self.pairs.elsewhere.get(step, ())
-            if places[i] == places[step] is not None
-        ]
-        return elsewhere + [
-            Equality(i, step) for i in self.pairs.apart.get(step, ()) if labels[i] == labels[step]
-        ]
-
-    def excess(self, refused: Equality) -> float:
-        """How clearly a return is refused alone: its chi-square, less the threshold."""
-        import numpy as np
-
-        from ssh_abduction.theory.evidence.loops import chi_squares
-
-        first, last, which = refused.first, refused.second, int(refused.of == "dstate")
-        squares = chi_squares(
-            *self.reckoning.loops_of_unknown_drift().closings(np.array([first]), np.array([last]))
-        )
-        return float(squares[which][0]) - self.threshold(2 + which, together=False)
-
-    def why_apart(self, first: int, last: int, number_from: int = 0) -> str | None:
-        """What keeps two steps from being at one place, or one dstate, in words; None where displacements do not.
-
-        number_from  the number of the first step of the trace, where that is part of a longer one
-        """
-        named = f"steps {first + number_from} and {last + number_from}"
-        i, j = self._begin_of_visit(first), self._begin_of_visit(last)
-        if i in self.pairs.elsewhere.get(j, ()):
-            they = (
-                "they"
-                if (i, j) == (first, last)
-                else f"steps {i + number_from} and {j + number_from}, where their visits begin,"
-            )
-            return (
-                f"{named} are not at one place: by the odometry {they} are "
-                f"{self.closing(i, j).metres} apart"
-            )
-        if first not in self.pairs.apart.get(last, ()):
-            return None
-        closing = self.closing(first, last)
-        far, turned = (
-            closing.square_of_position > self.threshold(2, False),
-            closing.square_of_heading > self.threshold(1, False),
-        )
-        if turned and not far:
-            return (
-                f"{named} are not one dstate: by the odometry their headings are "
-                f"{closing.degrees} apart"
-            )
-        off = closing.metres if far else f"{closing.metres} and {closing.degrees}"
-        return f"{named} are not one dstate: by the odometry they are {off} apart"
-
-    def why_not_both(self, returns: Collection[Equality], number_from: int = 0) -> str:
-        """What keeps two returns, which are refused together, from being true, in words."""
-        ordered = sorted(returns, key=lambda e: (e.second, e.first, e.of))
-        closings = [self.closing(e.first, e.second) for e in ordered]
-        named = ", and ".join(
-            f"steps {e.first + number_from} and {e.second + number_from}" for e in ordered
-        )
-        ways = " and ".join(f"{closing.way:.0f} m" for closing in closings)
-        sizes = " and ".join(f"{closing.size:.1f} m" for closing in closings)
-        turned = [
-            abs(math.degrees(closing.turned))
-            for e, closing in zip(ordered, closings, strict=True)
-            if e.of == "dstate"
-        ]
-        headings = (
-            f", and {' and '.join(f'{angle:.0f}' for angle in turned)} degrees in heading"
-            if any(map(round, turned))
-            else ""
-        )
-        return f"{named} cannot both be returns: the loops of {ways} close {sizes} off{headings}"
-
-    def closing(self, first: int, last: int) -> Closing:
-        """How far off the loop from one step to another closes, by dead reckoning; what repeats in all displacements counts as uncertainty."""
-        import numpy as np
-
-        from ssh_abduction.theory.evidence.loops import chi_squares
-
-        loops = self.reckoning.loops_of_unknown_drift()
-        off, covariance = loops.closings([first], [last])
-        size = float(np.hypot(*off[0, :2]))
-        along = off[0, :2] / size if size else np.array([1.0, 0.0])
-        return Closing(
-            way=float(loops.ways[last, 0] - loops.ways[first, 0]),
-            size=size,
-            size_sigma=math.sqrt(along @ covariance[0, :2, :2] @ along),
-            turned=float(off[0, 2]),
-            turned_sigma=math.sqrt(covariance[0, 2, 2]),
-            square_of_position=float(chi_squares(off, covariance)[0][0]),
-        )
-
-    def _begin_of_visit(self, step: int) -> int:
-        """The first step of the visit that a step belongs to, as far as turns stay at their place."""
-        return self.arrivals[bisect(self.arrivals, step) - 1] if self.evidence.turns_stay else step
-
-    def _together(self, rows: Steps, before: Together | None = None) -> Together:
-        from ssh_abduction.theory.evidence.together import Together  # loads numpy
-
-        thresholds = {freedom: self.threshold(freedom, together=True) for freedom in (4, 5, 6)}
-        return Together(self.reckoning, thresholds, rows, before)
-
-    def _is_new(self, rows: Steps) -> Mask:
-        """Which returns are not in the map that was accepted last, of which no two are refused together."""
-        import numpy as np
-
-        if not self._accepted:
-            return np.ones(len(rows), dtype=bool)
-        known = next(reversed(self._accepted.values())).rows
-        size = len(self.trace)
-        codes, known_codes = (
-            (found[:, 0] * size + found[:, 1]) * 2 + found[:, 2] for found in (rows, known)
-        )
-        new: Mask = np.isin(codes, known_codes, invert=True)
-        return new
-
-
-@dataclass(frozen=True)
-class Closing:
-    """How far off a loop closes: metres and radians, each with its standard deviation.
-
-    way                 driven from its first step to its last one, in metres
-    size, size_sigma    the distance of its ends, and the uncertainty of that, along the line between them
-    square_of_position  the chi-square of where it ends, with two degrees of freedom
-    """
-
-    way: float
-    size: float
-    size_sigma: float
-    turned: float
-    turned_sigma: float
-    square_of_position: float
-
-    @property
-    def square_of_heading(self) -> float:
-        """The chi-square of the heading in which it ends, with one degree of freedom."""
-        return (self.turned / self.turned_sigma) ** 2
-
-    @property
-    def metres(self) -> str:
-        """11.2 ± 1.4 m"""
-        return f"{self.size:.1f} ± {self.size_sigma:.1f} m"
-
-    @property
-    def degrees(self) -> str:
-        """90 ± 3 degrees"""
-        return (
-            f"{abs(math.degrees(self.turned)):.0f} ± {math.degrees(self.turned_sigma):.0f} degrees"
-        )
-
-
-class _Course(NamedTuple):
-    """All of a map that displacements are about."""
-
-    labels: tuple[int, ...]
-    places: tuple[int | None, ...]
-
-    @staticmethod
-    def of(labels: tuple[int, ...], places: tuple[int | None, ...]) -> _Course:
-        """Of the dstates that these steps know: a map may have more, as it grows."""
-        return _Course(labels, places[: max(labels, default=-1) + 1])
-
-
-def _hold(
-    equalities: Collection[Equality], labels: Sequence[int], places: Sequence[int | None]
-) -> bool:
-    """Whether all of these equalities hold, of two steps each, the first of which comes first.
-
-    labels  the dstate of each step
-    places  the place of each dstate
-    """
-    return all(
-        equality.second < len(labels)
-        and (
-            labels[equality.first] == labels[equality.second]
-            if equality.of == "dstate"
-            else places[labels[equality.first]] == places[labels[equality.second]] is not None
-        )
-        for equality in equalities
-    )
-
-
-def _parts(size: int, most: int = AT_A_TIME) -> Iterator[slice]:
-    """So many loops in parts that fit into memory."""
-    for start in range(0, size, most):
-        look_at_clock()
-        yield slice(start, start + most)

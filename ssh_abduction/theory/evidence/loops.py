@@ -1,31 +1,34 @@
-"""How far off the loops of a trace close: displacements and their covariances, composed along the trace.
+"""By how much the loops of a trace fail to close, and the covariance of that.
 
->>> from ssh_abduction import Trace >>> from ssh_abduction.theory.evidence.loops import Loops >>>
-square = [(10, 0, 0), (0, 0, 1.5708)] * 4 >>> loops = Loops.of(Trace.from_steps("abababab" + "a",
-["travel", "left"] * 4, displacements=square)) >>> closing, covariance = loops.closings([0], [8])
->>> bool(abs(closing[0]).max() < 0.001), covariance.shape (True, (1, 3, 3))
+>>> from ssh_abduction import Trace
+>>> from ssh_abduction.theory.evidence.loops import Loops
+>>> square = [(10, 0, 0), (0, 0, 1.5708)] * 4
+>>> trace = Trace.from_steps("ababababa", ["travel", "left"] * 4, displacements=square)
+>>> closing, covariance = Loops.of(trace).closings([0], [8])
+>>> bool(abs(closing[0]).max() < 0.001), covariance.shape
+(True, (1, 3, 3))
 
-A loop leads from step i to a later step j. It closes if the robot is then where it was before. By
-the displacements d of the steps between, it closes off by P(j) - P(i), where P is the pose by dead
-reckoning: all displacements composed from the first step on. An error e of a displacement that
-leads to step k turns all that comes after it. So to first order it moves the end of the loop by
+A loop leads from step i to a later step j. It closes if the robot is back where it was. By the
+displacements between the steps it is off by P(j) - P(i). P is the pose by dead reckoning: all
+displacements composed from the first step on. An error e of the displacement that leads to step k
+turns all that comes after it. To first order, it moves the end of the loop by
 
-    R(k) e_xy + e_theta S (p(j) - p(k))        where R(k) is the heading before the displacement,
-    and S a quarter turn,
+    R(k) e_xy + e_theta S (p(j) - p(k))
 
-and the covariance of the closing is the sum of these over the loop (Smith, Self & Cheeseman 1990,
-"Estimating uncertain spatial relationships in robotics"). It is a polynomial in p(j), so that sums
-from the first step on give it for any loop at once. Two errors repeat, and are unknown numbers of
-the whole trace rather than noise: a wrong scale, and a steady drift of heading. What a robot takes
-for the pose of a dstate may be off by itself at each visit, as where the middle of a place is told
-from laser scans: that adds to the covariance at both ends of the loop, and does not grow along the
-way.
+where R(k) is the heading before the displacement, and S a quarter turn. The covariance of the
+closing is the sum of these over the loop (Smith, Self & Cheeseman 1990, "Estimating uncertain
+spatial relationships in robotics"). It is a polynomial in p(j), so prefix sums give it for any
+loop at once.
 
-*Where headings are lost.* First order takes an arc for its tangent. An error of heading that is
-rare, at SIGMAS standard deviations, bends the way off the tangent by half of itself, as a share of
-what first order says it moves the end by. So much is added to the covariance, in all directions:
-where the heading is known to a few degrees that is next to nothing, and where it is lost nothing
-can be said any more.
+Two errors are not noise, but unknown constants of the whole trace: a wrong scale, and a steady
+drift of heading. The measured pose of a dstate may also be off at each visit, for example if the
+middle of a place is estimated from laser scans. This adds to the covariance at both ends of the
+loop and does not grow along the way.
+
+*Lost headings.* First order replaces an arc by its tangent. A rare error of heading, of SIGMAS
+standard deviations, moves the end off the tangent by half of that error, as a share of the
+first-order move. This much is added to the covariance in all directions. If the heading is known to
+a few degrees, that is next to nothing. If it is lost, the loop says nothing any more.
 """
 
 from __future__ import annotations
@@ -44,34 +47,38 @@ from ssh_abduction.data.trace import Trace
 Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]
 
-# Tests that together may refuse a true map once in a thousand traces refuse what is about so many
-# standard deviations off.
+# A test that refuses a true map once in a thousand traces allows about this many standard
+# deviations.
 SIGMAS = 6.0
-# Nothing is said of loops after which the heading is uncertain by more than this, in radians: what
-# is added for that outweighs any error.
+# Loops with a more uncertain heading than this, in radians, are not tested: the covariance that is
+# added for it exceeds any error.
 LOST = 1.0
-# So many values of a steady drift of heading are tried for each standard deviation of it: a loop is
-# refused if it closes badly with each of them.
+# Values of the steady drift of heading that are tried for each of its standard deviations. A loop
+# is refused if it closes badly with each of them.
 BENDS_A_SIGMA = 2
-# Drifts of more standard deviations than this are as unlikely as what is refused.
+# Drifts of more standard deviations than this are too unlikely to try.
 MOST_BENDS = 6
-# So many steps are worked on in one go: what is computed on the way takes some ten megabytes.
+# Steps that are computed at once. Intermediate arrays take some ten megabytes.
 AT_A_TIME = 1000
-# The columns of what is known of a step: its pose, and sums up to it.
+# The columns of a step: its pose, and sums up to it.
 COLUMNS = 3 + 17 + 3
 
 
 @dataclass(frozen=True)
 class Loops:
-    """Dead reckoning of a trace, and the sums from which closings are made.
+    """Dead reckoning of a trace, with prefix sums for the covariances of loops.
 
-    poses     by dead reckoning, n x 3, in metres and radians; where a displacement is missing the next pose is that of the step before
-    part      for each step, the number of displacements that are missing up to it: nothing is known of loops across one
-    moments   sums over the displacements up to each step, n x 17
-    ways      metres driven up to each step, and the sum of metres times where they were driven, turned by S: n x 3
-    odometry  what is wrong with all displacements
-    bend      drift of heading that was taken out of the displacements, in radians a metre
-    drift     standard deviation of the drift that is left, in radians a metre
+    Attributes:
+        poses: Poses by dead reckoning, n x 3, in metres and radians. After a missing displacement,
+            the pose is that of the step before.
+        part: For each step, the number of missing displacements up to it. Nothing is known about
+            loops across a missing one.
+        moments: Sums over the displacements up to each step, n x 17.
+        ways: Metres driven up to each step, and the sum of metres times positions, turned by S,
+            n x 3.
+        odometry: The errors that all displacements share.
+        bend: The drift of heading that was removed from the displacements, in radians a metre.
+        drift: The standard deviation of the drift that is left, in radians a metre.
     """
 
     poses: Array
@@ -84,10 +91,12 @@ class Loops:
 
     @staticmethod
     def of(trace: Trace, bend: float = 0.0, drift: float | None = None) -> Loops:
-        """The loops of a trace, once a drift of heading was taken out of its displacements.
+        """The loops of a trace after a drift of heading is removed from its displacements.
 
-        bend   that drift, in radians a metre
-        drift  standard deviation of the drift that is left; what the odometry says if not given
+        Args:
+            trace: The trace.
+            bend: The drift, in radians a metre.
+            drift: The standard deviation of the remaining drift; that of the odometry by default.
         """
         odometry = trace.odometry or Odometry()
         sums = _sums(trace, 0, len(trace), np.array([bend]), np.zeros((1, COLUMNS)))[0]
@@ -100,9 +109,14 @@ class Loops:
         return Loops(sums[..., :3], part, sums[..., 3:20], sums[..., 20:], odometry, bend, drift)
 
     def closings(self, first: ArrayLike, last: ArrayLike) -> tuple[Array, Array]:
-        """How far off loops close, m x 3, and the covariance of that, m x 3 x 3; in metres and radians, and in the frame of the first step of the trace.
+        """By how much loops fail to close, in the frame of the first step of the trace.
 
-        first, last  the steps at which each loop begins and ends, m each
+        Args:
+            first: The steps at which the loops begin, m.
+            last: The steps at which they end, m.
+
+        Returns:
+            The closings, m x 3, in metres and radians, and their covariances, m x 3 x 3.
         """
         i, j = np.asarray(first, dtype=int), np.asarray(last, dtype=int)
         closing = self._closing(i, j)
@@ -120,7 +134,10 @@ class Loops:
     def shared(
         self, loops: tuple[ArrayLike, ArrayLike], others: tuple[ArrayLike, ArrayLike]
     ) -> Array:
-        """The covariance between how far off loops close and how far off others do, m x 3 x 3: by the displacements that both have, and what is wrong with all."""
+        """The covariance between closings of two sets of loops, m x 3 x 3.
+
+        It comes from displacements in both loops, and from errors that all displacements share.
+        """
         (i, j), (k, m) = (
             tuple(np.asarray(steps, dtype=int) for steps in pair) for pair in (loops, others)
         )
@@ -129,7 +146,7 @@ class Loops:
         return covariance + self._repeated((i, j), (k, m))
 
     def _white(self, i: Steps, j: Steps, end: Steps, other_end: Steps) -> Array:
-        """What the noise of the displacements after step i, up to j, contributes to the covariance between loops that end at two steps."""
+        """The covariance that the noise of steps i + 1 to j adds between loops with these ends."""
         sums = self.moments[j] - self.moments[i]
         position, mixed, mixed_across = (
             sums[:, :4].reshape(-1, 2, 2),
@@ -160,7 +177,7 @@ class Loops:
         return covariance
 
     def _repeated(self, loops: tuple[Steps, Steps], others: tuple[Steps, Steps]) -> Array:
-        """What a wrong scale and a steady drift contribute to the covariance between closings."""
+        """The covariance between closings that a wrong scale and a steady drift add."""
         scaled, other_scaled = (self._by_scale(*pair) for pair in (loops, others))
         bent, other_bent = (self._by_bend(*pair) for pair in (loops, others))
         by_scale: Array = self.odometry.scale**2 * scaled[:, :, None] * other_scaled[:, None, :]
@@ -172,11 +189,11 @@ class Loops:
         return closing
 
     def _by_scale(self, i: Steps, j: Steps) -> Array:
-        """How a scale that is wrong by 1 moves the end of each loop."""
+        """By how much a scale that is wrong by 1 moves the end of each loop."""
         return (self.poses[j] - self.poses[i]) * (1.0, 1.0, 0.0)
 
     def _by_bend(self, i: Steps, j: Steps) -> Array:
-        """How a drift of 1 radian a metre moves the end of each loop."""
+        """By how much a drift of 1 radian a metre moves the end of each loop."""
         sums = self.ways[j] - self.ways[i]
         return np.hstack(
             [sums[:, :1] * _quarter_turned(self.poses[j, :2]) - sums[:, 1:], sums[:, :1]]
@@ -191,7 +208,7 @@ class Loops:
         return variance
 
     def _moved_by_heading(self, i: Steps, j: Steps) -> Array:
-        """The variance of the end of each loop, in both directions together, that comes of errors of heading."""
+        """The variance of the end of each loop from errors of heading, in both directions."""
         sums = self.moments[j] - self.moments[i]
         end = _quarter_turned(self.poses[j, :2])
         white = (
@@ -206,35 +223,33 @@ class Loops:
         return moved
 
     def of_ends(self, end: int) -> Array:
-        """What the noise of the displacements up to each step contributes to the covariance of where the robot is at step `end`, n x 9."""
+        """The covariance at step `end` from the noise up to each step, n x 9."""
         every = np.arange(end + 1)
         there = np.full(end + 1, end)
         return self._white(np.zeros_like(every), every, there, there).reshape(-1, 9)
 
     def noise(self, first: Steps, last: Steps) -> Array:
-        """What the noise of the displacements from one step to a later one contributes to the covariance of where the robot is at the later one, m x 3 x 3."""
+        """The covariance at the last steps from the noise since the first ones, m x 3 x 3."""
         return self._white(first, last, last, last)
 
     def repeated(self, first: Steps, last: Steps) -> Array:
-        """What a wrong scale and a steady drift contribute to the covariances of closings, m x 3 x 3."""
+        """The covariance of closings from a wrong scale and a steady drift, m x 3 x 3."""
         return self._repeated((first, last), (first, last))
 
 
 class Reckoning:
-    """Dead reckoning of a trace, for each drift of heading that it may have. No drift comes first.
+    """Dead reckoning of a trace for each drift of heading that it may have. No drift comes first.
 
-    bends     the drifts, in radians a metre
-    unlikely  the chi-square of each
-    begins    for each step, the first step from which on it is known where this one is: no
-        displacement is missing since, and the heading is not lost.
-              That is the same whatever the drift, and of a longer trace, too
+    Attributes:
+        bends: The drifts, in radians a metre.
+        unlikely: The chi-square of each drift.
+        begins: For each step, the first earlier step with a known relative pose: no displacement
+            is missing since, and the heading is not lost. It does not depend on the drift, or on
+            later steps.
     """
 
     def __init__(self, trace: Trace, before: Reckoning | None = None) -> None:
-        """The reckoning of a trace.
-
-        before  that of a trace which has grown to this one
-        """
+        """The reckoning of a trace. `before` is that of its first steps, if known."""
         self.odometry = trace.odometry or Odometry()
         sigma = self.odometry.bend
         step = sigma / BENDS_A_SIGMA
@@ -244,7 +259,7 @@ class Reckoning:
             else [0]
         )
         self.bends = [number * step for number in numbers]
-        # Each drift stands for those around it, and counts as the nearest of them.
+        # Each drift stands for an interval, and is as likely as the likeliest drift in it.
         self.unlikely = [(max(abs(number) - 0.5, 0.0) / BENDS_A_SIGMA) ** 2 for number in numbers]
         self._drift = step / 2
         self._size = len(trace)
@@ -264,7 +279,7 @@ class Reckoning:
         self.begins: Steps = self._begins(before.begins if before else np.zeros(0, dtype=int))
 
     def loops(self, number: int) -> Loops:
-        """The loops for one of the drifts."""
+        """The loops for the drift with this number."""
         return Loops._of(
             self._rows.array[number, : self._size],
             self._part,
@@ -274,13 +289,13 @@ class Reckoning:
         )
 
     def loops_of_unknown_drift(self) -> Loops:
-        """The loops without a drift, where any that the odometry allows is left."""
+        """The loops with the whole drift that the odometry allows as uncertainty."""
         return Loops._of(
             self._rows.array[0, : self._size], self._part, self.odometry, 0.0, self.odometry.bend
         )
 
     def closings(self, numbers: Steps, first: Steps, last: Steps) -> tuple[Array, Array]:
-        """As `Loops.closings`, but for loops each of which has a drift of its own."""
+        """As `Loops.closings`, for loops that each have a drift of their own."""
         array = self._rows.array
         flat = Loops._of(array.reshape(-1, COLUMNS), self._part, self.odometry, 0.0, self._drift)
         offset = numbers * array.shape[1]
@@ -297,7 +312,7 @@ class Reckoning:
             loops.part[since].tolist(),
         )
         found, shift = [], begin
-        # The beginning never goes back, as the heading gets no better.
+        # The beginning never goes back, because the heading only becomes more uncertain.
         for t in range(start - shift, len(part)):
             here = begin - shift
             while (
@@ -311,7 +326,7 @@ class Reckoning:
 
 
 class _Rows:
-    """Rows of numbers for each drift, drifts x rows x columns, to which more are added where room was left: so a step costs what it adds, mostly."""
+    """An array of drifts x rows x columns with spare room, so that adding a row is cheap."""
 
     def __init__(self, array: Array, size: int | None = None) -> None:
         self.array = array
@@ -319,9 +334,9 @@ class _Rows:
         self._lock = Lock()
 
     def extended(self, size: int, new: Array) -> _Rows:
-        """The first `size` rows, and new ones.
+        """The first `size` rows and new ones.
 
-        The array is the same, unless there is no room or somebody else added other rows.
+        It shares the array, unless there is no room or other rows were added meanwhile.
         """
         total = size + new.shape[1]
         with self._lock:
@@ -335,16 +350,27 @@ class _Rows:
 
 
 def _parts(trace: Trace, start: int = 0, missing: int = 0) -> Steps:
-    """For each step from `start` on, the number of displacements that are missing up to it, where so many are missing before."""
+    """For each step from `start` on, the number of missing displacements up to it.
+
+    `missing` is that number for the step before.
+    """
     unknown = [t > 0 and trace.steps[t].displacement is None for t in range(start, len(trace))]
     parts: Steps = missing + np.cumsum(unknown, dtype=int)
     return parts
 
 
 def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Array:
-    """The poses, moments and ways of some steps, as in Loops, for each drift: drifts x steps x COLUMNS.
+    """The poses, moments and ways of some steps for each drift, as in Loops.
 
-    last  those of the step before, drifts x COLUMNS; zeros where there is none
+    Args:
+        trace: The trace.
+        start: The first step.
+        stop: The step behind the last one.
+        bends: The drifts.
+        last: The row of the step before, drifts x COLUMNS; zeros if there is none.
+
+    Returns:
+        An array of drifts x steps x COLUMNS.
     """
     moved, noise = np.zeros((stop - start, 3)), np.zeros((stop - start, 3, 3))
     for t in range(max(start, 1), stop):
@@ -355,7 +381,7 @@ def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Arr
     rotated = moved[:, 2] - bends[:, None] * way
     straight = turned(moved[None, :, :2], -bends[:, None] * way / 2)
     heading = _summed(last[:, 2], rotated)
-    before = heading - rotated  # the heading in which each displacement begins
+    before = heading - rotated  # the heading at the start of each displacement
     onward = turned(straight, before)
     position = _summed(last[:, :2], onward)
     rotation = np.zeros((*before.shape, 3, 3))
@@ -387,13 +413,13 @@ def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Arr
 
 
 def _summed(before: Array, values: Array) -> Array:
-    """Sums of values along the second axis, which go on from what was summed before."""
+    """Cumulative sums along the second axis, starting from `before`."""
     summed: Array = np.cumsum(np.concatenate([before[:, None], values], axis=1), axis=1)[:, 1:]
     return summed
 
 
 def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
-    """For each closing, its chi-square by position alone (2 degrees of freedom), and by position and heading (3)."""
+    """The chi-square of each closing by position (2 degrees of freedom), and with heading (3)."""
     (a, b, p), (_, c, q), (_, _, s) = covariance.transpose(1, 2, 0)
     x, y, turned = closing.T
     determinant = a * c - b * b

@@ -1,21 +1,21 @@
-"""Paths meet at places only: a map can be drawn in the plane, with turns right to the right, without a crossing.
+"""Planarity as evidence: paths meet at places only, so a map can be drawn without a crossing.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> trace = Trace.from_steps("aaaaa", ["travel", "around", "travel", "around"])
 >>> [len(solve(trace, Theory(planar=planar, prefer=())).maps) for planar in (False, True)]
 [2, 1]
 
-A travel leads along an edge from a gateway of one place to a gateway of another, and no edge passes
-a place unseen: a gateway leads to one other gateway. Around a place, the order of gateways is told
-by turns, and where places have frames by stars, too; where it is not told, any order will do. So a
-map is planar if *some* orders make a drawing of it. A map of first steps has fewer edges, and what
-it says of orders the whole map says, too: a cut keeps a map planar.
+A travel leads along an edge from a gateway of one place to a gateway of another, and passes no
+place unseen. So a gateway leads to exactly one other gateway. Turns tell the order of the gateways
+around a place; in frames, stars do too. If the order is not known, any order will do. A map is
+planar if *some* orders allow a drawing. The first steps of a planar map are planar as well: they
+have fewer edges, and no other orders.
 
-To take an equality of places away may make a planar map one that is not: edges that crossed at a
-place now cross elsewhere. So what cannot be is, that some steps are at one place while others are
-at different ones. It is read off as few travels and turns as cross by themselves. For the places
-given, an equality of dstates only takes drawings away; so of those only as few are said as let the
-edges cross.
+If steps at one place are put at two places, a planar map may become one that is not: edges that met
+at the place may now cross elsewhere. So a conflict says which steps are at one place, and which are
+at different ones. It consists of few travels and turns that cross by themselves. For given places,
+more equal dstates only make drawing harder. So the conflict has only the equalities of dstates that
+make the edges cross.
 """
 
 from __future__ import annotations
@@ -41,25 +41,26 @@ Side = TypeVar("Side", bound=Hashable)
 
 QUARTERS = {"right": 1, "around": 2, "left": 3}
 SLOTS = 4
-BEHIND = 2  # so many slots from the one that is faced
+BEHIND = 2  # slots from the one that is faced to the one behind
 
 AHEAD, BACK = 1, -1
-# of an edge: its place, the group of dstates that it is known from, and its slot as that group has
-# it
+# The end of an edge: its place, its group of dstates, and its slot relative to that group.
 End: TypeAlias = tuple[int, int, int]
-Arm: TypeAlias = tuple[int, int]  # what is ahead of a dstate, or back
-Gateway: TypeAlias = tuple[int, Arm]  # of a place, and one of its arms that are this gateway
+Arm: TypeAlias = tuple[int, int]  # a dstate, and whether ahead of it or behind it
+Gateway: TypeAlias = tuple[int, Arm]  # a place, and one of the arms that are this gateway
 
 
 @dataclass(frozen=True)
 class Planar:
     """The field `planar` of a theory.
 
-    frames    places have frames of four slots: turns tell how many slots are between what two dstates face. If not, they tell sides only
-    turns     turns tell what they tell
-    stars     stars seen at a place agree, each turned by its heading
-    distinct  no two dstates face one slot
-    crossing  without frames: where a turn leads from one edge to another, these cross
+    Attributes:
+        frames: Whether places have frames of four slots. Turns then tell the number of slots
+            between the headings of two dstates; else they tell sides only.
+        turns: Whether the turns can be relied on.
+        stars: Whether stars of a place agree when turned by their headings.
+        distinct: Whether different dstates face different slots.
+        crossing: Without frames: whether two edges cross if a turn leads from one to the other.
     """
 
     name: ClassVar[str] = "planar"
@@ -95,7 +96,7 @@ class Planar:
         places = [ssh_map.dstates[label].place for label in ssh_map.labels]
         labels: Mapping[int, int] = dict(enumerate(ssh_map.labels))
         moves = _first_moves(trace, ssh_map.labels)
-        if since and all(t + 1 < since for t in moves):  # what the map is since then, it was before
+        if since and all(t + 1 < since for t in moves):  # no edge or turn is new since then
             return None
         at = {t: place for t, place in enumerate(places) if place is not None}
         if len(at) < len(places) or not self._cross(trace, moves, labels, at, self.distinct):
@@ -119,10 +120,12 @@ class Planar:
     ) -> bool:
         """Whether these travels and turns alone cannot be drawn.
 
-        moves     the steps at which they begin
-        labels    the dstate of each step
-        at        the place of each step
-        distinct  no two dstates face one slot
+        Args:
+            trace: The trace.
+            moves: The steps at which they begin.
+            labels: The dstate of each step.
+            at: The place of each step.
+            distinct: Whether different dstates face different slots.
         """
         shown = _Shown(trace, moves, labels, at, stars=self.stars)
         return not (
@@ -133,7 +136,7 @@ class Planar:
 
 
 def _first_moves(trace: Trace, labels: Sequence[int]) -> list[int]:
-    """The steps at which the travels and turns of a map were first done."""
+    """The steps where each travel and turn of a map is done for the first time."""
     first: dict[tuple[int, str, int], int] = {}
     for t, (here, there) in enumerate(pairwise(labels)):
         action = trace.steps[t].action
@@ -145,10 +148,11 @@ def _first_moves(trace: Trace, labels: Sequence[int]) -> list[int]:
 class _Shown:
     """What some travels and turns of a trace show.
 
-    travels  pairs of dstates
-    turns    at one place: a dstate, which way, and the dstate that is faced then
-    places   the place of each dstate
-    stars    the openings seen at each dstate, from ahead on clockwise
+    Attributes:
+        travels: Pairs of dstates.
+        turns: Turns at a place: a dstate, the direction, and the dstate that is faced then.
+        places: The place of each dstate.
+        stars: The openings seen at each dstate, clockwise from ahead.
     """
 
     def __init__(
@@ -180,10 +184,10 @@ class _Shown:
 
 
 def _can_draw_framed(shown: _Shown, turns: bool, distinct: bool) -> bool:
-    """Whether there are headings with which the edges can be drawn.
+    """Whether some headings allow the edges to be drawn.
 
-    Dstates that turns link are turned to each other as the turns say; how others are turned is
-    open, unless stars tell.
+    Turns fix the headings of the dstates that they link, relative to each other. The others may
+    have any heading that the stars allow.
     """
     group, slot, agree = _groups(shown, turns)
     ahead = {s: (place, group[s], slot[s]) for s, place in shown.places.items()}
@@ -214,7 +218,7 @@ def _slots_of(
     ends: Sequence[End],
     distinct: bool,
 ) -> list[dict[End, int]]:
-    """The slots that the ends of edges at a place may have, up to turning the place."""
+    """The slots that the ends of edges at a place may have, up to a rotation of the place."""
     here = [s for s in shown.places if shown.places[s] == place]
     groups = list(dict.fromkeys(group[s] for s in here))
     found: dict[tuple[int, ...], dict[End, int]] = {}
@@ -236,7 +240,7 @@ def _slots_of(
 
 
 def _is_drawing(edges: Iterable[tuple[End, End]], slots: Mapping[End, int]) -> bool:
-    """Whether the edges both ends of which have slots join each gateway to one other, and do not cross."""
+    """Whether the edges with known slots pair all gateways and do not cross."""
     joined = {
         frozenset((end[0], slots[end]) for end in edge)
         for edge in edges
@@ -259,7 +263,12 @@ def _are_paired(edges: Collection[frozenset[Side]]) -> bool:
 
 
 def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int], bool]:
-    """For each dstate, one of those that turns link it to, and how many slots from that one it faces; and whether the turns agree in that."""
+    """The groups of dstates that turns link.
+
+    Returns:
+        For each dstate, the first dstate of its group, and the number of slots between their
+        headings; and whether the turns agree on these.
+    """
     links: dict[int, list[tuple[int, int]]] = {dstate: [] for dstate in shown.places}
     for x, turn, y in shown.turns if turns else ():
         links[x].append((y, QUARTERS[turn]))
@@ -288,10 +297,14 @@ def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int],
 
 
 def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
-    """Whether there are orders of gateways with which the edges can be drawn, by sides: a turn tells which gateway is to the right of an edge, where both dstates
-    are at an edge. Who turns around faces the gateway that was behind.
+    """Whether some orders of gateways allow the edges to be drawn, if turns tell sides only.
 
-    crossing  where a turn leads from one edge to another, these cross
+    A turn tells which gateway is to the right of an edge, if both dstates are at an edge. After
+    turning around, a robot faces the gateway that was behind it.
+
+    Args:
+        shown: What the travels and turns show.
+        crossing: Whether two edges cross if a turn leads from one to the other.
     """
     same = _Classes()
     for x, turn, y in shown.turns:
@@ -323,8 +336,12 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
 
 
 def _paired(shown: _Shown, same: _Classes) -> list[frozenset[Gateway]] | None:
-    """The edges, each of which joins one gateway to one other, once gateways at one place to which one gateway leads are said to be one; None where it leads to
-    gateways at different places.
+    """The edges, each between two gateways.
+
+    Gateways of one place that lead to the same gateway become one.
+
+    Returns:
+        The edges; None if a gateway leads to gateways of different places.
     """
     joined = [
         ((shown.places[x], (x, AHEAD)), (shown.places[y], (y, BACK))) for x, y in shown.travels
@@ -346,7 +363,7 @@ def _paired(shown: _Shown, same: _Classes) -> list[frozenset[Gateway]] | None:
 
 
 def _at_edges(shown: _Shown) -> set[int]:
-    """The dstates that a travel starts or ends at, and those that turns around link to them."""
+    """The dstates where a travel starts or ends, and those linked to them by turning around."""
     found = {dstate for travel in shown.travels for dstate in travel}
     around = [{x, y} for x, turn, y in shown.turns if turn == "around"]
     while more := {dstate for pair in around if pair & found for dstate in pair} - found:
@@ -355,7 +372,7 @@ def _at_edges(shown: _Shown) -> set[int]:
 
 
 def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Sequence[Arm]]) -> bool:
-    """Whether the other gateways, too, can be put into a clockwise order of some, so that all is as told."""
+    """Whether the other gateways fit into a clockwise order of some, as the turns demand."""
     if not all(_is_clockwise(order, told) for told in clockwise):
         return False
     if not others:
@@ -368,7 +385,7 @@ def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Seque
 
 
 def _is_clockwise(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
-    """Whether what is there already of some gateways is in this order."""
+    """Whether the gateways that are in this order already agree with it."""
     positions = [order.index(arm) for arm in told if arm in order]
     if len(set(told)) < len(told):
         return False
@@ -376,7 +393,7 @@ def _is_clockwise(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
 
 
 class _Classes:
-    """Arms some of which are one."""
+    """Classes of arms that are one gateway."""
 
     def __init__(self) -> None:
         self._one_of: dict[Arm, Arm] = {}
@@ -387,7 +404,7 @@ class _Classes:
         return arm
 
     def join(self, first: Arm, second: Arm) -> None:
-        """Say that two arms are one; then what lies opposite, straight on, is one, too."""
+        """Say that two arms are one. Then the opposite arms, straight on, are one too."""
         for turned in (1, -1):
             one, other = (self.of((dstate, side * turned)) for dstate, side in (first, second))
             if one != other:
@@ -395,7 +412,7 @@ class _Classes:
 
 
 def _fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
-    """As few of some travels and turns as cross still: none of them can be left out."""
+    """A minimal subset of the travels and turns that still crosses."""
     size = max(1, len(moves) // 2)
     while True:
         begin = 0
@@ -414,7 +431,7 @@ def _fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
 def _split(
     labels: Mapping[int, int], steps: Sequence[int], cross: Callable[[Mapping[int, int]], bool]
 ) -> Mapping[int, int]:
-    """Labels of these steps by which as few of them are one dstate as let the edges cross still."""
+    """Labels of these steps with as few equal dstates as possible, with which edges still cross."""
     new = max(labels.values()) + 1
     for step in steps:
         look_at_clock()
@@ -427,12 +444,12 @@ def _split(
 def _description(
     labels: Mapping[int, int], at: Mapping[int, int], steps: Sequence[int], distinct: bool
 ) -> Iterator[Equality]:
-    """Which of these steps are one dstate, and which are at one place, and which are not."""
-    first: dict[int, int] = {}  # step of each dstate
+    """Which of these steps are one dstate, at one place, or not."""
+    first: dict[int, int] = {}  # the first step of each dstate
     for step in steps:
         if first.setdefault(labels[step], step) != step:
             yield Equality(first[labels[step]], step)
-    visits: dict[int, list[int]] = {}  # of each place, the first step of each of its dstates
+    visits: dict[int, list[int]] = {}  # for each place, the first step of each of its dstates
     for step in first.values():
         visits.setdefault(at[step], []).append(step)
     for here in visits.values():

@@ -1,4 +1,4 @@
-"""What a kind of evidence has to offer."""
+"""The interface of a kind of evidence."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Equality:
-    """That two steps are at one dstate, or at one place; or that they are not."""
+    """That two steps are one dstate, or at one place; or that they are not (`holds` is False)."""
 
     first: int
     second: int
@@ -24,35 +24,44 @@ class Equality:
 
 
 class Evidence(Protocol):
-    """A kind of evidence. encodings/NAME.lp holds its axiom, and says with `if` for which theories it holds."""
+    """A kind of evidence.
+
+    encodings/NAME.lp holds its axiom. The `if` behind the axiom says for which theories it holds.
+    """
 
     name: ClassVar[str]
     axiom: ClassVar[str]
 
     @classmethod
     def of(cls, theory: Theory) -> Evidence:
-        """What takes part in a theory."""
+        """The evidence that a theory uses."""
         ...
 
     def remembering(self, known: Any) -> Evidence:
-        """This evidence with what `known`, of the same kind, worked out about traces."""
+        """This evidence, with what `known` of the same kind computed about traces."""
         return self
 
     def pairs(self, trace: Trace) -> Pairs:
-        """What is known of pairs of steps before the search.
+        """What is known about pairs of steps before the search.
 
-        A map of the trace, cut down to some first steps, keeps what is said of these.
+        It must also hold for the first steps of a map, when a map is cut.
         """
         ...
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
-        """What else its encoding reads, of steps `start` to `stop - 1`."""
+        """Further facts for its encoding, about steps `start` to `stop - 1`."""
         ...
 
     def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        """A small set of equalities of a map of the first steps, and of what is not equal (`holds` is False), that cannot all hold, whatever the map; None if there is none.
+        """A small set of equalities and inequalities that cannot all hold, in any map.
 
-        since  the map of the steps before this one is known to be a map of these that is not
-        refused, so that it need not be asked about again
+        Args:
+            trace: The trace.
+            ssh_map: A map of its first steps.
+            since: The map of the steps before this one is known not to be refused. So only later
+                steps need to be checked.
+
+        Returns:
+            The set, which holds in the map; None if there is none.
         """
         ...

@@ -1,18 +1,22 @@
-"""Which returns of a map are refused two together, though none of them is refused alone.
+"""Which pairs of returns of a map are refused together, though neither is refused alone.
 
-Two returns, whose loops close off by o1 and o2 with covariances S1 and S2, and C between them, have
-the joint chi-square
+Let the loops of two returns be off by o1 and o2, with covariances S1 and S2, and C between them.
+Their joint chi-square is
 
-    (o1, o2)' (S1, C; C', S2)^-1 (o1, o2)        where that of each alone is z = o' S^-1 o.
+    (o1, o2)' (S1, C; C', S2)^-1 (o1, o2)
 
-A map of a thousand steps has some thousand returns, and some ten million sets of two. To solve as
-many systems of six equations takes minutes, so most sets are passed by a bound. Let s be the
-largest singular value of S1^-1/2 C S2^-1/2. The eigenvalues of the matrix, once it is whitened, are
-1 - s at least, so that the joint chi-square is at most (z1 + z2) / (1 - s). And C comes of what
-both loops share: some displacements, and the errors that repeat. If that contributes F to S1, then
-s squared is at most the largest eigenvalue of S1^-1 F. It is at most the trace, which is a sum over
-displacements, so that two look-ups in a table tell it; and for the few sets that the trace does not
-pass there is a sharper bound (Wolkowicz & Styan 1980, "Bounds for eigenvalues using traces").
+and that of each alone is z = o' S^-1 o.
+
+A map of a thousand steps has several thousand returns and some ten million pairs. Solving a system
+of six equations for each pair takes minutes. So a bound accepts most pairs. Let s be the largest
+singular value of S1^-1/2 C S2^-1/2. The eigenvalues of the whitened matrix are at least 1 - s, so
+the joint chi-square is at most (z1 + z2) / (1 - s).
+
+C comes from what both loops share: some displacements, and the errors that repeat. If this
+contributes F to S1, then s squared is at most the largest eigenvalue of S1^-1 F. A first bound on
+that is the trace, a sum over displacements, which two look-ups in a table give. For the few pairs
+that it does not accept, there is a sharper bound (Wolkowicz & Styan 1980, "Bounds for eigenvalues
+using traces").
 """
 
 from __future__ import annotations
@@ -29,21 +33,23 @@ from ssh_abduction.theory.evidence.loops import Array, Loops, Reckoning, Steps
 
 Mask: TypeAlias = NDArray[np.bool_]
 
-# A bound passes a set only if it is this far from letting it fail, as sums are rounded.
+# A bound accepts a pair only with this margin, because sums are rounded.
 MARGIN = 1e-3
-# So many sets are worked on in one go.
+# Pairs that are computed at once.
 AT_A_TIME = 1_000_000
-# So many returns, at most, tell which drift of heading is tried first.
+# At most this many returns decide which drift of heading is tried first.
 SAMPLE = 300
 
 
 @dataclass(frozen=True)
 class _Alone:
-    """What is known of each return alone, for one drift of heading.
+    """What is known about each of m returns alone, for one drift of heading.
 
-    inverse   of the covariance of its closing, m x 9; zeros for the heading of a return to a place, which says nothing
-    square    its chi-square, m
-    repeated  what errors that repeat contribute to the covariance, m x 9
+    Attributes:
+        inverse: The inverse covariance of its closing, m x 9. For a return to a place, the heading
+            says nothing and has zeros.
+        square: Its chi-square, m.
+        repeated: The covariance from errors that repeat, m x 9.
     """
 
     inverse: Array
@@ -60,10 +66,11 @@ class _Alone:
 
 
 class Together:
-    """Returns of one map, whose sets of two are tested.
+    """The returns of one map, and tests of pairs of them.
 
-    rows  one row for each return, by last step: its first step, its last step, and whether it is
-    one dstate rather than one place
+    Attributes:
+        rows: One row for each return, sorted by last step: its first step, its last step, and
+            whether it is one dstate rather than one place.
     """
 
     def __init__(
@@ -73,25 +80,32 @@ class Together:
         rows: Steps,
         before: Together | None = None,
     ) -> None:
-        """Nothing is tested yet.
+        """No test is done yet.
 
-        thresholds  the chi-square above which a set is refused, by its degrees of freedom
-        before      the first of these rows, made for the first steps of the trace: what is known of them is taken over
+        Args:
+            reckoning: The dead reckoning of the trace.
+            thresholds: The chi-square above which a pair is refused, by its degrees of freedom.
+            rows: The returns.
+            before: The same for the first of these rows and steps, whose results are kept.
         """
         self.rows = rows
         self._reckoning, self._thresholds = reckoning, thresholds
         self._alone: dict[int, _Alone] = dict(before._alone) if before else {}
-        self._number: int  # of the drift that is tried first
-        self._chosen_among: int  # returns
+        self._number: int  # the number of the drift that is tried first
+        self._chosen_among: int  # the number of returns when that drift was chosen
         if before and len(rows) <= 2 * before._chosen_among:
             self._number, self._chosen_among = before._number, before._chosen_among
         else:
             self._number, self._chosen_among = self._likeliest(), len(rows)
 
     def worst(self, new: Mask) -> tuple[Steps, Steps] | None:
-        """Of the sets with a new return in it, the one that is refused most clearly; None where none is refused.
+        """The pair that is refused most clearly, out of those with a new return.
 
-        new  whether each return is new
+        Args:
+            new: Whether each return is new.
+
+        Returns:
+            The two rows; None if no pair is refused.
         """
         rows = self.rows
         worst, most = None, 0.0
@@ -115,7 +129,7 @@ class Together:
         return worst
 
     def _overlapping(self, later: Steps, new: Mask) -> Sequence[Steps]:
-        """The rows that end no later than these, and whose loops share displacements with some of them; in parts."""
+        """In parts, the rows that end no later than these and may share displacements with them."""
         stop = int(later[-1]) + 1
         begin = int(np.searchsorted(self.rows[:stop, 1], self.rows[later, 0].min(), side="right"))
         earlier = np.arange(begin, stop)
@@ -125,13 +139,16 @@ class Together:
         return [earlier[at : at + size] for at in range(0, len(earlier), size)]
 
     def _unsafe(self, end: int, later: Steps, earlier: Steps, new: Mask) -> tuple[Steps, Steps]:
-        """The sets of a row that ends at a step and another one which the bound by the trace does not pass for the drift that is tried first."""
+        """The pairs of rows that the bound by the trace does not accept, for the first drift.
+
+        The later row of each pair ends at step `end`.
+        """
         alone, rows = self._of_each(self._number), self.rows
         first = rows[later, 0]
         inverse = alone.inverse[later]
         gathered = self._loops(self._number).of_ends(end) @ inverse.T
         before = np.arange(end + 1)[:, None] < first
-        # What comes before a loop is no part of it.
+        # Steps before the beginning of a loop do not count.
         gathered = np.where(before, gathered[first, np.arange(len(later))], gathered)
         share = (
             gathered[rows[earlier, 1]]
@@ -147,14 +164,20 @@ class Together:
         return later[these], earlier[others]
 
     def _is_safe(self, share: Array, squares: Array, number: int) -> Mask:
-        """Whether sets are not refused, by a bound on the largest eigenvalue of what both returns share, and the sums of their chi-squares."""
+        """Whether a bound shows that pairs are not refused.
+
+        Args:
+            share: A bound on the largest eigenvalue of what both returns share.
+            squares: The sums of their chi-squares.
+            number: The number of the drift.
+        """
         allowed = min(self._thresholds.values()) - self._reckoning.unlikely[number]
         left = 1 - squares / allowed if allowed > 0 else np.full_like(squares, -1.0)
         safe: Mask = (left > 0) & (share + MARGIN <= left**2)
         return safe
 
     def _least_excess(self, end: int, later: Steps, earlier: Steps) -> Array:
-        """By how much the chi-square of each set is above the threshold, for the drift for which that is least; 0 where it is not, for some drift."""
+        """The chi-square of each pair minus the threshold, for its best drift; 0 if negative."""
         excess = np.full(len(later), np.inf)
         others = (number for number in range(len(self._reckoning.bends)) if number != self._number)
         for number in (self._number, *others):
@@ -167,10 +190,10 @@ class Together:
         return excess
 
     def _excess(self, number: int, end: int, later: Steps, earlier: Steps) -> Array:
-        """By how much the chi-square of each set is above the threshold, for one drift; 0 where it is not."""
+        """The chi-square of each pair minus the threshold, for one drift; 0 if negative."""
         alone, rows, loops = self._of_each(number), self.rows, self._loops(number)
         squares = alone.square[later] + alone.square[earlier]
-        # Of what both loops share.
+        # The stretch that both loops share.
         begin, stop = (
             np.maximum(rows[earlier, 0], rows[later, 0]),
             rows[earlier, 1],
@@ -202,7 +225,13 @@ class Together:
         return excess
 
     def _largest_share(self, alone: _Alone, returns: Steps, noise: Array) -> Array:
-        """A bound on the largest share that some noise, m x 9, and the errors that repeat have in the covariance of returns, in any direction."""
+        """A bound on the largest share of noise and repeated errors in the covariance of returns.
+
+        Args:
+            alone: What is known about each return.
+            returns: The returns.
+            noise: The noise, m x 9.
+        """
         product = alone.inverse[returns].reshape(-1, 3, 3) @ (
             noise + alone.repeated[returns]
         ).reshape(-1, 3, 3)
@@ -217,7 +246,7 @@ class Together:
         return bound
 
     def _likeliest(self) -> int:
-        """The drift with which some of the loops close best."""
+        """The drift with which a sample of the loops closes best."""
         if not len(self.rows):
             return 0
         rows = self.rows[:: max(len(self.rows) // SAMPLE, 1)]
@@ -231,7 +260,7 @@ class Together:
         return int((squares.reshape(len(numbers), -1).sum(1) + self._reckoning.unlikely).argmin())
 
     def _of_each(self, number: int) -> _Alone:
-        """What is known of each return alone, for one drift."""
+        """What is known about each return alone, for one drift."""
         known = self._alone.get(number)
         if known is None or len(known.square) < len(self.rows):
             loops, rows = (
@@ -251,7 +280,7 @@ class Together:
 
 
 def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
-    """The joint chi-square of each of these rows, as in Together, with the other one at its side."""
+    """The joint chi-square of each of these rows with its partner in `others`."""
     joint, off = np.empty((len(these), 6, 6)), np.empty((len(these), 6))
     for rows, at in ((these, slice(3)), (others, slice(3, 6))):
         closing, covariance = loops.closings(rows[:, 0], rows[:, 1])
@@ -266,7 +295,7 @@ def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
 
 
 def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps) -> _Alone:
-    """What is known of each return alone, from how far off its loop closes and the covariance of that."""
+    """What is known about each return alone, from its closing and the covariance."""
     _cut_off_headings(closing, covariance, one_dstate)
     inverse: Array = np.asarray(np.linalg.inv(covariance), dtype=float)
     inverse[one_dstate == 0, 2, 2] = 0.0
@@ -275,7 +304,7 @@ def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps
 
 
 def _cut_off_headings(closing: Array, covariance: Array, one_dstate: Steps) -> None:
-    """Let the heading of a return to a place say nothing: it closes, and depends on nothing else."""
+    """Make the heading of returns to places say nothing: it closes, and is independent."""
     places = one_dstate == 0
     closing[places, 2] = 0.0
     covariance[places, 2, :] = covariance[places, :, 2] = 0.0

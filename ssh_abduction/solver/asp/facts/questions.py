@@ -9,7 +9,7 @@ from clingo import Function, Symbol
 from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.asp.facts.derivation_lp import active
 from ssh_abduction.theory.evidence import Equality
-from ssh_abduction.theory.theory import Count
+from ssh_abduction.theory.fields import Count
 
 
 def are_one(first: int, second: int) -> Symbol:

@@ -11,9 +11,10 @@ from ssh_abduction.data.trace import Action, Trace
 from ssh_abduction.solver.asp.facts.atoms import constant, numbers
 from ssh_abduction.solver.steps import frames
 from ssh_abduction.theory import encodings
+from ssh_abduction.theory.fields import EXCUSED
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import TRAVELS_AND_TURNS
-from ssh_abduction.theory.theory import EXCUSED, Theory
+from ssh_abduction.theory.theory import Theory
 
 
 def encoding_names(theory: Theory) -> tuple[str, ...]:

@@ -1,0 +1,527 @@
+"""The returns of a trace: which pairs of steps displacements allow to be one place or dstate.
+
+`displacement.py` says what a return is, and how often a true one is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+from ssh_abduction.data.maps import SSHMap
+from ssh_abduction.data.trace import Trace
+from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.theory.evidence.protocol import Equality
+from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
+
+if TYPE_CHECKING:
+    from ssh_abduction.theory.evidence.displacement import Displacement
+    from ssh_abduction.theory.evidence.loops import Reckoning, Steps
+    from ssh_abduction.theory.evidence.together import Mask, Together
+
+# The first and the last steps of returns to places (True) and to dstates (False).
+_Tested: TypeAlias = "dict[bool, tuple[Steps, Steps]]"
+# Loops that are computed at once. Their sums take some hundred megabytes.
+AT_A_TIME = 200_000
+# Accepted maps and refused sets that are remembered. Accepted maps may be checked again, or grow
+# with the trace. The next maps mostly contain the same refused sets.
+REMEMBERED = 64
+
+
+class Returns:
+    """The returns of a trace, and the tests that refuse some of them."""
+
+    def __init__(
+        self,
+        evidence: Displacement,
+        trace: Trace,
+        before: Returns | None = None,
+        reckoning: Reckoning | None = None,
+    ) -> None:
+        """No test is done yet, except those that `before` has done.
+
+        Args:
+            evidence: The fields of the theory.
+            trace: The trace.
+            before: The returns of the first steps, if known.
+            reckoning: The dead reckoning of the trace, if known.
+        """
+        from ssh_abduction.theory.evidence.loops import Reckoning  # loads numpy
+
+        self.evidence, self.trace = evidence, trace
+        self.reckoning: Reckoning = reckoning or Reckoning(
+            trace, before.reckoning if before else None
+        )
+        # Accepted maps, the last one last.
+        self._accepted: dict[_Course, Together] = dict(before._accepted) if before else {}
+        # Sets of two returns, the last one last.
+        self._refused: list[frozenset[Equality]] = list(before._refused) if before else []
+        self._pairs: Pairs | None = before._pairs if before else None
+        self._likely: int | None = before._likely if before else None
+        if before and (self._pairs is not None or self._likely is not None):
+            since = len(before.trace)
+            tested = self._tested(since)
+            if self._pairs is not None:
+                self._pairs = Pairs.joined([self._pairs, self._pairs_of(tested, since)])
+            if self._likely is not None:
+                self._likely += self._likely_among(tested)
+
+    @property
+    def pairs(self) -> Pairs:
+        """The pairs of steps at different places, or of different dstates."""
+        if self._pairs is None:
+            self._pairs = self._pairs_of(self._tested())
+        return self._pairs
+
+    def count(self) -> int:
+        """The number of returns that may be true: twice those with a p-value above one half.
+
+        It is rounded up to a power of two.
+        """
+        if self._likely is None:
+            self._likely = self._likely_among(self._tested())
+        return 1 << max(2 * self._likely - 1, 0).bit_length()
+
+    @cached_property
+    def arrivals(self) -> list[int]:
+        """The first step of each visit to a place.
+
+        If it is not known which actions are turns, each step is a visit.
+        """
+        return [0, *(t for t, action in enumerate(self.trace.actions, 1) if action.kind != "turn")]
+
+    def _tested(self, since: int = 0) -> _Tested:
+        """The returns without a missing displacement that end at step `since` or later."""
+        views: dict[object, list[int]] = defaultdict(list)
+        for t, step in enumerate(self.trace.steps):
+            views[step.view if self.evidence.has_one_view else None].append(t)
+        places = [self.arrivals] if self.evidence.has_places else []
+        return {
+            True: self._loops_within(places, since),
+            False: self._loops_within(list(views.values()), since),
+        }
+
+    def _loops_within(self, groups: Sequence[Sequence[int]], since: int = 0) -> tuple[Steps, Steps]:
+        """Loops within a group that end at `since` or later and miss no displacement."""
+        import numpy as np
+
+        begins = self.reckoning.begins
+        found: list[tuple[Steps, Steps]] = []
+        for group in groups:
+            if group[-1] < since:
+                continue
+            steps = np.asarray(group)
+            new = np.arange(np.searchsorted(steps, since), len(steps))
+            starts = np.searchsorted(steps, begins[steps[new]])
+            counts = new - starts
+            last = np.repeat(new, counts)
+            first = (
+                np.arange(len(last))
+                - np.repeat(np.cumsum(counts) - counts, counts)
+                + np.repeat(starts, counts)
+            )
+            found.append((steps[first], steps[last]))
+        empty = np.zeros(0, dtype=int)
+        return np.concatenate([empty, *(i for i, _ in found)]), np.concatenate(
+            [empty, *(j for _, j in found)]
+        )
+
+    def _pairs_of(self, tested: _Tested, since: int = 0) -> Pairs:
+        """The pairs of steps that these returns tell apart, because they are refused alone.
+
+        Args:
+            tested: All returns, or those that end at new steps.
+            since: The first new step.
+        """
+        far, other = (self._refused_among(*tested[places], places) for places in (True, False))
+        known = self._pairs or NO_PAIRS
+        elsewhere = Pairs.joined([known, Pairs.of(elsewhere=far)]).elsewhere
+        return Pairs.of([*other, *self._steps_of_visits(elsewhere, since)], far)
+
+    def _likely_among(self, tested: _Tested) -> int:
+        """The number of these returns with a p-value above one half."""
+        from scipy.special import gammainccinv
+
+        from ssh_abduction.theory.evidence.loops import chi_squares
+
+        loops, likely = self.reckoning.loops_of_unknown_drift(), 0
+        for places, (first, last) in tested.items():
+            half = 2 * gammainccinv((2 if places else 3) / 2, 0.5)
+            for part in _parts(len(first)):
+                squares = chi_squares(*loops.closings(first[part], last[part]))
+                likely += int((squares[0 if places else 1] < half).sum())
+        return likely
+
+    def threshold(self, freedom: int, together: bool) -> float:
+        """The chi-square above which a return, or a set of two, is refused.
+
+        Args:
+            freedom: The degrees of freedom.
+            together: Whether it is a set of two.
+        """
+        from scipy.special import gammainccinv
+
+        share = self.evidence.reject / (2 if self.evidence.joint > 1 else 1)
+        returns = max(self.evidence.returns, 1)
+        tests = returns * (returns - 1) / 2 if together else returns
+        return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
+
+    def _refused_among(self, first: Steps, last: Steps, places: bool) -> list[tuple[int, int]]:
+        """The returns that are refused alone: they close badly for every drift of heading."""
+        import numpy as np
+
+        from ssh_abduction.theory.evidence.loops import chi_squares
+
+        most, which = self.threshold(2 if places else 3, together=False), 0 if places else 1
+        drifts = [
+            number for number, unlikely in enumerate(self.reckoning.unlikely) if unlikely <= most
+        ]
+        # First try no drift: it lets most true returns close. Then try all other drifts.
+        for numbers in filter(None, (drifts[:1], drifts[1:])):
+            refused = np.ones(len(first), dtype=bool)
+            for part in _parts(len(first), AT_A_TIME // max(len(numbers), 1)):
+                i, j = first[part], last[part]
+                closings = self.reckoning.closings(
+                    np.repeat(numbers, len(i)), np.tile(i, len(numbers)), np.tile(j, len(numbers))
+                )
+                squares = chi_squares(*closings)[which].reshape(len(numbers), len(i))
+                unlikely = np.array([self.reckoning.unlikely[number] for number in numbers])
+                refused[part] = (squares + unlikely[:, None] > most).all(0)
+            first, last = first[refused], last[refused]
+        return list(zip(first.tolist(), last.tolist(), strict=True))
+
+    def _steps_of_visits(self, elsewhere: Earlier, since: int) -> Iterator[tuple[int, int]]:
+        """The pairs of steps with the same view in visits to different places.
+
+        Steps with different views are apart anyway.
+
+        Args:
+            elsewhere: The first steps of visits to different places.
+            since: Only pairs whose later step is this one or a later one.
+        """
+        if not self.evidence.turns_stay:
+            return
+        end = dict(zip(self.arrivals, [*self.arrivals[1:], len(self.trace)], strict=True))
+        views = self.trace.views
+        for j, others in elsewhere.items():
+            for t in range(max(j, since), end[j]):
+                yield from (
+                    (s, t) for i in others for s in range(i, end[i]) if views[s] == views[t]
+                )
+
+    def _returns_of(
+        self, labels: tuple[int, ...], places: tuple[int | None, ...], since: int = 0
+    ) -> Steps:
+        """The returns of a map: pairs of visits that begin at one place, or at one dstate.
+
+        Args:
+            labels: The dstate of each step.
+            places: The place of each dstate.
+            since: Only returns that end at this step or later.
+
+        Returns:
+            One row (first step, last step, one dstate) for each return, sorted by last step.
+        """
+        return self._returns_among(labels, [places[label] for label in labels], since)
+
+    def _returns_among(
+        self, labels: Sequence[int], places: Sequence[int | None], since: int = 0
+    ) -> Steps:
+        """The same as `_returns_of`, with the place of each step in `places`."""
+        import numpy as np
+
+        at_dstate: dict[int, list[int]] = defaultdict(list)
+        at_place: dict[int | None, list[int]] = defaultdict(list)
+        for t in self.arrivals:
+            if t < len(labels):
+                at_dstate[labels[t]].append(t)
+                at_place[places[t]].append(t)
+        at_place.pop(None, None)
+        found = []
+        for groups, one_dstate in ((at_dstate, True), (at_place, False)):
+            first, last = self._loops_within(list(groups.values()), since)
+            found.append(np.stack([first, last, np.full(len(first), one_dstate)], axis=1))
+        rows = np.concatenate(found)
+        ordered: Steps = rows[np.argsort(rows[:, 1], kind="stable")]
+        return ordered
+
+    def refused_together(self, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
+        """Two returns of a map that are refused together; None if there are none.
+
+        It prefers a set that was refused in an earlier map, then the clearest one.
+
+        Args:
+            ssh_map: The map.
+            since: The map of the steps before this one is known to be accepted. So only returns
+                that end later are tested.
+        """
+        import numpy as np
+
+        labels, places = ssh_map.labels, tuple(s.place for s in ssh_map.dstates)
+        course = _Course.of(labels, places)
+        if course in self._accepted:
+            return None
+        if (
+            known := next(
+                (found for found in reversed(self._refused) if _hold(found, labels, places)), None
+            )
+        ) is not None:
+            return known
+        before = self._accepted.pop(_Course.of(labels[:since], places), None)
+        rows = self._returns_of(labels, places, since if before else 0)
+        if before:
+            rows = np.concatenate([before.rows, rows])
+        together = self._together(rows, before)
+        worst = together.worst(rows[:, 1] >= since if since else self._is_new(rows))
+        if worst is not None:
+            refused = frozenset(
+                Equality(int(i), int(j), "dstate" if one_dstate else "place")
+                for i, j, one_dstate in worst
+            )
+            self._refused = [*self._refused[-REMEMBERED:], refused]
+            return refused
+        self._accepted[course] = together
+        if len(self._accepted) > REMEMBERED:
+            del self._accepted[next(iter(self._accepted))]
+        return None
+
+    def refused_at(
+        self, labels: Sequence[int], places: Sequence[int | None], step: int
+    ) -> frozenset[Equality] | None:
+        """The two returns that are most clearly refused together, but not alone.
+
+        Args:
+            labels: The dstate of each step. It need not be that of a map.
+            places: The place of each step.
+            step: The step where the later return ends.
+
+        Returns:
+            The two returns; None if there are none.
+        """
+        alone = self.pairs
+        rows = self._returns_among(labels[: step + 1], places)
+        refused = [
+            i in (alone.apart if one_dstate else alone.elsewhere).get(j, ())
+            for i, j, one_dstate in rows.tolist()
+        ]
+        rows = rows[[not is_refused for is_refused in refused]]
+        worst = self._together(rows).worst(rows[:, 1] == step)
+        if worst is None:
+            return None
+        return frozenset(
+            Equality(int(i), int(j), "dstate" if one_dstate else "place")
+            for i, j, one_dstate in worst
+        )
+
+    def refused_alone_at(
+        self, labels: Sequence[int], places: Sequence[int | None], step: int
+    ) -> list[Equality]:
+        """The returns that are refused alone and end at a step.
+
+        Args:
+            labels: The dstate of each step.
+            places: The place of each step.
+            step: The step.
+        """
+        elsewhere = [
+            Equality(i, step, "place")
+            for i in self.pairs.elsewhere.get(step, ())
+            if places[i] == places[step] is not None
+        ]
+        return elsewhere + [
+            Equality(i, step) for i in self.pairs.apart.get(step, ()) if labels[i] == labels[step]
+        ]
+
+    def excess(self, refused: Equality) -> float:
+        """The chi-square of a return minus the threshold."""
+        import numpy as np
+
+        from ssh_abduction.theory.evidence.loops import chi_squares
+
+        first, last, which = refused.first, refused.second, int(refused.of == "dstate")
+        squares = chi_squares(
+            *self.reckoning.loops_of_unknown_drift().closings(np.array([first]), np.array([last]))
+        )
+        return float(squares[which][0]) - self.threshold(2 + which, together=False)
+
+    def why_apart(self, first: int, last: int, number_from: int = 0) -> str | None:
+        """Why two steps are not one dstate or place, in words; None if displacements allow it.
+
+        Args:
+            first: The earlier step.
+            last: The later step.
+            number_from: The number of the first step, if the trace is a part of a longer one.
+        """
+        named = f"steps {first + number_from} and {last + number_from}"
+        i, j = self._begin_of_visit(first), self._begin_of_visit(last)
+        if i in self.pairs.elsewhere.get(j, ()):
+            they = (
+                "they"
+                if (i, j) == (first, last)
+                else f"steps {i + number_from} and {j + number_from}, where their visits begin,"
+            )
+            return (
+                f"{named} are not at one place: by the odometry {they} are "
+                f"{self.closing(i, j).metres} apart"
+            )
+        if first not in self.pairs.apart.get(last, ()):
+            return None
+        closing = self.closing(first, last)
+        far, turned = (
+            closing.square_of_position > self.threshold(2, False),
+            closing.square_of_heading > self.threshold(1, False),
+        )
+        if turned and not far:
+            return (
+                f"{named} are not one dstate: by the odometry their headings are "
+                f"{closing.degrees} apart"
+            )
+        off = closing.metres if far else f"{closing.metres} and {closing.degrees}"
+        return f"{named} are not one dstate: by the odometry they are {off} apart"
+
+    def why_not_both(self, returns: Collection[Equality], number_from: int = 0) -> str:
+        """Why two returns cannot both be true, in words."""
+        ordered = sorted(returns, key=lambda e: (e.second, e.first, e.of))
+        closings = [self.closing(e.first, e.second) for e in ordered]
+        named = ", and ".join(
+            f"steps {e.first + number_from} and {e.second + number_from}" for e in ordered
+        )
+        ways = " and ".join(f"{closing.way:.0f} m" for closing in closings)
+        sizes = " and ".join(f"{closing.size:.1f} m" for closing in closings)
+        turned = [
+            abs(math.degrees(closing.turned))
+            for e, closing in zip(ordered, closings, strict=True)
+            if e.of == "dstate"
+        ]
+        headings = (
+            f", and {' and '.join(f'{angle:.0f}' for angle in turned)} degrees in heading"
+            if any(map(round, turned))
+            else ""
+        )
+        return f"{named} cannot both be returns: the loops of {ways} close {sizes} off{headings}"
+
+    def closing(self, first: int, last: int) -> Closing:
+        """By how much a loop fails to close. A drift of heading counts as uncertainty."""
+        import numpy as np
+
+        from ssh_abduction.theory.evidence.loops import chi_squares
+
+        loops = self.reckoning.loops_of_unknown_drift()
+        off, covariance = loops.closings([first], [last])
+        size = float(np.hypot(*off[0, :2]))
+        along = off[0, :2] / size if size else np.array([1.0, 0.0])
+        return Closing(
+            way=float(loops.ways[last, 0] - loops.ways[first, 0]),
+            size=size,
+            size_sigma=math.sqrt(along @ covariance[0, :2, :2] @ along),
+            turned=float(off[0, 2]),
+            turned_sigma=math.sqrt(covariance[0, 2, 2]),
+            square_of_position=float(chi_squares(off, covariance)[0][0]),
+        )
+
+    def _begin_of_visit(self, step: int) -> int:
+        """The first step of the visit of a step; the step itself if turns may leave their place."""
+        return self.arrivals[bisect(self.arrivals, step) - 1] if self.evidence.turns_stay else step
+
+    def _together(self, rows: Steps, before: Together | None = None) -> Together:
+        from ssh_abduction.theory.evidence.together import Together  # loads numpy
+
+        thresholds = {freedom: self.threshold(freedom, together=True) for freedom in (4, 5, 6)}
+        return Together(self.reckoning, thresholds, rows, before)
+
+    def _is_new(self, rows: Steps) -> Mask:
+        """Which returns are not in the map that was accepted last."""
+        import numpy as np
+
+        if not self._accepted:
+            return np.ones(len(rows), dtype=bool)
+        known = next(reversed(self._accepted.values())).rows
+        size = len(self.trace)
+        codes, known_codes = (
+            (found[:, 0] * size + found[:, 1]) * 2 + found[:, 2] for found in (rows, known)
+        )
+        new: Mask = np.isin(codes, known_codes, invert=True)
+        return new
+
+
+@dataclass(frozen=True)
+class Closing:
+    """By how much a loop fails to close, in metres and radians, with standard deviations.
+
+    Attributes:
+        way: Metres driven from its first step to its last one.
+        size: The distance between its ends.
+        size_sigma: The standard deviation of that distance.
+        turned: The difference of heading.
+        turned_sigma: The standard deviation of that difference.
+        square_of_position: The chi-square of the position, with two degrees of freedom.
+    """
+
+    way: float
+    size: float
+    size_sigma: float
+    turned: float
+    turned_sigma: float
+    square_of_position: float
+
+    @property
+    def square_of_heading(self) -> float:
+        """The chi-square of the heading, with one degree of freedom."""
+        return (self.turned / self.turned_sigma) ** 2
+
+    @property
+    def metres(self) -> str:
+        """The distance in words, such as "11.2 ± 1.4 m"."""
+        return f"{self.size:.1f} ± {self.size_sigma:.1f} m"
+
+    @property
+    def degrees(self) -> str:
+        """The difference of heading in words, such as "90 ± 3 degrees"."""
+        return (
+            f"{abs(math.degrees(self.turned)):.0f} ± {math.degrees(self.turned_sigma):.0f} degrees"
+        )
+
+
+class _Course(NamedTuple):
+    """The parts of a map that displacements depend on."""
+
+    labels: tuple[int, ...]
+    places: tuple[int | None, ...]
+
+    @staticmethod
+    def of(labels: tuple[int, ...], places: tuple[int | None, ...]) -> _Course:
+        """The course of the dstates of these steps. The map may have more dstates."""
+        return _Course(labels, places[: max(labels, default=-1) + 1])
+
+
+def _hold(
+    equalities: Collection[Equality], labels: Sequence[int], places: Sequence[int | None]
+) -> bool:
+    """Whether all of these equalities hold.
+
+    Args:
+        equalities: Equalities of two steps, the earlier one first.
+        labels: The dstate of each step.
+        places: The place of each dstate.
+    """
+    return all(
+        equality.second < len(labels)
+        and (
+            labels[equality.first] == labels[equality.second]
+            if equality.of == "dstate"
+            else places[labels[equality.first]] == places[labels[equality.second]] is not None
+        )
+        for equality in equalities
+    )
+
+
+def _parts(size: int, most: int = AT_A_TIME) -> Iterator[slice]:
+    """Slices of a number of loops that fit into memory."""
+    for start in range(0, size, most):
+        look_at_clock()
+        yield slice(start, start + most)

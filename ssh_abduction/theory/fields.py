@@ -1,0 +1,231 @@
+"""The values that the fields of a theory may have, and their checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from ssh_abduction.data.errors import TheoryError, brief, is_finite, is_whole
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.rules import Rules
+
+if TYPE_CHECKING:
+    from ssh_abduction.theory.theory import Theory
+
+Count: TypeAlias = Literal["dstates", "paths", "places", "excuses", "auto", "tenths"]
+Pair: TypeAlias = tuple[int, int]  # two steps
+CHOICES: dict[str, tuple[str, ...]] = {
+    "level": ("causal", "topological"),
+    "boundary": ("none", "strict", "defeasible"),
+    "path_order": ("partial", "total"),
+    "star": ("auto", "none", "alike", "pattern", "frame", "gateways"),
+    "displacement": ("auto", "none", "use"),
+}
+# Readings of stars that compare the directions of gateways within their spreads.
+IN_TOLERANCE = ("alike", "gateways")
+COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
+# The default preferences. With displacements, which tell places apart, the fewest places are seldom
+# too few. Without them, the fewest paths are the better choice (docs/measurements/truth.md).
+AUTO: tuple[Count, ...] = ("auto",)
+PREFERRED: tuple[Count, ...] = ("dstates", "paths", "places")
+WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
+# The axioms that a fault of each kind may break. Speed-ups cannot rely on them.
+EXCUSED = {
+    "misread": {"functional_view", "star_pattern", "star_frame"},
+    "slipped": {
+        "deterministic",
+        "turn_stays",
+        "travel_leaves",
+        "travel_follows_path",
+        "turn_around_reverses",
+        "turn_changes_path",
+        "travel_orders",
+        "next_place",
+        "course_needs_travel",
+        "turn_rotates",
+    },
+    "jumped": {"one_pose"},
+}
+DEAREST = 1000.0  # dstates that a fault may cost at most
+MOST_JOINT = 2  # returns that may be tested together at most
+MOST_STEPS = 2**31  # the numbers of steps are below this: clingo's numbers have 32 bits
+ASSERTIONS = ("same", "different", "elsewhere")
+FAULTS = ("misread", "misseen", "slipped", "jumped")
+CAUSAL = "Theory.causal() (--theory causal)"  # for error messages
+
+
+def normalise(theory: Theory) -> None:
+    """Check all fields of a new theory, and bring each into one form. Raises TheoryError."""
+    for name, values in CHOICES.items():
+        if not isinstance(getattr(theory, name), str) or getattr(theory, name) not in values:
+            raise TheoryError(
+                f"{name}: expected one of {', '.join(values)}, got {brief(getattr(theory, name))}"
+            )
+    for field in fields(theory):
+        if isinstance(field.default, bool) and not isinstance(getattr(theory, field.name), bool):
+            raise TheoryError(
+                f"{field.name}: expected true or false, got {brief(getattr(theory, field.name))}"
+            )
+    _check_numbers(theory)
+    _set_names(theory, "prefer", (*COUNTS, *AUTO))
+    _set_names(theory, "without", [a.name for a in encodings.axioms()])
+    object.__setattr__(theory, "rules", Rules.all_of(theory.rules))
+    for name in ASSERTIONS:
+        object.__setattr__(theory, name, _pairs(name, getattr(theory, name)))
+    _check_rules(theory)
+    if theory.level == "causal":
+        for name, values in (("boundary", ("none",)), ("star", ("none", "alike"))):
+            if getattr(theory, name) not in values:
+                raise TheoryError(
+                    f"{name}: expected {' or '.join(values)} with level=causal, got "
+                    f"{getattr(theory, name)}; take {CAUSAL}"
+                )
+        if set(theory.prefer) - {"dstates", *AUTO}:
+            raise TheoryError(
+                f"prefer: expected dstates with level=causal, got {', '.join(theory.prefer)}; "
+                f"take {CAUSAL}"
+            )
+    if "auto" in theory.prefer and theory.prefer != AUTO:
+        raise TheoryError(
+            f"prefer: expected auto alone, got {', '.join(theory.prefer)}; name the counts, or "
+            "leave it out"
+        )
+    if theory.has_faults:
+        _check_faults(theory)
+    if "excuses" in theory.prefer and theory.boundary != "defeasible":
+        raise TheoryError(
+            f"prefer: expected no excuses with boundary={theory.boundary}; take "
+            f"{choice('boundary', 'defeasible')}"
+        )
+
+
+def choice(name: str, value: str) -> str:
+    """A choice for an error message: how to make it in Python and in the shell."""
+    flag = f"--{name} {value}" if name == "star" else f"--set {name}={value}"
+    return f"{name}={value} ({flag})"
+
+
+def _check_faults(theory: Theory) -> None:
+    if theory.prefer != AUTO and theory.prefer[:1] != ("dstates",):
+        raise TheoryError(
+            "prefer: expected dstates first where faults are allowed, got "
+            f"{', '.join(theory.prefer) or 'nothing'}; faults cost dstates"
+        )
+    if theory.star == "gateways":
+        raise TheoryError(
+            "star: expected no stars of any gateways where faults are allowed, got gateways; "
+            f"take {choice('star', 'alike')}"
+        )
+    if theory.boundary == "defeasible":
+        raise TheoryError(
+            "boundary: expected no excuses where faults are allowed, got defeasible; take "
+            f"{choice('boundary', 'strict')}"
+        )
+    if theory.jumped and theory.displacement == "none":
+        raise TheoryError(
+            "jumped: expected displacements to be used, which may be wrong, got "
+            f"displacement=none; leave it out, or take {choice('displacement', 'auto')}"
+        )
+    if theory.planar:
+        raise TheoryError(
+            "planar: expected no planarity where faults are allowed; leave it out (--set "
+            "planar=false)"
+        )
+
+
+def _check_numbers(theory: Theory) -> None:
+    for name in EXCUSED:
+        price = getattr(theory, name)
+        if not is_finite(price) or not (price == 0 or 0.1 <= price <= DEAREST):
+            raise TheoryError(
+                f"{name}: expected a number of dstates from 0.1 to {DEAREST:g}, or 0 for no "
+                f"such faults, got {brief(price)}"
+            )
+        object.__setattr__(theory, name, round(float(price), 1))
+    if not is_finite(theory.reject) or not 0 < theory.reject < 1:
+        raise TheoryError(
+            f"reject: expected a probability above 0 and below 1, got {brief(theory.reject)}; "
+            "take 0.001, or another small one"
+        )
+    for name, least, most in (("joint", 1, MOST_JOINT), ("returns", 0, MOST_STEPS)):
+        value = getattr(theory, name)
+        if not is_whole(value) or not least <= value <= most:
+            raise TheoryError(
+                f"{name}: expected a whole number from {least} to {most}, got {brief(value)}"
+            )
+        object.__setattr__(theory, name, int(value))
+    object.__setattr__(theory, "reject", float(theory.reject))
+
+
+def _check_rules(theory: Theory) -> None:
+    taken = {axiom.name for axiom in encodings.axioms()}
+    for rules in theory.rules:
+        for axiom in rules.axioms:
+            if axiom.name in taken:
+                raise TheoryError(
+                    f"{rules.name}: @axiom({axiom.name}): expected a name that no other axiom "
+                    "has; give it one of its own"
+                )
+            taken.add(axiom.name)
+
+
+def _set_names(theory: Theory, field: str, allowed: Iterable[str]) -> None:
+    value = getattr(theory, field)
+    if not isinstance(value, str | list | tuple):
+        raise TheoryError(f"{field}: expected a list of names, got {brief(value)}")
+    names = (
+        tuple(name.strip() for name in value.split(",")) if isinstance(value, str) else tuple(value)
+    )
+    known = list(allowed)
+    for i, name in enumerate(names):
+        if name not in known:
+            raise TheoryError(
+                f"{field}: expected names out of {', '.join(known)}, got {brief(name)}"
+            )
+        if name in names[:i]:
+            raise TheoryError(f"{field}: expected each name once, got {brief(name)} twice")
+    object.__setattr__(theory, field, names)
+
+
+class _Checked(tuple[Pair, ...]):
+    """Pairs that are checked. A theory made from another one need not check its pairs again."""
+
+
+def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
+    """Pairs of steps, each once and with the earlier step first.
+
+    Args:
+        field: The name of the field.
+        value: Pairs of numbers, or texts such as "3,12".
+
+    Raises:
+        TheoryError: The value is of another form.
+    """
+    if isinstance(value, _Checked):
+        return value
+    mend = f"write {field}=[(3, 12)] (--{field} 3,12)"
+    if isinstance(value, str):
+        value = [value]
+    if not isinstance(value, Iterable) or isinstance(value, Mapping | bytes):
+        raise TheoryError(f"{field}: expected pairs of steps, got {brief(value)}; {mend}")
+    found: dict[Pair, None] = {}
+    for given in value:
+        pair = given.split(",") if isinstance(given, str) else given
+        try:
+            steps = [int(step) if isinstance(step, str) else step.__index__() for step in pair]
+        except (AttributeError, TypeError, ValueError):
+            steps = []
+        if (
+            len(steps) != 2
+            or min(steps) < 0
+            or max(steps) >= MOST_STEPS
+            or any(isinstance(step, bool) for step in pair)
+        ):
+            raise TheoryError(
+                f"{field}: expected pairs of steps, counted from 0, got {brief(given)}; {mend}"
+            )
+        if steps[0] == steps[1]:
+            raise TheoryError(f"{field}: expected two steps, got {steps[0]} twice; {mend}")
+        found[min(steps), max(steps)] = None
+    return _Checked(found)
