@@ -178,7 +178,7 @@ def test_errors_that_repeat_are_estimated_along(scale: float, bend: float) -> No
         Theory.causal(),
     )
     if bend:
-        assert stiff.maps[0].labels != found.labels or stiff.odometry_warning
+        assert stiff.maps[0].labels != found.labels or stiff.support.odometry_warning
 
 
 @settings(max_examples=5)
@@ -249,7 +249,9 @@ def test_kilometres_are_noticed() -> None:
 
     said = "the odometry tells no travel from standing still: the longest displacement of one is 0.01 m, and its noise about 0.1 m; "
     assert (solve(scaled(0.001)).support.odometry_warning or "").startswith(said)
-    assert "the longest displacement of one is 0 m" in (solve(scaled(0.0)).support.odometry_warning or "")
+    assert "the longest displacement of one is 0 m" in (
+        solve(scaled(0.0)).support.odometry_warning or ""
+    )
     assert units_warning(scaled(0.001, position=0.001)) is None
     assert units_warning(trace) is None
     assert units_warning(trace.without_displacements()) is None
