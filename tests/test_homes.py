@@ -10,8 +10,8 @@ import pytest
 from ssh_abduction import Theory, Trace, solve
 from ssh_abduction.solver import Status, choosing
 from ssh_abduction.solver.asp.facts.paths_lp import Segments
-from ssh_abduction.solver.engines import frameless
-from ssh_abduction.solver.engines.frameless import PlacesAndPaths
+from ssh_abduction.solver.engines import frameless_paths as frameless
+from ssh_abduction.solver.engines.frameless_paths import PlacesAndPaths
 from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 

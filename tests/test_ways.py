@@ -18,7 +18,7 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.solver import Search, Start, Status, choosing
 from ssh_abduction.solver.asp.facts.readable import most_paths
 from ssh_abduction.solver.asp.limits import LimitError, Watch
-from ssh_abduction.solver.engines import frameless as ways
+from ssh_abduction.solver.engines import frameless_paths as ways
 from ssh_abduction.solver.engines import name_search, naming
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.frameless import FramelessEngine

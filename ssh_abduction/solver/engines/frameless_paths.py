@@ -1,0 +1,447 @@
+"""The places and paths of named dstates, for the engine without frames.
+
+paths_frameless.lp tells whether any places and paths fit labels, and finds the fewest. If labels
+have none, the path of some dstate mostly shows it: sides_frameless.lp is told some of these paths
+at a time; a dozen are mostly enough. What no single path shows is forbidden: a minimal set of the
+answer's links that has no places and paths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import chain, pairwise
+from typing import TypeAlias
+
+import clingo
+import networkx as nx
+
+from ssh_abduction.solver.asp.control import Asker, Control, mapped
+from ssh_abduction.solver.asp.facts import names_lp, path_reader, paths_lp, sides_lp
+from ssh_abduction.solver.asp.facts.atoms import numbers
+from ssh_abduction.solver.engines.base import Found, Task
+from ssh_abduction.solver.engines.doubts import Settled
+from ssh_abduction.solver.engines.homes import fewest_paths, homes_of
+from ssh_abduction.solver.engines.naming import NamedLabels
+from ssh_abduction.solver.engines.paths import PREPARING
+from ssh_abduction.solver.engines.refusing import smaller
+from ssh_abduction.solver.steps.chart import Link
+from ssh_abduction.theory import encodings
+from ssh_abduction.theory.evidence import Equality
+
+# Tell clingo of this many paths, or pairs of dstates, in one go: with fewer it would be asked more
+# often, and most of more would not be needed.
+CONTRARY = 8
+# After this many conflicts better paths are no longer looked for one after another; the bound is
+# raised from below instead.
+BETTERING = 20_000
+
+# Labels of all steps, options of clasp, and the parts of the program.
+_Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]
+# Parts of the program. TOLD: what segments tell of places and of each other before any two of them
+# are one. PARTS: which places and paths fit labels. EACH: also list answers that differ in paths
+# alone.
+TOLD, EACH = ("base", "segments"), ("each",)
+PARTS = (*TOLD, "least", "paths")
+# Whether the pairwise distinct places are enough is asked for at most TIGHT labels, within TIGHTLY
+# conflicts each: it mostly shows at once.
+TIGHT, TIGHTLY = 5, 2000
+
+
+@dataclass(frozen=True)
+class _Far:
+    """Pairs of dstates, mostly a single pair, some pair of which is not at one place.
+
+    Attributes:
+        pairs: Of dstates.
+        placed: The steps that evidence says so of, each with the dstate that it is at.
+    """
+
+    pairs: tuple[tuple[int, int], ...]
+    placed: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, labels: Sequence[int], equalities: Collection[Equality]) -> _Far | None:
+        """What follows for these labels if the equalities do not all hold.
+
+        None if nothing follows, as some steps that were to be one dstate are not.
+        """
+        steps = dict.fromkeys(
+            step for equality in equalities for step in (equality.first, equality.second)
+        )
+        if max(steps) >= len(labels) or any(
+            e.of == "dstate" and labels[e.first] != labels[e.second] for e in equalities
+        ):
+            return None
+        pairs = {(labels[e.first], labels[e.second]): None for e in equalities if e.of == "place"}
+        return cls(tuple(pairs), tuple((step, labels[step]) for step in steps))
+
+
+@dataclass(frozen=True)
+class _Members:
+    """Links, and dstates that are far from each other, which perhaps no places and paths fit."""
+
+    links: list[Link]
+    far: list[_Far]
+
+    @classmethod
+    def of(cls, members: Iterable[Link | _Far]) -> _Members:
+        links, far = list[Link](), list[_Far]()
+        for member in members:
+            if isinstance(member, _Far):
+                far.append(member)
+            else:
+                links.append(member)
+        return cls(links, far)
+
+    def all(self) -> list[Link | _Far]:
+        return [*self.links, *self.far]
+
+
+class PlacesAndPaths:
+    """Whether places and paths fit labels, why none do, and which are best.
+
+    Attributes:
+        named: The labels, and the control that is told what is forbidden.
+    """
+
+    def __init__(self, task: Task, asker: Asker, known: Sequence[int] = ()) -> None:
+        """Labels of no steps yet.
+
+        Args:
+            task: The trace, theory and speed-ups.
+            asker: It asks clingo.
+            known: The labels of all steps of a map with few dstates, if one is known.
+        """
+        self.named = NamedLabels(task, asker, known, self)
+        self._task, self._asker = task, asker
+        self._actions = dict(zip(task.log.actions, task.trace.actions, strict=True))
+        # Sets of equalities that do not all hold, and some of which are of places.
+        self._refused: list[Collection[Equality]] = []
+        self._forbidden = 0  # how many sets of links were forbidden
+        # Dstates whose paths clingo was told of, as keys of `NameProgram.names`.
+        self._told: set[tuple[int, int]] = set()
+        # The last labels, and the control for their places and paths.
+        self._asked: tuple[_Question, clingo.Control] | None = None
+        # Labels whose fewest places are known, with homes and a best map; and labels for which
+        # that was tried in vain.
+        self._tight: dict[tuple[int, ...], tuple[Mapping[int, list[int]], Found]] = {}
+        self._failed: set[tuple[int, ...]] = set()
+
+    def forget(self) -> None:
+        """Another control comes, for other labels."""
+        self._told = set()
+        self._forget_tight()
+
+    def _forget_tight(self) -> None:
+        self._tight, self._failed, self._asked = {}, set(), None
+
+    def tell_again(self) -> None:
+        """Tell a new control what the one before was told."""
+        told, self._told = self._told, set()
+        if told:
+            self._tell_of([key for key in self.named.program.names() if key in told])
+
+    def forbid_together(self, equalities: Collection[Equality]) -> None:
+        """From now on not all of these equalities hold."""
+        if any(equality.of == "place" for equality in equalities):
+            self._refused.append(equalities)
+            self._forget_tight()
+
+    def _tell_of(self, dstates: Collection[tuple[int, int]]) -> None:
+        """Tell clingo what the paths of these dstates demand, which it does not know yet."""
+        with self._asker.grounding_timed():
+            control, names = self._asker.control, self.named.program.names()
+            parts: list[tuple[str, list[clingo.Symbol]]] = []
+            if not self._told:
+                control.load(encodings.path("sides_frameless"))
+                control.add(
+                    "sides", [], sides_lp.sides_frameless_facts(self._task.theory, self._actions)
+                )
+                parts.append(("sides", []))
+            parts += [("path", numbers(names[dstate])) for dstate in dstates]
+            control.ground(parts)  # in one go: that takes half as long, and searching, too
+            self._told.update(dstates)
+
+    def fits(self, labels: Sequence[int]) -> bool:
+        """Whether some places and paths fit these labels."""
+        return self._tightly(labels) is not None or self._has_paths(self._path_control(labels))
+
+    def _tightly(self, labels: Sequence[int]) -> Found | None:
+        """A best map with these dstates, if pairwise distinct places are enough for one.
+
+        None if that is not known (`engines/homes.py`).
+        """
+        key = tuple(labels)
+        if key in self._tight:
+            return self._tight[key][1]
+        if (
+            "places" not in self._task.theory.priorities
+            or key in self._failed
+            or len(self._failed) >= TIGHT
+        ):
+            return None
+        with self._asker.grounding_timed():
+            control = self._control_for(
+                self._links_of(labels), labels, far=self._far_away(labels), parts=TOLD
+            )
+            told = paths_lp.Segments.read(control)
+            homes = homes_of(told)
+            if homes is not None:
+                _go_on_at_home(control, homes, (*PARTS, *EACH))
+        best = None if homes is None else self._best_at_home(labels, control, fewest_paths(told))
+        if best is None or homes is None:
+            self._failed.add(key)
+            return None
+        self._tight[key] = homes, best
+        self._asked = (key, (), (*PARTS, *EACH)), control
+        return best
+
+    def _best_at_home(self, labels: Sequence[int], control: Control, fewest: int) -> Found | None:
+        """The best map at some homes, if no other map with these dstates is known to be better.
+
+        Args:
+            labels: The dstates.
+            control: It knows the homes.
+            fewest: A lower bound on the number of paths.
+        """
+        places_first = (
+            next(count for count in self._task.theory.priorities if count in ("places", "paths"))
+            == "places"
+        )
+        reader = path_reader.PathReader(
+            control, self._task.trace, self._task.theory, self.named.chart, labels
+        )
+        answers = mapped(
+            reader.map_of,
+            self._asker.answers(reader.read, "opt", 0, control=control, conflicts=TIGHTLY),
+        )
+        best: Found | None = None
+        with closing(answers):
+            while True:
+                try:
+                    ssh_map = next(answers).without_headings()
+                except StopIteration as end:
+                    return best if end.value and places_first else None
+                best = Found.of(ssh_map, self._task.theory)
+                if len(ssh_map.paths) <= fewest:
+                    return best
+
+    def why_not(self, labels: list[int]) -> list[int] | None:
+        """These labels if no places and paths fit them, else None."""
+        return None if self.fits(labels) else labels
+
+    def _has_paths(self, control: clingo.Control) -> bool:
+        return next(self._asker.answers(lambda _: True, "ignore", 1, control=control), False)
+
+    def forbid(self, labels: Sequence[int]) -> None:
+        """Tell clingo why no places and paths fit these labels."""
+        links = self._links_of(labels)
+        control = self._control_for(links, parts=("base",))
+        contrary = next(self._asker.answers(paths_lp.read_contraries, "ignore", 1, control=control))
+        dstate_of = {name: dstate for dstate, name in self.named.program.names().items()}
+        new = [
+            dstate
+            for name in contrary
+            if (dstate := dstate_of.get(name)) is not None and dstate not in self._told
+        ][:CONTRARY]
+        if new:
+            self._tell_of(new)
+            return
+        far = self._far_away(labels)
+        for members in self._turned_together(links, far) or [
+            _Members.of(smaller(_Members([*links], far).all(), self._clashing))
+        ]:
+            placed = {at for apart in members.far for at in apart.placed}
+            self.named.program.add_links_at({step for step, _ in placed})
+            self._forbidden += 1
+            self.named.program.tell(
+                f"forbidden_{self._forbidden}", names_lp.forbidden_links(members.links, placed)
+            )
+
+    def _turned_together(self, links: Iterable[Link], far: Iterable[_Far]) -> list[_Members]:
+        """Dstates that are far from each other though turns lead from one to the other.
+
+        Each with a shortest way between them; the shortest ways first.
+        """
+        turns = nx.Graph(
+            (s, x, {"link": (s, action, x)}) for s, action, x in links if self._actions[action].turn
+        )
+        turns.add_nodes_from(dstate for apart in far for dstate in chain(*apart.pairs))
+        found = []
+        for apart in far:
+            if all(nx.has_path(turns, x, y) for x, y in apart.pairs):
+                ways = (nx.shortest_path(turns, x, y) for x, y in apart.pairs)
+                found.append(
+                    _Members(
+                        [turns.edges[pair]["link"] for way in ways for pair in pairwise(way)],
+                        [apart],
+                    )
+                )
+        return sorted(found, key=lambda members: len(members.links))[:CONTRARY]
+
+    def _clashing(self, members: list[Link | _Far]) -> list[Link | _Far] | None:
+        """These links and far dstates if no places and paths fit them, else None."""
+        some = _Members.of(members)
+        found = any(
+            self._has_paths(self._control_for(some.links, far=some.far, single=single))
+            for single in (True, False)
+        )
+        return None if found else members
+
+    def _far_away(self, labels: Sequence[int]) -> list[_Far]:
+        """The dstates that evidence says are not at one place.
+
+        Each pair comes once; sets of pairs, not all of which are at one place, come last.
+        """
+        away = self._task.log.pairs.elsewhere.items()
+        found = {
+            (labels[i], labels[t]): (i, t) for t, others in away if t < len(labels) for i in others
+        }
+        alone = [
+            _Far((pair,), tuple(zip(steps, pair, strict=True))) for pair, steps in found.items()
+        ]
+        return alone + [far for equalities in self._refused if (far := _Far.of(labels, equalities))]
+
+    def _links_of(self, labels: Sequence[int]) -> list[Link]:
+        """The links that these labels of all steps make, each once."""
+        return list(
+            dict.fromkeys((labels[t], action, labels[u]) for t, action, u in self.named.chart.links)
+        )
+
+    def _control_for(
+        self,
+        links: Collection[Link],
+        dstates: Iterable[int] = (),
+        options: Sequence[str] = (),
+        *,
+        far: Collection[_Far] = (),
+        single: bool = False,
+        parts: Iterable[str] = PARTS,
+    ) -> Control:
+        """A control for the places and paths of dstates.
+
+        Args:
+            links: How actions link them.
+            dstates: Further ones.
+            options: Of clasp.
+            far: Dstates that are not at one place.
+            single: Take no two places or segments for one unless they have to be.
+            parts: Of the program.
+        """
+        control = Control(options, self._asker.watch.check, PREPARING)
+        control.load_encodings("paths_frameless", "preference")
+        apart = [member.pairs for member in far]
+        dstates = dict.fromkeys(chain(dstates, *((s, x) for s, _, x in links), *chain(*apart)))
+        control.add(
+            "base",
+            [],
+            paths_lp.paths_frameless_facts(
+                self._task.theory, dstates, links, self._actions, apart, single=single
+            ),
+        )
+        control.ground([(part, []) for part in parts])
+        return control
+
+    def _path_control(
+        self,
+        labels: Sequence[int],
+        options: Sequence[str] = (),
+        parts: Sequence[str] = (*PARTS, *EACH),
+    ) -> clingo.Control:
+        """A control for the places and paths that fit these labels of all steps.
+
+        The last one is kept, as the next question is often to it.
+        """
+        key = tuple(labels), tuple(options), tuple(parts)
+        if self._asked is None or self._asked[0] != key:
+            with self._asker.grounding_timed():
+                at_home = key[0] in self._tight
+                control = self._control_for(
+                    self._links_of(labels),
+                    labels,
+                    options,
+                    far=self._far_away(labels),
+                    parts=TOLD if at_home else parts,
+                )
+                if at_home:
+                    _go_on_at_home(control, self._tight[key[0]][0], parts)
+            self._asker.watch.check()
+            self._asked = key, control
+        return self._asked[1]
+
+    def settled(self, labels: Sequence[int], mode: str) -> Settled:
+        """The maps with these dstates."""
+        control = self._path_control(labels)
+        reader = path_reader.PathReader(
+            control, self._task.trace, self._task.theory, self.named.chart, labels
+        )
+        return Settled(
+            self._asker,
+            control,
+            mode,
+            reader,
+            lambda answer: reader.map_of(answer).without_headings(),
+        )
+
+    def improving_maps(self, labels: Sequence[int]) -> Iterator[Found]:
+        """Maps with these dstates, each as good as the one before or better, the last one best.
+
+        There are none if no places and paths fit the labels.
+        """
+        if (best := self._tightly(labels)) is not None:
+            yield best
+            return
+        proven = yield from self.maps(labels, "opt", BETTERING)
+        if not proven:
+            yield from self.maps(labels, "opt", options=["--opt-strategy=usc"])
+
+    def maps(
+        self,
+        labels: Sequence[int],
+        mode: str,
+        conflicts: int = -1,
+        options: Sequence[str] = (),
+        parts: Sequence[str] = (*PARTS, *EACH),
+    ) -> Generator[Found, None, bool]:
+        """Maps with these dstates.
+
+        Args:
+            labels: The dstates.
+            mode: Clingo's opt-mode.
+            conflicts: The limit; -1 for none.
+            options: Of clasp.
+            parts: Of the program; without EACH there is one map for each choice of places.
+
+        Returns:
+            Whether clingo came to an end, and not to the limit of conflicts.
+        """
+        control = self._path_control(labels, options, parts)
+        reader = path_reader.PathReader(
+            control, self._task.trace, self._task.theory, self.named.chart, labels
+        )
+        answers = self._asker.answers(
+            reader.read,
+            mode,
+            int(mode == "ignore"),
+            control=control,
+            conflicts=conflicts,
+            ahead=True,
+        )
+        return (
+            yield from mapped(
+                lambda answer: Found.of(
+                    reader.map_of(answer).without_headings(), self._task.theory
+                ),
+                answers,
+            )
+        )
+
+
+def _go_on_at_home(control: Control, homes: Mapping[int, list[int]], parts: Iterable[str]) -> None:
+    """Ground the other parts of a control that has TOLD, with each place at one of its homes."""
+    control.add("homes", [], paths_lp.tight_facts(homes))
+    control.ground(
+        [(part, []) for part in ("homes", *(part for part in parts if part not in TOLD))]
+    )
