@@ -35,10 +35,11 @@ from ssh_abduction.solver.engines import (
 from ssh_abduction.solver.engines import paths as paths_module
 from ssh_abduction.solver.engines import visit_labels as same
 from ssh_abduction.solver.engines.base import Found
+from ssh_abduction.solver.engines.beside import Beside
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.framed_guess import GuessBeside
 from ssh_abduction.solver.engines.framed_paths import FramedPaths
-from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
+from ssh_abduction.solver.engines.nearby import NearbySearch
 from ssh_abduction.solver.engines.sides import FramedSides
 from ssh_abduction.solver.engines.visit_labels import OPEN, VisitLabels
 from ssh_abduction.solver.engines.visit_program import VisitProgram

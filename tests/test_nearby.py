@@ -30,8 +30,9 @@ from ssh_abduction.solver.engines import (
     small_maps,
 )
 from ssh_abduction.solver.engines.base import Found
+from ssh_abduction.solver.engines.beside import Beside
 from ssh_abduction.solver.engines.causal import CausalEngine
-from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
+from ssh_abduction.solver.engines.nearby import NearbySearch
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.guesses import annealing
 from ssh_abduction.solver.guesses.annealing import annealed

@@ -1,4 +1,4 @@
-"""What all engines have in common: what they are given, what they find, and the protocol that the search knows them by."""
+"""What all engines have in common: their task, what they find, and their protocol."""
 
 from __future__ import annotations
 
@@ -18,22 +18,29 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-# An engine with a chart tries a prefix of so many steps before one of AT_ONCE steps: most traces are settled by then.
+# An engine with a chart tries a prefix of this many steps before one of AT_ONCE steps: most traces
+# are settled by then.
 FIRST_PREFIXES = 32
-# So many steps, at most, are compared in pairs: the matrix of the pairs has the square of that many bytes.
+# Compare at most this many steps in pairs: the matrix of the pairs has the square of that many
+# bytes.
 AT_ONCE = 8000
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A map of a prefix, and what it costs: the preferred counts, first to last."""
+    """A map of a prefix.
+
+    Attributes:
+        map: The map.
+        cost: The preferred counts, first to last.
+    """
 
     map: SSHMap
     cost: tuple[int, ...]
 
     @staticmethod
     def of(ssh_map: SSHMap, theory: Theory) -> Found:
-        """A map and its counts, which it shows, as no axiom is left out."""
+        """A map with the counts that it shows."""
         return Found(ssh_map, Cost.of(ssh_map).preferred_by(theory))
 
 
@@ -41,11 +48,11 @@ class Found:
 class Task:
     """What an engine works on.
 
-    trace     the whole trace
-    theory    with star settled
-    log       the trace as integers
-    watch     the limits of the search
-    speedups  those that hold for the theory
+    Attributes:
+        problem: The whole trace, the settled theory and its evidence.
+        log: The trace as integers.
+        watch: The limits of the search.
+        speedups: Those that are on and hold for the theory.
     """
 
     problem: Problem
@@ -65,11 +72,10 @@ class Task:
 
     @staticmethod
     def of(problem: Problem, watch: Watch | None = None, speedups: Speedups | None = None) -> Task:
-        """A task for all speed-ups that hold for a theory, or for these of them."""
+        """A task for all speed-ups that hold for the theory, or for these of them."""
         speedups = (speedups or Speedups()).that_hold_for(problem.theory)
-        if speedups.sides and any(
-            action.slipped for action in problem.trace.actions
-        ):  # `sides` takes all that links two visits for a travel
+        # `sides` takes all that links two visits for a travel, so no action may have slipped.
+        if speedups.sides and any(action.slipped for action in problem.trace.actions):
             speedups = replace(speedups, sides=False)
         return Task(
             problem,
@@ -85,14 +91,15 @@ class Task:
 
 
 class Engine(Protocol):
-    """What the search may tell an engine, and ask it. An engine holds the axioms for the first `size` steps of a trace.
+    """What the search may tell an engine, and ask it.
 
-    asker     what it asks clingo with
-    size      how many steps it was given
-    paths     how many names for paths it has
-    intact    False after an error that may have left its control half told
-    lists_least  whether it can list only maps with the fewest dstates of the prefix alone
-    goes_on   whether it can go on with a trace that its own has grown to
+    An engine holds the axioms for the first `size` steps of a trace, the prefix.
+
+    Attributes:
+        asker: Asks clingo.
+        intact: False after an error that may have left its control half told.
+        lists_least: Whether it can list only maps with the fewest dstates of the prefix.
+        goes_on: Whether it can go on with a trace that its own has grown to.
     """
 
     asker: Asker
@@ -101,14 +108,18 @@ class Engine(Protocol):
     goes_on: bool
 
     @property
-    def size(self) -> int: ...
+    def size(self) -> int:
+        """How many steps it was given."""
+        ...
 
     @property
-    def paths(self) -> int: ...
+    def paths(self) -> int:
+        """How many names for paths it has."""
+        ...
 
     @property
     def bound(self) -> int | None:
-        """Lower bound, proven, on the count that is preferred first; None where nothing is known before a search ends."""
+        """A proven lower bound on the count that is preferred first; None if none is known."""
         ...
 
     def grow(self, size: int) -> None:
@@ -125,7 +136,7 @@ class Engine(Protocol):
         ...
 
     def with_paths(self, paths: int) -> Engine:
-        """Another engine, still for the empty prefix, with so many names for paths."""
+        """Another engine, still for the empty prefix, with this many names for paths."""
         ...
 
     def over(self, task: Task) -> Engine:
@@ -133,31 +144,52 @@ class Engine(Protocol):
         ...
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
-        """Maps of the prefix, each better than the one before; where the iteration ends, the last one is minimal.
+        """Maps of the prefix, each better than the one before.
 
-        most  what they cost at most, if that is known
+        When the iteration ends, the last one is minimal.
+
+        Args:
+            most: What they cost at most, if that is known.
         """
         ...
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        """All maps of the prefix that cost this and no more; or `enough` of them, unless that is 0."""
+        """All maps of the prefix that cost this and no more; or `enough` of them, if not 0."""
         ...
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled] | None:
-        """All labels that maps of the prefix have which cost this and no more, each once; None where dstates are not settled before places and paths."""
+        """All labels of maps of the prefix that cost this and no more, each once.
+
+        None if the engine does not settle dstates before places and paths.
+        """
         ...
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
-        """From now on no map has all of these equalities, of steps of the prefix. False where the engine cannot be told of such ones."""
+        """From now on no map has all of these equalities of steps of the prefix.
+
+        Returns:
+            Whether the engine can be told of such equalities.
+        """
         ...
 
     def settle(self) -> None:
-        """End what is still under way in clingo, when a search is over: a thread left behind would abort Python at its end."""
+        """End what is still under way in clingo, when a search is over.
+
+        A thread left behind would abort Python at its end.
+        """
         ...
 
 
 def next_charted_size(size: int, failed: int, steps: int) -> int:
-    """The size to grow to, of an engine that charts a prefix: to chart all steps takes little, unless they are too many to be compared in pairs."""
+    """The size to grow to, for an engine that charts a prefix.
+
+    To chart all steps takes little, unless they are too many to be compared in pairs.
+
+    Args:
+        size: How many steps the engine has.
+        failed: The step that the maps of the prefix do not explain.
+        steps: How many steps the trace has.
+    """
     if size < FIRST_PREFIXES:
         return min(steps, max(failed + 1, FIRST_PREFIXES))
     return steps if steps <= AT_ONCE else min(steps, max(failed + 1, 2 * size, AT_ONCE))

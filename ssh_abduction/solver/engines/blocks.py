@@ -1,13 +1,18 @@
-"""A bound for long traces with faults, by disjoint blocks of steps.
+"""A lower bound for long traces with faults, by disjoint blocks of steps.
 
-Let a map of the whole trace have N dstates. Cut down to a block of steps it is a map of that block, with N dstates at most. So what faults it has in a block cost at least as
-much as the block takes with N dstates, and blocks that share no step add up:
+This serves the faulty engine (`engines/faulty.py`). The bound holds for each map of the trace.
+
+Let a map of the whole trace have N dstates. Cut down to a block of steps it is a map of that block,
+with N dstates at most. So its faults in the block cost at least as much as any map of the block
+with N dstates needs. Blocks that share no step add up:
 
     cost  >=  least over N of  (10 N + sum over blocks of the least faults with N dstates)
 
-The blocks may be other ones for each N. With few dstates short blocks take a fault, and there are many of them; with many dstates a block has to be long to take one, but then
-the dstates alone cost much. That one block takes a fault is shown by steps that are pairwise apart if it had none: a clique of more than N (`steps/apart.py`). Where faults of a
-known map are so near to each other that no clique tells them apart, clingo is asked whether the block has a cheaper map of N dstates.
+The blocks may be other ones for each N. With few dstates short blocks take a fault, and there are
+many of them. With many dstates a block has to be long to take one, but then the dstates alone cost
+much. A block takes a fault if more than N of its steps would be pairwise apart without one
+(a clique, `steps/apart.py`). If faults of a known map are too near to each other for that, clingo
+is asked whether the block has a cheaper map of N dstates.
 """
 
 from __future__ import annotations
@@ -23,21 +28,29 @@ from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.theory.evidence import Pairs
 
-MARGIN = 3  # Such a block begins and ends so many times as many steps from the faults as there may be dstates, if there is room.
-COARSE = 5  # The shortest block is sought to a step, and to one more for each so many dstates that are asked for beyond those of the known map.
-MOST_STEPS = 200  # Clingo is asked of blocks up to this length,
-MOST_NAMES = 80  # and only with so few names for dstates, those of all views together.
-CONFLICTS = 20_000  # After so many conflicts a question is left open.
+# A block that clingo is asked of begins and ends this many steps from the faults for each dstate
+# that there may be, if there is room.
+MARGIN = 3
+# Find the shortest block to within a step, and one more for each COARSE dstates beyond those of the
+# known map.
+COARSE = 5
+# Ask clingo only of blocks up to this length, and with at most this many names for dstates.
+MOST_STEPS = 200
+MOST_NAMES = 80
+CONFLICTS = 20_000  # After this many conflicts a question is left open.
 
 
 @dataclass
 class Blocks:
-    """Bounds of a trace, by what a known map says of it.
+    """Lower bounds on the cost of a trace, found with the help of a known map.
 
-    seen, actions  as integers
-    price          tenths of dstates for each kind of fault that may be, at each step
-    faults         the steps of the faults of the known map, by kind
-    dstates        how many dstates it has
+    Attributes:
+        seen: The observation at each step, as an integer.
+        actions: The action after each step, as an integer.
+        price: Tenths of dstates for each kind of fault that is allowed, at each step.
+        faults: The steps of the faults of the known map, by kind.
+        dstates: How many dstates the known map has.
+        watch: The limits.
     """
 
     seen: Sequence[int]
@@ -46,9 +59,8 @@ class Blocks:
     faults: Mapping[str, Sequence[int]]
     dstates: int
     watch: Watch
-    _proven: dict[tuple[int, int], tuple[int, int]] = field(
-        default_factory=dict
-    )  # of blocks, with how many dstates which cost is proven
+    # Of blocks, with how many dstates which cost is proven.
+    _proven: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
 
     @property
     def cost(self) -> int:
@@ -62,13 +74,15 @@ class Blocks:
         while most > 0:
             least = self.least_faults(most)
             bound = min(bound, 10 * most + least)
-            most = (
-                min(most, -(-(bound - least) // 10)) - 1
-            )  # the same blocks do for all numbers in between
+            # The same blocks do for all numbers in between.
+            most = min(most, -(-(bound - least) // 10)) - 1
         return bound
 
     def least_faults(self, most: int) -> int:
-        """What faults cost, at least, in maps of so many dstates at most: the sum of blocks, from the left, each as short as it takes."""
+        """What the faults cost, at least, in maps of at most this many dstates.
+
+        This is the sum over blocks from the left, each as short as possible.
+        """
         total = begin = 0
         steps, places = (
             len(self.seen),
@@ -95,7 +109,7 @@ class Blocks:
         return total
 
     def _shortest(self, begin: int, fault: int, reach: int, most: int) -> int | None:
-        """The end of the shortest block from here that takes a fault; None where all steps that are left do not."""
+        """The end of the shortest block from here that takes a fault; None if there is none."""
         steps = len(self.seen)
         exact = 1 + max(most - self.dstates, 0) // COARSE
         low, high, stride = max(fault, begin + most), max(fault + reach, begin + most + 1), exact
@@ -118,7 +132,7 @@ class Blocks:
         return end > low and not self._takes_fault(begin, end, most)
 
     def _takes_fault(self, begin: int, end: int, most: int) -> bool:
-        """Whether without a fault these steps take more dstates than so many."""
+        """Whether these steps take more dstates than `most` if they have no fault."""
         self.watch.check()
         return (
             end - begin > most
@@ -129,7 +143,11 @@ class Blocks:
     def _wider(
         self, begin: int, end: int, places: Sequence[int], most: int
     ) -> tuple[int, int] | None:
-        """The end of a wider block, where faults of the known map are too near to each other for blocks of their own, and what these cost; None where that is not proven."""
+        """A wider block, if faults of the known map are too near to each other for own blocks.
+
+        Returns:
+            The end of the block, and what its faults cost; None if that is not proven.
+        """
         first = behind = bisect_left(places, begin)
         while behind < len(places) and places[behind] < max(
             end, places[behind - 1] + most + 1 if behind > first else 0
@@ -152,7 +170,16 @@ class Blocks:
         return end, known
 
     def _refuted(self, begin: int, end: int, most: int, tenths: int) -> bool:
-        """Whether these steps have no map of so many dstates whose faults cost no more than this. With one name more for each view than there may be dstates, none of them is the rest."""
+        """Whether no map of these steps has at most these dstates and this cost of faults.
+
+        Each view has one name more than there may be dstates, so no dstate is at the rest.
+
+        Args:
+            begin: The first step.
+            end: The step after the last one.
+            most: How many dstates.
+            tenths: What the faults cost at most.
+        """
         proven = self._proven.get((begin, end))
         if proven is None or proven[0] < most or proven[1] < tenths:
             seen, actions = self.seen[begin:end], self.actions[begin : end - 1]
@@ -186,7 +213,7 @@ class Blocks:
         return True
 
     def _known_cost(self, begin: int, end: int) -> int:
-        """What the known map's faults cost among these steps, and the links between them."""
+        """What the known map's faults cost at these steps and at the links between them."""
         last = {"misread": end, "slipped": end - 1}
         return sum(
             sum(

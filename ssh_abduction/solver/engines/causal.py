@@ -1,4 +1,8 @@
-"""The engine for the causal theory on long traces: labels that have names (`engines/naming.py`) are its maps."""
+"""The engine for the causal theory on long traces.
+
+Its maps are labels with named dstates (`engines/naming.py`). It finds the fewest dstates, proves
+that there are no fewer, and lists all maps that have as few.
+"""
 
 from __future__ import annotations
 

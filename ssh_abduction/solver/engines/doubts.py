@@ -1,7 +1,9 @@
-"""Asks for maps in which other steps are one than in those that are known.
+"""Asks for maps that contradict what the known maps share.
 
-What known maps share is in doubt: things that are one in all of them need not be one in all maps, and things that are one in none may be one in another. A
-*doubt* is one such pair. Clingo is told what it takes for a doubt to hold, once, and is then asked for an answer in which any of those that are still open does.
+This serves every engine. Steps that are one dstate, place, path or course in all known maps need
+not be so in all maps, and steps that are so in none may be so in another. A *doubt* is one such
+pair. Clingo is told once what it takes for a doubt to hold. Then it is asked for an answer in which
+some open doubt holds.
 """
 
 from __future__ import annotations
@@ -18,15 +20,12 @@ from ssh_abduction.solver.asp.facts import path_reader, questions
 from ssh_abduction.solver.sharing import Sort
 
 Answer = TypeVar("Answer")
-# That two steps, or two dstates of some labels, are one after all (True), or are not (False): as to their dstate, place, path, or course.
+# What is compared, two steps or two dstates of some labels, and whether they are one after all.
 Doubt: TypeAlias = tuple[Sort, int, int, bool]
 
 
 class Doubts:
-    """The doubts that one control was told of.
-
-    condition  what it takes for two steps, or two dstates, to be one: the body of a rule; None where they never are
-    """
+    """The doubts that one control was told of."""
 
     def __init__(
         self,
@@ -34,6 +33,14 @@ class Doubts:
         control: clingo.Control,
         condition: Callable[[Sort, int, int], str | None],
     ) -> None:
+        """Know no doubt yet.
+
+        Args:
+            asker: Asks clingo.
+            control: The control that is asked.
+            condition: The body of a rule that says when two steps, or two dstates, are one; None
+                if they never are.
+        """
         self._asker, self._control, self._condition = asker, control, condition
         self._told: dict[Doubt, int] = {}  # all that clingo knows, by their numbers
         self._open: set[Doubt] = set()
@@ -42,7 +49,7 @@ class Doubts:
     def answer(
         self, doubts: Collection[Doubt], read: Callable[[clingo.Model], Answer], mode: str
     ) -> Answer | None:
-        """An answer in which any of these doubts holds; None where there is none."""
+        """An answer in which any of these doubts holds; None if there is none."""
         doubts = set(doubts)
         if not doubts:
             return None
@@ -71,12 +78,7 @@ class Doubts:
 
 
 class Settled:
-    """The best maps of some labels, where places and paths are sought for dstates that are settled.
-
-    control  for these places and paths
-    mode     how clingo is asked for the best of them
-    map_of   makes a map of an answer
-    """
+    """The best maps of some labels, for engines that settle dstates before places and paths."""
 
     def __init__(
         self,
@@ -86,13 +88,17 @@ class Settled:
         reader: path_reader.PathReader,
         map_of: Callable[[path_reader.PathAnswer], SSHMap],
     ) -> None:
-        self._asker, self._control, self._mode, self._reader, self._map_of = (
-            asker,
-            control,
-            mode,
-            reader,
-            map_of,
-        )
+        """Nothing is asked yet.
+
+        Args:
+            asker: Asks clingo.
+            control: It has the places and paths of the labels.
+            mode: Clingo's opt-mode for the best of them.
+            reader: Reads the answers.
+            map_of: Makes a map of an answer.
+        """
+        self._asker, self._control, self._mode = asker, control, mode
+        self._reader, self._map_of = reader, map_of
         self._doubts = Doubts(asker, control, reader.condition)
         self._any: SSHMap | None = None
 

@@ -14,8 +14,9 @@ from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.asp.process import in_process
 from ssh_abduction.solver.engines.base import Found
+from ssh_abduction.solver.engines.beside import Beside
 from ssh_abduction.solver.engines.framed_paths import FramedPaths, Naming
-from ssh_abduction.solver.engines.nearby import Beside, NearbySearch
+from ssh_abduction.solver.engines.nearby import NearbySearch
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.engines.visit_labels import VisitLabels
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
@@ -102,7 +103,7 @@ class GuessBeside:
         self.search = self._tried = None
 
     def new_labels(self) -> list[int] | None:
-        """The labels last found, if they were not tried and have fewer dstates than the known map."""
+        """The labels last found, if they are untried and fewer than those of the known map."""
         labels, known = self._thread.labels if self._thread else None, self._visits.known
         if labels is self._tried or not labels or (known and len(set(labels)) >= len(set(known))):
             return None

@@ -1,13 +1,20 @@
-"""The fewest places for dstates that are given, where that needs no search: as many as there are places no two of which can be one.
+"""The fewest places for given dstates, if that needs no search.
 
-In a corridor of forty landmarks, driven there and back, the dstates are known at once. The places of the way there follow each other on one path, so they
-are forty different ones. Fewer places will not do. But clingo has to see that the forty places of the way back cannot be fewer either, and that is a
-pigeonhole problem, which takes clasp minutes.
+This serves the engine without frames. It finds a map with the fewest places, and proves that there
+are no fewer, if as few places are enough as are pairwise distinct.
 
-So a clique of places is sought no two of which can be one: they are *fixed*. Suppose that a map has just as many places. Then each other place is a
-fixed one, its *home*. Along a path, a place that comes after another has a home that can come after that one's home. This leaves few homes, in a corridor one
-for each place, and clingo tries only these. If there is such a map, it has the fewest places, and so have the other minimal maps: all of them are found with
-the same few homes. If there is none, nothing was assumed, and all ways to merge places are tried (`engines/frameless.py`).
+In a corridor of forty landmarks, driven there and back, the dstates are known at once. The places
+of the way there follow each other on one path, so they are forty different ones. Fewer places will
+not do. But clingo has to see that the forty places of the way back cannot be fewer either, and that
+is a pigeonhole problem, which takes clasp minutes.
+
+So a clique of places is looked for that are pairwise distinct: they are *fixed*. Suppose that a map
+has just as many places. Then each other place is a fixed one, its *home*. Along a path, a place
+that comes after another has a home that can come after the home of the other. This leaves few
+homes, in a corridor one for each place, and clingo tries only these. If there is such a map, it has
+the fewest places, and so have the other minimal maps: all of them are found with the same few
+homes. If there is none, nothing was assumed, and all ways to merge places are tried
+(`engines/frameless_paths.py`).
 """
 
 from __future__ import annotations
@@ -24,15 +31,15 @@ from ssh_abduction.solver.engines.paths import pairwise_distinct
 
 
 def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
-    """The fixed places that each place may be, if there are no more places than fixed ones; None where some place can be none of them.
+    """The fixed places that each place may be, if there are no more places than fixed ones.
+
+    None if some place can be none of them.
 
     Args:
         told: What the segments say of places.
     """
-    if any(
-        c == p for c, p in told.elsewhere
-    ):  # the segments contradict each other: no places fit these dstates
-        return None
+    if any(c == p for c, p in told.elsewhere):
+        return None  # the segments contradict each other: no places fit these dstates
     places = told.places
     number = {place: i for i, place in enumerate(places)}
     different = np.zeros((len(places), len(places)), dtype=bool)
@@ -61,7 +68,7 @@ def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
 
 
 def fewest_paths(told: Segments) -> int:
-    """A lower bound on the number of paths: so many segments are pairwise not one path."""
+    """A lower bound on the number of paths: the size of a clique of pairwise distinct segments."""
     return len(pairwise_distinct(told.segments, told.distinct))
 
 
@@ -73,10 +80,10 @@ def _by_segment(steps: list[tuple[int, int, int]]) -> Mapping[int, list[tuple[in
 
 
 def _may_follow(pairs: list[tuple[int, int]], columns: list[int]) -> NDArray[np.bool_]:
-    """Fixed x fixed: whether the second may come after the first one on the path of a segment, as far as the travels along it say.
+    """Whether one fixed place may come after another on the path of a segment: fixed x fixed.
 
     Args:
-        pairs: For each travel of the segment the places that it leads between, in the direction of the segment.
+        pairs: For each travel of the segment, the places that it leads between, in its direction.
         columns: The fixed places.
     """
     members = sorted({place for pair in pairs for place in pair})

@@ -20,8 +20,8 @@ from ssh_abduction.solver.asp.control import Asker, give_threads
 from ssh_abduction.solver.asp.facts import names_lp
 from ssh_abduction.solver.asp.limits import POLL, LimitError, Watch
 from ssh_abduction.solver.engines.base import Task
+from ssh_abduction.solver.engines.beside import Beside
 from ssh_abduction.solver.engines.name_program import Fitting, NameProgram
-from ssh_abduction.solver.engines.nearby import Beside
 from ssh_abduction.solver.engines.refusing import first_accepted_of
 from ssh_abduction.solver.engines.small_maps import SmallMaps
 from ssh_abduction.solver.steps.chart import Link

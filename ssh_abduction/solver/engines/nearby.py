@@ -1,11 +1,10 @@
 """Small maps near a guess, and the proof that none is smaller, from the guess outwards.
 
 This serves the causal theory, and the causal axioms of theories with frames. `NearbySearch` yields
-ever smaller maps; when it ends with a `bound`, the last one is minimal. `Beside` runs such a search
-in a thread of its own.
+ever smaller maps; when it ends with a `bound`, the last one is minimal.
 
-To find a map of the fewest dstates takes long if all steps are free. So most of them stay where a
-known map has them. The search tries to spare one dstate. If that is impossible, clingo returns a
+If all steps were free, the search would take long. So most of them stay where a known map has them.
+The search tries to spare one dstate. If that is impossible, clingo returns a
 core of assumptions: the steps that are in the way. Their dstates become free, until some steps can
 move, or it is shown that the dstate is needed. If that stays open, all steps of some part of the
 map become free at once; the parts are as large as can be settled soon (large neighbourhood search:
@@ -28,26 +27,14 @@ The nodes need not be the steps of a trace. If places have frames, they are thos
 `Chart.framed`, and rotations are links like actions. What is found then need not fit a frame, as
 names.lp does not know how rotations compose; but the bound holds. Names are poor at raising that
 bound core by core, which is why `engines/visit_labels.py` has none, but good at this.
-
-In the causal theory clasp uses its configuration `tweety`, which proves several times as soon as
-its default. With frames its default is better, above all to list answers.
 """
 
 from __future__ import annotations
 
 import random
-import threading
 import time
 from collections import Counter, deque
-from collections.abc import (
-    Callable,
-    Collection,
-    Generator,
-    Iterable,
-    Iterator,
-    Mapping,
-    Sequence,
-)
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
@@ -58,7 +45,7 @@ import numpy as np
 from ssh_abduction.solver.asp.control import Asker, give_threads, has_processors, new_control
 from ssh_abduction.solver.asp.facts import names_lp
 from ssh_abduction.solver.asp.facts.atoms import numbers
-from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart, numbered
@@ -66,15 +53,13 @@ from ssh_abduction.theory.speedups import Speedups
 
 # After this many conflicts a question is left open, at first; each round of questions doubles it.
 CONFLICTS = 2000
-# A question that assumes nothing of where steps are decides more: it may take this many times as
-# many conflicts.
+# A question that assumes nothing of where steps are may take this many times as many conflicts.
 WIDE = 10
 # Draw this many parts of the map in vain before anything else is tried.
 REGIONS = 40
 # Such a part has this many dstates at first, and at least.
 FIRST_REGION = 10
-# It gets this many dstates more if it is shown not to need fewer, and this many less if that was
-# left open.
+# It gets this many dstates more if it is shown to need them, and this many less if that is open.
 LARGER, SMALLER = 2, 4
 # After grounding, clingo prepares to solve for about as long again, and cannot be stopped.
 PREPARING = 1.0
@@ -85,7 +70,7 @@ AT_A_TIME = 100
 SECONDS_A_CHARACTER = 1e-6
 
 Labels: TypeAlias = list[int]
-_Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label
+Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label
 _Verdict: TypeAlias = Literal["moved", "needed", "open"]
 
 
@@ -161,7 +146,7 @@ class NearbySearch:
         """
         if known := self._pinned.chart.is_map(guess):
             yield list(guess)
-        guessed = _keys(guess, self._pinned.chart)
+        guessed = seen_labels(guess, self._pinned.chart)
         name_of = {
             guessed[node]: name for name, node in reversed(list(enumerate(self._pinned.clique)))
         }
@@ -506,83 +491,8 @@ class NearbySearch:
         self._label([renamed.get(name, name) for name in self._labels])
 
 
-def mended(guess: Sequence[int], chart: Chart) -> list[int]:
-    """Mend a guess: put each node where the same action from the same dstate mostly leads.
-
-    That mends a few wrong labels: from a right one on, all that follow become right.
-
-    Args:
-        guess: A label of each node, -1 where it is not known.
-        chart: The nodes and links.
-
-    Returns:
-        The mended labels. A label stays if the view at the node speaks against the new one.
-    """
-    keys = _keys(guess, chart)
-    leads: dict[tuple[_Key, int], Counter[_Key]] = {}
-    for t, action, u in chart.links:
-        if (here := keys[t]) is not None and (there := keys[u]) is not None:
-            leads.setdefault((here, action), Counter())[there] += 1
-    most = {key: counts.most_common(1)[0][0] for key, counts in leads.items()}
-    for t, action, u in chart.links:
-        if (
-            (here := keys[t]) is not None
-            and (likely := most.get((here, action))) is not None
-            and likely[0] == chart.seen[u]
-        ):
-            keys[u] = likely
-    return [-1 if key is None else key[1] for key in keys]
-
-
-def _keys(guess: Sequence[int], chart: Chart) -> list[_Key | None]:
+def seen_labels(guess: Sequence[int], chart: Chart) -> list[Key | None]:
     """The observation and the label of each node; None where the label is not known."""
     return [
         None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)
     ]
-
-
-class Beside:
-    """A search for small maps in a thread of its own.
-
-    Threads help, as numpy and clingo release Python's lock while they work.
-
-    Attributes:
-        labels: Those of the last map found, if any.
-        bound: That of the search, once the search is over.
-    """
-
-    def __init__(self, search: NearbySearch, watch: Watch, found: Iterator[Labels]) -> None:
-        self.labels: Labels | None = None
-        self.bound = 0
-        self._watch = watch
-        self._held = [search, found]  # until they are freed
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, args=(search, found), daemon=True)
-        self._thread.start()
-
-    @property
-    def running(self) -> bool:
-        """Whether the thread is still at work."""
-        return self._thread.is_alive()
-
-    def check(self) -> None:
-        """Raise the error that ended the thread, if one did."""
-        if self._error is not None:
-            raise self._error
-
-    def end(self) -> None:
-        """Stop the search, and wait until the thread has ended."""
-        self._watch.interrupted = True
-        self._thread.join()
-        # To free clingo's control may take seconds. Nobody has to wait for that.
-        threading.Thread(target=self._held.clear).start()
-
-    def _run(self, search: NearbySearch, found: Iterator[Labels]) -> None:
-        try:
-            for labels in found:
-                self.labels = labels
-            self.bound = search.bound or 0
-        except LimitError:
-            pass
-        except BaseException as error:
-            self._error = error

@@ -1,22 +1,27 @@
-"""Questions to paths_framed.lp: what order and sides say of the dstates of a trace whose places have frames, and which guesses they let be maps.
+"""Questions to paths_framed.lp: what order and sides say of dstates, and guesses that become maps.
 
-What takes a choice of places and paths is asked by an engine, under its limits (`engines/framed.py`). What is asked here takes none, or
-hardly any: so little time that some conflicts are limit enough.
+This serves the engine with frames. What takes a choice of places and paths is asked in
+`engines/framed_paths.py`, under the limits of the engine. What is asked here takes none, or hardly
+any: some conflicts are limit enough.
 
-*A guess.* Visits are annealed (`guesses/annealing.py`). Where the guess cannot be right its places are let free, and what is there is
-merged by evidence (`guesses/merging.py`), while paths_framed.lp says which visits cannot be one, and which have to be, and which merge leads to
-no paths: so a guess becomes a map.
+*A guess.* Visits are annealed (`guesses/annealing.py`). If the guess cannot be right, its places
+become free, and what is there is merged by evidence (`guesses/merging.py`). Meanwhile
+paths_framed.lp says which visits cannot be one, which have to be, and which merge leads to no
+paths. So a guess becomes a map.
 
-*Taken back.* Where what is known by then has no paths, the first merge that shows it is found by bisection, and the two classes that it
-made one are apart from then on. Where the guess itself has no paths, its places are taken in order, those visited once first and then
-those visited most; the first place with which there are no paths is left out of the guess, a few at most. Where a guess leads to no map,
-another one follows, with more spare names for places: places that fall together where names are short do not come apart later.
+*Taken back.* If what is known by then has no paths, the first merge that shows it is found by
+bisection, and the two classes that it made one are apart from then on. If the guess itself has no
+paths, its places are taken in order: those visited once first, then those visited most. The first
+place with which there are no paths is left out of the guess, a few at most. If a guess leads to no
+map, another one follows, with more spare names for places: places that fall together when names are
+short do not come apart later.
 
-*Separate paths.* To see that dstates have paths at all, no two places that turns do not join, and no two segments of a path, are taken
-for one unless they have to be. That takes a small part of the time that it takes to ground all ways to merge them.
+*Separate paths.* To see that dstates have paths at all, no two places that turns do not join, and
+no two segments of a path, are taken for one unless they have to be. That takes a small part of the
+time that it takes to ground all ways to merge them.
 
-*Pinned.* For the fewest paths, segments no two of which can be one path are paths of their own, and the other segments choose among these
-first.
+*Pinned.* For the fewest paths, pairwise distinct segments are paths of their own, and the other
+segments choose among these first.
 """
 
 from __future__ import annotations
@@ -50,27 +55,28 @@ from ssh_abduction.theory.theory import Theory
 
 # So clasp lists the answers in which no atom that is shown can be spared.
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
-# Of a trace that has more than twice as many pairs of visits that may be one, the beginning with so many is guessed first: annealing takes time for each pair.
+# If more than twice as many pairs of visits may be one, guess the beginning with this many pairs
+# first: annealing takes time for each pair.
 FIRST_PAIRS = 200_000
-# A guess at the beginning says where the visits of the whole trace are if it leaves this share of them open at most. With more it is worth little.
+# Continue a guess at the beginning if it leaves at most this share of the visits open. With more it
+# is worth little.
 LOST = 0.05
-# After so many conflicts it is left open whether there are separate paths: the question is asked thousands of times, and mostly decided without a conflict.
+# After this many conflicts it is left open whether there are separate paths: the question is asked
+# thousands of times, and mostly decided without a conflict.
 TRYING = 500
-# So many places, at most, are left out of a guess so that the others have paths. A guess that is wrong about more is better made anew.
+# Leave at most this many places out of a guess so that the others have paths. A guess that is wrong
+# about more is better made anew.
 LEFT_OUT = 3
-# So many times the time, and the memory, that grounding places and paths took clasp takes before it can be stopped, about.
+# Clasp prepares for about these multiples of the time and the memory that grounding took. It cannot
+# be stopped meanwhile.
 PREPARING = (1.6, 2.1)
-# Where a guess cannot be right, the places less than so many travels away are let free, too, as a wrong place mostly has a wrong neighbour.
+# If a guess cannot be right, the places less than this many travels away become free, too: a wrong
+# place mostly has a wrong neighbour.
 LOOSENED = 2
 
 
 class Paths:
-    """The axioms of places and paths, for charts of one trace.
-
-    pinned     whether segments no two of which can be one path are named as paths beforehand
-    check      called now and then while clingo grounds; may raise. A process that is sent these questions has its own, so this does not go along
-    forbidden  sets of equalities of steps that do not all hold, as evidence found out
-    """
+    """The axioms of places and paths, for charts of one trace."""
 
     def __init__(
         self,
@@ -81,6 +87,16 @@ class Paths:
         check: Callable[[], None] = lambda: None,
         forbidden: Sequence[Collection[Equality]] = (),
     ) -> None:
+        """Questions about a trace.
+
+        Args:
+            trace: The trace.
+            theory: The settled theory.
+            pinned: Whether pairwise distinct segments are named as paths beforehand.
+            check: Called now and then while clingo grounds; it may raise. It is not sent along to
+                another process, which has its own.
+            forbidden: Sets of equalities of steps that evidence found out cannot all hold.
+        """
         self._trace = trace
         self._theory = theory
         self._pinned = pinned
@@ -94,7 +110,7 @@ class Paths:
         )
 
     def _under(self, check: Callable[[], None]) -> Paths:
-        """The same questions, which these limits end."""
+        """The same questions under these limits."""
         return Paths(
             self._trace, self._theory, pinned=self._pinned, check=check, forbidden=self._forbidden
         )
@@ -118,7 +134,10 @@ class Paths:
         return control
 
     def clashing(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
-        """A control whose answers are the minimal sets of nodes whose labels no paths fit, as far as that takes no choice of paths."""
+        """A control whose answers are minimal sets of nodes whose labels no paths fit.
+
+        It finds only those that show without a choice of paths.
+        """
         control = self.control(chart, SMALLEST)
         control.add("base", [], paths_lp.open_labels(labels))
         control.ground([("base", [])])
@@ -133,7 +152,15 @@ class Paths:
         *,
         single: bool,
     ) -> clingo.Control:
-        """A control for the paths that fit the labels of all nodes, or of these; or only for single ones, none of which is taken for another."""
+        """A control for the paths that fit labels.
+
+        Args:
+            chart: The nodes.
+            labels: The dstate of each node.
+            options: Of clasp.
+            nodes: The nodes whose labels have to fit; all of them by default.
+            single: Ask only for separate paths, none of which is taken for another.
+        """
         control = self.control(chart, options)
         control.load_encodings("preference")
         nodes = range(len(labels)) if nodes is None else nodes
@@ -155,7 +182,13 @@ class Paths:
     def telling(
         self, chart: FramedChart, labels: Sequence[int], loose: Iterable[int]
     ) -> clingo.Control:
-        """A control for what holds wherever the nodes are at these dstates, though loose ones may turn out to be others."""
+        """A control for what holds in each map in which the nodes are at these dstates.
+
+        Args:
+            chart: The nodes.
+            labels: The dstate of each node.
+            loose: Dstates that may turn out to be others.
+        """
         control = self.control(chart)
         control.add(
             "base", [], f"{paths_lp.settled_labels(enumerate(labels))}\n{paths_lp.loose(loose)}"
@@ -164,7 +197,10 @@ class Paths:
         return control
 
     def told(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
-        """Which nodes are apart, and which are one, where these labels hold of all nodes but some; None where that cannot be."""
+        """Which nodes are apart, and which are one, if all labels but the loose ones hold.
+
+        None if they cannot hold.
+        """
         control = self.telling(chart, labels, {labels[node] for node in loose})
         with control.solve(yield_=True) as handle:
             model = handle.model()
@@ -176,7 +212,7 @@ class Paths:
         return _apart(chart, labels, elsewhere), [(first[a], first[b]) for a, b in one]
 
     def may_fit(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
-        """Whether these labels, which hold of all nodes but some, may be those of a map, as far as separate paths tell."""
+        """Whether labels, except the loose ones, may be those of a map with separate paths."""
         control = self.control(chart)
         control.add("base", [], paths_lp.settled_labels(enumerate(labels)))
         control.ground([("base", [])])
@@ -185,7 +221,10 @@ class Paths:
     def has_separate(
         self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None
     ) -> bool | None:
-        """Whether the labels of all nodes, or of these, have paths, as far as separate ones tell. None where that is not soon known."""
+        """Whether the labels of all nodes, or of these, have separate paths.
+
+        None if that is not soon known.
+        """
         options = [f"--solve-limit={TRYING}"]
         return self.settled(chart, labels, options, nodes, single=True).solve().satisfiable
 
@@ -197,9 +236,11 @@ class Paths:
         )
 
     def guessed_labels(self, chart: FramedChart, watch: Watch) -> list[int]:
-        """Labels of a map of the causal axioms: one that has paths, as far as separate ones tell, or where that is not soon found one of few dstates.
+        """Labels of a map of the causal axioms, if possible one that has separate paths.
 
-        Of a long trace the beginning is guessed, and the rest as that says; where that is no map, twice as many visits, and so on.
+        If no such map is soon found, it is one of few dstates. Of a long trace the beginning is
+        guessed, and continued along the rest. If that leads to no map, twice as many visits are
+        guessed, and so on.
         """
         asked = self._under(watch.check)
         visits = chart.visits_with(FIRST_PAIRS)
@@ -232,7 +273,7 @@ class Paths:
     def _continued(
         self, chart: FramedChart, part: FramedChart, known: Sequence[int], check: Callable[[], None]
     ) -> list[int] | None:
-        """Such labels of all visits near those of a beginning, if these say where most visits are."""
+        """Labels of all visits near those of a beginning, if these say where most visits are."""
         states = tracked(chart, dict(enumerate(states_of(part, known))))
         if states.count(-1) > LOST * len(states):
             return None
@@ -248,10 +289,13 @@ class Paths:
         start: Sequence[int],
         check: Callable[[], None] = lambda: None,
     ) -> list[int] | None:
-        """Labels near these, which are -1 where they are not known, of a map that has paths, as far as separate ones tell; None if none is soon found.
+        """Labels near a guess, of a map that has separate paths; None if none is soon found.
 
-        apart  which nodes are apart, nodes x nodes
-        check  called now and then; may raise
+        Args:
+            chart: The nodes.
+            apart: Which nodes are apart, nodes x nodes.
+            start: The guess, -1 where it is not known.
+            check: Called now and then; it may raise.
         """
         tell = partial(self._told_if_separate, chart)
         likely = self._likely(chart, apart, start, check)
@@ -265,14 +309,14 @@ class Paths:
     def _told_if_separate(
         self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]
     ) -> Told | None:
-        """As `told`; None where the others have no paths either, as far as separate ones tell."""
+        """As `told`; also None if the labels that are not loose have no separate paths."""
         told = self.told(chart, labels, loose)
         return told if told and self._may_have_separate(chart, labels, loose) else None
 
     def _likely(
         self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]
     ) -> list[int] | None:
-        """A guess without those of its places with which it has no paths, if they are few: -1 there."""
+        """A guess without places with which it has no paths, -1 there; None if they are many."""
         states = states_of(chart, kept(apart, chart.links, start))
         visits = Counter(state // 4 for state in states)
         # What was visited once cannot be wrong by itself, and hardly what was visited often.
@@ -302,7 +346,12 @@ class Paths:
 
 
 def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
-    """As many members as are soon found no two of which can be one, as these pairs cannot. They are segments, or places."""
+    """A large clique of pairwise distinct segments, or places, that is soon found.
+
+    Args:
+        members: All segments or places.
+        pairs: Those that are not one.
+    """
     number = {member: i for i, member in enumerate(members)}
     rivals = np.zeros((len(members), len(members)), dtype=bool)
     for g, h in pairs:
@@ -313,13 +362,18 @@ def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) 
 def _apart(
     chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]
 ) -> Matrix:
-    """Nodes x nodes: they are of visits some nodes of which have labels that are at different places."""
+    """Which nodes are of visits that have labels at different places: nodes x nodes.
+
+    Args:
+        chart: The nodes.
+        labels: The dstate of each node.
+        elsewhere: Pairs of dstates that are at different places.
+    """
     pairs = np.array(list(elsewhere), dtype=int).reshape(-1, 2)
     different = np.zeros((max(labels) + 1,) * 2, dtype=bool)
     different[pairs[:, 0], pairs[:, 1]] = different[pairs[:, 1], pairs[:, 0]] = True
-    visits = np.array(
-        [visit for visit, _ in chart.facing]
-    )  # in order, as nodes are numbered by the first step at them
+    # The visits are in order, as nodes are numbered by the first step at them.
+    visits = np.array([visit for visit, _ in chart.facing])
     starts = np.flatnonzero(np.diff(visits, prepend=-1))
     rows = np.logical_or.reduceat(different[list(labels)], starts, axis=0)
     apart = np.logical_or.reduceat(rows[:, list(labels)], starts, axis=1)

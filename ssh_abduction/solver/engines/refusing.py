@@ -1,7 +1,7 @@
-"""The one loop for what is found out only of an answer: whoever refuses it says why, that is forbidden, and clingo is asked again.
+"""The loop that asks for an answer, refuses it for a reason, forbids that, and asks again.
 
-What is forbidden takes away only answers that are no maps. So what clingo solves is a relaxation until nothing is refused, its bounds hold, and the
-first answer that nothing refuses is as good as any.
+What is forbidden takes away only answers that are no maps. So what clingo solves is a relaxation
+until nothing is refused, its bounds hold, and the first answer that is accepted is as good as any.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ def first_accepted(
     refuse: Callable[[Answer], Reason | None],
     forbid: Callable[[Reason], None],
 ) -> Answer | None:
-    """The first answer that nothing refuses; None where there is no answer left.
+    """The first answer that is not refused; None if there is no answer left.
 
-    ask     gives the next answer, now that something is forbidden
-    refuse  why an answer is none after all; None where it is one
-    forbid  what lets answers not be given again for this reason
+    Args:
+        ask: Gives the next answer by what is forbidden so far; None if there is none.
+        refuse: Why an answer is refused; None if it is accepted.
+        forbid: Keeps answers from being given again for this reason.
     """
     while (answer := ask()) is not None:
         reason = refuse(answer)
@@ -40,7 +41,10 @@ def first_accepted_of(
     refuse: Callable[[Answer], Reason | None],
     forbid: Callable[[Reason], None],
 ) -> Generator[Meanwhile, None, Answer | None]:
-    """The same as `first_accepted`, where asking takes long: what is found meanwhile is yielded, and the answer is what `ask` returns."""
+    """As `first_accepted`, for an `ask` that takes long.
+
+    What `ask` yields meanwhile is yielded; what it returns is the answer.
+    """
     while (answer := (yield from ask())) is not None:
         reason = refuse(answer)
         if reason is None:
@@ -56,11 +60,14 @@ def all_accepted(
     key: Callable[[Answer], Hashable],
     known: set[Hashable],
 ) -> Generator[Answer, None, None]:
-    """All answers that nothing refuses, each once. Parameters as in `first_accepted`, but for
+    """All answers that are not refused, each once.
 
-    ask    lists the answers anew, now that something is forbidden
-    key    what answers that are the same have in common
-    known  the keys of answers that are not to be given
+    Args:
+        ask: Lists the answers by what is forbidden so far.
+        refuse: Why an answer is refused; None if it is accepted.
+        forbid: Keeps answers from being given again for this reason.
+        key: Equal for answers that are the same.
+        known: The keys of answers to leave out. Those of accepted answers are added.
     """
     while True:
         reason: Reason | None = None

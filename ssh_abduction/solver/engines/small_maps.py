@@ -13,12 +13,13 @@ only the beginning is guessed; the guess is then followed along the rest
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 
 from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.engines.base import AT_ONCE, Task
-from ssh_abduction.solver.engines.nearby import NearbySearch, mended
+from ssh_abduction.solver.engines.nearby import Key, NearbySearch, seen_labels
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.guesses.annealing import annealed, annealed_steps
 from ssh_abduction.solver.guesses.continuing import followed
@@ -45,7 +46,11 @@ class SmallMaps:
         self._task, self._pinned = task, pinned
 
     def search(self, watch: Watch) -> NearbySearch:
-        """A search near a guess, under these limits."""
+        """A search near a guess, under these limits.
+
+        In the causal theory clasp's configuration `tweety` proves several times as soon as its
+        default. With frames its default is better, above all to list answers.
+        """
         chart = self._pinned.chart
         return NearbySearch(
             watch,
@@ -121,3 +126,31 @@ class SmallMaps:
             if steps.is_map(guess):
                 break
         return guess
+
+
+def mended(guess: Sequence[int], chart: Chart) -> list[int]:
+    """Mend a guess: put each node where the same action from the same dstate mostly leads.
+
+    That mends a few wrong labels: from a right one on, all that follow become right.
+
+    Args:
+        guess: A label of each node, -1 where it is not known.
+        chart: The nodes and links.
+
+    Returns:
+        The mended labels. A label stays if the view at the node speaks against the new one.
+    """
+    keys = seen_labels(guess, chart)
+    leads: dict[tuple[Key, int], Counter[Key]] = {}
+    for t, action, u in chart.links:
+        if (here := keys[t]) is not None and (there := keys[u]) is not None:
+            leads.setdefault((here, action), Counter())[there] += 1
+    most = {key: counts.most_common(1)[0][0] for key, counts in leads.items()}
+    for t, action, u in chart.links:
+        if (
+            (here := keys[t]) is not None
+            and (likely := most.get((here, action))) is not None
+            and likely[0] == chart.seen[u]
+        ):
+            keys[u] = likely
+    return [-1 if key is None else key[1] for key in keys]

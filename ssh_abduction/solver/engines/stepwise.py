@@ -1,4 +1,8 @@
-"""The engine that grounds the readable encodings, step by step: every theory can be asked of it."""
+"""The engine that grounds the readable encodings, step by step.
+
+It serves every theory. Its maps are all minimal ones of the prefix; other engines are faster for
+the theories that they serve.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,8 @@ from ssh_abduction.theory.fields import Count
 
 # A prefix grows by this factor at least, so that there are few of them.
 GROWTH = 1.25
-# So many steps are grounded in one call until the prefix has FIRST_STEPS: for a short prefix the call costs more than the steps.
+# Ground this many steps in one call until the prefix has FIRST_STEPS: for a short prefix the call
+# costs more than the steps.
 AT_FIRST, FIRST_STEPS = 8, 32
 
 
@@ -38,10 +43,10 @@ class StepEngine:
         self._task = task
         self._asked: int | None = None  # the step that is the last one, as far as clingo knows
         self._forbidden: list[Collection[Equality]] = []
-        self._number: tuple[int, Count] | None = (
-            None  # how many dstates, places or paths maps have, where somebody asked for just so many
-        )
-        # Seconds and MiB that it took to ground the last step: the next one takes about as much, and cannot be stopped.
+        # How many dstates, places or paths maps have, if somebody asked for an exact number.
+        self._number: tuple[int, Count] | None = None
+        # Seconds and MiB that it took to ground the last step. The next one takes about as much,
+        # and cannot be stopped.
         self._last_step = 0.0, 0.0
         control = self.asker.control
         self._doubts = Doubts(self.asker, control, questions.steps_are_one)
@@ -112,9 +117,8 @@ class StepEngine:
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         if most:
             configuration: Any = self.asker.control.configuration
-            configuration.solver.opt_strategy = (
-                "usc"  # as a good map is known, what is missing is a bound
-            )
+            # As a good map is known, a bound is missing.
+            configuration.solver.opt_strategy = "usc"
         if self._task.theory.priorities:
             return self.asker.answers(self._read, ",".join(["opt", *map(str, most)]), 0)
         return self.asker.answers(self._read, "ignore", 1)
@@ -124,7 +128,12 @@ class StepEngine:
         return self.asker.answers(self._read, f"enum,{bound}" if bound else "ignore", 0)
 
     def map_with(self, doubts: Collection[Doubt], cost: tuple[int, ...]) -> SSHMap | None:
-        """A map of the prefix that costs at most this, in which any of these doubts about steps holds; None where there is none."""
+        """A map of the prefix in which any of these doubts about steps holds; None if none does.
+
+        Args:
+            doubts: About steps.
+            cost: What the map costs at most.
+        """
         found = self._doubts.answer(
             doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore"
         )
@@ -139,7 +148,7 @@ class StepEngine:
         return True
 
     def ask_for(self, number: int, count: Count) -> None:
-        """From now on maps have just so many dstates, places or paths, and the prefix does not grow any more."""
+        """From now on maps have exactly this many of `count`. The prefix must not grow any more."""
         if self._number is not None:
             self.asker.control.release_external(questions.of_number(*self._number))
         self._number = number, count
@@ -174,7 +183,13 @@ class StepEngine:
 
 
 def paths_needed(task: Task, size: int, cost: tuple[int, ...] | None) -> int:
-    """How many names for paths it takes to be sure that no map of the prefix has another cost, or is missed at this one."""
+    """How many names for paths are enough to prove the cost of a prefix, or to list its maps.
+
+    Args:
+        task: The problem and the speed-ups.
+        size: How many steps the prefix has.
+        cost: The cost of its maps; None if it is not known.
+    """
     theory = task.theory
     segments = readable.most_paths(task.trace, theory, size)
     first = theory.priorities[0] if theory.priorities else None

@@ -22,8 +22,7 @@ the visits of the clique. An answer says where the others are, too (`steps/local
 does not, clingo is told of these visits, and of as many before them as it takes. Fewer visits are a
 relaxation, and an answer that says where all visits are is an answer for all of them.
 
-*From below.* Cores raise the bound (`Cores`). Each optimum of the whole holds what is asked for in
-the end, so these answers are all minimal ones. Clasp has that built in, but begins anew with each
+*From below.* Cores raise the bound (`Cores`). Clasp has that built in, but begins anew with each
 call, and an answer that fails to be transitive is a call.
 
 *Near a guess.* If that takes long, clingo is asked for answers in which visits are one that are one
@@ -34,7 +33,6 @@ bound, they do.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 from itertools import combinations, islice
@@ -46,8 +44,13 @@ from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.solver.engines.refusing import first_accepted, smaller
-from ssh_abduction.solver.engines.transitive import Pair, Three
-from ssh_abduction.solver.engines.visit_program import Sides, VisitProgram, fits_in_time
+from ssh_abduction.solver.engines.visit_program import (
+    Answer,
+    Refusal,
+    Sides,
+    VisitProgram,
+    fits_in_time,
+)
 from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
 from ssh_abduction.solver.steps.localising import Located, states_of
@@ -76,34 +79,6 @@ class Open(Enum):
 
 
 OPEN: Final = Open.OPEN
-
-
-@dataclass
-class _Answer:
-    """An answer of clingo.
-
-    Attributes:
-        pairs: The visits that are at one place.
-        everywhere: Where all visits are, once the pairs are known to be transitive.
-        is_open: Whether the answer is not known yet.
-    """
-
-    pairs: Sequence[Pair] = ()
-    everywhere: Located | None = None
-    is_open: bool = False
-
-
-@dataclass(frozen=True)
-class _Reason:
-    """Why an answer is refused.
-
-    Attributes:
-        threes: Visits on which it is not transitive.
-        missed: Visits whose places it does not say, if it is transitive.
-    """
-
-    threes: Sequence[Three]
-    missed: Collection[int]
 
 
 class VisitLabels:
@@ -240,38 +215,23 @@ class VisitLabels:
                 self._found.append(self.known)
                 break
             answer = first_accepted(
-                partial(self._best_answer, until), self._why_not, self._tell_why
+                partial(self._best_answer, until), self.program.why_not, self._tell_why
             )
             if answer is None:
                 return None
             if answer.is_open:
                 return OPEN
-            self._found.append(self._labels_by(answer))
+            self._found.append(self.program.labels(answer.located))
         return list(self._found[0])
 
-    def _why_not(self, answer: _Answer) -> _Reason | None:
-        """Why an answer is refused; None if it is not."""
-        if answer.is_open:
-            return None
-        threes = self.program.intransitive(answer.pairs)
-        if not threes:
-            answer.everywhere = self.program.located(answer.pairs)
-        missed = answer.everywhere.missed if answer.everywhere else ()
-        return _Reason(threes, missed) if threes or missed else None
-
-    def _tell_why(self, reason: _Reason) -> None:
+    def _tell_why(self, reason: Refusal) -> None:
         """Tell clingo why an answer was refused."""
         if reason.threes:
             self.program.close(reason.threes)
         else:
             self._give_more(reason.missed)
 
-    def _labels_by(self, answer: _Answer) -> tuple[int, ...]:
-        """The labels by an answer that was not refused."""
-        assert answer.everywhere is not None
-        return self.program.labels(answer.everywhere)
-
-    def _best_answer(self, until: Callable[[], bool]) -> _Answer | None:
+    def _best_answer(self, until: Callable[[], bool]) -> Answer | None:
         """An answer with the fewest lone nodes; None if there is none."""
         program = self.program
         if not self._task.speedups.core_guided:
@@ -281,14 +241,14 @@ class VisitLabels:
                 return None
             pairs, program.cores.least = better[-1]
             self._raise_bound()
-            return _Answer(pairs)
+            return Answer(pairs)
         while True:
             if until():
-                return _Answer(is_open=True)
+                return Answer(is_open=True)
             avoided = list(program.cores.avoided)
             pairs_found, core = self._asker.verdict(program.read, avoided, until=until)
             if core is None:
-                return _Answer(pairs_found or (), is_open=pairs_found is None)
+                return Answer(pairs_found or (), is_open=pairs_found is None)
             if not core:
                 return None
             program.cores.relax(core)
@@ -340,10 +300,10 @@ class VisitLabels:
                     }
                 else:
                     return
-            elif (reason := self._why_not(answer := _Answer(pairs_found or []))) is not None:
+            elif (reason := self.program.why_not(answer := Answer(pairs_found or []))) is not None:
                 self._tell_why(reason)
             else:
-                yield self._labels_by(answer)
+                yield program.labels(answer.located)
 
     def _together_impossible(self, places: list[int], place_of: Mapping[int, int]) -> list[int]:
         """A small subset of places that cannot all be as guessed."""
@@ -431,13 +391,13 @@ class VisitLabels:
     def _other(self, dstates: int) -> tuple[int, ...] | None:
         """Labels with this many dstates that were not excluded; None if there are none."""
 
-        def ask() -> _Answer | None:
+        def ask() -> Answer | None:
             mode, assumed = self._asking_for(dstates)
             found, _ = self._asker.verdict(self.program.read, assumed, mode=mode)
-            return None if found is None else _Answer(found)
+            return None if found is None else Answer(found)
 
-        answer = first_accepted(ask, self._why_not, self._tell_why)
-        return None if answer is None else self._labels_by(answer)
+        answer = first_accepted(ask, self.program.why_not, self._tell_why)
+        return None if answer is None else self.program.labels(answer.located)
 
     def _asking_for(self, dstates: int) -> tuple[str, list[int]]:
         """How clingo is asked for at most this many dstates: its opt-mode, and assumptions."""

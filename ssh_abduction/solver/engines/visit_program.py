@@ -6,7 +6,7 @@ relaxation, so what clingo proves of them holds of the trace.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -88,6 +88,40 @@ class Cores:
         if count <= self._sizes[core]:
             self._asker.control.ground([("over", numbers(core, count))])
             self.avoid(visits_lp.over(core, count))
+
+
+@dataclass
+class Answer:
+    """An answer of clingo.
+
+    Attributes:
+        pairs: The visits that are at one place.
+        everywhere: Where all visits are, once the pairs are known to be transitive.
+        is_open: Whether the answer is not known yet.
+    """
+
+    pairs: Sequence[Pair] = ()
+    everywhere: Located | None = None
+    is_open: bool = False
+
+    @property
+    def located(self) -> Located:
+        """Where all visits are, in an answer that was not refused."""
+        assert self.everywhere is not None
+        return self.everywhere
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why an answer is refused.
+
+    Attributes:
+        threes: Visits on which it is not transitive.
+        missed: Visits whose places it does not say, if it is transitive.
+    """
+
+    threes: Sequence[Three]
+    missed: Collection[int]
 
 
 @dataclass
@@ -272,6 +306,16 @@ class VisitProgram:
         return tuple(
             numbered(faced(everywhere.states[visit], slot) for visit, slot in self.chart.facing)
         )
+
+    def why_not(self, answer: Answer) -> Refusal | None:
+        """Why an answer is refused; None if it is not."""
+        if answer.is_open:
+            return None
+        threes = self.intransitive(answer.pairs)
+        if not threes:
+            answer.everywhere = self.located(answer.pairs)
+        missed = answer.everywhere.missed if answer.everywhere else ()
+        return Refusal(threes, missed) if threes or missed else None
 
     def standing(self, labels: Sequence[int]) -> dict[int, tuple[int, int]]:
         """The visit and slot of some node at each dstate, as far as clingo knows of any."""

@@ -1,0 +1,56 @@
+"""Runs a search for small maps in a thread of its own, beside the search of an engine."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+from ssh_abduction.solver.asp.limits import LimitError, Watch
+from ssh_abduction.solver.engines.nearby import Labels, NearbySearch
+
+
+class Beside:
+    """A search for small maps in a thread of its own.
+
+    Threads help, as numpy and clingo release Python's lock while they work.
+
+    Attributes:
+        labels: Those of the last map found, if any.
+        bound: That of the search, once the search is over.
+    """
+
+    def __init__(self, search: NearbySearch, watch: Watch, found: Iterator[Labels]) -> None:
+        self.labels: Labels | None = None
+        self.bound = 0
+        self._watch = watch
+        self._held = [search, found]  # until they are freed
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, args=(search, found), daemon=True)
+        self._thread.start()
+
+    @property
+    def running(self) -> bool:
+        """Whether the thread is still at work."""
+        return self._thread.is_alive()
+
+    def check(self) -> None:
+        """Raise the error that ended the thread, if one did."""
+        if self._error is not None:
+            raise self._error
+
+    def end(self) -> None:
+        """Stop the search, and wait until the thread has ended."""
+        self._watch.interrupted = True
+        self._thread.join()
+        # To free clingo's control may take seconds. Nobody has to wait for that.
+        threading.Thread(target=self._held.clear).start()
+
+    def _run(self, search: NearbySearch, found: Iterator[Labels]) -> None:
+        try:
+            for labels in found:
+                self.labels = labels
+            self.bound = search.bound or 0
+        except LimitError:
+            pass
+        except BaseException as error:
+            self._error = error
