@@ -25,7 +25,7 @@ from ssh_abduction.cli import main
 from ssh_abduction.data import TheoryError
 from ssh_abduction.explain.no_map import explain
 from ssh_abduction.online.replay import ReplayedMap
-from ssh_abduction.solver import Search, Status, choosing, judging, prefixes
+from ssh_abduction.solver import Search, Status, choosing, prefixes
 from ssh_abduction.solver.engines.causal import CausalEngine
 from ssh_abduction.solver.engines.framed import FramedEngine
 from ssh_abduction.solver.engines.frameless import FramelessEngine
@@ -34,6 +34,7 @@ from ssh_abduction.solver.judging import InternalError
 from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs
 from ssh_abduction.theory.rules import Rules
+from ssh_abduction.theory import settle as problems
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import SPEEDUPS, TABLE, row
 
@@ -214,6 +215,7 @@ class NoLongReturns:
     """A toy kind of evidence that only a whole map shows: no three steps of one dstate."""
 
     name: ClassVar[str] = "seldom"
+    axiom: ClassVar[str] = "seldom"
 
     @classmethod
     def of(cls, theory: Theory) -> NoLongReturns:
@@ -225,7 +227,9 @@ class NoLongReturns:
     def facts(self, trace: Trace, start: int, stop: int) -> str:
         return ""
 
-    def refuse(self, trace: Trace, ssh_map: SSHMap) -> frozenset[Equality] | None:
+    def refuse(
+        self, trace: Trace, ssh_map: SSHMap, since: int = 0
+    ) -> frozenset[Equality] | None:
         steps: dict[int, list[int]] = {}
         for t, label in enumerate(ssh_map.labels):
             if len(found := steps.setdefault(label, [])) == 2:
@@ -248,7 +252,7 @@ def test_what_evidence_refuses_of_a_map_is_forbidden(name: str, data: st.DataObj
 
     counts, expected = minimal_maps(trace, THEORIES[name], allows)
     with (
-        patch.object(judging, "evidence_of", lambda _: (NoLongReturns(),)),
+        patch.object(problems, "evidence_of", lambda *_: (NoLongReturns(),)),
         patch.object(prefixes, "FIRST_PREFIX", 1),
         patch.object(choosing, "FEW_STEPS", 0),
     ):
@@ -279,7 +283,7 @@ def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.
 
     counts, expected = minimal_maps(trace, settle(trace, theory).theory, allows)
     with (
-        patch.object(judging, "evidence_of", lambda _: (NoLongReturns(),)),
+        patch.object(problems, "evidence_of", lambda *_: (NoLongReturns(),)),
         patch.object(
             prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 8]), label="first prefix")
         ),

@@ -1,22 +1,22 @@
 """What all minimal maps of a trace share, without listing them.
 
-Some minimal maps are known. What they share is in doubt: two steps that are one in all of them need
-not be one in all minimal maps, and two steps that are one in none of them may be one in another. So
-clingo is asked for a minimal map in which any of these doubts holds. If there is one, it is taken
-in, and fewer doubts are left; if there is none, what is shared is proven. This is brave and
-cautious reasoning in one, and each answer is a map that can be looked at.
+Some minimal maps are known. What they share may not hold for all: two steps that are one in all
+known maps may be two in another minimal map, and the other way round. So clingo looks for a minimal
+map in which any of these doubts is true. If there is one, it is added, and fewer doubts are left.
+If there is none, what is shared is proven. This is brave and cautious reasoning in one. Each answer
+is a map that can be checked.
 
-*Prefixes.* It is asked for maps of a prefix that cost at most as much as minimal maps of the trace.
-The cut of a minimal map is among these (`solver/prefixes.py`). So a map that is found and replays
-to the end is minimal; where one does not, the prefix grows. Where none is left in which a doubt
-about steps of the prefix holds, the classes of steps that are one in all known maps are one in all
-minimal maps. As actions are deterministic, these classes replay like a map: where they replay to
-the end, each further step is in the class of a step of the prefix in every minimal map, and so
-nothing about it is in doubt. Where they do not, the prefix grows.
+*Prefixes.* clingo looks for maps of a prefix that cost at most as much as minimal maps of the
+trace. The cuts of minimal maps are among these (`prefixes.py`). So a found map that replays to the
+end is minimal. If a found map does not, the prefix grows. If no doubt about the prefix is left, the
+classes of steps that are one in all known maps are one in all minimal maps. Actions are
+deterministic, so these classes replay like a map. If they replay to the end, each later step is in
+the class of a step of the prefix in every minimal map, and no doubt about it is left. Else the
+prefix grows.
 
-*Labels.* An engine that settles dstates before places and paths has all labels of minimal maps,
-which are few, even where there are thousands of maps. Then dstates are not in doubt, and what is in
-doubt about places and paths is asked for each labels in turn.
+*Labels.* An engine that settles dstates before places and paths knows all labels of minimal maps.
+They are few, even if there are thousands of maps. Then dstates are not in doubt. Doubts about
+places and paths are resolved for each labelling in turn.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ from ssh_abduction.theory.evidence import Equality
 
 _log = log_of(__name__)
 
-# Without these axioms a dstate may be at several places, or along several courses, of which a map
-# shows one.
+# Without these axioms a dstate may be at several places or along several courses, but a map shows
+# only one.
 SHOWN_ONCE = frozenset({"one_place", "one_course"})
 
 
 class Rivals:
-    """The minimal maps of a trace that are known, and what is known of the others.
+    """The minimal maps of a trace that are known.
 
     Attributes:
         sharing: What the known maps share.
-        listed: Whether there are no others.
+        listed: Whether there are no other minimal maps.
         engine: The engine that found them.
-        reasons: Whether that engine can say what the maps that are not listed share.
+        reasons: Whether that engine can prove what all minimal maps share.
     """
 
     def __init__(self, task: Task, judging: Judging) -> None:
@@ -59,7 +59,7 @@ class Rivals:
 
         Args:
             task: The task of the search that lists the maps.
-            judging: Says which maps the evidence refuses.
+            judging: Knows which maps the evidence refuses.
         """
         self.sharing = Sharing()
         self.listed = False
@@ -70,14 +70,14 @@ class Rivals:
         self._proven = False
 
     def add(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-        """Take in a minimal map and its preferred counts."""
+        """Add a minimal map with its preferred counts."""
         self._cost = cost
         self.sharing.absorb(ssh_map)
 
     def reason(self) -> None:
         """Find out what all minimal maps share, unless all are listed.
 
-        It ends early when a limit of the search is over, or with Ctrl-C.
+        It ends early if a limit of the search is over, or with Ctrl-C.
         """
         if self.listed or self._proven or not self.reasons or not self.sharing.maps:
             return
@@ -91,7 +91,7 @@ class Rivals:
 
     @property
     def backbone(self) -> Backbone | None:
-        """What the known minimal maps share; None where none is known."""
+        """What the known minimal maps share; None if none is known."""
         return (
             self.sharing.backbone(proven=self.listed or self._proven) if self.sharing.maps else None
         )
@@ -104,15 +104,14 @@ def prove_backbone(
     sharing: Sharing,
     engine: Engine | None = None,
 ) -> bool:
-    """Find minimal maps until those found share only what all minimal maps of the trace share.
+    """Find minimal maps until they share only what all minimal maps of the trace share.
 
     Args:
         task: The task of the search.
-        judging: Says which maps the evidence refuses.
+        judging: Knows which maps the evidence refuses.
         cost: The preferred counts of minimal maps, the most important one first.
-        sharing: What the known minimal maps share, of which there is at least one. The maps that
-            are found are added.
-        engine: The engine that proved them minimal, if it is still at hand.
+        sharing: What at least one known minimal map shares. New maps are added to it.
+        engine: The engine that proved them minimal, if it is still available.
 
     Returns:
         Whether it is proven. This is impossible for a theory in which a dstate may be at several
@@ -130,7 +129,7 @@ def prove_backbone(
 
 
 class _Reasoning:
-    """Asks for minimal maps in which other steps are one than in those that are known."""
+    """Finds minimal maps that differ from all known ones in which steps are one."""
 
     def __init__(
         self, task: Task, judging: Judging, cost: tuple[int, ...], sharing: Sharing
@@ -138,9 +137,10 @@ class _Reasoning:
         self._task, self._judging, self._cost, self._sharing = task, judging, cost, sharing
 
     def settle_labels(self, engine: Engine) -> bool:
-        """Take in maps, for each labels of minimal maps, until nothing is in doubt.
+        """Add maps for each labelling of minimal maps until no doubt is left.
 
-        Returns False where that cannot be done with this engine.
+        Returns:
+            False if this engine cannot do it.
         """
         forbidden = set[frozenset[Equality]]()
         while (labellings := engine.labellings(self._cost)) is not None:
@@ -172,7 +172,7 @@ class _Reasoning:
         return False
 
     def _differing_map(self, settled: Settled, labels: Sequence[int]) -> SSHMap | None:
-        """A map of these labels in which some doubt about places or paths holds."""
+        """A map with these labels in which a doubt about places or paths is true."""
         return settled.map_with(
             [
                 (sort, labels[i], labels[j], one)
@@ -182,8 +182,8 @@ class _Reasoning:
         )
 
     def settle_steps(self) -> None:
-        """Take in maps until nothing is in doubt, where the readable encodings are asked."""
-        # No cut of a minimal map has more paths than it.
+        """Add maps until no doubt is left, with the readable encodings."""
+        # The cut of a minimal map never has more paths than the map.
         counts = dict(zip(self._task.theory.priorities, self._cost, strict=True))
         names = (
             counts["paths"]
@@ -196,7 +196,7 @@ class _Reasoning:
             size = self._settle_prefix(engine, size)
 
     def _first_size(self) -> int:
-        """The shortest prefix that could settle all: the classes of what is known replay from there to the end."""
+        """The shortest prefix that may be enough: from it, the known classes replay to the end."""
         classes, actions = self._sharing.classes, self._task.log.actions
         if not self._task.speedups.prefixes:
             return len(classes)
@@ -209,9 +209,10 @@ class _Reasoning:
         return size
 
     def _settle_prefix(self, engine: StepEngine, size: int) -> int:
-        """Settle what is in doubt about a prefix.
+        """Resolve the doubts about a prefix.
 
-        Returns the size to go on with; 0 where nothing is in doubt any more.
+        Returns:
+            The size of the next prefix; 0 if no doubt is left.
         """
         engine.grow(size)
         while (found := engine.map_with(list(self._doubts(size)), self._cost)) is not None:
@@ -232,13 +233,13 @@ class _Reasoning:
         )
 
     def _replay(self, found: SSHMap) -> Replay:
-        """The trace replayed over a map of a prefix."""
+        """Replay the trace over a map of a prefix."""
         return self._task.log.replay(
             found.labels, None, [s.place for s in found.dstates] if self._task.log.pairs else None
         )
 
     def _doubts(self, size: int) -> Iterator[Doubt]:
-        """What is in doubt about a prefix: that steps are one after all, or are not."""
+        """The doubts about a prefix: which steps may be one after all, or may not be."""
         firsts = self._sharing.firsts()
         yield from (
             ("dstates", firsts[self._sharing.classes[t]], t, False) for t in self._entering(size)
@@ -246,17 +247,17 @@ class _Reasoning:
         yield from self._doubts_of_classes(size)
 
     def _doubts_of_classes(self, size: int) -> Iterator[Doubt]:
-        """The same of classes, each of which the first step of it stands for."""
+        """The doubts about classes. The first step of each class stands for it."""
         sharing = self._sharing
         firsts = [t for t in sharing.firsts() if t < size]
         for sort in sharing.sorts():
             known = sharing.kept(sort)
-            heads: dict[int, int] = {}  # the first class of each number
+            heads: dict[int, int] = {}  # for each number, its first class
             for c in range(len(firsts)):
                 head = heads.setdefault(known.always[c], c)
                 if head != c:
                     yield sort, firsts[head], firsts[c], False
-                # Whether it is along a path.
+                # It is in doubt whether this class is along a path.
                 if sort == "paths" and ((c, c) in known.together) != (c in known.unnamed):
                     yield sort, firsts[c], firsts[c], c in known.unnamed
             for c, d in combinations(heads.values(), 2):
@@ -266,7 +267,7 @@ class _Reasoning:
                     yield sort, firsts[c], firsts[d], True
 
     def _may_be_one(self, i: int, j: int) -> bool:
-        """Whether the views of two steps let them be one dstate."""
+        """Whether two steps may be one dstate by their views."""
         steps = self._task.trace.steps
         return (
             None in (views := {steps[i].view, steps[j].view})
@@ -275,7 +276,10 @@ class _Reasoning:
         )
 
     def _entering(self, size: int) -> Iterator[int]:
-        """Steps of the prefix that are not the first of their class, and that no earlier step shows to be there, as the same action led there from the same class."""
+        """Steps of the prefix that come back to a known class in a new way.
+
+        If the same action led there from the same class before, determinism proves it.
+        """
         classes, actions = self._sharing.classes, self._task.log.actions
         seen, links = {classes[0]}, set[tuple[int, int]]()
         deterministic = "deterministic" in self._task.theory.hard

@@ -1,4 +1,7 @@
-"""Maps of a whole trace that nothing proves to be minimal: they pass the checker, and clingo has to better them."""
+"""Maps of the whole trace without a proof that they are minimal.
+
+The checker has accepted them. clingo then only has to find better ones.
+"""
 
 from __future__ import annotations
 
@@ -23,29 +26,27 @@ from ssh_abduction.theory.speedups import row
 
 _log = log_of(__name__)
 
-SKETCH_SHARE = (
-    0.4  # A sketch and its check may take such a share of the time that is left for all of them.
-)
-# The surest sketch may take this many seconds even if less time is left. Else a slow machine would
-# leave no map at all.
+# A sketch and its check may take this share of the time that is left for all sketches.
+SKETCH_SHARE = 0.4
+# The most reliable sketch may take this many seconds even if less time is left. Else a slow machine
+# would find no map at all.
 SUREST = 1.5
 
 
 class Candidates:
-    """Makes maps of the whole trace, and keeps each that is better than the best one known, and that the checker accepts."""
+    """Makes maps of the whole trace. Keeps each one that is better and that the checker accepts."""
 
     def __init__(
         self, task: Task, known: Known, judging: Judging, report: Callable[[], None]
     ) -> None:
-        self._trace = task.trace  # whose views may be unknown
+        self._trace = task.trace  # some of its views may be unknown
         self._task, self._known, self._judging, self._report = (
             _with_all_views(task),
             known,
             judging,
             report,
         )
-        # so that who asks for a snapshot waits for a sketch that is nearly done, rather than make
-        # another one
+        # A snapshot waits for a sketch under way instead of making another one.
         self._sketching = threading.Lock()
 
     def merge(self) -> None:
@@ -54,14 +55,15 @@ class Candidates:
             self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
 
     def sketch(self, seconds: float = math.inf) -> None:
-        """Where no map of the whole trace is known yet, make one without a search: from the best map of a prefix on, or of all steps.
+        """If no map of the whole trace is known, make one without a search.
 
-        The map that takes nothing for seen before is large, but it is accepted most often and
-        fastest. So it comes first. Then a smaller one is sought: those that become smallest are
-        tried first. Where time is short, the first one that the checker accepts will do.
+        It goes on from the best map of a prefix, or begins anew. The map that takes no step for
+        seen before is large, but the checker accepts it most often and fastest. So it comes first.
+        Then smaller maps are tried, the smallest first. If time is short, the first one that the
+        checker accepts is enough.
 
         Args:
-            seconds: What it may take. Each sketch may use a share of what is left.
+            seconds: The time for all sketches. Each may use a share of what is left.
         """
         with self._sketching:
             if (
@@ -88,10 +90,13 @@ class Candidates:
                     return
 
     def sketch_least(self) -> bool:
-        """Offer a sketch that has as few dstates as steps of the trace are pairwise apart, so that no map has fewer. Says whether there is one.
+        """Offer a sketch with as few dstates as any map: as many as steps are pairwise apart.
 
-        Where the robot drives there and back, and most views are different, that is so. Then only
+        This works if the robot drives there and back, and most views are different. Then only
         places and paths remain to be found.
+
+        Returns:
+            Whether there is such a sketch.
         """
         from ssh_abduction.solver.steps.apart import Continuations  # loads numpy
 
@@ -118,7 +123,7 @@ class Candidates:
         return False
 
     def _attempts(self) -> list[Callable[[], None]]:
-        """The ways to make a map without a search. Those that make small maps come first."""
+        """The ways to make a map without a search, those that make small maps first."""
         trace, theory = self._task.trace, self._task.theory
         known = self._known.partial if trace is self._trace else None
         if theory.star == "gateways":
@@ -129,7 +134,7 @@ class Candidates:
         return [self.merge, *(partial(self._go_on_to_end, sketch) for sketch in sketches)]
 
     def _offer_gated(self, *, homing: bool) -> None:
-        """Offer a map whose places have gateways at any angles, if one is made at once."""
+        """Offer a map with gateways at any angles, if one can be made at once."""
         ssh_map = gated_map(
             self._task.trace, self._task.theory, homing=homing, pairs=self._task.log.pairs
         )
@@ -137,14 +142,14 @@ class Candidates:
             self.offer(ssh_map)
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
-        """Offer a sketch that goes on to the end of the trace, if the trace does not contradict it before."""
+        """Offer a sketch after extending it to the end of the trace, if the trace allows that."""
         trace, done = self._task.trace, len(sketch.labels)
         later = each_looking(zip(trace.actions[done - 1 :], trace.steps[done:], strict=True))
         if all(sketch.extend(action, step) for action, step in later):
             self.offer(sketch.map())
 
     def offer(self, ssh_map: SSHMap) -> None:
-        """Keep a map of the whole trace if it is better than the best one known, and satisfies all axioms."""
+        """Keep a map of the whole trace if it is the best one so far and satisfies all axioms."""
         if self._task.trace is not self._trace:
             views = answer_maps.views_of(dict(enumerate(ssh_map.labels)), self._trace)
             ssh_map = replace(
@@ -163,9 +168,9 @@ class Candidates:
 
 
 def _with_all_views(task: Task) -> Task:
-    """The same task, where steps whose views are unknown have a view that no other step has.
+    """The same task with a new view for each step of unknown view.
 
-    Each map of that trace is one of the trace itself, too: it only has fewer steps at one dstate.
+    Each map of that trace is also a map of the trace itself, in which fewer steps are one dstate.
     """
     if not task.theory.unknown_views:
         return task

@@ -1,4 +1,4 @@
-"""How well a map closes: the poses of its dstates that agree best with the displacements of the trace.
+"""How well a map closes: the poses of its dstates that agree best with the displacements.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.solver.fit import fit
@@ -9,12 +9,12 @@
 >>> len(found.poses) == len(ssh_map.dstates)
 True
 
-Unknown are the position of each place (of each dstate, where the map has no places), the heading of
-each dstate, and what is wrong with all displacements: their scale, and a steady drift of heading,
-which have a prior. Each displacement of the trace, divided by its standard deviations, says what
-they should be. The best poses are those with the least sum of squares (Lu & Milios 1997, "Globally
-consistent range scan alignment"). That sum is chi-square distributed if the map is true and the
-odometry is as good as it says. It ranks maps that are equally minimal, and warns; it refuses none.
+The unknowns are the position of each place (of each dstate, if the map has no places), the heading
+of each dstate, and two errors of all displacements with a prior: their scale, and a steady drift of
+heading. Each displacement of the trace gives equations, divided by its standard deviations. The
+best poses have the least sum of squares (Lu & Milios 1997, "Globally consistent range scan
+alignment"). That sum is chi-square distributed if the map is true and the odometry is as good as it
+claims. It ranks equally minimal maps, and may cause a warning. It refuses no map.
 """
 
 from __future__ import annotations
@@ -41,16 +41,17 @@ Array: TypeAlias = NDArray[np.float64]
 
 # With a standard deviation below this, in metres or radians, a displacement counts as exact.
 EXACT = 2e-3
-# The power method takes so many sweeps, and holds each rotation with so much weight to where it
-# was: little, as a metre is worth some hundreds.
+# The number of sweeps of the power method, and the weight that pulls a rotation to its old value.
+# The weight is small: a metre weighs some hundreds.
 SWEEPS, HELD = 20, 1e-2
 
 
 def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
-    """The poses of the dstates of a map that agree best with the displacements, and how well they do.
+    """Find the poses of the dstates that agree best with the displacements.
 
-    trace    with displacements on some of its steps
-    ssh_map  a map of all of its steps
+    Args:
+        trace: A trace with displacements on some of its steps.
+        ssh_map: A map of all of its steps.
     """
     return _Problem(trace, ssh_map).solved()
 
@@ -59,7 +60,7 @@ class _Problem:
     """Least squares over the places and headings of one map.
 
     The unknowns are x and y of each position, then the heading of each dstate, then the scale and
-    the drift, as multiples of their standard deviations.
+    the drift as multiples of their standard deviations.
     """
 
     def __init__(self, trace: Trace, ssh_map: SSHMap) -> None:
@@ -72,7 +73,7 @@ class _Problem:
             -1, 3
         )
         noise = np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
-        # Each dstate has one pose here, so how far off it is taken to be at a visit counts as an
+        # Each dstate has one pose here. So an error of its measured pose at a visit counts as an
         # error of the displacements to it and from it.
         travelled = np.array(
             [trace.actions[t - 1].kind != "turn" for t in steps], dtype=float
@@ -89,8 +90,7 @@ class _Problem:
         self._place = np.array([number[place] for place in places], dtype=int)
         self._positions, self._headings = len(number), len(places)
         self._size = 2 * self._positions + self._headings + 2
-        # The group of each dstate: displacements connect the headings of one group, and of one part
-        # of the map the positions.
+        # Displacements connect the headings of a group, and the positions of a part of the map.
         self._group = connected_components(
             self._graph(self._from, self._to, self._headings), directed=False
         )[1]
@@ -115,14 +115,14 @@ class _Problem:
         return Fit(squares, freedom, p, scale, bend, self._poses(unknown))
 
     def _begun(self) -> Array:
-        """Unknowns to begin with."""
+        """The values of the unknowns to begin with."""
         unknown = np.zeros(self._size)
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
             unknown[2 * self._positions : -2],
         )
-        # Headings first, which are linear but for whole turns, and then positions, which are linear
-        # where headings are known (Carlone et al. 2014).
+        # First the headings: the problem is linear, except for whole turns. Then the positions: it
+        # is linear once the headings are known (Carlone et al. 2014).
         reckoned = self._reckoned()
         off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
         off -= math.tau * np.round(off / math.tau)
@@ -140,7 +140,7 @@ class _Problem:
         return unknown
 
     def _reckoned(self) -> Array:
-        """For each dstate, the heading as seen from one of its group, by the fewest displacements between."""
+        """The heading of each dstate relative to one of its group, by the fewest displacements."""
         heading = np.zeros(self._headings)
         rotated: dict[tuple[int, int], float] = {}
         for s, x, angle in zip(
@@ -155,13 +155,14 @@ class _Problem:
         return heading
 
     def _rotations(self, onward: Array) -> Array:
-        """By how much the headings of each group are to be turned, in radians, so that positions agree.
+        """The rotation of each group of headings that makes positions agree best, in radians.
 
-        What is least is a quadratic form of the rotations, as complex numbers on the unit circle.
-        They are sought by the power method for its inverse, from anywhere (Boumal 2016, "Nonconvex
-        phase synchronization"). What positions do not tell stays as it begins.
+        It minimises a quadratic form of complex numbers on the unit circle, by the power method for
+        its inverse (Boumal 2016, "Nonconvex phase synchronization"). A rotation that positions do
+        not determine stays as it is.
 
-        onward  the displacements, as headings are now
+        Args:
+            onward: The displacements under the present headings.
         """
         size = int(self._group.max()) + 1
         inverse = np.linalg.inv(self._misfit(onward) + HELD * np.identity(size))
@@ -176,9 +177,12 @@ class _Problem:
         return angles
 
     def _misfit(self, onward: Array) -> NDArray[np.complex128]:
-        """The least sum of squares that positions can come to, as a quadratic form of the rotation of each group; vectors are complex numbers.
+        """The least sum of squares over positions, as a quadratic form of the groups' rotations.
 
-        onward  the displacements, as headings are without these rotations
+        Vectors are complex numbers.
+
+        Args:
+            onward: The displacements under the headings without these rotations.
         """
         weights = 1 / self._sigmas(0)
         vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
@@ -195,21 +199,21 @@ class _Problem:
         return form
 
     def _moves(self) -> csr_array:
-        """The matrix that makes, of positions, how far each displacement leads."""
+        """The matrix that turns positions into displacements."""
         return self._differences(self._place[self._from], self._place[self._to], self._positions)
 
     def _graph(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
         return coo_array((np.ones(len(first)), (first, second)), shape=(size, size)).tocsr()
 
     def _sigmas(self, axis: int) -> Array:
-        """The standard deviation of each displacement along an axis, about."""
+        """The approximate standard deviation of each displacement along an axis."""
         sigmas: Array = 1 / np.sqrt((self._whitening[:, :, axis] ** 2).sum(1))
         return sigmas
 
     def _differences(
         self, first: NDArray[np.int_], second: NDArray[np.int_], size: int
     ) -> csr_array:
-        """The matrix that makes, of values, their differences: second minus first."""
+        """The matrix that turns values into differences: second minus first."""
         rows = np.arange(len(first))
         ones = np.ones(len(first))
         entries = (
@@ -219,7 +223,7 @@ class _Problem:
         return coo_array(entries, shape=(len(first), size)).tocsr()
 
     def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
-        """What each displacement should be, and the cosine and sine of the heading in its middle."""
+        """The predicted displacements, and cosine and sine of the heading in the middle of each."""
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
             unknown[2 * self._positions : -2],
@@ -286,7 +290,7 @@ class _Problem:
         return coo_array(entries, shape=(3 * m + 2, self._size)).tocsr()
 
     def _parts(self) -> NDArray[np.int_]:
-        """The part of the map that each position is in: displacements do not connect one part with another."""
+        """The part of the map that each position is in. No displacement connects two parts."""
         part: NDArray[np.int_] = connected_components(
             self._graph(self._place[self._from], self._place[self._to], self._positions),
             directed=False,
@@ -294,13 +298,13 @@ class _Problem:
         return part
 
     def _freedom(self, unknown: Array) -> int:
-        """The degrees of freedom: what displacements say, without what the poses take up.
+        """The degrees of freedom: the number of equations minus that of the unknowns they settle.
 
-        Each part of the map may be moved as a whole, and turned, as may each group of headings in
-        it that positions leave open.
+        Each part of the map may be moved and turned as a whole, and so may each group of headings
+        in it that positions leave open.
 
-        What is known to the millimetre has no noise that would count: it settles as many unknowns
-        as it is about, and says no more.
+        A displacement that is known to the millimetre has no noise worth counting. It settles as
+        many unknowns as it has equations, and adds no freedom.
         """
         said = np.unique(np.concatenate([self._from, self._to]))
         used = np.unique(self._place[said])
@@ -324,9 +328,11 @@ class _Problem:
         )
 
     def _open_rotations(self, unknown: Array, said: NDArray[np.int_]) -> int:
-        """In how many ways groups of headings can be turned while all displacements stay what they are.
+        """The number of ways to turn groups of headings that change no displacement.
 
-        said  the dstates that displacements are about
+        Args:
+            unknown: The unknowns.
+            said: The dstates with displacements.
         """
         groups = np.unique(self._group[said])
         if len(groups) == len(np.unique(self._parts()[self._place[said]])):
@@ -338,7 +344,7 @@ class _Problem:
         return int((np.linalg.eigvalsh(form) < 1e-6 * max(float(form.diagonal().max()), 1.0)).sum())
 
     def _poses(self, unknown: Array) -> tuple[Pose, ...]:
-        """The poses, each part of the map seen from the first dstate there; and how uncertain the positions are as seen from it."""
+        """The poses and the spreads of positions, relative to the first dstate of each part."""
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
             unknown[2 * self._positions : -2],
@@ -365,7 +371,10 @@ class _Problem:
         return tuple(poses)
 
     def _spreads(self, unknown: Array, origins: Sequence[int]) -> Array:
-        """The covariance of the position of each dstate, m x 2 x 2, in square metres, where the poses of the origins are known."""
+        """The covariance of each dstate's position, m x 2 x 2, in square metres.
+
+        The positions of `origins` count as known.
+        """
         jacobian = self._jacobian(unknown)
         fixed = [
             k
@@ -396,7 +405,7 @@ def _identity(size: int) -> csr_array:
 
 
 def _least(differences: csr_array, values: Array, weights: Array) -> Array:
-    """Values whose differences come nearest to these, which are weighted already."""
+    """The values whose differences fit these best, by weighted least squares."""
     weighted = csr_array(differences.multiply(weights[:, None]))
     solved: Array = lsqr(
         weighted, values, atol=1e-10, btol=1e-10, iter_lim=4 * differences.shape[1] + 100

@@ -1,8 +1,8 @@
 """The front of faults: the fewest dstates that explain a trace, for each number of faults.
 
-Without faults the causal theory always has a map, however wrong the trace is, and with many faults
-a map of few dstates: what is true is where the number of dstates stops falling fast, the *knee*.
-One number that counts both hides it.
+Without faults the causal theory always has a map, even if the trace is wrong. With many faults it
+has a map of few dstates. The truth is at the *knee*, where the number of dstates stops falling
+fast. A single number that counts both hides the knee.
 
 >>> from ssh_abduction import Trace
 >>> from ssh_abduction.solver.front import fault_front
@@ -26,19 +26,19 @@ from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-# Both kinds of faults are allowed where the theory names none. What they cost plays no part in a
-# front.
+# Both kinds of faults are allowed if the theory names none. Their costs do not matter for a front.
 KINDS = {"misread": 1.5, "slipped": 1.5}
 
 
 @dataclass(frozen=True)
 class Point:
-    """What so many faults are worth.
+    """The fewest dstates for a number of faults.
 
-    faults   how many faults a map has, at most
-    dstates  how many dstates a map has then, at least
-    map      a map with so few; None where none was found in time
-    proven   whether there is no map with fewer; without a proof, dstates is a lower bound
+    Attributes:
+        faults: The number of faults that a map may have.
+        dstates: The fewest dstates of such a map.
+        map: A map with these; None if none was found in time.
+        proven: Whether no map has fewer. Without a proof, `dstates` is a lower bound.
     """
 
     faults: int
@@ -49,12 +49,13 @@ class Point:
 
 @dataclass(frozen=True)
 class Front:
-    """The points for 0, 1, 2, … faults, as far as time allowed.
+    """The points for 0, 1, 2, … faults that were computed in time.
 
-    There is none for numbers of faults that what somebody asserts rules out.
+    A number of faults that contradicts the assertions of the theory has no point.
 
-    points   what so many faults are worth
-    stopped  whether the time limit ended the search
+    Attributes:
+        points: The points.
+        stopped: Whether the time limit ended the search.
     """
 
     points: tuple[Point, ...]
@@ -62,7 +63,10 @@ class Front:
 
     @property
     def knee(self) -> int | None:
-        """The number of faults at which the number of dstates stops falling fast: where it fell most more than it falls next. None where it never does, or where nothing is proven."""
+        """The number of faults at which the number of dstates stops falling fast.
+
+        There, it fell by most more than it falls next. None if it never does, or nothing is proven.
+        """
         counts = self._proven
         bends = {
             k: (counts[k - 1] - counts[k]) - (counts[k] - counts[k + 1])
@@ -74,7 +78,10 @@ class Front:
 
     @property
     def prices(self) -> tuple[float, float] | None:
-        """What a fault must cost, in dstates, for the map at the knee to be minimal among those of the front: more than the first number, and less than the second. None without such a price."""
+        """The fault costs, in dstates, for which the map at the knee is the best of the front.
+
+        A cost must be above the first number and below the second; None if there is no such cost.
+        """
         if self.knee is None:
             return None
         counts = self._proven
@@ -87,7 +94,7 @@ class Front:
 
     @property
     def _proven(self) -> dict[int, int]:
-        """The number of dstates for each number of faults for which it is proven."""
+        """The proven numbers of dstates, by number of faults."""
         return {point.faults: point.dstates for point in self.points if point.proven}
 
 
@@ -95,13 +102,18 @@ class Front:
 def fault_front(
     trace: Trace, theory: Theory | None = None, most: int = 5, time_limit: float | None = None
 ) -> Front:
-    """The fewest dstates for at most 0, 1, …, `most` faults.
+    """Find the fewest dstates for at most 0, 1, …, `most` faults.
 
-    theory  Theory.causal() by default; its prices say which kinds of faults there are, both where it has none
-    time_limit   seconds in all
+    Args:
+        trace: The trace.
+        theory: Theory.causal() by default. Its costs say which kinds of faults are allowed; both
+            kinds if it has none.
+        most: The greatest number of faults.
+        time_limit: Seconds in all.
 
-    Raises TheoryError where the theory has places, whose axioms are not known to the engine that
-    counts faults, and where it asserts something of steps that the trace does not have.
+    Raises:
+        TheoryError: The theory has places, which the engine that counts faults does not know, or
+            it names steps that the trace does not have.
     """
     theory = Theory.causal() if theory is None else checked_theory(theory)
     check_limit("time_limit", "seconds", time_limit)
@@ -149,8 +161,8 @@ def _points(task: Task, most: int) -> Iterator[Point]:
                 proven=False,
             )
             return
-        if best is None:  # what somebody asserts leaves no map with so few faults
+        if best is None:  # the assertions allow no map with so few faults
             continue
         if before is None or len(best.map.dstates) < len(before.dstates):
-            before = best.map  # a map that needs fewer faults is shown again
+            before = best.map  # repeats a map that needs fewer faults
         yield Point(faults, len(before.dstates), before, proven=True)

@@ -1,9 +1,8 @@
-"""The second net: maps pass the checker, which shares nothing with the encodings, before they are answers.
+"""A second safety net: maps must pass the checker, which shares no code with the encodings.
 
-To check each step of a long replay, or each map of a long list, would take longer than to find
-them. So checking has a tenth of the time of the search, and a hundredth of a second more: the first
-maps are checked always, by the steps that clingo was given at least; of what comes after, as many
-as that share allows.
+Checking every step of a long replay, or every map of a long list, would take longer than finding
+them. So checking gets a share of the search time. The first maps are always checked, at least over
+the steps that clingo was given. Later maps are checked as far as that share allows.
 """
 
 from __future__ import annotations
@@ -20,52 +19,45 @@ from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem
 
-# At most such a share of the time of the search, and so many seconds more, are spent on checking
-# what is not checked always.
+# Optional checks take at most this share of the search time, and this many seconds more.
 SHARE = 0.1
 BEYOND = 0.01
-# So many maps are checked however long that takes, by the steps that clingo was given at least.
-ALWAYS = 3
-# So many steps beyond these are looked at where there is no time for all of them.
-SAMPLE = 1000
-# So many seconds the checker takes for a step, about, before the first check has shown it.
-A_STEP = 5e-6
-# Without these axioms a map shows one of several places, courses or headings of a dstate, so that
-# the checker cannot judge it.
+ALWAYS = 3  # maps that are always checked, over the steps that clingo was given
+SAMPLE = 1000  # steps beyond these that are sampled if there is no time for all
+A_STEP = 5e-6  # seconds that the checker takes for a step, before the first check measures it
+# Without these axioms a dstate may have several places, courses or headings, but a map shows only
+# one. So the checker cannot judge it.
 UNSHOWN = frozenset({"one_place", "one_course", "one_heading", "gateway_heading"})
 
 
 class InternalError(AbductionError):
-    """A map that was found breaks an axiom: a defect of this program, and not of the trace."""
+    """A map breaks an axiom: a defect of this program, not of the trace."""
 
 
 class Judging:
-    """Passes the maps of one search through the checker.
-
-    trace   the whole trace
-    theory  with star settled
-    """
+    """Checks the maps of one search."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._trace = problem.trace
         theory = self._theory = problem.theory
         self._evidence = problem.evidence
-        self._accepted: SSHMap | None = (
-            None  # the last map that passed the checker before it was kept
-        )
+        self._accepted: SSHMap | None = None  # the map that the checker accepted last
         self._judged = 0
-        self._seconds = 0.0  # spent so far
-        self._a_step = A_STEP  # seconds that a step takes, by the last check
+        self._seconds = 0.0  # spent on checking so far
+        self._a_step = A_STEP  # seconds for a step in the last check
         self._shown = not UNSHOWN & theory.given_up
 
     @property
     def may_refuse(self) -> bool:
-        """Whether there is evidence that may find out of a map that it is none."""
+        """Whether some evidence may refuse whole maps."""
         return bool(self._evidence)
 
     def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """Equalities of a map, of the trace or a prefix, that some evidence finds out cannot all hold; None where it refuses none."""
+        """Equalities of a map that contradict some evidence; None if no evidence refuses the map.
+
+        The map may be one of a prefix.
+        """
         refusal = self.refusal(ssh_map)
         return refusal[1] if refusal else None
 
@@ -79,14 +71,17 @@ class Judging:
     def allows_grown(self, trace: Trace, ssh_map: SSHMap, since: int) -> bool:
         """Whether no evidence refuses a map of a trace that has grown.
 
-        since  the map of so many first steps was refused by none
+        Args:
+            trace: The trace.
+            ssh_map: The map.
+            since: The number of first steps whose map no evidence refused.
         """
         self._trace = trace
         return not any(evidence.refuse(trace, ssh_map, since) for evidence in self._evidence)
 
     @cached_property
     def can_accept(self) -> bool:
-        """Whether all that the theory asks for can be judged of a map: by the checker, and for own rules by clingo, which grounds them with the map."""
+        """Whether all that the theory demands can be checked, own rules by clingo."""
         own = {axiom.name for rules in self._theory.rules for axiom in rules.axioms} | {
             rules.name for rules in self._theory.rules
         }
@@ -94,7 +89,7 @@ class Judging:
         return not others and own.isdisjoint(AXIOMS) and can_be_asked(self._theory)
 
     def accepts(self, ssh_map: SSHMap) -> bool:
-        """Whether a map of the whole trace that nothing proves yet is known to satisfy all axioms."""
+        """Whether an unproven map of the whole trace satisfies all axioms, as far as is known."""
         accepted = (
             self.can_accept
             and next(violations(self._trace, ssh_map, self._theory), None) is None
@@ -105,10 +100,15 @@ class Judging:
         return accepted
 
     def pass_map(self, ssh_map: SSHMap, prefix: int, elapsed: float) -> None:
-        """Raise InternalError where a map of the whole trace breaks an axiom, as far as there is time to look.
+        """Check a map of the whole trace, as far as there is time.
 
-        prefix   how many of the first steps clingo was given
-        elapsed  seconds that the search took so far
+        Args:
+            ssh_map: The map.
+            prefix: The number of first steps that clingo was given.
+            elapsed: The seconds that the search took so far.
+
+        Raises:
+            InternalError: The map breaks an axiom.
         """
         if not self._shown or ssh_map == self._accepted:
             return
@@ -122,14 +122,18 @@ class Judging:
         self._judged += 1
 
     def has_time_for(self, steps: int, elapsed: float) -> bool:
-        """Whether a map of so many steps can be checked within the share of the time so far.
+        """Whether checking a map of this many steps keeps to the share of the search time.
 
-        The first short ones always can.
+        There is always time for the first short maps.
         """
         return self._shown and self._a_step * steps <= BEYOND + SHARE * elapsed - self._seconds
 
     def pass_grown_map(self, trace: Trace, ssh_map: SSHMap) -> None:
-        """Raise InternalError where a map breaks an axiom, that was replayed along a trace which has grown."""
+        """Check a map that was replayed along a trace that has grown.
+
+        Raises:
+            InternalError: The map breaks an axiom.
+        """
         self._trace = trace
         self._check(ssh_map, len(trace))
 
@@ -143,7 +147,7 @@ class Judging:
             self._fail(violations[0])
 
     def _look_at_sample(self, ssh_map: SSHMap, prefix: int) -> None:
-        """Look at some links and views beyond the prefix."""
+        """Check some links and views beyond the prefix."""
         links = set(ssh_map.links)
         beyond = range(prefix, len(self._trace))
         for t in random.Random(0).sample(beyond, min(SAMPLE, len(beyond))):
@@ -171,7 +175,7 @@ class Judging:
 
 
 def _of_first_steps(ssh_map: SSHMap, steps: int) -> SSHMap:
-    """A map of the whole trace whose dstates and links the first steps show all, as a map of these."""
+    """A map of the whole trace as a map of the first steps, which show all dstates and links."""
     return SSHMap(
         ssh_map.labels[:steps],
         ssh_map.dstates,

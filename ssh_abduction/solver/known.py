@@ -1,4 +1,4 @@
-"""What a search knows of a trace so far: it only ever gets better."""
+"""What a search knows about a trace so far. It only gets better."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from ssh_abduction.theory.theory import Theory
 
 
 class Known:
-    """What is known of the maps of a trace.
+    """What is known about the maps of a trace.
 
-    status    what is known in all
-    best      the best map of the whole trace, if there is any
-    cost      what that costs: the preferred counts, first to last
-    bound     proven lower bounds
-    lower     what every map of the trace costs at least, as a prefix showed; None where none has yet
-    partial   the best map of a prefix that was found last
-    stopped   why the search ended before it was complete, if it did
-    complete  whether no further minimal map exists
-    count     how many minimal maps were given
-    refused   how many sets of equalities each kind of evidence refused
+    Attributes:
+        status: What is proven.
+        best: The best map of the whole trace; None if there is none.
+        cost: The preferred counts of that map, the most important one first.
+        bound: Proven lower bounds.
+        lower: A lower bound on the cost of every map, from a prefix; None if there is none.
+        partial: The best map of a prefix that was found last.
+        stopped: Why the search ended before it was complete; None if it did not.
+        complete: Whether no further minimal map exists.
+        count: The number of minimal maps that were given.
+        refused: The number of sets of equalities that each kind of evidence refused.
     """
 
     def __init__(self, theory: Theory) -> None:
@@ -44,17 +45,17 @@ class Known:
         return self.best is None or found.cost < self.cost
 
     def keep(self, found: Found, labels: tuple[int, ...]) -> None:
-        """Take a map for the best; with these labels it is one of the whole trace."""
+        """Make a map the best one. With these labels it is a map of the whole trace."""
         self.best, self.cost = replace(found.map, labels=labels), found.cost
 
     def raise_bound(self, proven: int | None) -> None:
-        """No map has fewer than this of what is preferred first."""
+        """Raise the lower bound on the count that is preferred first."""
         first = self._theory.priorities[0] if self._theory.priorities else None
         if first and proven is not None and proven > (getattr(self.bound, first) or 0):
             self.bound = replace(self.bound, **{first: proven})
 
     def raise_lower(self, cost: tuple[int, ...]) -> None:
-        """No map costs less than this, as a minimal map of a prefix does."""
+        """Raise the lower bound on the cost of every map to that of a minimal map of a prefix."""
         self.raise_bound(cost[0] if cost else None)
         if self.lower is None or cost > self.lower:
             self.lower = cost

@@ -62,7 +62,7 @@ def listed(
 
 
 def note(parts: Parts, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-    """Take a map into what the minimal maps share, if it is one of them."""
+    """Add a map to what the minimal maps share, if it is minimal."""
     if parts.known.status is Status.OPTIMAL and cost == parts.known.cost:
         parts.rivals.add(ssh_map, cost)
 

@@ -1,21 +1,21 @@
-"""Maps with faults in theories that have places: faults are guessed and mended in the trace, and the mended trace is solved as if nothing had been wrong.
+"""Maps with faults in theories with places: guess the faults, mend the trace, and solve that.
 
-To disbelieve a view is to believe another one, to disbelieve an action is to know nothing of it,
-and a displacement that is disbelieved might be missing. So a map with faults is a map without them
-of a mended trace, which all fast engines take. Where faults may be is guessed twice: by robust
-merging of visits (`guesses/voting.py`), where places have frames, and by the causal theory with
-faults (`engines/faulty.py`), whose maps any map with places is one of, places aside.
+To disbelieve a view is to believe another one. To disbelieve an action is to know nothing about it.
+A displacement that is disbelieved may as well be missing. So a map with faults is a map without
+faults of a mended trace, which all fast engines can solve. The places of faults are guessed in two
+ways: by robust merging of visits (`guesses/voting.py`), if places have frames, and by the causal
+theory with faults (`engines/faulty.py`). Any map with places, without its places, is one of its
+maps.
 
-*Displacements.* Which of them may be wrong is guessed by labels for which displacements were not
-asked (`guesses/outliers.py`), and by those of the maps that come of that. A map need not disbelieve
-all that were guessed: those are believed again with which it agrees.
+*Displacements.* Labels that ignore displacements show which of these may be wrong
+(`guesses/outliers.py`), and so do the labels of the maps that follow. A map need not disbelieve all
+that were guessed: those that agree with it are believed again.
 
-*Bound.* A map of the theory, its places taken away, is a causal map with the same dstates, and with
-no more faults: so what is proven of the causal theory holds here. Where the mended trace has a map
-that costs no more, its dstates and faults are minimal. And where all cheapest causal maps are
-listed, each minimal map of the theory has the labels and faults of one of them: so it is among the
-minimal maps of the traces that these mend, and the best of all of them are the answer, and all of
-it.
+*Bound.* A map of the theory, without its places, is a causal map with the same dstates and with no
+more faults. So a bound for the causal theory holds here. If the mended trace has a map that costs
+no more, its dstates and faults are minimal. If all cheapest causal maps are listed, each minimal
+map of the theory has the labels and faults of one of them. So it is one of the minimal maps of the
+traces that these mend, and the best of these are the complete answer.
 """
 
 from __future__ import annotations
@@ -38,55 +38,52 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
 
-# So many causal maps that cost the least are mended at most: where there are more, the list of
-# minimal maps is not known to be complete.
+# At most this many cheapest causal maps are mended. If there are more, the list of minimal maps may
+# be incomplete.
 MOST_CAUSAL = 200
-# The rounds of robust merging that begin with the last map, while that gets better.
-ROUNDS = 5
-# For so many seconds a better map is sought of what merging mends, and for such a share of the time
-# that is left at most.
+ROUNDS = 5  # rounds of robust merging at most, each beginning with a better map
+# A trace that merging mends is solved for at most this many seconds and this share of the time that
+# is left.
 MERGED, SHARE = 30.0, 0.5
-# A dstate that is visited so many times or less is rare; one of so many actions before it may have
-# slipped; so many actions are suspected at most.
+# A dstate with at most RARE visits is rare. One of the BEFORE actions before it may have slipped.
+# At most SUSPECTED actions are tried.
 RARE, BEFORE, SUSPECTED = 1, 3, 60
 
-# Solves a mended trace by a theory without faults, and lists so many maps at most (0: all): its
-# minimal maps, and True; or the best one known, and False. The last argument are the seconds that
-# it may take.
+# Solves a mended trace. Arguments: the trace, a theory without faults, the number of maps to list
+# (0: all), and the seconds it may take. Returns the minimal maps and True, or the best map known
+# and False.
 Solver = Callable[[Trace, Theory, int, float], tuple[tuple[SSHMap, ...], bool]]
 
 
 class Mending:
-    """Finds maps with faults of a trace."""
+    """Finds maps with faults."""
 
     def __init__(self, task: Task, solver: Solver) -> None:
         self._task, self._solver = task, solver
         self._without_faults = task.theory.without_faults()
-        # The best map of each mended trace that was solved, and whether it is known to be minimal.
-        # One that is not is sought once more where there is more time.
+        # The best map of each mended trace, and whether it is proven minimal. If not, the trace is
+        # solved again when there is more time.
         self._solved: dict[Trace, tuple[Found | None, bool]] = {}
         self._best: Found | None = None
         self._best_mended: Trace | None = None
-        self._cheapest: list[
-            Trace
-        ] = []  # what all causal maps mend that cost the least, once these are known
+        self._cheapest: list[Trace] = []  # traces mended by all cheapest causal maps
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
-        self._causal_labels: tuple[int, ...] = ()  # of the last causal map
-        # The log is that of the theory: so stars tell dstates apart, and so do pairs of steps that
-        # are not at one place.
+        self._causal_labels: tuple[int, ...] = ()  # the labels of the last causal map
+        # The log is that of the theory with places. So stars and pairs at different places tell
+        # dstates apart.
         self._causal = FaultyEngine(replace(task, problem=task.problem.changed(theory=causal)))
 
     @property
     def bound(self) -> int | None:
-        """Tenths of dstates that a map costs at least, as far as the causal theory shows; None before anything is known."""
+        """A lower bound on the cost of a map, in tenths of dstates; None if none is known yet."""
         return self._causal.bound
 
     def settle(self) -> None:
-        """End what is still under way in clingo."""
+        """Stop clingo."""
         self._causal.settle()
 
     def maps(self) -> Iterator[Found]:
-        """Maps of the whole trace, each better than the one before."""
+        """Yield maps of the whole trace, each better than the one before."""
         if self._task.theory.jumped and self._task.theory.star == "frame":
             merging = Merging(
                 self._task.trace, self._task.theory, self._task.log.pairs, self._task.watch.check
@@ -104,9 +101,13 @@ class Mending:
         yield from self._by_rare_dstates()
 
     def minimal_maps(self, most: int) -> tuple[SSHMap, ...] | None:
-        """The minimal maps, once `maps` has ended, where no causal map is cheaper than the best one; None where one is, or where some may be missing.
+        """The minimal maps. Call it when `maps` has ended.
 
-        most  list so many of each mended trace at most; 0 for all
+        Args:
+            most: The number of maps to list for each mended trace; 0 for all.
+
+        Returns:
+            The maps; None if a causal map is cheaper than the best map, or if some may be missing.
         """
         if self._best is None or self._best.cost[0] != self.bound or not self._cheapest:
             return None
@@ -124,18 +125,19 @@ class Mending:
         return tuple(dict.fromkeys(listed))
 
     def _improving(self, better: Found | None, mended: Trace) -> Iterator[Found]:
-        """A map of a mended trace, if it is better than the best one so far."""
+        """Yield the map of a mended trace if it is the best one so far."""
         if better is not None and (self._best is None or better.cost < self._best.cost):
             self._best, self._best_mended = better, mended
             yield better
 
     def _by_merging(self, trace: Trace) -> Iterator[Found]:
-        """Maps of what robust merging mends; then once more from the places of the best map, while that gets better.
+        """Yield maps of what robust merging mends, and merge again from each better map's places.
 
-        The merged groups are nearly a map, which is there at once; what is better is sought for a
-        share of the time.
+        The merged groups are almost a map, which is given at once. A share of the time is spent on
+        a better one.
 
-        trace  that of the task, some displacements of which may be missing
+        Args:
+            trace: The trace of the task, perhaps without some displacements.
         """
         theory = self._task.theory
         if theory.star != "frame" or not (theory.misread or theory.jumped):
@@ -163,7 +165,9 @@ class Mending:
     def _by_missing_displacements(
         self, labels: Sequence[int], places: Sequence[int | None]
     ) -> Iterator[Found]:
-        """Maps in which displacements are disbelieved, at first those that do not fit the given labels; then once more by those of the best map, while that gets better."""
+        """Yield maps that disbelieve displacements that do not fit the labels, then those of each
+        better map.
+        """
         trace, tried = self._task.trace, set()
         for _ in range(ROUNDS):
             wrong = wrong_displacements(trace, labels, places)
@@ -181,14 +185,17 @@ class Mending:
             )
 
     def _by_causal_maps(self) -> Iterator[Trace]:
-        """What causal maps mend, each cheaper than the one before."""
+        """Yield maps of the traces that causal maps mend, each cheaper than the one before."""
         self._causal.grow(len(self._task.trace))
         for found in self._causal.improving_maps():
             self._causal_labels = found.map.labels
             yield self._mended(found.map)
 
     def _by_cheapest_causal_maps(self) -> Iterator[Trace]:
-        """What the causal maps mend that cost the least: the faults of some may have smaller maps with places than those of others."""
+        """Yield maps of the traces that the cheapest causal maps mend.
+
+        The faults of some of these have smaller maps with places than those of others.
+        """
         causal: list[SSHMap] = []
         found: dict[Trace, None] = {}
         for cheapest in self._causal.maps_of_cost((self.bound or 0,), MOST_CAUSAL):
@@ -200,10 +207,10 @@ class Mending:
         self._cheapest = list(found) if len(causal) < MOST_CAUSAL else []
 
     def _by_rare_dstates(self) -> Iterator[Found]:
-        """Maps in which an action slipped shortly before a dstate that is hardly ever visited, while that gives better ones.
+        """Yield maps in which an action slipped shortly before a rarely visited dstate.
 
-        The causal theory does not see each slip: what it takes for one more link may break a path.
-        Then the places behind it come out as new ones.
+        The causal theory does not notice every slip: one more link in it may break a path. Then the
+        places behind it come out as new ones.
         """
         before: Found | None = None
         while self._task.theory.slipped and self._best is not before:
@@ -222,7 +229,11 @@ class Mending:
                 yield from self._improving(self._minimal(slipped)[0], slipped)
 
     def _mended(self, causal: SSHMap) -> Trace:
-        """The trace with what a causal map disbelieves replaced: by what was seen at another step at the same dstate, or by an action of which nothing is known."""
+        """The trace without what a causal map disbelieves.
+
+        A wrong view is replaced by that of another step at the same dstate, and a wrong action by
+        an unknown one.
+        """
         wrong = {
             kind: {fault.step for fault in causal.faults if fault.kind == kind}
             for kind in ("misread", "slipped")
@@ -245,9 +256,14 @@ class Mending:
         return self._task.problem.changed(mended, self._without_faults)
 
     def _minimal(self, mended: Trace, seconds: float = math.inf) -> tuple[Found | None, bool]:
-        """A minimal map of a mended trace, as one of the trace itself, and whether it is known to be minimal. None where it has no map, or none was found in time.
+        """The best map of a mended trace, as a map of the trace itself, and whether it is minimal.
 
-        seconds  that it is sought at most
+        Args:
+            mended: The mended trace.
+            seconds: The time it may take.
+
+        Returns:
+            The map, and whether it is proven minimal; None for the map if none was found.
         """
         if mended not in self._solved or not (self._solved[mended][1] or seconds < math.inf):
             maps, proven = self._maps_of(mended, 1, seconds)
@@ -257,14 +273,14 @@ class Mending:
     def _maps_of(
         self, mended: Trace, most: int, seconds: float = math.inf
     ) -> tuple[list[SSHMap], bool]:
-        """Minimal maps of a mended trace, and whether they are known to be minimal."""
+        """Minimal maps of a mended trace, and whether they are proven minimal."""
         maps, proven = self._solver(
             mended, self._without_faults, most, min(seconds, SHARE * self._task.watch.left())
         )
         return list(maps), proven
 
     def _believed_again(self, ssh_map: SSHMap, mended: Trace) -> Trace:
-        """A mended trace with as many of its missing displacements as a map agrees with, one after the other."""
+        """The mended trace with each missing displacement that the map agrees with put back."""
         for t, (step, other) in enumerate(zip(self._task.trace.steps, mended.steps, strict=True)):
             if step.displacement == other.displacement:
                 continue
@@ -289,12 +305,12 @@ class Mending:
 
 
 def _has_frames(task: Task) -> bool:
-    """Whether the fast engine for frames is exact here."""
+    """Whether the fast engine for frames is exact for this task."""
     return row("visits").holds_for(task.theory)
 
 
 def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
-    """The place of each step, and the slot of the place that it faces."""
+    """The place of each step, and the slot of the place that the robot faces."""
     at = [
         None if s.place is None or s.heading is None else (s.place, s.heading)
         for s in ssh_map.dstates
@@ -303,9 +319,9 @@ def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
 
 
 def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) -> SSHMap:
-    """A map of a mended trace as a map of the trace, with what was mended as its faults.
+    """A map of a mended trace as a map of the trace, with the mended observations as faults.
 
-    Each dstate has the view that most of its steps show.
+    Each dstate gets the view that most of its steps have.
     """
     votes: dict[int, Counter[View]] = {}
     for label, step in zip(ssh_map.labels, trace.steps, strict=True):

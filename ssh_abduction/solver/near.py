@@ -1,12 +1,11 @@
-"""Maps that cost more than the least: for each number of dstates up to so many more, the best of the maps that have just so many.
+"""Maps that cost more than the minimum: for each greater number of dstates, the best maps with it.
 
-The proof in `solver/prefixes.py`, that a prefix may stand for the trace, speaks of minimal maps
-alone: cut down to a prefix, a map with one dstate more than the least may well be minimal. So these
-maps are asked of the readable encodings for the whole trace, where one rule says how many dstates
-there are.
+A prefix may stand for the trace only for minimal maps (`prefixes.py`): a map with one dstate more
+may become minimal when it is cut to a prefix. So the readable encodings find these maps for the
+whole trace, with a rule that fixes the number of dstates.
 
-Where the theory prefers few paths or places first, it is these that are counted. Excuses are not,
-as they are witnesses: what some excuses make consistent, more of them do, too.
+If the theory prefers few paths or places first, these are counted instead. Excuses are not counted,
+because they only witness a conflict: more excuses never make a map inconsistent.
 """
 
 from __future__ import annotations
@@ -29,20 +28,23 @@ from ssh_abduction.theory.theory import Theory
 
 
 class NearMinimal:
-    """Lists the maps of a trace that cost more than the least.
+    """Lists the maps of a trace that cost more than the minimum.
 
-    engine  holds the axioms for the whole trace
+    Attributes:
+        engine: Holds the axioms for the whole trace.
     """
 
     def __init__(
         self, task: Task, judging: Judging, most: int, report: Callable[[], None], before: Asker
     ) -> None:
-        """Nothing is asked yet.
+        """Nothing is searched yet.
 
-        task    of the search for the minimal maps
-        most    maps that are asked for; 0 for all
-        report  is called now and then
-        before  what the minimal maps were asked of: the seconds that it took count on
+        Args:
+            task: The task of the search for the minimal maps.
+            judging: Checks maps.
+            most: The number of maps that are wanted; 0 for all.
+            report: Called now and then.
+            before: The engine of the minimal maps. Its times are included.
         """
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report
@@ -58,16 +60,17 @@ class NearMinimal:
     def maps(
         self, minimal: tuple[int, ...], within: int
     ) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
-        """The maps, and what they cost: the preferred counts, first to last.
+        """List the maps with their preferred counts, the most important one first.
 
-        minimal  what minimal maps cost
-        within   how many dstates they have more than these, at most
+        Args:
+            minimal: The preferred counts of minimal maps.
+            within: How many dstates more than these a map may have.
         """
         count = counted_first(self._task.theory)
         assert count is not None
         least = minimal[self._task.theory.priorities.index(count)]
         self.engine.grow(len(self._task.trace))
-        # There are no more of anything than there are steps.
+        # No count exceeds the number of steps.
         for number in range(least + 1, min(least + within, len(self._task.trace)) + 1):
             self.engine.ask_for(number, count)
             known = Known(self._task.theory)
@@ -82,5 +85,7 @@ class NearMinimal:
 
 
 def counted_first(theory: Theory) -> Count | None:
-    """Of what near-minimal maps may have more: what the theory prefers first, excuses aside; None where it prefers nothing else."""
+    """The count that near-minimal maps may have more of: what the theory prefers first, except
+    excuses; None if it prefers nothing else.
+    """
     return next((name for name in theory.priorities if name != "excuses"), None)

@@ -57,24 +57,24 @@ from ssh_abduction.theory.evidence import Equality
 
 _log = log_of(__name__)
 
-FIRST_PREFIX = 8  # The first prefix has so many steps: solving it costs next to nothing.
-# So many maps are kept until a prefix proves long enough; from there on they stream, so that memory
-# stays constant.
+FIRST_PREFIX = 8  # steps of the first prefix, which is solved at once
+# At most this many maps are held until a prefix proves long enough. Further maps stream, so that
+# memory stays constant.
 HELD_BACK = 1000
-# Where all maps are asked for and evidence may refuse some, so many are remembered. Until then what
-# is refused is forbidden, and maps are listed anew; from there on refused maps are left out one by
+# If all maps are wanted and evidence may refuse some, at most this many are remembered. Up to then,
+# a refused set is forbidden, and maps are listed anew. After that, refused maps are left out one by
 # one.
 REMEMBERED = 10_000
-# So many names for paths there are to begin with: few traces need more, and grounding grows with
-# the square of their number.
+# Names for paths to begin with. Few traces need more, and grounding grows with their square.
 FIRST_PATHS = 8
 
 
 class Prefixes:
-    """Finds the minimum, and lists the minimal maps, by growing prefixes.
+    """Finds the minimum and lists the minimal maps by growing prefixes.
 
-    engine  holds the axioms for the prefix
-    start   the first prefix that is solved
+    Attributes:
+        engine: Holds the axioms for the prefix.
+        start: The size of the first prefix.
     """
 
     def __init__(
@@ -88,8 +88,13 @@ class Prefixes:
     ) -> None:
         """Nothing is solved yet.
 
-        most    maps that are asked for; 0 for all
-        report  is called now and then
+        Args:
+            task: The task of the search.
+            known: What is known about the trace.
+            judging: Checks maps.
+            engine: The engine to begin with.
+            most: The number of maps that are wanted; 0 for all.
+            report: Called now and then.
         """
         self.engine = engine
         self._task, self._known, self._judging, self._most, self._report = (
@@ -104,15 +109,18 @@ class Prefixes:
         self.start = len(task.trace) if self._at_once else FIRST_PREFIX
 
     def go_on_with(self, engine: Engine, start: int) -> None:
-        """Solve with another engine, from a prefix of so many steps on."""
+        """Solve with another engine, from a prefix of `start` steps on."""
         self.engine, self.start = engine, start
 
     def find_minimum(self) -> None:
-        """Extend the prefix until a minimal map of it replays to the end, or until it has no map; and set the status to that."""
+        """Extend the prefix until a minimal map of it replays to the end, or it has no map.
+
+        Sets the status accordingly.
+        """
         size, steps = min(len(self._task.trace), self.start), len(self._task.trace)
         while True:
             if size == steps:
-                self._task.watch.use_reserve(LAST)  # which is for a search like this one
+                self._task.watch.use_reserve(LAST)  # the reserve is kept for this search
             _log.debug("%s is given %d of %d steps", type(self.engine).__name__, size, steps)
             self.engine.grow(size)
             minimal = self.minimise()
@@ -130,14 +138,14 @@ class Prefixes:
                 self._known.keep(
                     replace(minimal, map=self._whole(minimal.map, replayed)), replayed.labels
                 )
-            # A map of the whole trace, as cheap as any of the prefix.
+            # The best map of the whole trace is as cheap as any map of the prefix.
             if self._known.best is not None and self._known.cost <= minimal.cost:
                 self._known.status = Status.OPTIMAL
                 return
             size = self.engine.next_size(len(replayed.labels))
 
     def minimise(self) -> Found | None:
-        """A minimal map of the prefix that no evidence refuses, or None where it has no map."""
+        """A minimal map of the prefix that no evidence refuses; None if it has no map."""
 
         def why_refused(found: Found) -> frozenset[Equality] | None:
             refusal = self._judging.refusal(found.map)
@@ -151,7 +159,7 @@ class Prefixes:
         return first_accepted(self._minimise_as_told, why_refused, self._forbid)
 
     def _forbid(self, equalities: frozenset[Equality]) -> None:
-        """Let no map have all of these equalities; where the engine cannot be told, another one goes on that can."""
+        """Forbid all maps with these equalities. Changes the engine if this one cannot do it."""
         if self._tell(equalities):
             return
         _log.debug("%s cannot be told so: the readable encodings go on", type(self.engine).__name__)
@@ -164,17 +172,14 @@ class Prefixes:
         self.engine.forbid(equalities)
 
     def _tell(self, equalities: frozenset[Equality]) -> bool:
-        """Tell the engine that no map has all of these equalities.
-
-        False where it cannot be told so.
-        """
+        """Forbid all maps with these equalities, in this engine. Returns whether it can."""
         can_be_told = isinstance(self.engine, StepEngine) or all(
             equality.holds for equality in equalities
         )
         return can_be_told and self.engine.forbid(equalities)
 
     def _minimise_as_told(self) -> Found | None:
-        """A minimal map of the prefix by what clingo was told, or None.
+        """A minimal map of the prefix under the constraints that clingo has; None if it has no map.
 
         Better maps of the whole trace are kept on the way.
         """
@@ -202,14 +207,14 @@ class Prefixes:
                 return minimal
 
     def _predicts_all(self, found: Found, replayed: Replay) -> bool:
-        """Whether a map of the prefix is one of the whole trace, that no evidence refuses."""
+        """Whether a map of the prefix is one of the whole trace and no evidence refuses it."""
         whole = replayed.outcome is Outcome.PREDICTED
         return whole and not self._judging.why_refused(self._whole(found.map, replayed))
 
     def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
-        """Take a control with more names for paths, if the minimal cost found needs them.
+        """Begin a control with more names for paths, if the minimal cost needs them.
 
-        Says whether it was so.
+        Returns whether it did.
         """
         needed = paths_needed(self._task, self.engine.size, cost)
         if needed <= self.engine.paths:
@@ -221,8 +226,8 @@ class Prefixes:
         return True
 
     def minimal_maps(self) -> Iterator[SSHMap]:
-        """Every map of minimal cost, once, after those of the longest prefix that is needed have been seen to replay."""
-        streamed: list[int] = []  # prefixes whose completely replayed maps went out already
+        """List every minimal map once, after the prefix has proven long enough."""
+        streamed: list[int] = []  # prefixes whose completely replayed maps were given
         held: list[SSHMap] = []  # maps of this prefix that replay
         try:
             while True:
@@ -240,16 +245,18 @@ class Prefixes:
     def _maps_of_prefix(
         self, held: list[SSHMap], streamed: list[int]
     ) -> Generator[SSHMap, None, int]:
-        """Hold back the minimal maps of this prefix that replay to the end, or give them where they are many or the prefix is the whole trace.
+        """Find the minimal maps of this prefix that replay to the end.
 
-        Returns the farthest step that some map fails at; 0 where all replay, so that there are no
-        others.
+        They are held back, or given if they are many or the prefix is the whole trace.
+
+        Returns:
+            The farthest step at which a replay fails; 0 if all maps replay and there are no others.
         """
         enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
         asked = self._most and self._most + 1
         streaming = self.engine.size == len(self._task.trace)
         stuck, telling = 0, True
-        given = set[SSHMap]()  # or held back, where some maps may be refused
+        given = set[SSHMap]()  # or held back, if some maps may be refused
         while True:
             came, refusal = 0, None
             for found in self.engine.maps_of_cost(self._known.cost, asked):
@@ -283,7 +290,7 @@ class Prefixes:
                     streaming = True
                     yield from held
                     held.clear()
-            if refusal:  # all is listed anew, without what is refused if the engine can be told
+            if refusal:  # list anew; forbid the refused maps if the engine can
                 telling = self._tell(refusal)
                 continue
             if stuck or not asked or came < asked:
@@ -296,9 +303,10 @@ class Prefixes:
         return stuck
 
     def _replay(self, ssh_map: SSHMap, known: int | None = None) -> Replay:
-        """The trace replayed over a map of a prefix, of which so many steps make links.
+        """Replay the trace over a map of a prefix.
 
-        Where stars agree in tolerance, those of all steps have to.
+        `known` is the number of steps of the prefix that make links. If stars are compared within
+        tolerance, those of all steps must agree.
         """
         log = self._task.log
         replayed = log.replay(
@@ -321,9 +329,9 @@ class Prefixes:
         return replayed
 
     def _whole(self, ssh_map: SSHMap, replayed: Replay) -> SSHMap:
-        """A map of a prefix as a map of the steps that are replayed over it.
+        """A map of a prefix as a map of all steps that replay over it.
 
-        Where stars agree in tolerance, its headings are those that all of them allow.
+        If stars are compared within tolerance, its headings are those that all stars allow.
         """
         whole = replace(ssh_map, labels=replayed.labels)
         if not self._in_tolerance or len(ssh_map.labels) == len(replayed.labels):

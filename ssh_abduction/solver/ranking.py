@@ -1,4 +1,4 @@
-"""Ranks equally minimal maps by how well they close, where the trace has displacements."""
+"""Rank equally minimal maps by how well they close, if the trace has displacements."""
 
 from __future__ import annotations
 
@@ -14,30 +14,27 @@ from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.theory.evidence.displacement import jumped
 
-# So many maps are ranked, at most; of a longer list those that come later stay in the order in
-# which they are found, so that memory stays constant.
+# At most this many maps are ranked, so that memory stays constant. Later maps keep their order.
 RANKED = 1000
-# The noise of the odometry is said to be wrong where a chi-square like that of the best map is as
-# unlikely as this, in either direction,
+# A warning about the noise of the odometry needs a chi-square of the best map that is at most this
+# probable, in either direction,
 DOUBTED = 1e-3
-# and the standard deviations are too small by this factor at least, or too large by that one: less
-# changes no answer, and too large ones only exclude less.
+# and standard deviations that are too small or too large by these factors. Smaller errors change no
+# answer.
 TOO_SMALL, TOO_LARGE = 1.5, 2.0
-# A displacement of so many standard deviations may be that of a robot which stands still.
+# A displacement of at most this many standard deviations may be that of a robot standing still.
 STANDING = 2.0
-# Displacements that agree to the last digit would make it 0.
-NEVER_LESS = 0.01
+NEVER_LESS = 0.01  # the least factor; displacements that agree exactly would make it 0
 
-# So many seconds beyond the limit it may take to tell how well the first map closes.
-OVERTIME = 0.3
+OVERTIME = 0.3  # seconds beyond the limit for the fit of the first map
 
 _Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...], tuple[int, ...]]
 
 
 class Ranking:
-    """Says of maps of one trace how well they close.
+    """Computes how well the maps of one trace close.
 
-    Maps that differ in paths alone close alike, so that is worked out once.
+    Maps that differ only in paths close alike. Their fit is computed once.
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -45,7 +42,7 @@ class Ranking:
         self._known: dict[_Key, Fit] = {}
 
     def fitted(self, ssh_map: SSHMap) -> SSHMap:
-        """The same map, with how well it closes."""
+        """The same map with its fit."""
         from ssh_abduction.solver.fit import fit  # loads scipy
 
         key = ssh_map.labels, tuple(s.place for s in ssh_map.dstates), jumped(ssh_map)
@@ -57,9 +54,9 @@ class Ranking:
         """The same maps, the one that closes best first.
 
         Args:
-            maps: As they are found.
-            over: Whether the limits are over. Then maps come as they are found, without how well
-                they close; for the first one OVERTIME more may be used.
+            maps: The maps as they are found.
+            over: Whether the limits are over. Then the maps keep their order and get no fit. The
+                first one may use OVERTIME seconds more for its fit.
         """
         overtime = Watch(OVERTIME)
 
@@ -89,11 +86,15 @@ class Ranking:
 
 
 def in_order(maps: Sequence[SSHMap], counts: Iterable[int]) -> tuple[SSHMap, ...]:
-    """Maps in an order that is the same in each run, whatever order they are found in: those that close best first, and of equal ones by their labels, then by their
-    places, then by their courses, each as numbered by first visit.
+    """Sort maps into an order that is the same in each run.
 
-    counts  how many maps there are of each level; each level is put in order by itself, and what is
-    beyond stays as it is
+    Maps that close best come first. Equal ones are sorted by their labels, then by their places,
+    then by their courses, numbered by first visit.
+
+    Args:
+        maps: The maps.
+        counts: The number of maps of each level. Each level is sorted by itself. Maps beyond the
+            last level keep their order.
     """
     left = iter(maps)
     levels = [sorted(islice(left, count), key=_order) for count in counts]
@@ -118,7 +119,7 @@ def _order(ssh_map: SSHMap) -> tuple[object, ...]:
 
 
 def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
-    """How likely rival maps are, as displacements alone say, among these: exp(-chi2/2), normalised.
+    """The relative probabilities of rival maps by displacements alone: exp(-chi2/2), normalised.
 
     Empty unless all of them have a fit.
     """
@@ -130,15 +131,14 @@ def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
 
 
 def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
-    """What is wrong with the noise that the odometry claims, by how well the best map closes; None where nothing is."""
+    """A warning if the best map contradicts the noise that the odometry claims; else None."""
     if fit is None or fit.dof < 1 or min(fit.p, 1 - fit.p) > DOUBTED / 2:
         return None
     factor = max(math.sqrt(fit.chi2 / fit.dof), NEVER_LESS)
     if 1 / TOO_LARGE < factor < TOO_SMALL:
         return None
     if factor < 1 and trace.odometry and trace.odometry.offset:
-        # How far off dstates are taken to be counts at each displacement there, which is more than
-        # there is.
+        # The error of a dstate's measured pose counts at each displacement there: that is too much.
         return None
     how, told = ("smaller", "tight") if factor > 1 else ("larger", "loose")
     return (
@@ -150,7 +150,10 @@ def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
 
 
 def units_warning(trace: Trace) -> str | None:
-    """That displacements do not tell any travel from standing still, as where they are in kilometres; None where they do, or no travel has one."""
+    """A warning if displacements cannot tell travel from standing still, as if in kilometres.
+
+    None if they can, or if no travel has a displacement.
+    """
     ways: list[float] = []
     sigmas: list[float] = []
     for action, step, t in zip(trace.actions, trace.steps[1:], range(1, len(trace)), strict=True):

@@ -1,4 +1,4 @@
-"""The answer for one trace: a frozen value that holds no solver. Importing it does not load clingo."""
+"""The answer for one trace: a frozen value without a solver. Importing it does not load clingo."""
 
 from __future__ import annotations
 
@@ -381,7 +381,7 @@ def _checked_record(read: FieldReader, data: Any) -> Mapping[str, Any]:
 def _check_steps(
     where: str, maps: tuple[SSHMap, ...], steps: int, theory: Theory, trace: Trace | None
 ) -> None:
-    """Raise MapError where maps are not of so many steps, or not of the trace."""
+    """Raise MapError if maps do not have this many steps, or are not of the trace."""
     for i, ssh_map in enumerate(maps):
         if len(ssh_map.labels) != steps:
             raise MapError(

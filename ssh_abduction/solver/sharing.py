@@ -1,4 +1,6 @@
-"""What maps of one trace share: which steps are one dstate, at one place, along one path and course, in all, in some, or in none of them.
+"""What maps of one trace share: which steps are one in all, in some, or in none of them.
+
+Two steps are one if they are at one dstate, at one place, or along one path or course.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
@@ -28,26 +30,25 @@ Pair: TypeAlias = tuple[int, int]
 Sort: TypeAlias = Literal["dstates", "places", "paths", "courses"]
 
 SORTS: tuple[Sort, ...] = ("dstates", "places", "paths", "courses")
-# So many pairs of steps are printed, at most: more say little that the numbers of `always` do not.
-PRINTED = 1000
-# So many stretches of steps a sentence names, at most.
-NAMED = 6
-# So many ways in which dstates have places, paths or courses are remembered, so that none is
-# compared twice.
-REMEMBERED = 10_000
+PRINTED = 1000  # pairs of steps that are printed at most; further ones add little
+NAMED = 6  # stretches of steps that a sentence names at most
+REMEMBERED = 10_000  # assignments of places, paths or courses that are not compared again
 
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """Which steps maps take for one: one dstate, at one place, along one path, or along one course (a path in one direction).
+    """Which steps maps take for one dstate, place, path or course (a path in one direction).
 
-    always     a number for each step. Steps of one number are one in all maps; the numbers are those of the first steps that have them, in order
-    sometimes  pairs of steps that are one in some maps and not in others. Each step stands for all of its number, and is the first of these
-    untold     where a file has only some of the pairs (PRINTED): the steps in which the maps differ, all the same
+    Steps with two different numbers that are not in a pair are one in no map. If a dstate is along
+    no path, its steps have a number of their own. A pair of a step with itself means that it is
+    along a path in some maps, and along none in others.
 
-    Steps of any other two numbers are one in no map. Where a dstate is along no path, its steps
-    have a number that no others have; a pair of a step with itself says that it is along some path
-    in some maps, and along none in others.
+    Attributes:
+        always: A number for each step. Steps with one number are one in all maps. Numbers are
+            given in the order of the first steps that have them.
+        sometimes: Pairs of steps that are one in some maps and not in others. Each step is the
+            first with its number, and stands for all of them.
+        untold: The steps in which the maps differ, if a file has only some of the pairs (PRINTED).
     """
 
     always: tuple[int, ...]
@@ -71,14 +72,19 @@ class Shared:
 
     @property
     def differing(self) -> tuple[int, ...]:
-        """The steps in which the maps differ: those which are one with an earlier step in some maps and not in others, and all that go with these."""
+        """The steps in which the maps differ: those that are one with an earlier step in some maps
+        only, and all steps with their numbers.
+        """
         if self.untold:
             return self.untold
         numbers = {self.always[later] for _, later in self.sometimes}
         return tuple(t for t, number in enumerate(self.always) if number in numbers)
 
     def to_dict(self, steps: Iterable[int]) -> dict[str, Any]:
-        """The numbers of these steps, and the pairs: if there are more than PRINTED, as many of them, their count, and the steps in which the maps differ."""
+        """The numbers of these steps, and the pairs.
+
+        If there are more than PRINTED pairs: that many, their count, and the steps that differ.
+        """
         more = (
             {"pairs": len(self.sometimes), "differing": list(self.differing)}
             if len(self.sometimes) > PRINTED
@@ -95,12 +101,14 @@ class Shared:
 class Backbone:
     """What all minimal maps of a trace share.
 
-    dstates, places, paths, courses  which steps are one, in all maps or in some. Of theories
-        without places only dstates
-    proven                           whether this holds of all minimal maps. Else it is what those
-        found share: pairs of steps that are one in some of these
-                                     are so in some minimal maps, but other minimal maps may differ
-                                         in more
+    Attributes:
+        dstates: Which steps are one dstate, in all maps or in some.
+        places: Which steps are at one place; None for theories without places.
+        paths: Which steps are along one path; None likewise.
+        courses: Which steps are along one course; None likewise.
+        proven: Whether this holds for all minimal maps. Else only for those that were found:
+            pairs that are one in some of these are so in some minimal maps, but further maps may
+            differ more.
     """
 
     dstates: Shared
@@ -114,7 +122,7 @@ class Backbone:
 
     @property
     def sorts(self) -> dict[Sort, Shared]:
-        """What there is of dstates, places, paths and courses."""
+        """The sorts that are compared: dstates, and for most theories places, paths and courses."""
         return {sort: shared for sort in SORTS if (shared := getattr(self, sort)) is not None}
 
     @property
@@ -130,7 +138,10 @@ class Backbone:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As `solve --json` prints it (docs/reference/formats.md): the dstates by step, and the rest by dstate, so that it is short for a long trace."""
+        """As `solve --json` prints it (docs/reference/formats.md).
+
+        Dstates are given by step, the rest by dstate, so that it is short for a long trace.
+        """
         labels = self.dstates.always
         firsts = {number: t for t, number in reversed(list(enumerate(labels)))}
         by_dstate = [firsts[number] for number in sorted(firsts)]
@@ -142,9 +153,10 @@ class Backbone:
 
     @classmethod
     def from_dict(cls, data: Any, steps: int, where: str = "backbone") -> Backbone:
-        """What `to_dict` wrote, for a trace of so many steps.
+        """Read what `to_dict` wrote, for a trace of this many steps.
 
-        Raises MapError with the field that is wrong.
+        Raises:
+            MapError: A field is wrong. The message names it.
         """
         a_text("where", where, MapError)
         a_whole_number("steps", steps, MapError, 1)
@@ -170,22 +182,21 @@ class Backbone:
 
 
 class Sharing:
-    """Takes in maps of one trace, one by one, and keeps what they share.
+    """Takes in maps of one trace, one by one, and keeps what they share, in constant memory.
 
-    The memory that it takes does not grow with their number.
+    Steps that are one dstate in all maps so far are a *class*. In all of these maps they are at one
+    place and along one course. So places and courses are compared by class.
 
-    Steps that are one dstate in all maps so far are a *class*. They are at one place, and along one
-    course, in all of them, too: so these are compared by class.
-
-    maps     how many maps were taken in
-    classes  the class of each step
+    Attributes:
+        maps: The number of maps.
+        classes: The class of each step.
     """
 
     def __init__(self) -> None:
         self.maps = 0
         self.classes: tuple[int, ...] = ()
-        self._labels: tuple[int, ...] = ()  # of the last map
-        self._label_of: list[int] = []  # of each class, in the last map
+        self._labels: tuple[int, ...] = ()  # the labels of the last map
+        self._label_of: list[int] = []  # the label of each class in the last map
         self._kept: dict[Sort, Kept] = {}
 
     def absorb(self, ssh_map: SSHMap) -> None:
@@ -204,7 +215,7 @@ class Sharing:
         return self._kept
 
     def _split_by(self, labels: tuple[int, ...]) -> None:
-        """Split classes, so that the steps of each are at one dstate in this map, too."""
+        """Split classes until the steps of each are at one dstate in this map too."""
         both = list(zip(self.classes or [0] * len(labels), labels, strict=True))
         number = {pair: i for i, pair in enumerate(dict.fromkeys(both))}
         self.classes = tuple(map(number.__getitem__, both))
@@ -224,7 +235,7 @@ class Sharing:
         return self._kept
 
     def kept(self, sort: Sort) -> Kept:
-        """What is known of one sort."""
+        """What is known about one sort."""
         return self._kept[sort]
 
     def backbone(self, *, proven: bool) -> Backbone:
@@ -251,9 +262,11 @@ class Sharing:
 class Kept:
     """Which classes are one in all maps, and which in some.
 
-    always    a number for each class: those of one number are one in all maps
-    together  pairs of classes that are one in some map, the smaller one first; each class with itself, unless it has no name in any
-    unnamed   classes that have no name in some map
+    Attributes:
+        always: A number for each class. Classes with one number are one in all maps.
+        together: Pairs of classes that are one in some map, the smaller one first. It contains
+            each class with itself, unless it has no name in any map.
+        unnamed: Classes that have no name in some map.
     """
 
     def __init__(self, classes: int) -> None:
@@ -263,7 +276,7 @@ class Kept:
         self._seen: set[tuple[Hashable, ...]] = set()
 
     def split(self, before: Sequence[int]) -> None:
-        """There are other classes now, each a part of one before."""
+        """Replace the classes by parts of them. `before` has the old class of each new one."""
         parts: dict[int, list[int]] = {}
         for new, old in enumerate(before):
             parts.setdefault(old, []).append(new)
@@ -273,7 +286,7 @@ class Kept:
         self._seen.clear()
 
     def absorb(self, names: tuple[Hashable, ...]) -> None:
-        """Take in what the classes are named in a map; those of one name are one, and None is no name."""
+        """Take in the names of the classes in a map. None is no name."""
         if names in self._seen:
             return
         if len(self._seen) == REMEMBERED:
@@ -297,7 +310,10 @@ class Kept:
 
 
 def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: str) -> Shared:
-    """What a file says of one sort: its numbers are of steps or, where a number of each step is given, of these."""
+    """What a file says about one sort.
+
+    Its numbers are those of steps, or of dstates if `of_step` gives the dstate of each step.
+    """
     expected = steps if of_step is None else len(set(of_step))
     always = data.get("always") if isinstance(data, Mapping) else None
     if (
@@ -370,7 +386,7 @@ def _told_differing(sort: Sort, shared: Shared) -> str:
 
 
 def stretches(steps: Sequence[int]) -> str:
-    """12–15 and 40: at most NAMED stretches of steps, and how many steps more."""
+    """Words for steps, such as "12–15 and 40": at most NAMED stretches, and how many more steps."""
     runs: list[list[int]] = []
     for step in steps:
         if runs and step == runs[-1][-1] + 1:
@@ -383,5 +399,5 @@ def stretches(steps: Sequence[int]) -> str:
 
 
 def _listed(words: Sequence[str]) -> str:
-    """a, b and c."""
+    """Words with commas and "and" between them."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

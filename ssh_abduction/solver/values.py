@@ -1,4 +1,4 @@
-"""Counts, bounds and statuses: plain values that a solution is made of. Nothing here needs clingo."""
+"""Counts, bounds and statuses: the plain values of a solution. Nothing here needs clingo."""
 
 from __future__ import annotations
 
