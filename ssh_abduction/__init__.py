@@ -1,4 +1,4 @@
-"""From what a robot saw and did, find the map: every minimal topological map of distinctive states, places and paths.
+"""Find every minimal topological map that explains what a robot saw and did.
 
 Each name is loaded when it is first used. The command line therefore starts at once and hears
 Ctrl-C from then on. This module imports nothing, not even `__future__`, before `__main__` has put

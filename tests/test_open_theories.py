@@ -32,9 +32,9 @@ from ssh_abduction.solver.engines.frameless import FramelessEngine
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import InternalError
 from ssh_abduction.theory import Speedups, encodings
+from ssh_abduction.theory import settle as problems
 from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs
 from ssh_abduction.theory.rules import Rules
-from ssh_abduction.theory import settle as problems
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import SPEEDUPS, TABLE, row
 
@@ -227,9 +227,7 @@ class NoLongReturns:
     def facts(self, trace: Trace, start: int, stop: int) -> str:
         return ""
 
-    def refuse(
-        self, trace: Trace, ssh_map: SSHMap, since: int = 0
-    ) -> frozenset[Equality] | None:
+    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
         steps: dict[int, list[int]] = {}
         for t, label in enumerate(ssh_map.labels):
             if len(found := steps.setdefault(label, [])) == 2:
