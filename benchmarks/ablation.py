@@ -1,9 +1,10 @@
-"""What each speed-up gains: the time with it switched off, as a ratio to the time with all of them, measured in one run.
+"""The gain of each speed-up: the time without it divided by the time with all, in one run.
 
-    python benchmarks/ablation.py [--limit S] [--memory MIB] [--only PATTERN] [--out benchmarks/results/ablation.json]
+    python benchmarks/ablation.py [--limit S] [--memory MIB] [--only PATTERN]
+                                  [--out benchmarks/results/ablation.json]
 
-The table is in the form of bench.py, with the solver without a speed-up in place of a peer; "without all" is the plain encoding of the
-axioms, whole trace at once.
+The table has the form of bench.py, with the solver without a speed-up in place of a peer. "without
+all" is the plain encoding of the axioms, with the whole trace at once.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ USED = {
 
 
 def variants(instance: Instance) -> list[str]:
-    """The speed-ups to leave out, one at a time and all: those that the theory of the instance uses."""
+    """The speed-ups to leave out, one at a time and all: those that the instance's theory uses."""
     theory = "causal" if instance.causal else "framed" if instance.name in FRAMED else "full"
     return [*(name for name in SPEEDUPS if name in USED[theory]), ",".join(SPEEDUPS)]
 
@@ -79,7 +80,7 @@ def main() -> None:
         "--only",
         default="",
         metavar="PATTERN",
-        help="instances whose name this regular expression is found in",
+        help="measure only instances that match this regular expression",
     )
     parser.add_argument(
         "--out",
@@ -106,7 +107,8 @@ def main() -> None:
                 cell = run(tool, INSTANCES[name], 0, options.limit, options.memory)
                 cell["tool"] = OURS if not off else f"−{off}" if "," not in off else "−all"
                 print(
-                    f"{name:24} {cell['tool']:14} {cell['status']:14} {cell.get('seconds', 0):8.2f} s",
+                    f"{name:24} {cell['tool']:14} {cell['status']:14} "
+                    f"{cell.get('seconds', 0):8.2f} s",
                     file=sys.stderr,
                 )
                 results["cells"].append(cell)

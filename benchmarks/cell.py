@@ -1,30 +1,32 @@
-"""One tool on one trace, in a process of its own. It prints a line when the clock starts, and a line with what came of it.
+"""Run one tool on one trace, in this process, and print the result as JSON.
 
     python benchmarks/cell.py TOOL INSTANCE SEED SECONDS MIB [CLOCK]
 
-TOOL is a peer, ssh-abduction, or "ssh-abduction without" and the names of speed-ups, commas between. `following` is not one that a user can
-switch off: here the guesses at the beginning of a long causal trace, which are followed along the rest, are left out. CLOCK is wall, or cpu: then
-seconds are those that the processors worked for this process, and limits are of these.
+TOOL is a peer, ssh-abduction, or "ssh-abduction without" and names of speed-ups, separated by
+commas. Users cannot switch `following` off: here it leaves out the guesses at the beginning of a
+long causal trace, which are followed along the rest. CLOCK is wall, or cpu: then seconds and
+limits are CPU seconds of this process.
 
-The process is ended by a signal when its time is over. The clock does not run while programs are loaded, the trace is made, or the
-answer is checked: a map by the checker, a peer's machine by running it along the trace.
+A first line is printed when the clock starts, and a second line with the result. A signal ends the
+process when its time is over. Loading programs, making the trace and checking the answer do not
+count. The checker checks a map; a peer's machine is run along the trace.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import importlib
 import io
 import json
 import resource
 import signal
-import sys
 import time
 from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any
 
-import numpy  # noqa: F401 - the search loads it when it first needs it: rather before the clock starts
+import numpy  # noqa: F401 - load it before the clock starts, as the search would load it later
 from peers import PEERS, Machine, NotApplicableError
 from suite import INSTANCES
 from table import OURS, WITHOUT
@@ -36,24 +38,32 @@ from ssh_abduction.solver.asp import limits
 from ssh_abduction.solver.asp.limits import peak_memory
 from ssh_abduction.theory import Speedups
 
-AROUND = 300  # seconds for all that the clock does not count
-MARGIN = 0.1  # how much later than its own limit a solver of ours is ended: time to hand over what it has
-SHARE = 0.8  # of the memory is its own limit, for the same reason
+AROUND = 300  # seconds for everything that the clock does not count
+MARGIN = 0.1  # share of its limit that our solver has on top, to hand over its answer
+SHARE = 0.8  # share of the memory that is our solver's own limit, for the same reason
 
 
 def main() -> None:
-    tool, name, seed, seconds, memory, *clock = sys.argv[1:]
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("tool", help="a peer, or ssh-abduction")
+    parser.add_argument("instance", help="name of an instance of suite.py")
+    parser.add_argument("seed", type=int)
+    parser.add_argument("seconds", type=float, help="time limit")
+    parser.add_argument("memory", type=int, help="address space in MiB")
+    parser.add_argument("clock", choices=("wall", "cpu"), nargs="?", default="wall")
+    options = parser.parse_args()
+    tool, limit, space = options.tool, options.seconds, options.memory
     now, timer = time.perf_counter, signal.ITIMER_REAL
-    if clock == ["cpu"]:
+    if options.clock == "cpu":
         now, timer = cpu_seconds, signal.ITIMER_PROF
         vars(limits)["time"] = SimpleNamespace(
             perf_counter=cpu_seconds
-        )  # the clock that a search looks at
-    instance, limit, space = INSTANCES[name], float(seconds), int(memory)
+        )  # a search reads this clock
+    instance = INSTANCES[options.instance]
     end_after(AROUND)
     for module in PEERS[tool].modules if tool in PEERS else ():
         importlib.import_module(module)
-    walk = instance.walk(int(seed))
+    walk = instance.walk(options.seed)
     trace, theory = walk.trace, instance.theory
     resource.setrlimit(resource.RLIMIT_AS, (space * 2**20, -1))
     say(images=len(trace), true_dstates=len(set(walk.truth)) or None, cpu=cpu_seconds())
@@ -81,7 +91,7 @@ def main() -> None:
     except NotApplicableError as error:
         say(status="not applicable", reason=str(error))
         return
-    except Exception as error:  # whatever a program raises is what came of it
+    except Exception as error:  # any error of a program is its result
         outcome = {
             "status": "memory" if _of_memory(error) else "error",
             "reason": f"{type(error).__name__}: {error}"[:200],
@@ -101,7 +111,7 @@ def main() -> None:
 
 
 def of_solution(solution: Solution, trace: Trace, theory: Theory) -> dict[str, Any]:
-    """What came of our solver: a map that the checker finds right, the bound, and where the time went."""
+    """The result of our solver: status, bound and times, after the checker has tested its maps."""
     wrong = [
         violation.message
         for ssh_map in solution.maps
@@ -124,7 +134,7 @@ def of_solution(solution: Solution, trace: Trace, theory: Theory) -> dict[str, A
 
 
 def of_machine(machine: Machine, trace: Trace, proven: bool) -> dict[str, Any]:
-    """What came of a peer: a machine that shows the views of the trace."""
+    """The result of a peer: its machine, if it shows the views of the trace."""
     states = machine.states(trace)
     if states is None:
         return {"status": "wrong", "reason": "the machine does not show the views of the trace"}
@@ -132,7 +142,7 @@ def of_machine(machine: Machine, trace: Trace, proven: bool) -> dict[str, Any]:
 
 
 def all_but(names: str) -> Speedups:
-    """All speed-ups but these."""
+    """All speed-ups except these."""
     off = names.split(",")
     if "following" in off:
         off.remove("following")
@@ -142,7 +152,7 @@ def all_but(names: str) -> Speedups:
 
 
 def cpu_seconds() -> float:
-    """What the processors worked for this process, all its threads, and the processes that it waited for."""
+    """CPU seconds of this process with its threads, and of the child processes it waited for."""
     return sum(
         used.ru_utime + used.ru_stime
         for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
@@ -150,7 +160,7 @@ def cpu_seconds() -> float:
 
 
 def end_after(seconds: float, timer: int = signal.ITIMER_REAL) -> None:
-    """From now on the process has so long, by this timer; then the system ends it, whatever it is doing. 0: no longer."""
+    """Let the system end this process after these seconds of a timer; 0 switches it off."""
     signal.setitimer(timer, seconds)
 
 

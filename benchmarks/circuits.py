@@ -8,6 +8,7 @@ runs on this machine. Compare the ratios, not the seconds.
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import time
 
@@ -35,6 +36,7 @@ def median(trace: Trace, theory: Theory, prefixes: bool = True) -> float:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
     print(
         f"{'theory':16} {'images':>7} {'prefix':>7} {'s':>8} "
         f"{'x 2 circuits':>13} {'at once, s':>11}"

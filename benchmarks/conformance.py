@@ -10,6 +10,7 @@ the deciles of all ratios are printed.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import statistics
@@ -59,7 +60,8 @@ def answer() -> None:
         print(milliseconds(Trace.load(path), Theory.from_dict(theory)), flush=True)
 
 
-def main(other: str | None = None) -> None:
+def compare(other: str | None) -> None:
+    """Measure this checkout and, if given, another one, and print the times."""
     checkouts = [str(ROOT), *([other] if other else [])]
     command = [sys.executable, str(Path(__file__).resolve()), "--answer"]
     children = [
@@ -85,6 +87,7 @@ def main(other: str | None = None) -> None:
                 rows[-1].append(float(child.stdout.readline()))
     for child in children:
         child.communicate()
+    # Print the times of each checkout, then their ratios.
     for path, times in zip(checkouts, zip(*rows, strict=True), strict=True):
         print(
             f"{len(times)} traces, {path}: median {statistics.median(times):.1f} ms, "
@@ -98,5 +101,13 @@ def main(other: str | None = None) -> None:
         )
 
 
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("checkout", nargs="?", help="another checkout to compare with")
+    parser.add_argument("--answer", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    answer() if options.answer else compare(options.checkout)
+
+
 if __name__ == "__main__":
-    answer() if sys.argv[1:] == ["--answer"] else main(*sys.argv[1:2])
+    main()

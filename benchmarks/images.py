@@ -9,6 +9,7 @@ rectangle: from poses near its eight dstates ("dstates"), or from uniformly draw
 
 from __future__ import annotations
 
+import argparse
 import resource
 import subprocess
 import sys
@@ -86,14 +87,20 @@ def queries(kind: str, count: int) -> None:
 
 
 def main() -> None:
+    # Each measurement runs this script again, so that its peak memory is its own.
     if sys.argv[1:2] in (["search"], ["queries"]):
         (search if sys.argv[1] == "search" else queries)(sys.argv[2], int(sys.argv[3]))
         return
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument(
+        "sizes", nargs="*", type=int, default=SIZES, metavar="SIZE", help="numbers of images"
+    )
+    sizes = parser.parse_args().sizes
     for world in ("notched-rectangle", "taylor-hall"):
         simulated(world)
     for job in ("search", "queries"):
         for kind in ("dstates", "anywhere"):
-            for count in [int(size) for size in sys.argv[1:]] or SIZES:
+            for count in sizes:
                 subprocess.run([sys.executable, __file__, job, kind, str(count)], check=True)
 
 

@@ -7,11 +7,11 @@ The default picture is docs/figures/growth.png.
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import re
 import statistics
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -130,8 +130,18 @@ def curve(results: dict[str, Any], pattern: str, tool: str, size: str) -> list[t
 
 
 def main() -> None:
-    results = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
-    draw(results, Path(sys.argv[2]) if len(sys.argv) > 2 else PICTURE)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("results", type=Path, metavar="RESULTS.json", help="a stored run")
+    parser.add_argument(
+        "picture",
+        type=Path,
+        nargs="?",
+        default=PICTURE,
+        metavar="PICTURE",
+        help="file to draw into",
+    )
+    options = parser.parse_args()
+    draw(json.loads(options.results.read_text(encoding="utf-8")), options.picture)
 
 
 if __name__ == "__main__":

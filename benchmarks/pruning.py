@@ -1,12 +1,15 @@
-"""Which speed-ups earn their lines: each is switched off by itself, on several families of instances and seeds, with and without in turns.
+"""Which speed-ups are worth keeping: each is switched off on several families and seeds.
 
     python benchmarks/pruning.py [--only SWITCHES] [--seeds N] [--resume] [--out RESULTS.json]
 
-A speed-up stays if on two families the median over the seeds is at least GAIN times as many seconds without it, or as many dstates where a
-limit ends the search. Seconds are those that the processors worked, unless TRIALS says otherwise: so other work on the machine
-counts little. A search that its limit ends counts as if it had ended then, so the true ratio is at least as far from 1. `following` is no switch: cell.py
-says what is left out. Each run is a process of its own, and one runs at a time. The results are stored as JSON, run by run; --resume goes on with them.
-readme.py writes the table into docs/measurements/performance.md.
+Runs with and without a speed-up alternate. A speed-up stays if on two families the median ratio
+over the seeds is at least GAIN. The ratio compares seconds, or dstates where a limit ends the
+search, without and with the speed-up. Seconds are CPU seconds unless TRIALS says otherwise, so
+other work on the machine hardly matters. A search that hits its limit counts as if it had ended
+then, so the true ratio is at least as far from 1. `following` is not a switch: cell.py says what
+is left out. Each run has its own process, and they run one at a time. Results are stored as JSON
+after each run; --resume continues a stored run. readme.py writes the table into
+docs/measurements/performance.md.
 """
 
 from __future__ import annotations
@@ -29,21 +32,23 @@ from table import OURS, WITHOUT
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 ROOT = Path(__file__).parent.parent
-GAIN = 1.5  # times as many seconds, or dstates, without a speed-up that stays,
-STAYING = 2  # on so many families of instances,
-FAMILIES = 3  # of so many at least
-LIMIT = 4.0  # seconds that a search has,
-LONGER = 12.0  # where little was expected of a speed-up, or a map takes its time,
-SHORT = 3.0  # and where a map is asked for before anything can be proved
+GAIN = 1.5  # least ratio of seconds or dstates, without to with a speed-up that stays
+STAYING = 2  # families of instances with this gain
+FAMILIES = 3  # least number of measured families
+LIMIT = 4.0  # seconds of a search
+LONGER = 12.0  # seconds where little gain was expected, or maps take long
+SHORT = 3.0  # seconds where the first map matters, before a proof is possible
 MEMORY = 4096  # MiB
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A speed-up that is switched off on a family of instances, which is one instance with several seeds.
+    """A speed-up that is switched off on a family: one instance with several seeds.
 
-    measure  "seconds" until one minimal map is proven, or "dstates" of the best map at the limit
-    clock    as in cell.py
+    Attributes:
+        measure: "seconds" until one minimal map is proven, or "dstates" of the best map at the
+            limit.
+        clock: As in cell.py.
     """
 
     switch: str
@@ -123,14 +128,14 @@ TRIALS = (
     *_timed("processes", STARS, FEW_SEEN, clock="wall"),
     *_ended("processes", "full maze 10x10 n=400", clock="wall"),
 )
-# What can be run: a speed-up that went keeps its trials above, which say what its row of the page is of.
+# The speed-ups that can be measured. Removed ones keep their trials above, for the stored results.
 SWITCHES = tuple(
     dict.fromkeys(trial.switch for trial in TRIALS if trial.switch in (*SPEEDUPS, "following"))
 )
 
 
 def ratio(measure: str, limit: float, base: dict[str, Any], without: dict[str, Any]) -> float:
-    """What is needed without a speed-up, as a ratio to with it."""
+    """The need without a speed-up divided by the need with it."""
     if measure == "dstates":
         here, there = (cell.get("dstates") or math.inf for cell in (base, without))
         return 1.0 if here == there else there / here
@@ -141,7 +146,7 @@ def ratio(measure: str, limit: float, base: dict[str, Any], without: dict[str, A
 
 
 def ratios(results: dict[str, Any]) -> dict[str, dict[Trial, list[float]]]:
-    """The ratios of each trial, one a seed, by switch."""
+    """The ratios of each trial by switch, one for each seed."""
     pairs: dict[tuple[Trial, int], dict[bool, dict[str, Any]]] = {}
     for cell in results["cells"]:
         trial = Trial(
@@ -158,16 +163,17 @@ def ratios(results: dict[str, Any]) -> dict[str, dict[Trial, list[float]]]:
 
 
 def verdict(of_switch: Collection[list[float]]) -> str:
-    """Whether the ratios of a switch, a list for each family, show that it earns its lines."""
+    """Whether the ratios of a switch, a list for each family, show that it should stay."""
     if sum(statistics.median(of_family) >= GAIN for of_family in of_switch) >= STAYING:
         return "stays"
     return "**goes**" if len(of_switch) >= FAMILIES else "not measured yet"
 
 
 def table(results: dict[str, Any]) -> str:
-    """Markdown: a row for each switch."""
+    """Markdown with a row for each switch."""
     rows = [
-        "| speed-up | without it, as a ratio to with it: the median over the seeds (least to most) | verdict |",
+        "| speed-up | without it, as a ratio to with it: the median over the seeds "
+        "(least to most) | verdict |",
         "| -- | -- | -- |",
     ]
     for switch, trials in ratios(results).items():
@@ -189,7 +195,7 @@ def table(results: dict[str, Any]) -> str:
 
 
 def _meant(trial: Trial) -> str:
-    """What is compared, where that is not CPU seconds."""
+    """What a trial compares, if not CPU seconds."""
     return (
         f", dstates after {trial.limit:g} s"
         if trial.measure == "dstates"
@@ -235,7 +241,10 @@ def measure(results: dict[str, Any], trials: Iterable[Trial], seeds: int, out: P
                         }
                     )
                     store(results, out)
-                    came = f"{cell['status']:8} {cell.get('seconds', 0):6.2f} s {cell.get('dstates')} dstates"
+                    came = (
+                        f"{cell['status']:8} {cell.get('seconds', 0):6.2f} s "
+                        f"{cell.get('dstates')} dstates"
+                    )
                     print(f"{trial.family:50} {seed} {tool:34} {came}", file=sys.stderr, flush=True)
 
 
@@ -245,13 +254,13 @@ def main() -> None:
         "--only",
         default=",".join(SWITCHES),
         metavar="SWITCHES",
-        help="speed-ups, commas between (default all)",
+        help="speed-ups, separated by commas (default all)",
     )
     parser.add_argument(
         "--seeds", type=int, default=5, metavar="N", help="traces of each family (default 5)"
     )
     parser.add_argument(
-        "--resume", action="store_true", help="keep what is stored, and run only what is not"
+        "--resume", action="store_true", help="keep stored runs, and run only the others"
     )
     parser.add_argument(
         "--out",

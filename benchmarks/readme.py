@@ -8,10 +8,10 @@ Each table stands between two comments that name it. The text around them stays.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +63,15 @@ def rewritten(page: str, name: str, results: dict[str, Any], path: Path) -> str:
 
 
 def main() -> None:
-    path = Path(sys.argv[1]).resolve()
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("results", type=Path, metavar="RESULTS.json", help="a stored run")
+    parser.add_argument(
+        "tables", nargs="*", default=["peers"], metavar="TABLE", help="peers (default) or pruning"
+    )
+    options = parser.parse_args()
+    path = options.results.resolve()
     results = json.loads(path.read_text(encoding="utf-8"))
-    for name in sys.argv[2:] or ["peers"]:
+    for name in options.tables:
         page = PAGES[name]
         page.write_text(
             rewritten(page.read_text(encoding="utf-8"), name, results, path), encoding="utf-8"

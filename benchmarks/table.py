@@ -7,10 +7,10 @@ Time and memory of all tools, then the size of our ground program.
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import statistics
-import sys
 from collections.abc import Iterable, Sequence
 from itertools import permutations
 from pathlib import Path
@@ -226,7 +226,9 @@ def _markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def main() -> None:
-    results = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("results", type=Path, metavar="RESULTS.json", help="a stored run")
+    results = json.loads(parser.parse_args().results.read_text(encoding="utf-8"))
     print(f"{times(results)}\n\n{grounding(results)}")
 
 

@@ -10,8 +10,8 @@ what the player typed and read.
 
 from __future__ import annotations
 
+import argparse
 import random
-import sys
 from pathlib import Path
 
 import networkx as nx
@@ -55,8 +55,11 @@ def maze() -> nx.MultiDiGraph:
 
 
 def main() -> None:
-    if sys.argv[1:2] == ["--play"]:
-        play(commands=100, seed=1).save(sys.argv[2])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--play", metavar="F", help="play the game, and write its trace to F")
+    options = parser.parse_args()
+    if options.play:
+        play(commands=100, seed=1).save(options.play)
         return
     trace = Trace.load(HERE / "adventure.jsonl")
     solution = solve(trace, Theory.causal())

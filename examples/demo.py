@@ -7,7 +7,7 @@ Prints the minimal maps of the route and what tells them apart, and draws one of
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 from ssh_abduction import Theory, Trace, compare, solve
@@ -18,6 +18,11 @@ from ssh_abduction.output import to_svg
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument(
+        "folder", type=Path, nargs="?", default=Path("out"), help="where files go (default: out)"
+    )
+    folder = parser.parse_args().folder
     trace = Trace.load(Path(__file__).parent / "aces3-route.jsonl")
     theory = Theory.topological()
     solution = solve(trace, theory)
@@ -31,7 +36,6 @@ def main() -> None:
         violations = check(trace, ssh_map, theory)
         print(f"\nmap {i + 1}: {violations or 'satisfies every axiom'}\n{describe(ssh_map)}")
     print("\nwhat tells them apart", *compared(compare(solution)), sep="\n")
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out")
     folder.mkdir(parents=True, exist_ok=True)
     picture = folder / "aces3-map.svg"
     picture.write_text(to_svg(solution.maps[0]) + "\n", encoding="utf-8")

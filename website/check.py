@@ -10,6 +10,7 @@ a line. The exit code is 1 if there is any.
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 from collections.abc import Iterator
@@ -110,7 +111,9 @@ def fetching(address: str, where: Path) -> Iterator[str]:
 
 
 def main() -> int:
-    site = Path(sys.argv[1])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("site", type=Path, help="the folder that mkdocs built")
+    site = parser.parse_args().site
     found = list(problems(site))
     print(*found, sep="\n", end="\n" if found else "")
     pages = len(list(site.rglob("*.html")))
