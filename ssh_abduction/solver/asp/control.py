@@ -1,4 +1,4 @@
-"""Asking clingo, under limits: what all engines and searches have in common."""
+"""Asks clingo under limits, for all engines and searches."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from ssh_abduction.solver.values import Grounding
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import Speedups
 
-# After grounding, clasp prepares the program before it begins to solve, and cannot be stopped meanwhile. That takes about this share of the time, and of the
-# memory, that grounding took; so a search is not begun where a limit would be over by then.
+# After grounding, clasp prepares the program and cannot be stopped meanwhile. That takes about this
+# share of the time, and of the memory, that grounding took. So no search is begun if a limit would
+# be over by then.
 PREPARING = 0.6, 1.0
 
 SLOW = 0.05  # seconds of grounding from which on the log mentions it
@@ -31,20 +32,24 @@ _under_way: set[clingo.SolveHandle] = set()  # the searches that clingo does now
 
 @atexit.register
 def _end_all() -> None:
-    """When Python ends, end the searches of streams that somebody still holds, as their threads would abort Python."""
+    """End the searches of streams that somebody still holds, when Python ends.
+
+    Their threads would abort Python.
+    """
     for handle in list(_under_way):
         handle.cancel()
 
 
 @contextmanager
 def _held_back_interrupts() -> Iterator[None]:
-    """Ctrl-C and SIGTERM take effect when this context ends. Raised while clingo starts a thread, they would leave the thread without an owner."""
+    """Hold back Ctrl-C and SIGTERM until this context ends.
+
+    Raised while clingo starts a thread, they would leave the thread without an owner.
+    """
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     held = {number: handler for number, handler in handlers.items() if callable(handler)}
-    if (
-        threading.current_thread() is not threading.main_thread()
-    ):  # only the main thread may handle signals
-        yield
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may handle signals
         return
     caught: list[int] = []
     for number in held:
@@ -65,12 +70,13 @@ Made = TypeVar("Made")
 class Control(clingo.Control):
     """A clingo control without warnings.
 
-    Only one control at a time reads or grounds: two threads that do so side by side wait for each other at each symbol, which takes three times as long.
+    Only one control at a time reads or grounds. Two threads that do so side by side wait for each
+    other at each symbol, which takes three times as long.
 
-    check      called now and then while clingo grounds, where an encoding has `@go_on`; what it raises ends the grounding, and the control is of no use then
-    preparing  see PREPARING
-    seconds    that clingo has grounded since it last began to solve
-    mebibytes  by which the process has grown meanwhile
+    Attributes:
+        preparing: As PREPARING.
+        seconds: How long clingo has grounded since it last began to solve.
+        mebibytes: By how much the process has grown meanwhile.
     """
 
     def __init__(
@@ -79,6 +85,14 @@ class Control(clingo.Control):
         check: Callable[[], None] = lambda: None,
         preparing: tuple[float, float] = PREPARING,
     ) -> None:
+        """A control without a program.
+
+        Args:
+            options: Of clingo.
+            check: Called now and then while clingo grounds, if an encoding has `@go_on`. What it
+                raises ends the grounding; the control is of no use then.
+            preparing: As PREPARING.
+        """
         super().__init__(["--warn=none", *options])
         self.preparing = preparing
         self.seconds = self.mebibytes = 0.0
@@ -86,7 +100,7 @@ class Control(clingo.Control):
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """No other control reads or grounds meanwhile. While one does, this waits, and looks whether to go on."""
+        """Let no other control read or ground meanwhile; wait while one does, under the limits."""
         while not _grounding.acquire(timeout=POLL):
             self._check()
         try:
@@ -124,9 +138,8 @@ class Control(clingo.Control):
         try:
             super().ground(parts, context or asked)
         except BaseException:
-            if (
-                asked.raised is not None
-            ):  # clingo raises a copy of this exception, which lacks what it holds
+            if asked.raised is not None:
+                # Clingo raises a copy of this exception, which lacks its attributes.
                 raise asked.raised from None
             raise
         finally:
@@ -151,7 +164,10 @@ class _Asked:
         self._next = time.perf_counter() + POLL
 
     def go_on(self, *_: clingo.Symbol) -> clingo.Symbol:
-        """1, unless `check` raises. `check` is called only now and then, as clingo may ask this millions of times."""
+        """Return 1, unless `check` raises.
+
+        `check` is called only now and then, as clingo may ask this millions of times.
+        """
         try:
             if time.perf_counter() > self._next:
                 self._check()
@@ -163,11 +179,13 @@ class _Asked:
 
 
 class Asker:
-    """One clingo control, and the questions to it under limits. What asks clingo has one of these.
+    """One clingo control, and the questions to it under limits.
 
-    control  the control that is asked; a new one may take its place
-    watch    the limits; another search may go on under others
-    ground_seconds, solve_seconds  the time that clingo took so far
+    Attributes:
+        control: The control that is asked; a new one may take its place.
+        watch: The limits; another search may go on under others.
+        ground_seconds: How long clingo has grounded so far.
+        solve_seconds: How long clingo has solved so far.
     """
 
     def __init__(self, watch: Watch) -> None:
@@ -178,7 +196,7 @@ class Asker:
 
     @contextmanager
     def grounding_timed(self) -> Iterator[None]:
-        """What is done in here counts as grounding."""
+        """Count the time in this context as grounding."""
         began = time.perf_counter()
         try:
             yield
@@ -187,7 +205,10 @@ class Asker:
 
     @property
     def grounding(self) -> Grounding:
-        """The size of the program in the last call of clingo that came to an end. To ask takes a millisecond, as clingo tells all that it counts."""
+        """The size of the program in the last call of clingo that came to an end.
+
+        To ask takes a millisecond, as clingo returns all its statistics.
+        """
         try:
             program = self.control.statistics["problem"]["lp"]
         except (RuntimeError, KeyError):  # no call came to an end
@@ -207,16 +228,21 @@ class Asker:
         until: Callable[[], bool] = lambda: False,
         ahead: bool = False,
     ) -> Generator[Answer, None, bool]:
-        """The answers of clingo, each read as soon as it comes. Returns whether these are all, and neither the limit of conflicts nor `until` ended the search.
+        """The answers of clingo, each read as soon as it comes.
 
-        read       makes a value of an answer, which clingo may change afterwards
-        mode       how clingo optimises: its option opt-mode
-        models     how many answers are asked for, 0 for all
-        conflicts  the limit, -1 for none
-        on_bound   called with each bound that clingo proves
-        control    another control than this one's own
-        until      asked now and then; where it is true, the search ends
-        ahead      let clingo search for the next answer while the caller uses this one
+        Args:
+            read: Makes a value of an answer, which clingo may change afterwards.
+            mode: Clingo's opt-mode.
+            models: How many answers to ask for; 0 for all.
+            assumptions: What has to hold in each answer.
+            conflicts: The limit; -1 for none.
+            on_bound: Called with each bound that clingo proves.
+            control: Another control than this one's own.
+            until: Asked now and then; the search ends once it is true.
+            ahead: Let clingo search for the next answer while the caller uses this one.
+
+        Returns:
+            Whether these are all: neither the limit of conflicts nor `until` ended the search.
         """
         project = "no" if mode.partition(",")[0] == "opt" else "project"
         with self._solving(
@@ -244,7 +270,17 @@ class Asker:
         mode: str = "ignore",
         until: Callable[[], bool] = lambda: False,
     ) -> tuple[Answer | None, list[int] | None]:
-        """An answer in which these literals are true, or else a core of them. Neither, where the limit of conflicts or `until` ended the search."""
+        """An answer in which these literals are true, or else a core of them.
+
+        Both are None if the limit of conflicts or `until` ended the search.
+
+        Args:
+            read: Makes a value of an answer.
+            assumed: The literals.
+            conflicts: The limit; -1 for none.
+            mode: Clingo's opt-mode.
+            until: Asked now and then; the search ends once it is true.
+        """
         with self._solving(self.control, assumed, mode, 1, "no", conflicts) as handle:
             if not self._has_come(handle, until):
                 return None, None
@@ -254,9 +290,8 @@ class Asker:
             if not _result(handle, conflicts).unsatisfiable:
                 return None, None
             known = set(assumed)
-            return None, [
-                literal for literal in handle.core() if literal in known
-            ]  # a core may also have external atoms, which clingo assumes
+            # A core may also have external atoms, which clingo assumes.
+            return None, [literal for literal in handle.core() if literal in known]
 
     @contextmanager
     def _solving(
@@ -293,7 +328,11 @@ class Asker:
                 handle.cancel()
 
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
-        """Wait until clingo has come to an answer or to an end, and return True; or until `until` holds, and return False."""
+        """Wait until clingo has come to an answer or to an end, or until `until` holds.
+
+        Returns:
+            Whether clingo has come to an answer or to an end.
+        """
         began = time.perf_counter()
         try:
             while not handle.wait(POLL):
@@ -309,7 +348,11 @@ class Asker:
 def mapped(
     function: Callable[[Answer], Made], answers: Generator[Answer, None, bool]
 ) -> Generator[Made, None, bool]:
-    """The results of a function for each answer. Returns what the generator of the answers returns."""
+    """The results of a function for each answer.
+
+    Returns:
+        What the generator of the answers returns.
+    """
     with closing(answers):
         while True:
             try:
@@ -320,7 +363,11 @@ def mapped(
 
 
 def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
-    """How a search ended. Raises LimitError if it was interrupted from outside, and not ended by the limit of conflicts."""
+    """How a search ended.
+
+    Raises:
+        LimitError: It was interrupted from outside, and not ended by the limit of conflicts.
+    """
     result = handle.get()
     if result.interrupted and conflicts < 0:
         raise LimitError("interrupted")

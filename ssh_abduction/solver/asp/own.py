@@ -1,7 +1,8 @@
-"""Whether a map keeps a user's own rules: they are grounded with all that the map says as facts.
+"""Checks whether a map keeps a user's own rules.
 
-The checker knows no rules of others. But where a rule reads only what a map shows, clingo has nothing to choose but what the rules leave open themselves. So that
-takes hardly longer than to ground them.
+The rules are grounded with all that the map says as facts. The checker does not know such rules. If
+a rule reads only what a map shows, clingo chooses only what the rules leave open themselves. So the
+check takes hardly longer than grounding.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.solver.asp.own import keeps_own_rules
@@ -48,8 +49,12 @@ SHOWN = frozenset(
 )
 OF_TRACE = frozenset({"view", "act", "kind", "turns", "open", "axiom", "path", "prefer", "query"})
 FRAME = """
-#defined query/1. #defined violation/2. #defined is/2. #defined same/2. #defined at/2. #defined same_place/2. #defined along/3. #defined same_course/2.
-#defined on_some_path/1. #defined on/2. #defined before/3. #defined travel/1. #defined turn/2. #defined kind/2. #defined turns/2. #defined open/2.
+#defined query/1. #defined violation/2. #defined is/2. #defined same/2. #defined at/2.
+#defined same_place/2.
+#defined along/3.
+#defined same_course/2. #defined on_some_path/1. #defined on/2. #defined before/3.
+#defined travel/1.
+#defined turn/2. #defined kind/2. #defined turns/2. #defined open/2.
 #defined act/2. #defined prefer/2. #defined path/1.
 #program step(t).
 :- violation(N,t), axiom(N).
@@ -59,7 +64,7 @@ FRAME = """
 
 
 def can_be_asked(theory: Theory) -> bool:
-    """Whether a map alone says whether the rules of a theory, whose star is settled, hold."""
+    """Whether a map alone shows if the rules of a settled theory hold."""
     if not theory.rules:
         return True
     settled = not theory.has_faults and (theory.level == "causal" or theory.path_order == "total")
@@ -97,12 +102,14 @@ def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
 
 
 def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
-    """What the encodings say of each step where they have this map. Dstates and places have the names of their first steps, and paths are numbered from 1."""
+    """The atoms of the encodings for each step of this map.
+
+    Dstates and places have the names of their first steps; paths are numbered from 1.
+    """
     first: dict[int, int] = {}
     place: dict[int, int] = {}
-    path: dict[
-        int, tuple[int, int]
-    ] = {}  # for each path, its number, and the direction that is faced first
+    # For each path, its number, and the direction that is faced first.
+    path: dict[int, tuple[int, int]] = {}
     before: dict[int, list[int]] = {}  # for each dstate, and place, and course, its steps so far
     here: dict[int, list[int]] = {}
     along: dict[tuple[int, int], list[int]] = {}

@@ -1,9 +1,12 @@
-"""Whether clingo can read a user's own rules, and would ever read them: the errors say how to write them.
+"""Checks whether clingo can read a user's own rules, and would ever ground them.
+
+The errors say how to write them.
 
 >>> from ssh_abduction import Theory
 >>> from ssh_abduction.solver.asp.rules import check_rules
 >>> from ssh_abduction.theory.rules import Rules
->>> check_rules(Theory.causal().replace(rules=[Rules("own.lp", "#program step(t). :- same(I,t), t > 9.")]))
+>>> rules = Rules("own.lp", "#program step(t). :- same(I,t), t > 9.")
+>>> check_rules(Theory.causal().replace(rules=[rules]))
 """
 
 from __future__ import annotations
@@ -23,11 +26,8 @@ from ssh_abduction.theory.theory import Theory
 # The predicates of a trace's facts, which come step by step.
 OF_STEPS = {"view", "act", "kind", "turns", "open", "excluded", "elsewhere", "one"}
 READABLE = {"axiom", "path", "prefer", "defeasible"}  # the predicates of a theory's facts
-PARTS = {
-    "base": 0,
-    "step": 1,
-    "check": 1,
-}  # the program parts that are grounded, with the number of their parameters
+# The program parts that are grounded, with the number of their parameters.
+PARTS = {"base": 0, "step": 1, "check": 1}
 TEXT = "<string>"  # what clingo calls a text that is no file
 ALLOWED = {
     ast.ASTType.Rule,
@@ -36,11 +36,18 @@ ALLOWED = {
     ast.ASTType.Defined,
     ast.ASTType.Comment,
 }
-EXAMPLE = "% @axiom(brief) No dstate is seen again later.\n#program step(t).\nviolation(brief,t) :- same(I,t), t-I > 10."
+EXAMPLE = (
+    "% @axiom(brief) No dstate is seen again later.\n#program step(t).\n"
+    "violation(brief,t) :- same(I,t), t-I > 10."
+)
 
 
 def check_rules(theory: Theory) -> None:
-    """Raises TheoryError where the rules of a theory, whose star is settled, cannot be read, or never would be."""
+    """Check the rules of a settled theory.
+
+    Raises:
+        TheoryError: Rules cannot be read, or would never be grounded.
+    """
     for rules in theory.rules:
         others = tuple(other for other in theory.rules if other is not rules)
         _check(rules, others, encodings.needed_by(vars(theory)))
@@ -71,48 +78,57 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
         where = f"{rules.name}:{begin.line}"
         if begin.filename != TEXT:
             raise TheoryError(
-                f"{rules.name}: expected rules, got #include of {begin.filename}; give that file, too (--rules may be given again)"
+                f"{rules.name}: expected rules, got #include of {begin.filename}; "
+                "give that file, too (--rules may be given again)"
             )
         if statement.ast_type not in ALLOWED:
             raise TheoryError(
-                f"{where}: expected rules, got {_short(statement)}; what is minimised and shown is chosen by the theory"
+                f"{where}: expected rules, got {_short(statement)}; "
+                "what is minimised and shown is chosen by the theory"
             )
         for function in _functions_of_python(statement):
             raise TheoryError(
-                f"{where}: expected what clingo works out by itself, got {function}, a function of Python's; say it in rules"
+                f"{where}: expected what clingo works out by itself, got {function}, "
+                "a function of Python's; say it in rules"
             )
         if statement.ast_type is not ast.ASTType.Rule:
             continue
         for name in _heads(statement):
             if name in known - {"violation"}:
                 raise TheoryError(
-                    f"{where}: expected a rule that reads {name}, got one that defines it; derive violation(name,t), or an atom of your own"
+                    f"{where}: expected a rule that reads {name}, got one that defines it; "
+                    "derive violation(name,t), or an atom of your own"
                 )
         for atom in _derived(statement.head):
             if atom.name == "violation" and len(atom.arguments) not in numbers["violation"]:
                 raise TheoryError(
-                    f"{where}: {atom}: expected {_counted(numbers['violation'])}, got {len(atom.arguments)}; derive violation(name,t)"
+                    f"{where}: {atom}: expected {_counted(numbers['violation'])}, "
+                    f"got {len(atom.arguments)}; derive violation(name,t)"
                 )
         for violated in _violations(statement):
             if violated not in named:
                 raise TheoryError(
-                    f"{where}: violation({violated},…): expected a sentence for it; write % @axiom({violated}) and what it says, on a line before"
+                    f"{where}: violation({violated},…): expected a sentence for it; "
+                    f"write % @axiom({violated}) and what it says, on a line before"
                 )
         for atom, positive in _atoms(statement):
             name = atom.name
             if name in of_steps and part == "base":
                 raise TheoryError(
-                    f"{where}: {name}: expected in a program part of steps, as what is in base is read before there are steps; write #program step(t). before the rule"
+                    f"{where}: {name}: expected in a program part of steps, as what is in base is "
+                    "read before there are steps; write #program step(t). before the rule"
                 )
             if name not in known | own | defined | OF_STEPS | READABLE:
                 raise TheoryError(
-                    f"{where}: {name}: expected an atom that this theory has, got one that nothing defines; there are {', '.join(sorted(of_steps))}"
+                    f"{where}: {name}: expected an atom that this theory has, got one that nothing "
+                    f"defines; there are {', '.join(sorted(of_steps))}"
                 )
             if name not in own | defined and len(atom.arguments) not in numbers.get(
                 name, {len(atom.arguments)}
             ):
                 raise TheoryError(
-                    f"{where}: {atom}: expected {_counted(numbers[name])}, got {len(atom.arguments)}"
+                    f"{where}: {atom}: expected {_counted(numbers[name])}, "
+                    f"got {len(atom.arguments)}"
                 )
             if (
                 name in of_steps
@@ -122,8 +138,10 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
                 and all(_is_settled(a, parameter) for a in atom.arguments)
             ):
                 raise TheoryError(
-                    f"{where}: not {atom}: expected to be asked at a step, got a question that is asked before its steps are there; "
-                    f"write {parameter} = {atom.arguments[-1]}, not {name}(…,{parameter}), in the body"
+                    f"{where}: not {atom}: expected to be asked at a step, got a question that is "
+                    "asked before its steps are there; "
+                    f"write {parameter} = {atom.arguments[-1]}, "
+                    f"not {name}(…,{parameter}), in the body"
                 )
     _check_safety(rules)
 
@@ -152,7 +170,11 @@ def read_by(rules: Rules, every: Iterable[Rules]) -> frozenset[str]:
 
 
 def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
-    """The statements of rules, each with the program part that it is in, and the parameter of that. Raises TheoryError."""
+    """The statements of rules, each with its program part and the parameter of the part.
+
+    Raises:
+        TheoryError: Clingo cannot read the rules, or a part is never grounded.
+    """
     found: list[tuple[ast.AST, str, str]] = []
     messages: list[str] = []
     part, parameter = "base", ""
@@ -167,7 +189,8 @@ def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
             if PARTS.get(part) != len(statement.parameters):
                 where = f"{rules.name}:{statement.location.begin.line}"
                 raise TheoryError(
-                    f"{where}: expected a program part base, step(t) or check(t), got {_short(statement)}; others are never grounded"
+                    f"{where}: expected a program part base, step(t) or check(t), "
+                    f"got {_short(statement)}; others are never grounded"
                 )
         found.append((statement, part, parameter))
 
@@ -175,20 +198,23 @@ def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
         ast.parse_string(rules.text, take, logger=lambda _, message: messages.append(message))
     except RuntimeError:
         raise TheoryError(_said(rules, messages)) from None
-    return [
-        entry for entry in found[1:] if entry[0].ast_type is not ast.ASTType.Comment
-    ]  # the first one opens base
+    # The first one opens base.
+    return [entry for entry in found[1:] if entry[0].ast_type is not ast.ASTType.Comment]
 
 
 def _said(rules: Rules, messages: list[str]) -> str:
     """What clingo said of rules, on one line."""
     said = " ".join(messages[0].split()) if messages else "clingo cannot read them"
     said = re.sub(r"^<[^>]*>", lambda _: rules.name, said)
-    return f"{said if said.startswith(rules.name) else f'{rules.name}: {said}'}; rules are written as in: {' '.join(EXAMPLE.split(chr(10)))}"
+    said = said if said.startswith(rules.name) else f"{rules.name}: {said}"
+    return f"{said}; rules are written as in: {' '.join(EXAMPLE.splitlines())}"
 
 
 def _check_safety(*files: Rules) -> None:
-    """Let clingo look at rules as it does before it grounds them: unsafe variables show only then. Nothing is grounded, as that may take long."""
+    """Let clingo look for unsafe variables, as it does before it grounds rules.
+
+    Nothing is grounded, as that may take long.
+    """
     messages: list[str] = []
     control = clingo.Control(logger=lambda _, message: messages.append(message))
     try:
@@ -205,7 +231,12 @@ def _check_safety(*files: Rules) -> None:
 def _predicates(
     files: tuple[str, ...],
 ) -> tuple[frozenset[str], frozenset[str], dict[str, frozenset[int]]]:
-    """The predicates of these encodings that are about steps; all that they define; and how many arguments each may have that they define or read."""
+    """The predicates of these encodings.
+
+    Returns:
+        Those about steps, all that the encodings define, and for each that they define or read the
+        numbers of arguments that it may have.
+    """
     of_steps = set(OF_STEPS)
     defined, numbers = set[str](), dict[str, set[int]]()
     for name in files:
@@ -253,7 +284,10 @@ def _derived(head: ast.AST) -> Iterator[ast.AST]:
 
 
 def _atoms(statement: ast.AST) -> Iterator[tuple[ast.AST, bool]]:
-    """The atoms that a rule reads, in its body and in the conditions of its head; and whether it reads that they hold."""
+    """The atoms that a rule reads, and whether it reads that they hold.
+
+    They are in its body and in the conditions of its head.
+    """
     derived = list(_derived(statement.head))
     for literal in statement.body:
         yield from _atoms_in(literal)

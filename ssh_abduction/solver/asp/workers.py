@@ -1,7 +1,9 @@
-"""Processes that do one piece of work after another, each begun anew rather than forked: a process that is forked while a thread grounds may wait for ever.
+"""Processes that do one piece of work after another.
 
-They end when the process that began them does, however that ends: their input ends then. One that is killed loses the piece it was at, and no other.
-Their temporary files lie in one folder, which goes with them.
+Each process is begun anew rather than forked: one that is forked while a thread grounds may wait
+for ever. The processes end when the process that began them ends, as their input ends then. One
+that is killed loses the piece that it was at, and no other. Their temporary files lie in one
+folder, which is deleted with them.
 """
 
 from __future__ import annotations
@@ -22,9 +24,10 @@ from typing import Any, BinaryIO, NamedTuple
 
 from ssh_abduction.runtime.program import command, search_path
 
-# So many seconds a process may take to begin, at most, on a machine that has much else to do.
+# A process may take at most this many seconds to begin, on a machine that has much else to do.
 STARTING = 10.0
-# So many seconds pass between two looks at whether all is to stop: short against the two seconds in which Ctrl-C has to be heard.
+# Seconds between two looks at whether to stop: short against the two seconds in which Ctrl-C has to
+# take effect.
 POLL = 0.05
 
 _BEGIN = b"\0ssh-abduction answers\n"  # what is printed before, as Python begins, is no answer
@@ -40,11 +43,12 @@ class Lost(NamedTuple):
 class Worker:
     """A process that does one piece of work at a time, until `end`.
 
-    folder    where its temporary files are made
-    deadline  when the piece under way is to be answered, at the latest; then the process is killed
+    Attributes:
+        deadline: When the process is killed if it has not answered, on the monotonic clock.
     """
 
     def __init__(self, folder: str) -> None:
+        """Begin a process, which makes its temporary files in this folder."""
         self.deadline: float | None = None
         self._late = False
         self._process = subprocess.Popen(
@@ -58,7 +62,7 @@ class Worker:
         self._begun = False
 
     def end(self) -> None:
-        """Kill the process, and close what leads to it."""
+        """Kill the process, and close its pipes."""
         self.kill()
         self._process.wait()
         for end in (self._process.stdin, self._process.stdout):
@@ -71,7 +75,14 @@ class Worker:
         return self._process.poll() is None
 
     def done(self, number: int, work: Callable[..., Any], arguments: tuple[object, ...]) -> Any:
-        """What `work` makes of these arguments and, as the last one, whether that is given up; Lost if the process ends before. All of it is picklable."""
+        """What `work` returns; Lost if the process ends before.
+
+        Args:
+            number: Of the piece of work.
+            work: A function that can be pickled. Its last argument says whether the work is given
+                up.
+            arguments: All others.
+        """
         self._send((work, arguments))
         output = self._process.stdout
         assert output
@@ -120,11 +131,15 @@ def answers(
     seconds: float | None,
     patience: float,
 ) -> Iterator[Any]:
-    """What `work` makes of each task, whose first argument is its number, in so many processes, as it is ready; Lost where there is no answer.
+    """What `work` returns for each task, as soon as it is ready; Lost if there is no answer.
 
-    stopped   whether all is to end: no task begins any more, those under way are given up
-    seconds   that a task may take, until its process is killed; None where there is no such limit
-    patience  seconds that a task may take once it is given up
+    Args:
+        work: As in `Worker.done`.
+        tasks: Arguments, of which the first is the number of the task.
+        processes: How many processes work at once.
+        stopped: Whether to end: no task begins any more, and those under way are given up.
+        seconds: How long a task may take until its process is killed; None for no limit.
+        patience: How many seconds a task may take once it is given up.
     """
     waiting = queue.SimpleQueue[tuple[Any, ...]]()
     for task in tasks:
@@ -193,7 +208,7 @@ def _living(worker: Worker | None, folder: str) -> Worker:
 
 
 def _end(workers: Sequence[Worker], threads: Sequence[threading.Thread]) -> None:
-    """Kill processes, and close what leads to them once the threads that read from it have ended."""
+    """Kill processes, and close their pipes once the threads that read from them have ended."""
     for worker in workers:
         worker.kill()
     for thread in threads:
@@ -203,7 +218,7 @@ def _end(workers: Sequence[Worker], threads: Sequence[threading.Thread]) -> None
 
 
 class _Work:
-    """The pieces of work that come in, in a process that does them, and the folder for its temporary files."""
+    """The pieces of work that a process is sent, and the folder for its temporary files."""
 
     def __init__(self, folder: str) -> None:
         self._folder = folder
@@ -234,7 +249,7 @@ _outputs: list[BinaryIO] = []  # where the answers go, in a process that does su
 
 
 def reply(answer: object) -> None:
-    """Send the answer of the work under way. Whoever does so from another thread ends the process then."""
+    """Send the answer of the work under way. Another thread that does so then ends the process."""
     pickle.dump(answer, _outputs[0])
     _outputs[0].flush()
 
@@ -245,7 +260,7 @@ def serves() -> bool:
 
 
 def serve() -> None:
-    """Do the work that comes in, and send what comes of it, until the input ends."""
+    """Do the work that comes in, and send the answers, until the input ends."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(
             number, signal.SIG_IGN
