@@ -1,13 +1,12 @@
-"""The command line as a program. It loads nothing until it knows what Ctrl-C is to do."""
+"""The command line as a program. It handles Ctrl-C before it loads anything else."""
 
 import os
 import sys
 
 from ssh_abduction.runtime import program
 
-sys.path[:] = (
-    program.search_path()
-)  # `python -m` puts the current folder first, and a file there is no module of Python's
+# `python -m` puts the current folder first. A file there must not hide a module of Python's.
+sys.path[:] = program.search_path()
 
 try:
     import signal
