@@ -33,7 +33,7 @@ from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.solver.judging import InternalError
 from ssh_abduction.theory import Speedups, encodings
 from ssh_abduction.theory import settle as problems
-from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs
+from ssh_abduction.theory.evidence import NO_PAIRS, Equality, Pairs, evidence_of
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import SPEEDUPS, TABLE, row
@@ -250,7 +250,11 @@ def test_what_evidence_refuses_of_a_map_is_forbidden(name: str, data: st.DataObj
 
     counts, expected = minimal_maps(trace, THEORIES[name], allows)
     with (
-        patch.object(problems, "evidence_of", lambda *_: (NoLongReturns(),)),
+        patch.object(
+            problems,
+            "evidence_of",
+            lambda theory, known=(): (*evidence_of(theory), NoLongReturns()),
+        ),
         patch.object(prefixes, "FIRST_PREFIX", 1),
         patch.object(choosing, "FEW_STEPS", 0),
     ):
@@ -281,7 +285,11 @@ def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.
 
     counts, expected = minimal_maps(trace, settle(trace, theory).theory, allows)
     with (
-        patch.object(problems, "evidence_of", lambda *_: (NoLongReturns(),)),
+        patch.object(
+            problems,
+            "evidence_of",
+            lambda theory, known=(): (*evidence_of(theory), NoLongReturns()),
+        ),
         patch.object(
             prefixes, "FIRST_PREFIX", data.draw(st.sampled_from([1, 8]), label="first prefix")
         ),

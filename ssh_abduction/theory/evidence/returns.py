@@ -9,13 +9,13 @@ import math
 from bisect import bisect
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
+from ssh_abduction.theory.evidence.closing import Closing
 from ssh_abduction.theory.evidence.protocol import Equality
 from ssh_abduction.theory.pairs import NO_PAIRS, Earlier, Pairs
 
@@ -447,44 +447,6 @@ class Returns:
         )
         new: Mask = np.isin(codes, known_codes, invert=True)
         return new
-
-
-@dataclass(frozen=True)
-class Closing:
-    """By how much a loop fails to close, in metres and radians, with standard deviations.
-
-    Attributes:
-        way: Metres driven from its first step to its last one.
-        size: The distance between its ends.
-        size_sigma: The standard deviation of that distance.
-        turned: The difference of heading.
-        turned_sigma: The standard deviation of that difference.
-        square_of_position: The chi-square of the position, with two degrees of freedom.
-    """
-
-    way: float
-    size: float
-    size_sigma: float
-    turned: float
-    turned_sigma: float
-    square_of_position: float
-
-    @property
-    def square_of_heading(self) -> float:
-        """The chi-square of the heading, with one degree of freedom."""
-        return (self.turned / self.turned_sigma) ** 2
-
-    @property
-    def metres(self) -> str:
-        """The distance in words, such as "11.2 ± 1.4 m"."""
-        return f"{self.size:.1f} ± {self.size_sigma:.1f} m"
-
-    @property
-    def degrees(self) -> str:
-        """The difference of heading in words, such as "90 ± 3 degrees"."""
-        return (
-            f"{abs(math.degrees(self.turned)):.0f} ± {math.degrees(self.turned_sigma):.0f} degrees"
-        )
 
 
 class _Course(NamedTuple):
