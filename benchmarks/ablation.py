@@ -43,7 +43,7 @@ USED = {
         "threads",
         "greedy",
     },
-    "full": {"prefixes", "path_names", "ways"},
+    "full": {"prefixes", "path_names", "framing", "ways"},
     "framed": {
         "prefixes",
         "names",

@@ -15,6 +15,7 @@ from functools import partial
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.runtime.clock import each_looking, heeding
 from ssh_abduction.runtime.logs import log_of
+from ssh_abduction.solver import choosing
 from ssh_abduction.solver.asp.facts import answer_maps
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.solver.engines.base import Found, Task
@@ -22,10 +23,13 @@ from ssh_abduction.solver.guesses.gated import gated_map
 from ssh_abduction.solver.guesses.tree import Sketch
 from ssh_abduction.solver.judging import Judging
 from ssh_abduction.solver.known import Known
-from ssh_abduction.theory.speedups import row
+from ssh_abduction.theory.speedups import Speedups, row
 
 _log = log_of(__name__)
 
+# Maps with frames are sought for this many seconds at most, and for this many times as long until
+# there is any map.
+FRAMING, UNMAPPED = 30.0, 2.0
 # A sketch and its check may take this share of the time that is left for all sketches.
 SKETCH_SHARE = 0.4
 # The most reliable sketch may take this many seconds even if less time is left. Else a slow machine
@@ -147,6 +151,26 @@ class Candidates:
         later = each_looking(zip(trace.actions[done - 1 :], trace.steps[done:], strict=True))
         if all(sketch.extend(action, step) for action, step in later):
             self.offer(sketch.map())
+
+    def frame(self, speedups: Speedups) -> None:
+        """Offer maps in which places have frames, though the theory does not ask for any.
+
+        Args:
+            speedups: The speed-ups that the caller has on. Others may hold if places have frames.
+        """
+        from ssh_abduction.solver.engines.framing import maps_with_frames  # loads numpy
+
+        watch = self._task.watch
+        seconds = min(FRAMING, choosing.STEPWISE_SHARE * watch.left())
+        part = watch.part(UNMAPPED * seconds)
+        try:
+            with heeding(part.check):
+                for ssh_map in maps_with_frames(self._task.problem, part, speedups):
+                    part.shorten(seconds)
+                    self.offer(ssh_map)
+                    self._report()
+        except LimitError:
+            watch.check()
 
     def offer(self, ssh_map: SSHMap) -> None:
         """Keep a map of the whole trace if it is the best one so far and satisfies all axioms."""

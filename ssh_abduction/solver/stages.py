@@ -66,6 +66,7 @@ class Stages:
                 engine.grow(steps if engine.lists_least else min(steps, prefixes.FIRST_PREFIX))
             return
         may_change = isinstance(engine, StepEngine) and not self._goes_on and takes_all(task)
+        may_frame = may_change and task.speedups.framing
         may_settle = may_change and task.speedups.ways and parts.speedups.names
         if (
             may_settle
@@ -74,12 +75,16 @@ class Stages:
         ):
             self._settle_dstates_first()
         elif (
-            may_settle
+            (may_frame or may_settle)
             and parts.known.status is Status.UNKNOWN
             and not self._find_minimum_soon(choosing.STEPWISE)
         ):
             _log.info("no minimum after %.1f s step by step", parts.watch.elapsed())
-            self._settle_dstates_first()
+            if may_frame:
+                _log.info("maps in which places have frames are sought as candidates")
+                parts.candidates.frame(parts.speedups)
+            if may_settle:
+                self._settle_dstates_first()
         if parts.known.status is Status.UNKNOWN:
             parts.prefixes.find_minimum()
 

@@ -277,6 +277,19 @@ class Theory:
         """The pairs of steps that the user asserts. Computed once, as there may be many."""
         return Pairs.of(self.different, self.elsewhere, self.same)
 
+    def with_frames(self) -> Theory:
+        """The theory in which places have frames and fewest dstates come first.
+
+        For star=pattern. Its maps, without their headings, are maps of this theory, too: paths are
+        totally ordered, the axioms of sides hold without excuses, and stars that agree in a frame
+        are one pattern.
+        """
+        boundary = "none" if self.boundary == "none" else "strict"
+        rest = [count for count in self.priorities if count in ("paths", "places")]
+        return self.replace(
+            star="frame", path_order="total", boundary=boundary, prefer=("dstates", *rest)
+        )
+
     def require(self, step: Step, where: str) -> None:
         """Check that a step has what the axioms need. `star` must be settled.
 

@@ -1,0 +1,74 @@
+"""With star=pattern, maps in which places have frames are candidates."""
+
+from __future__ import annotations
+
+from unittest.mock import patch
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instances import maze
+from strategies import theories, traces
+
+from ssh_abduction import Theory, check, solve
+from ssh_abduction.solver import Status, Watch, choosing
+from ssh_abduction.solver.asp.limits import StageTimeError
+from ssh_abduction.solver.engines.framing import maps_with_frames
+from ssh_abduction.solver.prefixes import Prefixes
+from ssh_abduction.theory import Speedups
+from ssh_abduction.theory.settle import settle
+from ssh_abduction.theory.speedups import SPEEDUPS, row
+
+PATTERN = Theory(star="pattern")
+
+
+@settings(max_examples=12)
+@given(st.data())
+def test_maps_with_frames_are_maps_of_the_theory(data: st.DataObject) -> None:
+    trace = data.draw(traces(max_steps=10).filter(lambda t: t.has_stars), label="trace")
+    theory = data.draw(theories(trace), label="theory")
+    if theory.level != "topological" or theory.has_faults:
+        return
+    problem = settle(trace, theory.replace(star="pattern"))
+    if not row("framing").holds_for(problem.theory):
+        return
+    watch = Watch()
+    watch.start()
+    costs = []
+    for ssh_map in maps_with_frames(problem, watch, Speedups()):
+        assert check(trace, ssh_map, problem.theory) == ()
+        costs.append(len(ssh_map.dstates))
+    assert costs == sorted(costs, reverse=True)
+
+
+@settings(max_examples=8)
+@given(st.data())
+def test_a_map_with_frames_changes_no_answer(data: st.DataObject) -> None:
+    trace = data.draw(traces(max_steps=6).filter(lambda t: t.has_stars), label="trace")
+    expected = solve(trace, PATTERN, max_maps=None, speedups=Speedups.without(SPEEDUPS))
+    with patch.multiple(choosing, STEPWISE=-1.0, FEW_STEPS=0):
+        found = solve(trace, PATTERN, max_maps=None)
+    assert (found.status, set(found.maps)) == (expected.status, set(expected.maps))
+
+
+def test_a_maze_has_a_small_map_before_the_proof() -> None:
+    """The robot was in fewer than 40 dstates; a sketch without frames has hundreds."""
+    walk = maze(3, 3, steps=300, seed=0, stars=True)
+    with patch.object(Prefixes, "find_minimum", side_effect=[StageTimeError, KeyboardInterrupt]):
+        solution = solve(walk.trace, PATTERN)
+    assert (solution.status, solution.stopped) == (Status.FEASIBLE, "interrupted")
+    assert solution.cost
+    assert solution.cost.dstates <= len(set(walk.truth))
+    assert check(walk.trace, solution.maps[0], solution.theory) == ()
+
+
+def test_only_patterns_need_it() -> None:
+    trace = maze(2, 2, steps=20, seed=0, stars=True).trace
+    assert row("framing").holds_for(settle(trace, PATTERN).theory)
+    for theory in (Theory(), Theory(star="none"), Theory.causal()):
+        assert not row("framing").holds_for(settle(trace, theory).theory)
+
+
+@pytest.mark.parametrize("name", ["frame", "gateways", "alike"])
+def test_it_is_off_for_other_stars(name: str) -> None:
+    assert not row("framing").holds_for(Theory(star=name))  # type: ignore[arg-type]
