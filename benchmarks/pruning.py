@@ -111,7 +111,7 @@ TRIALS = (
     *_timed("ways", BARE_CORRIDORS, BARE.name, LARGE_BLOCK, limit=2 * LIMIT),
     *_timed("prefixes", SMALL_BLOCK, BLOCK, TAYLOR),
     *_timed("path_names", SMALL_BLOCK, LARGE_BLOCK, BARE_CORRIDORS, PATTERNS),
-    *_timed("framing", BARE.name, limit=2 * LIMIT),
+    *_timed("framing", BARE.name, BARE_CORRIDORS, LARGE_BLOCK, limit=2 * LIMIT),
     *_ended(
         "framing",
         "full maze 4x4 n=800, no stars",

@@ -155,7 +155,7 @@ def test_lists_the_maps_of_the_plain_encoding(
         ),
     }
     processors = data.draw(st.booleans(), label="processors")
-    off = off - {"names"} | {"processes"}  # in which nothing would be patched
+    off = off - {"names"}
     charted = data.draw(st.sampled_from([FramedEngine._charted, plainly_charted]), label="charted")
     prefixes = patch.object(engine, "FIRST_PREFIXES", first)
     with (
@@ -211,7 +211,7 @@ def test_maps_that_a_search_beside_shows_to_be_minimal(
         patch.object(GuessBeside, "proved", always_proved),
         patch.object(FramedEngine, "_charted", plainly_charted),
     ):
-        search = Search(trace, theory, max_maps=None, speedups=Speedups.without("processes"))
+        search = Search(trace, theory, max_maps=None, speedups=Speedups())
         maps = tuple(search)
     found = search.solution(maps)
     assert found.status is expected.status

@@ -365,7 +365,8 @@ TABLE = (
     Speedup(
         "processes",
         "processes",
-        "With frames: make a guess in a process of its own, where there are two processors.",
+        "While a robot drives: guess and solve in a process of its own, where there are two "
+        "processors.",
         _any_theory,
         NOTHING,
         EVERY,

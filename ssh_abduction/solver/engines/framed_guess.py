@@ -12,7 +12,6 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 
 from ssh_abduction.solver.asp.control import Asker
 from ssh_abduction.solver.asp.limits import Watch
-from ssh_abduction.solver.asp.process import in_process
 from ssh_abduction.solver.engines.base import Found
 from ssh_abduction.solver.engines.beside import Beside
 from ssh_abduction.solver.engines.framed_paths import FramedPaths, Naming
@@ -77,11 +76,7 @@ class GuessBeside:
     ) -> Iterator[list[int]]:
         """Labels, each time fewer, of maps of the causal axioms near a guess."""
         guessed_labels = self._fitting.paths.guessed_labels
-        self.guess = (
-            in_process(guessed_labels, chart, watch=watch)
-            if self._fitting.task.speedups.processes
-            else guessed_labels(chart, watch)
-        )
+        self.guess = guessed_labels(chart, watch)
         yield from search.fewer(self.guess)
 
     def absorb(self) -> None:
