@@ -8,10 +8,10 @@ import inspect
 import io
 import json
 import math
-import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from perception.errors import ImageWarning, PerceptionError
 from perception.features import telling_features
 from perception.images import images_of
 from perception.reciprocal import ReciprocalTransformer
+from perception.recognition import learning_curve
 from perception.views import ViewClusterer
 from simulator.laser import BEARINGS, Laser
 from simulator.tours import simulate
@@ -35,6 +36,7 @@ from ssh_abduction.checker.checker import check
 from ssh_abduction.cli import main
 from ssh_abduction.data import Step
 from ssh_abduction.data.errors import TraceError
+from ssh_abduction.evaluation.paper import experiments
 from ssh_abduction.evaluation.paper.claim_table import claims, summary
 from ssh_abduction.evaluation.paper.experiments import (
     EXPERIMENTS,
@@ -75,6 +77,7 @@ def measured() -> Run:
     """The measurements of `reproduce` with seed 500 and, to be fast, few circuits."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(EXPERIMENTS, "notched-rectangle", FEW_CIRCUITS)
+        patch.setattr(experiments, "learning_curve", partial(learning_curve, folds=2))
         return measure("notched-rectangle", 500)
 
 
@@ -303,10 +306,10 @@ def test_the_beams_that_tell_corners_apart_see_the_notch(run: Trace) -> None:
 
 
 def test_the_shell_tells_what_tells_dstates_apart(
-    run: Trace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Trace, learnt: BootstrapLearner, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     views, maps = tmp_path / "views.jsonl", tmp_path / "maps.json"
-    learner = BootstrapLearner(VIEWS_ALONE, ViewClusterer(k=4, random_state=0)).fit(run)
+    learner = learnt
     run.with_views(learner.views_.tolist()).save(views)
     maps.write_text(json.dumps(learner.map_.to_dict()))
     assert main(["tell-apart", str(maps), str(views), "--plot", str(tmp_path / "beams.png")]) == 0
@@ -484,7 +487,9 @@ def test_clustering_into_another_folder_keeps_the_images(
     )
 
 
-def test_what_was_replaced_is_said_in_one_line(tmp_path: Path) -> None:
+def test_what_was_replaced_is_said_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     table = np.array([[1.0, np.inf, 2.0], [1.0, 1.0, np.nan], [3.0, 1.0, 0.0], [3.0, 1.1, 1.0]])
     np.save(tmp_path / "scans.npy", table)
     steps = [
@@ -493,10 +498,10 @@ def test_what_was_replaced_is_said_in_one_line(tmp_path: Path) -> None:
     ]
     Trace(tuple(steps), images="scans.npy").save(tmp_path / "run.jsonl")
     words = ["cluster", str(tmp_path / "run.jsonl"), "-o", str(tmp_path / "v.jsonl")]
-    done = subprocess.run(
-        [sys.executable, "-m", "ssh_abduction", *words], capture_output=True, text=True, check=True
-    )
-    assert done.stderr == (
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert main(words) == 0
+    assert capsys.readouterr().err == (
         "ssh-abduction: warning: 3 of 12 ranges were replaced: 1 infinite and 1 missing (NaN) are "
         "taken as nothing seen, "
         "1 of zero or less as 0.05 m\n"
@@ -642,6 +647,8 @@ def test_from_simulation_to_recognition_in_the_shell(
                 "learning-curve",
                 path("maps.json"),
                 path("views.jsonl"),
+                "--set",
+                "folds=2",
                 "--json",
                 "--plot",
                 path("curve.png"),
@@ -652,7 +659,8 @@ def test_from_simulation_to_recognition_in_the_shell(
     curve = json.loads(capsys.readouterr().out)
     assert curve["sizes"][-1] == 80
     assert curve["mean"][-1] > 0.8
-    assert main(["learning-curve", path("maps.json"), path("views.jsonl")]) == 0
+    folds = ["--set", "folds=2"]
+    assert main(["learning-curve", path("maps.json"), path("views.jsonl"), *folds]) == 0
     assert capsys.readouterr().out.splitlines()[0].split() == [
         "images",
         "recognised",
@@ -840,9 +848,18 @@ def test_a_summary_counts_the_seeds_in_which_a_claim_holds(measured: Run) -> Non
     assert table["labels from the views alone are the true dstates"]["holds"] == 1
 
 
-@pytest.mark.parametrize("kind", ["person", "random"])
-def test_bad_images_are_disbelieved_where_views_may_be_misread(kind: str) -> None:
+@pytest.fixture(scope="module")
+def eight_circuits() -> tuple[Trace, BootstrapLearner]:
+    """A run of eight circuits, and what is learnt from it."""
     trace = simulate(World.named("notched-rectangle"), tours=8, seed=503)
+    return trace, BootstrapLearner().fit(trace)
+
+
+@pytest.mark.parametrize("kind", ["person", "random"])
+def test_bad_images_are_disbelieved_where_views_may_be_misread(
+    kind: str, eight_circuits: tuple[Trace, BootstrapLearner]
+) -> None:
+    trace, without = eight_circuits
     images, bad, rng = (
         images_of(trace).copy(),
         [9, 30, 44],
@@ -866,7 +883,6 @@ def test_bad_images_are_disbelieved_where_views_may_be_misread(kind: str) -> Non
     assert np.flatnonzero(learner.labels_ < 0).tolist() == bad
     assert {fault.step for fault in learner.map_.faults} <= set(bad)
     other = simulate(World.named("notched-rectangle"), tours=2, seed=504)
-    without = BootstrapLearner().fit(trace)
     meaning = dict(
         zip(
             true_dstates(trace), zip(learner.map_.labels, without.labels_, strict=True), strict=True

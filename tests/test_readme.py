@@ -143,7 +143,7 @@ def run_line(line: str) -> int:
     command, _, target = command.partition(" > ")
     if not command.startswith("ssh-abduction ") or set(command) & set("*$;&<\\"):
         return shell(line)
-    out, code = printed_often(command) if command == OFTEN else printed(command)
+    out, code = printed_often(command) if OFTEN.fullmatch(command) else printed(command)
     if pipe:
         return shell(reader, out)
     if target:
@@ -161,8 +161,8 @@ def printed(command: str) -> tuple[str, int]:
     return out.getvalue(), code
 
 
-# Many blocks begin with this line, which has the same answer each time.
-OFTEN = "ssh-abduction solve examples/aces3-route.jsonl -n 0 --json"
+# Solves an example and writes no file. Many blocks begin with the same command.
+OFTEN = re.compile(r"ssh-abduction solve examples/[\w-]+\.jsonl(?: -n \d+| --json| --set \S+)*")
 printed_often = cache(printed)
 
 
