@@ -178,12 +178,11 @@ def test_json_lines_are_the_single_objects(
 def test_everywhere_the_same(
     traces: Path, scheduler: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    paths = [f"{name}.jsonl" for name in ("comb", "quick", "broken", "impossible", "quick")]
+    paths = [f"{name}.jsonl" for name in ("comb", "broken", "impossible", "quick")]
     shown = {}
     for where in (
         (),
         ("--jobs", "2"),
-        ("--scheduler", scheduler),
         ("--scheduler", scheduler, "--jobs", "1"),
     ):
         assert main(["solve", *paths, "--json", *where]) == 1
@@ -331,7 +330,7 @@ def test_what_nobody_foresaw_is_an_answer_too(monkeypatch: pytest.MonkeyPatch) -
 
 def test_only_the_trace_whose_process_is_killed_is_lost(traces: Path, scheduler: str) -> None:
     deadly = Deadly(*(getattr(QUESTION, name) for name in Question.__slots__))
-    paths = [f"{name}.jsonl" for name in ("quick", "deadly", "comb", "quick")]
+    paths = [f"{name}.jsonl" for name in ("quick", "deadly", "quick")]
     stop = StopFlag()
     for answers in (
         answers_here(deadly, paths, 2, stop),

@@ -295,10 +295,9 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
             assert answer.count == expected.count
 
 
-@pytest.mark.parametrize("seed", [0])
-def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
+def test_a_maze_is_mapped_while_it_is_explored() -> None:
     """Long enough for cores, for visits told to be transitive, and for paths, all of which the longer trace keeps."""
-    trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
+    trace = maze(3, 3, steps=60, seed=0, stars=True).trace
     first, *rest = trace.steps
     paths = set()
     with (
@@ -309,7 +308,7 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
         mapper = OnlineMapper(first.view or "", star=first.star, time_limit=None, max_maps=None)
         for i, (action, step) in enumerate(zip(trace.actions, rest, strict=True)):
             answer = mapper.observe(action, step.view or "", star=step.star)
-            if i % 5 == seed or i == len(rest) - 1:
+            if i % 10 == 5 or i == len(rest) - 1:
                 expected = solve(
                     trace.prefix(i + 2), max_maps=None, speedups=Speedups.without("sides")
                 )
@@ -325,13 +324,12 @@ def test_a_maze_is_mapped_while_it_is_explored(seed: int) -> None:
             if isinstance(engine, FramedEngine):
                 paths.add((engine._visits.program.batch, len(engine._sides._said)))
     assert max(paths)[0] > 5
-    assert seed != 0 or any(told for _, told in paths)
+    assert any(told for _, told in paths)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_each_speedup_off_alone(seed: int) -> None:
+def test_each_speedup_off_alone() -> None:
     """On walks long enough for cores, for visits that have to be told to be transitive, and for maps that are found nearby."""
-    trace = maze(2, 2, steps=45, seed=seed, stars=True).trace
+    trace = maze(2, 2, steps=45, seed=0, stars=True).trace
     expected = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without("names"))
     for off in ("", "clique", "core_guided", "sides"):
         with patch.object(same, "MANY", 1), patch.object(transitive, "AT_A_TIME", 5):
@@ -432,7 +430,7 @@ def test_mazes_are_mapped(seed: int, counts: tuple[int, int, int]) -> None:
         assert check(walk.trace, ssh_map, Theory.topological()) == ()
 
 
-@pytest.mark.parametrize(("seed", "pinned", "stretches"), [(13, 4, 7), (14, 4, 6), (41, 3, 5)])
+@pytest.mark.parametrize(("seed", "pinned", "stretches"), [(13, 4, 7), (41, 3, 5)])
 def test_pinned_stretches_leave_all_maps(seed: int, pinned: int, stretches: int) -> None:
     trace = maze(4, 4, steps=100, seed=seed, stars=True).trace
     given: list[tuple[list[int], Sequence[int]]] = []
@@ -482,7 +480,7 @@ def test_what_is_not_told_beforehand_is_found() -> None:
 def test_sides_and_streets_say_the_same(theory: Theory) -> None:
     """sides_framed.lp, of one path and visits that are one, against paths_framed.lp, of all paths and settled dstates that may have none."""
     contradicted = 0
-    for seed in range(6):
+    for seed in range(3):
         trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
         engine = Search(trace, theory)._parts.prefixes.engine
         assert isinstance(engine, FramedEngine)
@@ -586,7 +584,7 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
     trace = maze(10, 10, steps=150, seed=0, stars=True).trace
     fewest: set[int] = set()
     stopped = 0
-    for stop in range(0, 50, 4):
+    for stop in range(4, 25, 5):
         engine = Search(trace, Theory.topological())._parts.prefixes.engine
         assert isinstance(engine, FramedEngine)
         engine.grow(len(trace))
@@ -608,7 +606,7 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
         assert len(set(labels)) == engine.bound
         fewest.add(len(set(labels)))
     assert len(fewest) == 1
-    assert stopped > 5
+    assert stopped > 2
 
 
 def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
@@ -711,9 +709,8 @@ def test_what_fails_to_be_transitive_is_among_the_scattered(
     assert bool(failing) == bool(scattered)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_annealing_finds_the_places_of_a_maze(seed: int) -> None:
-    walk = maze(4, 4, steps=800, seed=seed, stars=True)
+def test_annealing_finds_the_places_of_a_maze() -> None:
+    walk = maze(4, 4, steps=800, seed=0, stars=True)
     chart = Chart.framed(walk.trace, Log(walk.trace, Theory(star="frame")))
     with patch.object(annealing, "ANNEALED", ((0.5, 500),)):
         guess = next(guess for failed, guess in attempts(chart) if not failed)
@@ -824,10 +821,9 @@ def test_any_guess_is_merged_to_a_map(
             assert (asked._fitting.some(chart, labels) is not None) >= singles
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_true_guess_stays_as_it_is(seed: int) -> None:
+def test_a_true_guess_stays_as_it_is() -> None:
     """Also where the dstates of some visits are left open, if these went on for long."""
-    walk = maze(4, 4, steps=400, seed=seed, stars=True)
+    walk = maze(4, 4, steps=400, seed=0, stars=True)
     asked = framed_engine(walk.trace, Theory.topological())
     chart = asked._chart
     truth = numbered([walk.truth[chart.node_of.index(node)] for node in range(len(chart.seen))])
@@ -837,7 +833,7 @@ def test_a_true_guess_stays_as_it_is(seed: int) -> None:
     assert asked._fitting.paths.labels_near(chart, apart, some) == truth
 
 
-@pytest.mark.parametrize(("size", "steps", "seed"), [(5, 300, 0), (6, 300, 2)])
+@pytest.mark.parametrize(("size", "steps", "seed"), [(6, 300, 2)])
 def test_places_that_a_guess_has_for_one_are_told_apart(size: int, steps: int, seed: int) -> None:
     """Where the causal axioms do not show that they are two, but paths do."""
     walk = maze(size, size, steps=steps, seed=seed, stars=True)

@@ -515,9 +515,9 @@ def test_a_displacement_that_is_none_changes_nothing(given: dict[str, Any], mess
 @pytest.mark.parametrize(
     ("theory", "stars", "steps"),
     [
-        (Theory(), True, 24),
+        (Theory(), True, 18),
         (Theory(), False, 16),
-        (Theory.causal(), False, 24),
+        (Theory.causal(), False, 18),
         (Theory(joint=1), True, 16),
     ],
 )
@@ -571,7 +571,7 @@ def test_maps_with_displacements_are_guessed_while_the_robot_drives() -> None:
 
     That includes maps of steps before the threshold changed.
     """
-    trace = maze(4, 4, steps=40, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
+    trace = maze(4, 4, steps=32, seed=1, stars=True, odometry=Odometry(along=0.02)).trace
     given: list[Trace] = []
 
     def guessed_map(trace: Trace, *others: Any) -> SSHMap | None:

@@ -241,7 +241,7 @@ class NoLongReturns:
 @given(data=st.data())
 def test_what_evidence_refuses_of_a_map_is_forbidden(name: str, data: st.DataObject) -> None:
     """The answer is that of the brute force, whichever maps clingo finds first."""
-    trace = data.draw(traces(max_steps=6), label="trace")
+    trace = data.draw(traces(max_steps=5), label="trace")
     named = Rules("seldom.lp", "% @axiom(seldom) No dstate is seen three times.\n")
     theory = THEORIES[name].replace(rules=(named,))
 
@@ -276,7 +276,7 @@ FAST = {
 def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.DataObject) -> None:
     """An engine that settles dstates first is told of it, too, and its maps are those of the brute force."""
     theory, kind = FAST[name]
-    trace = data.draw(traces(max_steps=6), label="trace")
+    trace = data.draw(traces(max_steps=5), label="trace")
     if theory.star == "frame" and not trace.has_stars:
         return
 

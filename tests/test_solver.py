@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -214,8 +215,8 @@ def test_fifty_circuits_need_no_longer_prefix_than_two(theory: Theory) -> None:
 
 
 @pytest.mark.parametrize("theory", THEORIES.values(), ids=THEORIES)
-def test_five_thousand_circuits(theory: Theory) -> None:
-    trace = rectangle(40_000)
+def test_a_thousand_circuits(theory: Theory) -> None:
+    trace = rectangle(8_000)
     solution = solve(trace, theory)
     assert solution.status is Status.OPTIMAL
     assert solution.complete
@@ -258,9 +259,9 @@ def test_a_stream_of_millions_starts_at_once() -> None:
     """One and a half circuits have 20,289 consistent maps without sides; three have far more than anyone waits for."""
     theory = Theory(boundary="none", path_order="partial", prefer=())
     search = Search(rectangle(24), theory, max_maps=None)
-    first = list(itertools.islice(search, 400))
-    assert len(set(first)) == 400
-    assert search.count == 400
+    first = list(itertools.islice(search, 100))
+    assert len(set(first)) == 100
+    assert search.count == 100
 
 
 def test_nothing_preferred_means_all_consistent_maps() -> None:
@@ -438,12 +439,14 @@ def test_what_a_theory_asks_of_a_trace() -> None:
     assert solve(some, Theory(star="none")).cost is not None
 
 
-def maps_of_all_tours() -> Iterator[tuple[Trace, Theory, SSHMap]]:
-    for tour in TOURS:
-        for theory in THEORIES.values():
-            trace = drive(*TOURS[tour])
-            for ssh_map in solve(trace, theory).maps:
-                yield trace, theory, ssh_map
+@cache
+def maps_of_all_tours() -> list[tuple[Trace, Theory, SSHMap]]:
+    return [
+        (trace, theory, ssh_map)
+        for trace in (drive(*tour) for tour in TOURS.values())
+        for theory in THEORIES.values()
+        for ssh_map in solve(trace, theory).maps
+    ]
 
 
 def test_a_map_predicts_the_trace_it_was_made_for() -> None:

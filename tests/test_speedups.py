@@ -147,7 +147,7 @@ CIRCUITS = Trace.from_steps(
     [f"v{i % 4}" for i in range(24)], [("right", "travel")[i % 2] for i in range(23)]
 )
 CASES = {
-    "causal": (moore(6, 2, steps=60, seed=1).trace, Theory.causal()),
+    "causal": (moore(6, 2, steps=40, seed=1).trace, Theory.causal()),
     "topological": (CIRCUITS, Theory.topological()),
     "circumscriptive": (CIRCUITS, Theory.circumscriptive()),
     "framed": (maze(3, 3, steps=26, seed=0, stars=True).trace, Theory.topological()),
