@@ -657,6 +657,7 @@ def test_from_simulation_to_recognition_in_the_shell(
         == 0
     )
     curve = json.loads(capsys.readouterr().out)
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
     assert curve["sizes"][-1] == 80
     assert curve["mean"][-1] > 0.8
     folds = ["--set", "folds=2"]
