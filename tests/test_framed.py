@@ -823,7 +823,7 @@ def test_any_guess_is_merged_to_a_map(
 
 def test_a_true_guess_stays_as_it_is() -> None:
     """Also where the dstates of some visits are left open, if these went on for long."""
-    walk = maze(4, 4, steps=400, seed=0, stars=True)
+    walk = maze(4, 4, steps=400, seed=1, stars=True)
     asked = framed_engine(walk.trace, Theory.topological())
     chart = asked._chart
     truth = numbered([walk.truth[chart.node_of.index(node)] for node in range(len(chart.seen))])
