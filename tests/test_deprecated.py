@@ -1,0 +1,80 @@
+"""What version 0.1.0 called otherwise still works, and says what it is called now."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import ssh_abduction
+from ssh_abduction import OnlineMapper, Theory, Trace, solve
+from ssh_abduction.cli import main
+
+ACES = str(Path(__file__).parent.parent / "examples" / "aces3-route.jsonl")
+TRACE = Trace.from_steps("aba", ["travel", "travel"])
+
+
+@pytest.mark.parametrize("name", ssh_abduction._MOVED)
+def test_old_names_are_the_new_ones(name: str) -> None:
+    with pytest.warns(DeprecationWarning, match=f"ssh_abduction.{name} is deprecated; use"):
+        value = getattr(ssh_abduction, name)
+    assert value.__name__ == ssh_abduction._MOVED[name].rpartition(".")[2]
+
+
+def test_the_new_names_are_few() -> None:
+    assert 15 <= len(ssh_abduction.__all__) <= 20
+
+
+def test_old_parameters_work() -> None:
+    with pytest.warns(DeprecationWarning, match="is deprecated; use") as caught:
+        found = solve(TRACE, Theory.causal(), limit=100, maps=0, memory=10_000)  # type: ignore[call-arg]
+    assert found == solve(TRACE, Theory.causal(), time_limit=100, max_maps=None)
+    assert [str(warning.message) for warning in caught] == [
+        "limit is deprecated; use time_limit",
+        "maps is deprecated; use max_maps",
+        "memory is deprecated; use memory_limit",
+    ]
+    with pytest.warns(DeprecationWarning, match="limit is deprecated"):
+        OnlineMapper("a", Theory.causal(), limit=None)  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (["solve", ACES, "--boundary", "none"], ["solve", ACES, "--set", "boundary=none"]),
+        (["solve", ACES, "--no-planar"], ["solve", ACES, "--set", "planar=false"]),
+        (["facts", ACES, "--path-order=partial"], ["facts", ACES, "--set", "path_order=partial"]),
+    ],
+)
+def test_old_flags_work(old: list[str], new: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(new) == 0
+    expected = capsys.readouterr().out.splitlines()[1:]
+    assert main(old) == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines()[1:] == expected
+    assert f"is deprecated; write {' '.join(new[2:])}" in said.err
+
+
+def test_maps_of_version_0_1_0_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What 0.1.0 printed, and the order of files that it took."""
+    old = Path(__file__).parent / "files" / "maps-0.1.0.json"
+    assert main(["check", str(old), ACES, "--bound"]) == 0
+    assert main(["check", ACES, str(old)]) == 0
+    assert "name the maps first" in capsys.readouterr().err
+    picture = tmp_path / "map.svg"
+    assert main(["show", str(old), "--svg", str(picture)]) == 0
+    assert picture.read_text().startswith("<svg")
+
+
+def test_a_theory_is_read_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    toml = tmp_path / "mine.toml"
+    toml.write_text('preset = "topological"\nboundary = "none"\nprefer = ["dstates", "paths"]\n')
+    assert Theory.from_toml(toml) == Theory(boundary="none", prefer=("dstates", "paths"))
+    assert main(["solve", ACES, "--theory", str(toml)]) == 0
+    by_file = capsys.readouterr().out.splitlines()[1:]
+    flags = ["--set", "boundary=none", "--set", "prefer=dstates,paths"]
+    assert main(["solve", ACES, *flags]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == by_file
+    toml.write_text("boundary = 3\n")
+    assert main(["solve", ACES, "--theory", str(toml)]) == 1
+    assert "mine.toml: boundary: expected one of" in capsys.readouterr().err
