@@ -376,6 +376,6 @@ def test_maps_that_differ_in_directions_along_paths_alone_are_told_apart() -> No
             if one.dstates[s] != other.dstates[x]
         } <= told
         assert all(
-            line.startswith("directions along paths: in the first map steps ")
+            line.startswith("directions along paths: the first map groups steps ")
             for line in found.lines
         )
