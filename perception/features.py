@@ -1,4 +1,4 @@
-"""Finds the beams that tell two dstates apart that look alike.
+"""Finds the beams that distinguish two similar dstates.
 
 >>> images = [[1.0, 2.0, 3.0], [1.1, 2.0, 3.0], [1.0, 2.1, 3.0]]
 >>> images += [[1.0, 2.0, 5.0], [1.1, 2.0, 5.1], [1.0, 2.1, 5.0]]
@@ -7,8 +7,8 @@
 ({'margin': 2, 'permutation': 2, 'linear': 2}, 1.0)
 
 The paper hopes that back-propagation could learn which features of an image matter. Our recogniser
-is the nearest neighbour, which has no weights. So three measures stand side by side, each with its
-own weakness:
+is the nearest neighbour, which has no weights. So three measures are compared, each with its own
+weakness:
 
 - margin: by how much a feature makes the nearest image of the other dstate farther than the nearest
   image of its own dstate (Relief: Kira and Rendell 1992);
@@ -39,7 +39,7 @@ SHUFFLED = 10
 
 @dataclass(frozen=True, eq=False)
 class TellingFeatures:
-    """How much each feature helps to tell two dstates apart, by three methods.
+    """How much each feature helps to distinguish two dstates, by three methods.
 
     The shares of a method are not negative. They sum to 1, or are all 0 if no feature helps.
 
@@ -48,7 +48,7 @@ class TellingFeatures:
         permutation: (d,) shares by permutation.
         linear: (d,) shares by logistic regression.
         recognised: Share of images whose nearest other image is of their own dstate. At about 0.5
-            the dstates cannot be told apart, and the shares mean nothing.
+            the dstates look the same. Then the shares mean nothing.
     """
 
     margin: Floats
@@ -64,7 +64,7 @@ class TellingFeatures:
 def telling_features(
     X: ArrayLike, labels: ArrayLike, a: Any, b: Any, random_state: int = 0
 ) -> TellingFeatures:
-    """Find the features that tell the dstates `a` and `b` apart.
+    """Find the features that distinguish dstates `a` and `b`.
 
     Args:
         X: (n, d) images as the recogniser compares them, which are reciprocals of ranges.
@@ -136,7 +136,7 @@ def _neighbours(
 
 
 def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
-    """The margin lost by shuffling each feature; every second image is known, others test."""
+    """The margin lost by shuffling each feature. Half of the images are known, half test."""
     order = np.argsort(second, kind="stable")
     known, asked = order[::2], order[1::2]
     model = KNeighborsClassifier(1, algorithm="brute").fit(images[known], second[known])

@@ -7,8 +7,7 @@
 >>> likelihood.labels([[1.1, 4.0], [3.0, 3.2], [9.0, 0.0]])
 ['corner', 'hall', None]
 
-The nearest neighbour always answers, even for an image of nothing. Here its distances are read as
-densities:
+The nearest neighbour always answers, even for an unknown place. Here its distances give densities:
 
 - p(o|x): the squared distance from image o to the nearest image of place x is a sum of `dimensions`
   squared Gaussian deviations of equal variance. Its mean and variance are those of the distances
@@ -17,9 +16,9 @@ densities:
 - p(o|novel): the density of an unknown appearance, which is a Gaussian around the mean of all
   remembered images, as wide as all of them.
 - p(o|nowhere) = (sum over places x of p(o|x) + p(o|novel)) / (places + 1). An unknown place looks
-  like one of the known places or like none of them, all with equal probability. Hence what is seen
-  everywhere is no evidence. FAB-MAP (Cummins and Newman 2008) also uses the average place, by
-  sampling.
+  like one of the known places or like none of them, all with equal probability. An appearance
+  common to all places is no evidence. FAB-MAP (Cummins and Newman 2008) also uses the average
+  place, by sampling.
 """
 
 from __future__ import annotations
@@ -56,12 +55,11 @@ class ImageLikelihood:
 
     Attributes:
         recogniser: The fitted PlaceRecogniser, or a pipeline that ends with one.
-        classes: (c,) its places.
+        classes: (c,) place names.
         within: Mean squared distance from an image to the nearest other one of its place.
         spread: Mean squared distance from an image to the mean of all images.
         centre: (d,) mean of all images.
-        dimensions: Number of independent squared deviations that a squared distance is the sum of,
-            from 1 to d.
+        dimensions: Number of independent squared deviations in a squared distance, from 1 to d.
     """
 
     recogniser: Any
@@ -151,7 +149,7 @@ class ImageLikelihood:
             unmapped: Prior probability that an image is of no known place.
 
         Returns:
-            For each image a class, or None if no known place is more probable.
+            For each image a class, or None if an unknown place is likelier.
         """
         found = []
         for ratios in self.ratios(images):

@@ -291,8 +291,8 @@ class _Cells:
         # The products are small: threads would wait for each other longer than they work.
         with threadpool_limits(1, user_api="blas"):
             while len(pairs):
-                # A pair of cells is worth a look only if its bound is below the best edge of some
-                # component in it.
+                # Compare a pair of cells only if its bound is below the best edge of a component in
+                # it.
                 limits = np.maximum.reduceat(search.best[search.components], self.starts[:-1])
                 pairs = pairs[
                     self.bounds[pairs]
@@ -397,7 +397,7 @@ def _wider(images: Floats, best: float) -> float:
     scale = radii[0]
     if scale == 0:
         return 0.0
-    # Float32 products tell which pairs may exceed the best. Radii fall, so that a row can stop
+    # Float32 products show which pairs may exceed the best. Radii fall, so that a row can stop
     # early.
     small = (centred[kept] / scale).astype(np.float32)
     norms = np.einsum("ij,ij->i", small, small)

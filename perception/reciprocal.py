@@ -27,7 +27,7 @@ class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimato
     ImageWarning. Ranges between 0 and the floor become the floor without a warning.
 
     Args:
-        floor: Shortest range that is believed, in metres, greater than 0.
+        floor: Smaller ranges become this; metres, greater than 0.
     """
 
     def __init__(self, floor: float = 0.05) -> None:

@@ -147,7 +147,7 @@ class LearningCurve:
     """The recognition rate as a function of the number of images seen.
 
     Attributes:
-        sizes: (s,) numbers of first images that were seen.
+        sizes: (s,) numbers of images to learn from.
         mean: (s,) mean share of recognised images over the folds, in [0, 1].
         lowest: (s,) lowest share over the folds.
         highest: (s,) highest share over the folds.

@@ -1,7 +1,7 @@
 """Stores a fitted recogniser in a file that cannot run code when it is read.
 
 The file is a skops archive, which describes types and arrays. Reading it makes objects of
-scikit-learn's own types and of those in `OURS` only. A pickle is refused unread.
+scikit-learn's own types and of those in `OURS` only. Pickles are rejected.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Stored:
 
         Raises:
             PerceptionError: The images have another length than the learnt ones, or the model was
-                damaged in its file, which may show only when it answers.
+                damaged in its file (which `load` may not notice).
         """
         table = np.asarray(images, np.float64)
         try:
@@ -108,7 +108,7 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
         path: The file to write.
 
     Raises:
-        PerceptionError: `load` would refuse the model, or the file cannot be written.
+        PerceptionError: `load` would reject the model, or the file cannot be written.
     """
     classes = np.asarray(getattr(model, "classes_", ())).tolist()
     versions = {
@@ -123,7 +123,7 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
             "versions": versions,
         }
     )
-    # Refuse now what `load` would refuse later.
+    # Reject now what `load` would reject later.
     if foreign := _foreign(data=data):
         raise PerceptionError(
             f"{path}: expected a model of types that can be read back, got {', '.join(foreign)}"
@@ -144,7 +144,7 @@ def load(path: str | os.PathLike[str]) -> Stored:
     """Read what `save` wrote, without running anything in the file.
 
     Raises:
-        PerceptionError: The file cannot be read, or is anything else.
+        PerceptionError: The file is unreadable or has other content.
     """
     try:
         # Measure and check the types before reading any object.

@@ -39,13 +39,13 @@ ROUNDS = 30
 # There is a runner-up if trimmed M of the chosen k is below this multiple of the largest trimmed M
 # of the others. docs/measurements/reproduction.md has measurements.
 NEAR = 1.5
-# A larger k is also a runner-up if its trimmed M is at least this. A few views that are far apart
-# can each hide several well-separated ones.
+# A larger k is also a runner-up if its trimmed M is at least this. A few distant views can each
+# hide several well-separated ones.
 APART = 2.3
 # Values of trimmed M within this factor of the largest count as equal, and the smallest k wins.
 EQUAL = 0.95
 # An image is isolated by its distance to this nearest neighbour, so that two or three images of one
-# strange thing are isolated, too.
+# strange thing are isolated.
 NEIGHBOURS = 3
 # More starts of k-means than this are an error, since each takes as long as the first.
 MOST_STARTS = 10_000
@@ -60,8 +60,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     If k is not given, it is the number in [k_min, k_max] with the largest M (eq. 5 of the paper);
     ties go to the smallest k. M depends on two distances only, so a single lost beam can change it.
     Each k therefore also has a trimmed M, which uses quantiles. If trimmed M clearly or nearly
-    prefers another number of views, that number is the runner-up: it is worth making a map with its
-    views, too. If all images are equal, there is one view, and an ImageWarning.
+    prefers another number of views, that number is the runner-up, whose views may make a better
+    map. If all images are equal, there is one view, and an ImageWarning.
 
     Args:
         k: Number of views; None chooses it by M.
@@ -174,8 +174,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     def predict(self, X: ArrayLike) -> NDArray[np.intp]:
         """Predict the views of images.
 
-        A clusterer that can predict is asked (k-means takes the nearest centre). Otherwise an image
-        gets the view of the nearest fitted image.
+        A clusterer that can predict is used (k-means: nearest centre). Otherwise an image gets the
+        view of the nearest fitted image.
 
         Args:
             X: (n, d) images, finite.

@@ -2,8 +2,8 @@
 
 A plan draws each room as a polygon and each door as a point on its outline. So the walls are the
 outlines of all rooms. A door is an opening of DOOR metres in the outlines of both of its rooms,
-moved along the wall if a corner would narrow it. If the outlines are apart, as walls are thick,
-jambs connect them.
+moved along the wall if a corner would narrow it. If thick walls separate the outlines, jambs
+connect them.
 """
 
 from __future__ import annotations

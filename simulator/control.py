@@ -1,10 +1,10 @@
-"""Control laws, which see laser images and command motions. None knows the true pose.
+"""Control laws: from laser images to motions. They do not know the true pose.
 
 Trajectory-following leads the robot along the midline between two walls, or along one wall at a
 fixed distance. Hill-climbing leads it to a fixed point. Along its path, this is half a corridor's
 width before the wall ahead, or the middle of a street that opens to a side. Across its path, it is
 midway between the walls, or half a corridor's width from the only wall. The heading is along the
-walls. What the image does not show is not corrected.
+walls. The robot corrects only what the image shows.
 
 Reference:
     Kuipers & Beeson 2002, section on distinctive states; Kuipers 2000, the control level.
@@ -27,7 +27,7 @@ from simulator.sight import Sight, sight
 from simulator.world import World
 
 Array = NDArray[np.float64]
-# Slots between the headings before and after an action, clockwise.
+# Quarter turns clockwise from the heading before an action to after.
 QUARTERS = {"travel": 0, "right": 1, "around": 2, "left": 3}
 TURNS = {"left": math.pi / 2, "right": -math.pi / 2, "around": math.pi}
 # Metres between two images while the robot travels.
@@ -37,7 +37,7 @@ STILL = 9
 # Largest number of corrections while hill-climbing, since noise may keep the robot out of
 # tolerance.
 TRIES = 12
-# A travel of more metres has failed: walls that lead round in a circle would never end it.
+# Metres after which a travel has failed, since walls in a circle would never end it.
 LONGEST_TRAVEL = 300.0
 
 
@@ -45,7 +45,7 @@ LONGEST_TRAVEL = 300.0
 class Tolerance:
     """Distance from the fixed point at which hill-climbing ends.
 
-    The defaults are as precise as such a robot can be steered.
+    The defaults are the best precision of such a robot.
 
     Attributes:
         close: Metres along the path.
@@ -61,15 +61,15 @@ class Tolerance:
 
 @dataclass
 class Driver:
-    """A robot in a world, with its laser: everything that control laws may use.
+    """A robot in a world, with its laser, as control laws use it.
 
     Attributes:
-        world: The world as it is on this tour.
+        world: World with this tour's clutter.
         robot: The robot.
         laser: Its laser.
         rng: Source of noise.
-        tolerance: Precision of hill-climbing.
-        on_travel: Called with the driver after each stride of a travel.
+        tolerance: Errors at which hill-climbing ends, in metres and radians.
+        on_travel: Called with the driver after each motion in `travel`.
         recorder: Records the pose after each motion, for a log.
     """
 
@@ -203,8 +203,8 @@ def _come_again(driver: Driver) -> None:
 class Corridors:
     """Does the actions of a route with the control laws for right angles.
 
-    It collects the openings of the place where the robot is. They are numbered by slots, clockwise
-    from the direction of arrival.
+    It collects the openings of the current place, numbered by quarter turns (slots) clockwise from
+    the direction of arrival.
 
     Args:
         driver: The robot.
@@ -236,7 +236,7 @@ class Corridors:
             self._openings, self._facing = {2: True}, 0
 
     def star(self, image: Array) -> tuple[float, ...]:
-        """The openings ahead, right, behind and left, as far as known.
+        """The star: openings ahead, right, behind and left, if known.
 
         A direction is open if its wall is far. The image does not show what is behind the robot.
         """

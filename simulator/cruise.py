@@ -1,8 +1,8 @@
 """Drives along a planned route and around unknown obstacles.
 
 The driver knows the building and sees what the laser sees. The robot aims at a point AIM metres
-ahead on its route. Where the laser shows an obstacle that is no known wall, the route is planned
-again, around it.
+ahead on its route. If the laser shows an obstacle that is no known wall, the robot plans a
+route around this obstacle.
 """
 
 from __future__ import annotations

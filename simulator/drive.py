@@ -45,7 +45,7 @@ class Drive:
         metres: Driven distance.
         odometer: Noise of the odometry.
         laser: The scanner.
-        truth: The truth about places as plain data, for evaluation only.
+        truth: True places as plain data, for evaluation only.
     """
 
     name: str
@@ -110,7 +110,7 @@ class Recorder:
     poses: list[Pose] = field(default_factory=list)
     scans: list[tuple[World, list[int]]] = field(default_factory=list)
     metres: float = 0.0
-    _seconds: list[float] = field(default_factory=list)  # Of each pose.
+    _seconds: list[float] = field(default_factory=list)  # Per pose.
     _way: float = 0.0  # Metres since the last scan.
     _turned: float = 0.0
 

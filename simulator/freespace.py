@@ -145,7 +145,7 @@ class Part:
             return None
         way = self._middles(cells)
         way[0], way[-1] = start, goal
-        # Use the smoothed point only where it is far enough from obstacles.
+        # Use a smoothed point only if it is far enough from obstacles.
         smooth = gaussian_filter1d(way, SMOOTH / CELL, axis=0, mode="nearest")
         smooth[0], smooth[-1] = start, goal
         safe = self.clearance[self._cells(smooth)] >= self.least
@@ -200,8 +200,8 @@ def _shortest(
 ) -> Cells | None:
     """Cells of the cheapest route, (n, 2) rows and columns, at least this far from walls.
 
-    Near start and goal, where the robot may be closer to something than planned, all cells are free
-    that do not touch an occupied one.
+    The robot may be closer to obstacles than planned at start and goal. There, a cell is free if it
+    touches no occupied one.
     """
     rows, columns = clearance.shape
     free = clearance >= least

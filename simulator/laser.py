@@ -24,7 +24,7 @@ class Laser:
 
     Attributes:
         noise: Standard deviation of a range in metres.
-        reach: Largest range in metres, which also stands for anything farther.
+        reach: Largest range in metres; anything farther reads as this.
         dropouts: Probability that a beam is lost and reads as the largest range.
     """
 
@@ -70,7 +70,7 @@ def _near(segments: Array, poses: Array, reach: float) -> Array:
 
 
 def meetings(segments: Array, poses: Array, bearings: Array) -> Array:
-    """Distances from m poses along b bearings to w walls; infinite where a ray misses the wall.
+    """Distances from m poses along b bearings to w walls; infinite if a ray misses the wall.
 
     Args:
         segments: (w, 4) walls in metres.

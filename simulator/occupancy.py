@@ -343,7 +343,7 @@ def _cells(fields: MapFile, path: Path) -> Cells:
 def _shades(
     image: Image.Image, with_alpha: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | bool]:
-    """Brightness of the pixels of an image, from 0 (black) to 1, and which of them are opaque.
+    """Brightness of the pixels of an image, from 0 (black) to 1, and the mask of opaque ones.
 
     Args:
         image: An image in grey, colours or a palette.

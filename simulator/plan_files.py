@@ -68,7 +68,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tupl
         ) from None
     except ValueError as error:
         raise SimulatorError(f"{named(path)}: expected a plan: {error}; check the path") from None
-    # Entities can blow up to gigabytes.
+    # Entities can expand to gigabytes.
     if b"<!ENTITY" in data:
         raise SimulatorError(
             f"{named(path)}: expected a plan without entities of its own, got some; write them out"

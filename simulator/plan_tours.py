@@ -52,23 +52,23 @@ def tour(
     bend: float = 0.0,
     apart: float = APART,
 ) -> Trace:
-    """Simulate a drive from room to room, with views, stars and displacements.
+    """Simulate a drive from room to room: views, stars (openings seen), displacements.
 
     The robot turns to the door of the room that it has passed least often and travels through it.
-    Ties are broken at random. It does not go back through the door that it came by unless there is
-    no other. A turn is named by its side and by the number of gateways that it passes to that side.
-    A turn is "around" if it ends where the robot came from, or goes from a door to the opposite
-    one. A view is the number of doors and their rough directions, so many rooms look alike.
+    Ties are broken at random. It goes back through the same door only in a dead end. A turn is
+    named by its side and by the number of gateways passed on that side. A turn is "around" if it
+    ends where the robot came from, or goes from a door to the opposite one. A view is the number of
+    doors and their rough directions, so many rooms look alike.
 
     Args:
         plan: The plan.
         steps: Number of actions.
         seed: Seed of the drive and of the noise.
-        odometry: Noise of the displacements, which the trace states; None makes them exact.
+        odometry: Noise of the displacements, stored in the trace; None makes them exact.
         scale: Systematic error of distances, as in simulator.motion.reported.
         bend: Systematic error of headings, as in simulator.motion.reported.
-        apart: Degrees between the doors of a room, as in Plan.told_apart. Bearings are off by at
-            most a quarter of it, so that two doors never look like one.
+        apart: Least degrees between doors, as in Plan.told_apart. Bearings are off by at most a
+            quarter of this, so that two doors never look like one.
 
     Returns:
         A trace whose truth has dstate, place, path and pose.
@@ -123,7 +123,7 @@ class Floor:
     ('1 door: 0', ['travel'])
 
     Attributes:
-        plan: The plan, with doors told apart already, as by Plan.told_apart.
+        plan: The plan, as returned by Plan.told_apart.
         spread: Error of the bearings that a star states, in degrees. The bearings are exact.
     """
 
@@ -211,7 +211,7 @@ def _heading(plan: Plan, stand: Stand) -> float:
 def _bearings(plan: Plan, stand: Stand) -> tuple[float, ...]:
     """Bearing of each gateway of the room, in degrees clockwise from ahead.
 
-    Their order would reveal the heading, so stars are sorted.
+    Stars are sorted, as this order reveals the heading.
     """
     heading = _heading(plan, stand)
     return tuple(

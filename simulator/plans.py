@@ -46,7 +46,7 @@ class Gateway:
         door: Index of the door in the plan.
         to: Room behind it.
         bearing: Degrees clockwise from north, which is +y.
-        opposite: Index of the gateway of the same room that is straight opposite, or None.
+        opposite: Index of the opposite gateway of the same room, or None.
     """
 
     door: int
@@ -135,7 +135,7 @@ class Plan:
         return other if room == one else one
 
     def _straight_on(self, leg: Leg) -> tuple[Leg, ...]:
-        """A leg, and those straight on from it; the whole circle once if they lead back to it."""
+        """A leg and all legs straight ahead of it; a circle is followed once."""
         legs = [leg]
         while True:
             room = self._behind(*legs[-1])
@@ -146,7 +146,7 @@ class Plan:
 
     @cached_property
     def courses(self) -> dict[Leg, tuple[int, int]]:
-        """For each exit of a room, its path, and whether it leads along it (1) or back (-1)."""
+        """For each exit of a room, its path, and its direction on the path: 1 or -1."""
         return {
             leg: (number, direction)
             for number, path in enumerate(self.paths)
@@ -155,7 +155,7 @@ class Plan:
         }
 
     def told_apart(self, degrees: float = APART) -> Plan:
-        """Remove doors, so that those of a room are at least this many degrees apart.
+        """Remove doors until each room's doors differ by at least this many degrees.
 
         The doors nearest to the middles of their rooms stay.
         """

@@ -1,4 +1,4 @@
-"""A robot that drives and turns (a unicycle) with errors, and whose odometry has errors."""
+"""A robot that drives and turns (a unicycle). Motions and odometry have errors."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from simulator.motion import Pose, between
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Displacement
 
-# Largest systematic errors, as a share and in radians a metre. Beyond them, the robot could not
-# tell when it has left a place.
+# Largest systematic errors, as a share and in radians a metre. Beyond them, the robot does not
+# notice that it left a place.
 WORST = 0.5
 # Options of the verb `simulate` for these errors.
 OPTIONS = {"odometry": "odometry-noise", "scale": "scale-error", "bend": "bend-error"}
@@ -97,7 +97,7 @@ class Robot:
         )
         self._rng = rng
         self._reported = self.odometry  # The odometry at the last report.
-        # Of the odometry since the last report, in the frame of the start.
+        # Covariance of odometry since the last report, in the start frame.
         self._covariance = np.zeros((3, 3))
 
     def move(self, forward: float, turn: float) -> None:

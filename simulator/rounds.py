@@ -45,7 +45,7 @@ LASER = Laser(noise=0.01, reach=30.0)
 
 
 class Rooms:
-    """Routes for a robot of some radius: within rooms with shut doors, and straight through doors.
+    """Plans routes: free-space paths inside each room, straight lines through doorways.
 
     Args:
         building: The building.
@@ -160,7 +160,7 @@ class Round:
     Attributes:
         way: (n, 2) route in metres.
         rooms: Room of each point of the route.
-        doors: For each passage, the index of the point in the door, and the door.
+        doors: For each passage, the index of its point in `way`, and the door.
     """
 
     way: Array = field(repr=False)
@@ -202,7 +202,7 @@ class Round:
 
 
 def _legs(rooms: Rooms, home: int, metres: float, chance: np.random.Generator) -> Iterator[Within]:
-    """The legs of a round: a room, with the doors of entry and exit; None stands for its middle."""
+    """The legs of a round: room, entry door and exit door; None stands for its middle."""
     passed: Counter[int] = Counter()
     room, came, done = home, None, 0.0
     while True:

@@ -5,7 +5,7 @@ walls that face each other, about twice `reach` apart. The fixed point of a plac
 midlines of its streets meet; at a dead end it is `reach` before the wall.
 
 An image shows half a circle. A robot that turns on the spot sees the same walls rotated, so images
-overlap, and the rotation that makes them agree best is its turn: a visual compass. So images of a
+overlap, and the rotation with the best agreement is its turn: a visual compass. So images of a
 turning robot add up to a panorama of the whole circle.
 """
 
@@ -124,7 +124,7 @@ def apart(one: float, other: float) -> float:
 
 
 def _straight(points: NDArray[np.complex128]) -> Iterator[Wall]:
-    """Split points into walls where they are farthest from the line between their ends.
+    """Split points into walls, at the point farthest from the line of both ends.
 
     This is the algorithm of Douglas and Peucker.
     """
@@ -208,7 +208,7 @@ class Place:
 
     @property
     def headings(self) -> list[float]:
-        """Headings of dstates in radians: along each street, and opposite if nothing is there."""
+        """Headings of dstates, radians: along each street, and opposite if no street is there."""
         out = [street.bearing for street in self.streets]
         return out + [
             bearing + math.pi
@@ -275,7 +275,7 @@ class Panorama:
 
     @property
     def ranges(self) -> Array:
-        """(360,) metres, counterclockwise; NaN where nothing is known.
+        """(360,) metres, counterclockwise; NaN if unknown.
 
         The median over images ignores a beam that is lost in one of them.
         """
@@ -300,7 +300,7 @@ def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
         ranges: (360,) known ranges in metres.
         image: The image.
         about: Expected heading.
-        turned: Turn by odometry since the last known heading, which is off by a share of it.
+        turned: Turn by odometry since the last known heading. Its error is relative.
     """
     best = about
     for window, step in ((2 + OFF * math.degrees(abs(turned)), 0.5), (0.5, 0.05)):
@@ -315,7 +315,7 @@ def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
 
 
 def _around(image: Array, heading: float) -> Array:
-    """An image as ranges all around, (360,) metres; NaN where it shows nothing."""
+    """An image as ranges all around, (360,) metres; NaN in unseen directions."""
     bearings = np.angle(np.exp(1j * (AROUND - heading)))
     ranges: Array = np.interp(bearings, BEARINGS, image, left=np.nan, right=np.nan)
     return ranges

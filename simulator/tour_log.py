@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 def noise_of(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Noise:
-    """The noise of the displacements. If each has a covariance, only systematic errors remain."""
+    """Noise of displacements; only systematic errors if each displacement has a covariance."""
     if world.angles == "any" and tolerance is not None:
         return Noise(scale=abs(body.scale), bend=abs(body.bend))
     return noise_model(log.reports, body, tolerance)
@@ -35,7 +35,7 @@ class Eye:
         camera: The camera, or None for ranges.
         walls: Number of segments of the world without clutter.
         rng: Source of noise of the camera.
-        actions: Number of actions of the run, which tells the hour.
+        actions: Number of actions of the run, to find the hour.
     """
 
     camera: Camera | None

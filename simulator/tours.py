@@ -47,9 +47,8 @@ def simulate(
     """Drive tours of a world, and log an image at each dstate.
 
     A trace has tours x actions steps, and its last step has no action. The displacement of a step
-    is the odometry of all motions since the last step, also those of hill-climbing; the odometry of
-    the trace is the noise that fits them. `truth` has dstate, place, path and pose, for evaluation
-    only.
+    is the odometry of all motions since the last step, also those of hill-climbing; `odometry` of
+    the trace is their noise model. `truth` has dstate, place, path and pose, for evaluation only.
 
     Args:
         world: The world.
@@ -58,7 +57,7 @@ def simulate(
         laser: The scanner.
         body: Errors of the robot.
         tolerance: Precision of hill-climbing.
-        stars: Whether to log the openings at each place, as seen since the robot arrived there.
+        stars: Whether to log the openings seen at each place since arrival.
         every: Metres of odometry between images, wherever the robot is; the trace then has travels
             only. None logs at dstates.
         camera: A camera whose panoramas are logged instead of ranges, row by row, as whole numbers;
@@ -127,7 +126,7 @@ def record(
 ) -> Drive:
     """Drive tours as `simulate` does, and log scans.
 
-    The odometer of the log is not the one for control: it has the noise of robots in recorded logs.
+    The odometer of the log differs from that of control: it is as noisy as in recorded logs.
 
     Args:
         world: The world.

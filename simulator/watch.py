@@ -1,4 +1,4 @@
-"""Checks that actions end where the world says, and that tours end where they began.
+"""Checks that each action ends at the expected place, and each tour at its start.
 
 The control laws see images only and do not notice when they confuse places. This module compares
 the true pose with the true dstates of the world, if it has any. Errors name the action and the
@@ -77,7 +77,7 @@ class Watch:
             raise SimulatorError(f"{error} ({where}){self._because(before)}") from None
         after = self.driver.robot.pose
         expected = self._expected(name, before)
-        # The control law believes that it arrived; the truth may differ.
+        # The robot may not be where the control law assumes.
         if expected and self._is_elsewhere(expected, after):
             at = self.world.places[expected]
             raise SimulatorError(

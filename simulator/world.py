@@ -85,20 +85,20 @@ def distances_to(walls: Array, point: Point) -> Array:
 
 @dataclass(frozen=True)
 class World:
-    """Walls and clutter, and what a robot is to do in them.
+    """Walls and clutter; start and route of a robot.
 
     Attributes:
         name: Name of the world.
         segments: (n, 4) walls: x1, y1, x2, y2 in metres.
         clutter: Polygons that may move between tours.
         start: Start pose (x, y, heading) in metres and radians.
-        route: Actions of one tour, which ends where it began; or the places to drive to.
+        route: Actions, or places to drive to, of one tour. A tour ends at its start.
         reach: Distance in metres at which the robot follows a wall: half the width of a corridor.
         dstates: The truth, for evaluation only.
-        angles: Angles at which streets meet, which choose the control laws: right, or any.
+        angles: How streets meet, "right" or "any"; it selects the control laws.
         places: (x, y) of places in metres by name: those of the dstates, or of a route of places.
         via: (x, y) by name of points that are no places, through which a route of places may lead.
-        own_reach: The reach of the file, if another one was chosen.
+        own_reach: The file's reach in metres if `reach` replaces it.
     """
 
     name: str
@@ -209,7 +209,7 @@ class World:
             reach: Metres.
 
         Raises:
-            SimulatorError: An argument has no such form.
+            SimulatorError: An argument is malformed.
         """
         reader = WorldReader(self.name)
         # The reader names the argument in its errors.

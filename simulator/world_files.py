@@ -25,7 +25,7 @@ ARC, RAGGED = 5.0, 0.3
 # Largest total length of ragged walls, in metres.
 LONGEST = 20_000
 # A wall is square if it is within SQUARE radians of a right angle to the others. A right-angled
-# world has at most OBLIQUE of its walls, by length, that are not: a column or a cut corner.
+# world has at most a share OBLIQUE of other walls, by length: a column or a cut corner.
 SQUARE, OBLIQUE = math.radians(5), 0.1
 # Smallest `reach` of a world in metres: a laser reports no smaller range.
 NEAREST = 0.01
@@ -69,7 +69,7 @@ def are_square(walls: Array) -> bool:
     """Whether nearly all walls, by length, have one of two perpendicular directions."""
     ways = (walls[:, 2] - walls[:, 0]) + 1j * (walls[:, 3] - walls[:, 1])
     lengths = np.abs(ways)
-    directions = np.angle(ways) * 4  # Directions a quarter turn apart become equal.
+    directions = np.angle(ways) * 4  # Makes perpendicular directions equal.
     axis = directions[lengths.argmax()]
     off = np.abs(np.angle(np.exp(1j * (directions - axis)))) / 4
     return bool(lengths[off > SQUARE].sum() <= OBLIQUE * lengths.sum())

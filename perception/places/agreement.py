@@ -2,7 +2,7 @@
 
 Scan matching corrects an odometer that drifts by some percent. If the trajectories differ by more,
 something is read wrongly: the field of view, the position of the laser on the robot, a range that
-means "nothing came back", or the odometer itself. The kind of difference tells which.
+means "nothing came back", or the odometer itself. The kind of difference shows which.
 
 Both trajectories are cut into stretches. A stretch is a motion in the plane: a complex number in
 the frame of the robot at its beginning. The least-squares factor that maps odometry motions to scan
@@ -34,14 +34,14 @@ STRETCH, BEND = 1.0, math.radians(30)
 # Turns are compared over stretches that turn by at least this many radians, if there are at least
 # LEAST_TURNS of them.
 TURN, LEAST_TURNS = math.radians(15), 8
-# The trajectories part in a stretch if their ends differ by more than this share of it plus this
+# Trajectories diverge in a stretch if their ends differ by more than this share of it plus this
 # many metres.
 PARTED, ASIDE = 0.25, 0.2
 # In good logs, recorded and simulated, the trajectories differ by at most 4 % in length, 2 degrees
-# in direction and 6 % in turns, and they part in at most 3 % of the stretches. Matching can correct
+# in direction and 6 % in turns, and diverge in at most 3 % of the stretches. Matching can correct
 # that. About twice as much is worth a warning.
 LENGTH, ANGLE, TURNING, PARTING = 0.1, math.radians(10), 0.15, 0.05
-# A robot that was pushed or slipped once has trajectories that part in fewer stretches than this.
+# If the robot was pushed or slipped once, the trajectories diverge in fewer stretches than this.
 LEAST_PARTED = 3
 # Distance of the scans of a pair: at least the first number and less than the second, in metres
 # (GAP) or radians (TURN_OF_PAIR).
@@ -67,7 +67,7 @@ class Agreement:
         scans: Metres by scan matching.
         angle: Radians by which the motion by scans points farther to the left than by odometry.
         turning: Median ratio of turns by scans to turns by odometry; None if there are few turns.
-        parted: Number of stretches in which the trajectories part.
+        parted: Number of stretches in which they diverge.
         of: Number of stretches.
     """
 
@@ -90,7 +90,7 @@ class Agreement:
 
     @property
     def is_good(self) -> bool:
-        """Whether matching can correct the differences."""
+        """Whether the two trajectories nearly agree."""
         is_other_length = abs(self.scans - self.odometry) > max(LENGTH * self.odometry, STRETCH)
         is_parted = self.parted >= max(LEAST_PARTED, PARTING * self.of)
         return not (is_other_length or self.is_askew or self.has_other_turns or is_parted)
@@ -152,7 +152,7 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
     laser = log.scans[0].laser
     differences = [f"{found.scans:.0f} m by scans, {found.odometry:.0f} m by odometry"]
     causes: list[str] = []
-    # Turns tell the field of view; a negative ratio means that left and right are swapped.
+    # Turns show the field of view; a negative ratio means that left and right are swapped.
     fov = _fov(log.scans[0])
     if found.turning is not None and found.has_other_turns:
         differences.append(f"turns by scans are {found.turning:.2f} times those by odometry")
@@ -198,7 +198,7 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
 def direction(log: RobotLog) -> float | None:
     """Estimate the direction of the laser, in degrees to the left of straight ahead.
 
-    None if it is as the log says, if the scans do not tell, or if there are several lasers.
+    None if the log is right, if the scans do not show it, or if there are several lasers.
     """
     angles = {scan.laser.mount[2] for scan in log.scans}
     apart = _apart(log, np.radians(TURNS)) if len(angles) == 1 else None
@@ -213,7 +213,7 @@ def direction(log: RobotLog) -> float | None:
 def field_of_view(log: RobotLog) -> float | None:
     """Estimate the field of view in degrees.
 
-    None if it is as the log says, or if the scans do not tell.
+    None if the log is right, or if the scans do not show it.
     """
     fov = _fov(log.scans[0])
     tried = [_apart(log, np.zeros(1), float(degrees) / fov) for degrees in FIELDS]

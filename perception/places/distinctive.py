@@ -1,7 +1,7 @@
 """Finds the distinctive places that a robot passes: junctions, corners, dead ends, turning points.
 
-At each milestone of the trajectory, the local map gives the exits and the point where they part. If
-three or more exits part there, or if the corridor bends, the milestone votes for a place with its
+At each milestone of the trajectory, the local map gives the exits and the point where they meet. If
+three or more exits meet there, or if the corridor bends, the milestone votes for a place with its
 middle at that point. A point that most of the nearby milestones vote for is a place. The robot
 visits it as it passes.
 """

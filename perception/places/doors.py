@@ -1,6 +1,6 @@
 """Finds the doors that a robot drives through, for buildings whose places are doors.
 
-In a building of rooms, the robot crosses wide spaces freely, and no corridor bends or parts. It
+In a building of rooms, the robot crosses wide spaces freely, and no corridor bends or forks. It
 cannot avoid doors: constrictions of the free space on its trajectory. So a place is a door, and a
 path crosses a room from one door to the next.
 """

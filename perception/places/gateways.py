@@ -1,8 +1,8 @@
-"""Finds the exits of the free space around a point, and the point where they part.
+"""Finds the exits of the free space around a point, and the point where they meet.
 
-An exit is a part of the free space at the distance of the radius, along the shortest drivable path,
-that can be reached at full width. So an alcove is no exit, and a corridor is one even if something
-stands in it.
+An exit is a part of the free space, one radius away by the shortest drivable path, that can be
+reached at full width. So an alcove is no exit, and a corridor is one even if something stands in
+it.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def apart(a: float, b: float) -> float:
 
 
 def parting(patch: Patch, open_cells: Bools, seen: Outlook, radius: float) -> Cell:
-    """The cell where the paths to all exits part.
+    """The cell where the paths to all exits meet.
 
     The sum of the paths to the exits is shortest there. Of nearly equal cells, the one with the
     most room is taken. With two exits, it is the sharpest bend of the path between them.

@@ -49,12 +49,12 @@ class Imported:
     """Result of `import_log`.
 
     Attributes:
-        trace: One step for each visited dstate, with view, image, star and displacement.
+        trace: One step for each visited dstate, with view, image, star (exits), displacement.
         track: Trajectory of the robot.
         scale: Scale of the building.
         visits: The distinctive places that the robot passed, in order.
         seconds: Processor time of each stage.
-        notes: Sentences about what makes the track suspicious.
+        notes: Sentences on suspicious features of the track.
     """
 
     trace: Trace
@@ -83,11 +83,11 @@ def import_log(
             it.
         name: Name of the trace.
         doors: Whether places are the doors that the robot drives through, instead of where
-            corridors part or bend. None decides by the log, or means False if gateway or radius is
-            given, as these describe corridors that part.
+            corridors fork or bend. None means False if gateway or radius is given (they describe
+            corridors). Otherwise, the log decides.
 
     Returns:
-        The trace, and what it was made from.
+        The trace and its source data.
 
     Raises:
         LogError: The robot passed no distinctive place or hardly moved, or the scans do not match.
@@ -210,8 +210,8 @@ def _besides(notes: Sequence[str]) -> str:
 def with_views(trace: Trace) -> Trace:
     """Add views of the images, by clustering.
 
-    Few views are made, so that each place has one view in spite of moved objects (Kuipers & Beeson
-    2002, section 3).
+    Few views are made, so that a place keeps its view even if objects move (Kuipers & Beeson 2002,
+    section 3).
     """
     images = ReciprocalTransformer(floor=0.3).fit_transform(
         np.array([step.image for step in trace.steps])

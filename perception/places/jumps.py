@@ -208,10 +208,10 @@ class Unknown:
     """Scans that a step with unknown odometry leads to.
 
     Attributes:
-        unknown: The odometer jumps, or stands still while the robot was moved.
-        carried: Those of them to which the robot was carried while nothing was logged.
-        doubtful: Other long steps. They are jumps if the scan does not match there but matches at
-            the previous pose.
+        unknown: Scans after an odometer jump, or a motion that it missed.
+        carried: Unknown scans to which the robot was carried while not logging.
+        doubtful: Scans after other long steps. The step is a jump if only the previous pose
+            matches.
         still: First and last scan of each stretch in which the odometer stands still.
     """
 
@@ -226,7 +226,7 @@ class Unknown:
 
 
 def unknown_steps(log: RobotLog) -> Unknown:
-    """Find jumps of the odometer, and where it stands still while the laser sees changes."""
+    """Find jumps of the odometer, and stretches where only the laser shows motion."""
     if len(log) < 3:
         return Unknown()
     seconds = _seconds(log)

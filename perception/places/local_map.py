@@ -30,7 +30,7 @@ CELL = 0.1
 # Beams are ignored beyond this many metres, where they are too far apart to show what is between.
 SIGHT = 12.0
 # A cell is occupied if at least this share of the scans that looked there hit something. So passing
-# people are soon overruled.
+# people soon disappear.
 OCCUPIED = 0.25
 # Cells per step of a wave that alternates between four and eight neighbours, averaged over all
 # directions.

@@ -38,8 +38,7 @@ class Scale:
         gateway: Smallest width of a gateway.
         radius: Distance that an exit must lead from the middle of a place.
         most: Width that most of the trajectory exceeds.
-        doors: Whether places are the doors between rooms; otherwise they are where corridors part
-            or bend.
+        doors: Whether places are the doors between rooms; otherwise, where corridors fork or bend.
     """
 
     gateway: float

@@ -1,7 +1,7 @@
 """Turns the visits of a log into a trace.
 
-Each step has what the robot saw at a dstate. Turns and travels lead from step to step, with
-displacements and stars.
+Each step has what the robot saw at a dstate. Turns and travels connect steps. A star is the exits
+seen at a place.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def to_trace(
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
     for number, visit in enumerate(visits):
-        # One step for the heading of arrival and one for that of departure, unless these are alike.
+        # One step for the heading of arrival and one for that of departure, if they differ.
         patch = maps.around(visit.scan, visit.middle, scale.half)
         came = (
             None if visit.arrived is None else wrapped(visit.ways[visit.arrived].bearing + math.pi)
@@ -162,7 +162,7 @@ def _aligned(visits: Sequence[Visit], stride: float) -> list[Visit]:
     """Align the exits of all visits to multiples of a stride from the direction of the walls.
 
     So an exit has the same direction at each visit. An exit that is far from all multiples becomes
-    uncertain. If the walls tell no direction, that of the visit before is used.
+    uncertain. If the walls show none, the previous visit's axis is used.
 
     Args:
         visits: The visits, in order.
@@ -172,8 +172,7 @@ def _aligned(visits: Sequence[Visit], stride: float) -> list[Visit]:
     axis = next((visit.axis for visit in visits if visit.straight >= AGREE), 0.0)
     count = round(2 * math.pi / stride)
     for visit in visits:
-        # Walls tell the axis up to quarter turns. Take the nearest to the last axis, so that it
-        # does not jump.
+        # Walls show the axis up to quarter turns. The turn nearest to the last axis prevents jumps.
         here = visit.axis if visit.straight >= AGREE else axis
         axis = axis + _off(here - axis, QUARTER)
         ways: dict[int, Way] = {}

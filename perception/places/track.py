@@ -3,7 +3,7 @@
 A scan is matched from points to lines (Chen & Medioni 1992; Censi 2008): the pose moves until the
 points of the scan lie on the walls that the last scans saw. Odometry is a prior. In a bare
 corridor, where walls do not show how far the robot went, the odometer decides. Nothing is global:
-errors accumulate along the trajectory, and the covariance of each increment says by how much.
+errors accumulate along the trajectory, as the covariances of the increments state.
 
 Where an odometer jumps, it is ignored (`jumps`), and the scan is matched near the previous pose. If
 it matches, the track goes on, and only the increment is unknown. If nothing in the scan was seen
@@ -104,8 +104,8 @@ class Track:
             was matched.
         cuts: Scans before which the motion is unknown because the odometer jumped. No displacement
             crosses a cut.
-        breaks: Those of the cuts at which the robot may be anywhere, because nothing was seen
-            before. Neither a path nor a place crosses a break.
+        breaks: Cuts after which the robot may be anywhere, because nothing was seen before. Neither
+            a path nor a place crosses a break.
     """
 
     poses: Array

@@ -123,7 +123,7 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
             f"{named(path)}: expected a folder of ROS 2 with metadata.yaml, or with files "
             "*.mcap, *.db3 or *.bag, got none of these; name a file"
         )
-    # Without metadata.yaml, only the names tell which files belong together.
+    # Without metadata.yaml, only names show which files belong together.
     drives = {_drive(part) for part in parts}
     if len(drives) > 1:
         names = ", ".join(named(part.name) for part in parts[:4]) + (

@@ -233,7 +233,7 @@ def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
     sources = sources_of(track)
     if len(sources) == 1:
         return track
-    # The distance of the first two sources tells how bad it is.
+    # The gap between the first two sources shows the error.
     table = track.table()
     first, second = (Track() for _ in range(2))
     for number in sources[0]:

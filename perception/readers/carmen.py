@@ -197,8 +197,7 @@ class _Odometer:
         behind: The chain before the last ODOM line since the last scan.
         last: Pose and time of the last ODOM line.
         before: Pose and time of the ODOM line before that.
-        restarts: Whether the next ODOM line starts from a corrected pose, so that it tells no
-            motion.
+        restarts: Whether the next ODOM line starts from a corrected pose, and gives no motion.
         vertex: Index of the last vertex.
         truth: A corrected pose, and the odometer's at the same time.
         news: A corrected pose that waits for the odometry of the next scan.
@@ -242,9 +241,9 @@ class _Odometer:
             self.skip_line(tag)
 
     def skip_line(self, tag: bytes) -> None:
-        """Take in that a line cannot be read.
+        """Note that a line cannot be read.
 
-        The line may have been a scan, after which ODOM lines restart. Then the next ODOM line tells
+        The line may have been a scan, after which ODOM lines restart. Then the next ODOM line gives
         no motion.
         """
         self.restarts |= self.meaning == "restarts" and tag != b"ODOM"

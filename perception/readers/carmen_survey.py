@@ -55,15 +55,15 @@ class Survey:
         scans: Number of scans.
         beams: Number of beams of the first scan.
         most: Largest range.
-        repeated: Number of times that it occurs.
+        repeated: Number of times `most` occurs.
         mount: First pose in the frame of the second, at the first scan.
         mounted: Number of scans with about the same mount.
-        wandered: Number of scans with a very different one.
+        wandered: Number of scans with a very different mount.
         same: Number of scans whose two poses are equal.
         restarts: Number of scans whose pose the next ODOM line repeats, though the line before it
             has the same time and another pose.
         moves: Number of scans at which a restart could be seen.
-        unmoved: Lines of scans before which no ODOM line tells the motion.
+        unmoved: Lines of scans before which no ODOM line gives motion.
         poses: Second poses, three numbers each.
     """
 
@@ -193,7 +193,7 @@ def mount_of(found: Found, survey: Survey, meaning: Meaning, kind: str) -> Pose:
 
 
 def reach_of(found: Found, survey: Survey, kind: str, assumed: dict[str, str]) -> float:
-    """The range that means that nothing is near; infinite if the lines of the scans tell it."""
+    """The range that means that nothing is near; infinite if the lines of the scans give it."""
     if kind != "FLASER":
         return math.inf
     if (reach := found.parameters.get("reach", 0.0)) > 0:

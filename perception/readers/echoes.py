@@ -8,7 +8,7 @@ constant below it, 0, or NaN. A log rarely says which. So the whole log is surve
 - Beams of 0 or NaN mean that nothing came back if their neighbours are long. If their neighbours
   have usual lengths, the laser failed there, and nothing is known.
 
-Notes say what was found. `Told` holds what the user knows better.
+Notes say what was found. `Told` holds the user's corrections.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class Meaning:
 
     Attributes:
         reach: Metres from which a range means that nothing came back.
-        free: Kinds of beams without a measurement, of KINDS, that mean the same.
+        free: Which of KINDS (beams without a measurement) also mean this.
     """
 
     reach: float
@@ -202,7 +202,7 @@ def moving(scans: Iterable[Scan]) -> list[Scan]:
 
 
 def _measured(scan: Scan, meaning: Meaning) -> Scan:
-    """The scan with infinite ranges where nothing came back, and NaN where nothing is known."""
+    """The scan with infinite ranges if nothing came back, and NaN if nothing is known."""
     ranges, kinds = scan.ranges.copy(), _kinds(scan)
     with np.errstate(invalid="ignore"):
         ranges[scan.ranges >= meaning.reach] = np.inf

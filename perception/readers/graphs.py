@@ -36,7 +36,7 @@ class Chain:
 
     Attributes:
         poses: Pose at each vertex.
-        gaps: Vertices before which no edge tells the motion; the robot seems to have stood still.
+        gaps: Vertices before which no edge gives motion; the robot seems to have stood still.
     """
 
     poses: tuple[Pose, ...]
@@ -100,7 +100,7 @@ class Graph:
         return next((i for i in sorted(near) if same_pose(self.vertices[i][1], pose)), None)
 
     def share_at_vertices(self, poses: Sequence[float]) -> float:
-        """Share of the poses, given as consecutive numbers, that are poses of vertices."""
+        """Share of poses (flat: x, y, heading, x, …) that are poses of vertices."""
         table: NDArray[np.float64] = np.reshape(poses, (-1, 3))
         last = len(self.vertices) - 1
         at = sum(

@@ -30,7 +30,7 @@ BAGS = {
     "mcap": "a file of MCAP",
 }
 FORMATS = {**LINES, **BAGS}
-# Number of first bytes that tell the format of a file.
+# Number of first bytes that show a file's format.
 HEAD = 2**16
 
 

@@ -1,6 +1,6 @@
 """Poses over time with two clocks: the time in the header, and the time of recording.
 
-The messages themselves tell which clock is usable, and whether two programs published at once.
+The messages show which clock is usable, and whether two programs published at once.
 """
 
 from __future__ import annotations

@@ -203,7 +203,7 @@ def _sqlite(path: Path) -> Iterator[Message]:
     with closing(
         sqlite3.connect(f"file:{quote(str(path))}?mode=ro&immutable=1", uri=True)
     ) as database:
-        # Without this, SQLite refuses a file that is shorter than its first page says.
+        # Without this, SQLite rejects a file that is shorter than its first page says.
         database.execute("PRAGMA writable_schema=ON")
         topics = {
             number: (topic, kind)

@@ -65,8 +65,8 @@ class Scan:
     """One scan, with the pose of the robot.
 
     Attributes:
-        ranges: (beams,) metres. Infinite if nothing came back or only from beyond the reach; NaN if
-            the range is no measurement.
+        ranges: (beams,) metres. Infinite if nothing came back from within the reach; NaN if the
+            range is no measurement.
         laser: The scanner.
         odometry: Pose by the odometer, which starts anywhere and drifts. Only its increments
             matter.
@@ -144,7 +144,7 @@ class Reading:
         items: Scans with ranges as the driver wrote them, and skipped parts, in the order of the
             file.
         assumed: Notes on what the reader assumed, by the field of `perception.readers.echoes.Told`
-            that would tell it.
+            that replaces it.
     """
 
     format: str
