@@ -1,6 +1,7 @@
 """Worlds: walls, clutter that may move between tours, and the true dstates if known.
 
-A world is a JSON file that a user can write (docs/reference/worlds.md), or an occupancy map of ROS (a YAML
+A world is a JSON file that a user can write (docs/reference/worlds.md), or an occupancy map of ROS
+(a YAML
 file and an image).
 
 >>> from simulator.world import World
@@ -274,7 +275,8 @@ class World:
 
     @classmethod
     def from_occupancy(cls, path: str | os.PathLike[str]) -> World:
-        """Make a world from an occupancy map of ROS, a YAML file and its image (docs/reference/worlds.md).
+        """Make a world from an occupancy map of ROS, a YAML file and its image
+        (docs/reference/worlds.md).
 
         The robot starts in the mean of the ends of all walls.
         """

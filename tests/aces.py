@@ -1,4 +1,5 @@
-"""The real route of the ACES building, and what the command line says of it, which many tests look at and none has to compute again."""
+"""The real route of the ACES building, and what the command line says of it, which many tests look
+at and none has to compute again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Every map of a tiny trace (up to seven observations), by trying all of them: slow, plain, independent of encodings and checker.
+"""Every map of a tiny trace (up to seven observations), by trying all of them: slow, plain,
+independent of encodings and checker.
 
 >>> from ssh_abduction import Theory, Trace
 >>> trace = Trace.from_steps("aaa", ["travel", "travel"])
@@ -8,9 +9,11 @@ Counts(dstates=3, paths=1, places=3, excuses=0)
 >>> keys
 {((0, 1, 2), (0, 1, 2), ((0, 1), (0, 1), (0, 1)))}
 
-A map is an equality of the steps, a place of every dstate, and a course (path and direction), or none, of every dstate. Orders, sides,
-headings and excused pairs of paths are witnesses: they have to exist, but do not tell two maps apart. A trace has to have views; a
-topological theory also needs the kinds of the actions. `one_place` and `one_course` always hold, even if the theory leaves them out.
+A map is an equality of the steps, a place of every dstate, and a course (path and direction), or
+none, of every dstate. Orders, sides, headings and excused pairs of paths are witnesses: they have
+to exist, but do not tell two maps apart. A trace has to have views; a topological theory also needs
+the kinds of the actions. `one_place` and `one_course` always hold, even if the theory leaves them
+out.
 """
 
 from __future__ import annotations
@@ -59,7 +62,8 @@ class Counts(NamedTuple):
 
 
 def key(ssh_map: SSHMap) -> Key:
-    """The map without its witnesses; dstates, places and paths numbered by the first step, where a path is faced in direction +1."""
+    """The map without its witnesses; dstates, places and paths numbered by the first step, where a
+    path is faced in direction +1."""
     by_id = {s.id: s for s in ssh_map.dstates}
     visited = [by_id[s] for s in dict.fromkeys(ssh_map.labels)]
     labels = {s.id: i for i, s in enumerate(visited)}
@@ -85,11 +89,13 @@ def key(ssh_map: SSHMap) -> Key:
 def minimal_maps(
     trace: Trace, theory: Theory, allows: Callable[[Key], bool] = lambda _: True
 ) -> tuple[Counts | None, set[Key]]:
-    """The counts and the keys of the consistent maps that come first by `theory.priorities`; (None, empty) where there is none.
+    """The counts and the keys of the consistent maps that come first by `theory.priorities`; (None,
+    empty) where there is none.
 
     allows  what an axiom says of a map that the brute force does not know
 
-    The maps agree in the counts that the theory minimises. The other counts are those of one of them.
+    The maps agree in the counts that the theory minimises. The other counts are those of one of
+    them.
     """
     best: tuple[int, ...] | None = None
     counts: Counts | None = None
@@ -108,11 +114,13 @@ def minimal_maps(
 def near_minimal_maps(
     trace: Trace, theory: Theory, within: int, allows: Callable[[Key], bool] = lambda _: True
 ) -> dict[tuple[int, ...], set[Key]]:
-    """By their cost: the maps that come first by `theory.priorities` among those with one number of dstates, in the order of these numbers.
+    """By their cost: the maps that come first by `theory.priorities` among those with one number of
+    dstates, in the order of these numbers.
 
     within  how much greater that number may be than in minimal maps
 
-    Where the theory prefers few paths or places first, these are counted instead of dstates; where it prefers none of these, all maps have one number.
+    Where the theory prefers few paths or places first, these are counted instead of dstates; where
+    it prefers none of these, all maps have one number.
     """
     counted = next((name for name in theory.priorities if name != "excuses"), None)
     best: dict[int, tuple[tuple[int, ...], set[Key]]] = {}  # by that number
@@ -134,7 +142,8 @@ def near_minimal_maps(
 
 
 def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]]:
-    """Every map that satisfies the axioms, once, with its counts: excuses are the fewest that make it consistent."""
+    """Every map that satisfies the axioms, once, with its counts: excuses are the fewest that make
+    it consistent."""
     theory = settle(trace, theory).theory
     on = frozenset(theory.axioms)
     defeasible = theory.boundary == "defeasible"
@@ -190,7 +199,8 @@ def consistent_maps(trace: Trace, theory: Theory) -> Iterator[tuple[Key, Counts]
 
 
 def _as_asserted(labels: Labels, places: tuple[int, ...] | None, theory: Theory) -> bool:
-    """Whether dstates, and places where they are given, are as the theory says of pairs of steps that the trace has."""
+    """Whether dstates, and places where they are given, are as the theory says of pairs of steps
+    that the trace has."""
     there = [
         [(i, j) for i, j in pairs if j < len(labels)]
         for pairs in (theory.same, theory.different, theory.elsewhere)
@@ -314,11 +324,15 @@ def _headings(
     stars: tuple[Openings | None, ...],
     on: Axioms,
 ) -> Iterator[tuple[int, ...]]:
-    """The headings that fit turns and stars. At the first step at a place it is 0: this chooses the place's frame."""
+    """The headings that fit turns and stars.
+
+    At the first step at a place it is 0: this chooses the place's frame.
+    """
     at = [places[label] for label in labels]
 
     def slots(step: int, heading: int) -> set[int]:
-        """The open slots of the place, by the star of a step: opening j from ahead belongs to slot heading + j."""
+        """The open slots of the place, by the star of a step: opening j from ahead belongs to slot
+        heading + j."""
         star = stars[step]
         assert star is not None
         return {(heading + j) % 4 for j in SLOTS if star[j]}
@@ -326,7 +340,8 @@ def _headings(
     def allowed(headings: tuple[int, ...]) -> bool:
         last = len(headings) - 1
         turn = actions[last - 1].turn if last else None
-        # Headings at two places are in two frames: without turn_stays a turn may lead from one to the other.
+        # Headings at two places are in two frames: without turn_stays a turn may lead from one to
+        # the other.
         stays = last and at[last - 1] == at[last]
         if (
             "turn_rotates" in on
@@ -364,7 +379,8 @@ def _headings(
 def _goes_straight(
     labels: Labels, places: tuple[int, ...], courses: Courses, headings: tuple[int, ...], on: Axioms
 ) -> bool:
-    """A path leaves a place through opposite slots; a slot belongs to one path and direction, and these to one slot."""
+    """A path leaves a place through opposite slots; a slot belongs to one path and direction, and
+    these to one slot."""
     if "path_goes_straight" not in on:
         return True
     through: dict[tuple[int, int], set[Course]] = defaultdict(set)
@@ -392,7 +408,8 @@ def _gateways_agree(
     on: Axioms,
     orders: dict[int, Order] | None = None,
 ) -> bool:
-    """Whether at each place the gateways of all steps can be named, so that stars agree when turned by whole degrees, and lead on where paths go on in these orders."""
+    """Whether at each place the gateways of all steps can be named, so that stars agree when turned
+    by whole degrees, and lead on where paths go on in these orders."""
     at = [places[label] for label in labels]
     onward: list[set[int]] = [set() for _ in labels]
     for t, label in enumerate(labels):
@@ -420,7 +437,8 @@ def _named(
     on: Axioms,
     onward: list[set[int]],
 ) -> bool:
-    """Whether each of these steps, which are at one place, has a reading of its star: the bearing of each gateway of the place, in a clockwise order that is the same for all."""
+    """Whether each of these steps, which are at one place, has a reading of its star: the bearing
+    of each gateway of the place, in a clockwise order that is the same for all."""
 
     def extend(chosen: dict[int, tuple[Named, ...]]) -> bool:
         if len(chosen) == len(steps):
@@ -445,7 +463,8 @@ def _named(
 
 
 def _readings(step: Step) -> list[tuple[Named, ...]]:
-    """The gateways (number in the star, bearing, spread) from ahead clockwise, with or without each that was not observed."""
+    """The gateways (number in the star, bearing, spread) from ahead clockwise, with or without each
+    that was not observed."""
     star = step.gateways
     gateways = star.gateways if star else ()
     found = []
@@ -566,7 +585,8 @@ def _turn(action: Action, seen: tuple[Named, ...], star: tuple[Gateway, ...]) ->
 
 
 def _way_on(seen: tuple[Named, ...], star: tuple[Gateway, ...]) -> tuple[int, int] | None:
-    """The gateways ahead and behind, by their numbers in the star, where a path bends through gateways that are declared opposite."""
+    """The gateways ahead and behind, by their numbers in the star, where a path bends through
+    gateways that are declared opposite."""
     by_number = {k: (b, d) for k, b, d in seen}
     for k, bearing, spread in sorted(
         seen, key=lambda g: (star[g[0]].bearing + star[g[0]].spread) % 360
@@ -583,7 +603,10 @@ def _way_on(seen: tuple[Named, ...], star: tuple[Gateway, ...]) -> tuple[int, in
 
 
 def _courses(places: tuple[int, ...], links: frozenset[Link], on: Axioms) -> Iterator[Courses]:
-    """The course of each dstate: None, or a path and a direction, numbered by first visit and +1 there."""
+    """The course of each dstate:
+
+    None, or a path and a direction, numbered by first visit and +1 there.
+    """
     supported = _supported(links)
 
     def allowed(courses: Courses) -> bool:
@@ -661,7 +684,8 @@ def _least_excuses(
     defeasible: bool,
     ends: Callable[[dict[int, Order]], bool] | None,
 ) -> int | None:
-    """The fewest pairs of paths to be excused from B2, under any orders of the paths that `ends` allows; None where no orders and excuses will do."""
+    """The fewest pairs of paths to be excused from B2, under any orders of the paths that `ends`
+    allows; None where no orders and excuses will do."""
     paths = sorted({course[0] for course in courses if course})
     on_path = {
         h: {p for p, c in zip(places, courses, strict=True) if c and c[0] == h}
@@ -709,7 +733,10 @@ def _least_excuses(
 
 
 def _orders(places: set[int], before: Order, on: Axioms) -> Iterator[Order]:
-    """The least order that has `before` in it or, with path_order_total, every total one. Fewer pairs never break an axiom."""
+    """The least order that has `before` in it or, with path_order_total, every total one.
+
+    Fewer pairs never break an axiom.
+    """
     if "order_transitive" in on:
         while more := {(p, r) for p, q in before for q1, r in before if q == q1} - before:
             before |= more
@@ -801,7 +828,10 @@ def _is_planar(
     headings: list[tuple[int, ...]],
     theory: Theory,
 ) -> bool:
-    """Whether the edges that travels lead along can be drawn. By headings where places have frames; if not, by sides."""
+    """Whether the edges that travels lead along can be drawn.
+
+    By headings where places have frames; if not, by sides.
+    """
     travels = {(s, t) for s, action, t in links if action.kind == "travel"}
     if theory.star == "frame":
         for heading in headings:
@@ -864,7 +894,8 @@ def _is_planar(
 
 
 def _clockwise(order: tuple[object, ...], ends: list[tuple[int, int]]) -> bool:
-    """Whether these arms, which have to be different ones, come one after another going round once."""
+    """Whether these arms, which have to be different ones, come one after another going round
+    once."""
     start = order.index(ends[0])
     turned = [(order.index(end) - start) % len(order) for end in ends]
     return len(set(turned)) == len(ends) and turned == sorted(turned)

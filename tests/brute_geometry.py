@@ -1,7 +1,9 @@
-"""What displacements say of a map, with matrices written out in full: slow, plain, and independent of the package.
+"""What displacements say of a map, with matrices written out in full: slow, plain, and independent
+of the package.
 
-The error of each displacement is a variable of its own (three for each step), and so are the scale and the drift of the heading. How a loop moves with each of
-them is found by moving it a little, and the covariance of several closings is J C J' with these derivatives J.
+The error of each displacement is a variable of its own (three for each step), and so are the scale
+and the drift of the heading. How a loop moves with each of them is found by moving it a little, and
+the covariance of several closings is J C J' with these derivatives J.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ class Geometry:
         self.judged: dict[tuple[tuple[int, int, int], ...], bool] = {}
 
     def end(self, i: int, j: int, bend: float, errors: np.ndarray) -> np.ndarray:
-        """The pose at step j by dead reckoning from the first step, where displacements after step i, the scale and the drift have these errors."""
+        """The pose at step j by dead reckoning from the first step, where displacements after step
+        i, the scale and the drift have these errors."""
         x = y = heading = 0.0
         for t in range(1, j + 1):
             displacement = self.trace.steps[t].displacement
@@ -88,7 +91,8 @@ class Geometry:
 
     @cache  # noqa: B019
     def loop(self, i: int, j: int, bend: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
-        """How far off a loop closes, its derivatives, what is added to its covariance, and whether anything is known of it."""
+        """How far off a loop closes, its derivatives, what is added to its covariance, and whether
+        anything is known of it."""
         off = self.end(i, j, bend, np.zeros(3 * len(self.trace) + 2)) - self.end(
             i, i, bend, np.zeros(3 * len(self.trace) + 2)
         )

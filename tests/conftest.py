@@ -1,4 +1,5 @@
-"""Settings of all tests: how fast the machine is, and whether somebody watches it, decides nothing."""
+"""Settings of all tests: how fast the machine is, and whether somebody watches it, decides
+nothing."""
 
 import contextlib
 import math
@@ -8,8 +9,8 @@ from hypothesis import HealthCheck, settings
 
 from ssh_abduction.cli import verbosity, view
 
-# No example takes too long, nor does it take too long to draw one. And the examples are the same in each run: of traces at random, some take clingo a hundred
-# times as long as others.
+# No example takes too long, nor does it take too long to draw one. And the examples are the same in
+# each run: of traces at random, some take clingo a hundred times as long as others.
 settings.register_profile(
     "the same everywhere",
     deadline=None,
@@ -24,6 +25,7 @@ verbosity.EVERY = math.inf
 # A page may spend three seconds on what assumptions cost. Tests of these costs ask for them.
 view.ASSUMING = 0.1
 
-# Programs that are begun in the background do not hear Ctrl-C, nor do those that they begin. Tests do, from any thread that is the main one.
+# Programs that are begun in the background do not hear Ctrl-C, nor do those that they begin. Tests
+# do, from any thread that is the main one.
 with contextlib.suppress(ValueError):
     signal.signal(signal.SIGINT, signal.default_int_handler)

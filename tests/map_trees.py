@@ -1,7 +1,9 @@
-"""The tree of all maps that explain what a robot meets in a world of streets on a grid: stars only, no views, gateways joined in pairs.
+"""The tree of all maps that explain what a robot meets in a world of streets on a grid: stars only,
+no views, gateways joined in pairs.
 
-It knows nothing of the theory's encodings. A map says which gateways are joined: `{(place, slot): (place, slot)}`, both ways. Each arrival leads where the map says or,
-through a gateway that it does not know yet, to a new place or to a free gateway of a place that looks like this one.
+It knows nothing of the theory's encodings. A map says which gateways are joined: `{(place, slot):
+(place, slot)}`, both ways. Each arrival leads where the map says or, through a gateway that it does
+not know yet, to a new place or to a free gateway of a place that looks like this one.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ def lattice(width: int, height: int) -> Cells:
 
 
 def stars_on(route: str, cells: Cells | None) -> list[Star]:
-    """What a robot sees around it that begins at cell 0, 0, heading east, and goes these ways; without cells all gateways are open everywhere."""
+    """What a robot sees around it that begins at cell 0, 0, heading east, and goes these ways;
+    without cells all gateways are open everywhere."""
     x, y, heading = 0, 0, 1
     stars = []
     for way in ["", *route]:

@@ -18,7 +18,8 @@ from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
 
 ACTIONS = (*STANDARD_ACTIONS.values(), Action("creep", "travel"), Action("veer", "turn", "right"))
-# Few openings, so that stars often agree: all alike, a straight street, a corner, a dead end, a tee.
+# Few openings, so that stars often agree: all alike, a straight street, a corner, a dead end, a
+# tee.
 ODOMETRY = (
     {},
     {"scale": 0.0, "bend": 0.0},
@@ -31,7 +32,8 @@ STARS = ((1, 1, 1, 1), (1, 0, 1, 0), (1, 1, 0, 0), (1, 0, 0, 0), (1, 1, 1, 0))
 
 FOREIGN = ("without", "rules")  # what the checker cannot judge maps by
 PAIRS = ("same", "different", "elsewhere")
-# Axioms that may be left out: the map can't show what holds without these, as a dstate of a map has one place and one course.
+# Axioms that may be left out: the map can't show what holds without these, as a dstate of a map has
+# one place and one course.
 LEFT_OUT = sorted(
     {axiom.name for axiom in axioms()}
     - {"one_place", "one_course", "one_heading", "turn_rotates", "star_frame", "asserted"}
@@ -40,7 +42,8 @@ LEFT_OUT = sorted(
 
 @dataclass(frozen=True)
 class Toy:
-    """An axiom that no speed-up and no checker knows: as rules, and what it says of a map as the brute force has it."""
+    """An axiom that no speed-up and no checker knows: as rules, and what it says of a map as the
+    brute force has it."""
 
     rules: Rules
     allows: Callable[[Key], bool]
@@ -88,7 +91,8 @@ TOYS = (
     _toy(
         "short",
         "step",
-        "stands(H,P,t) :- at(t,P), along(t,H,D).\nviolation(short,t) :- path(H), 3 #count { P : stands(H,P,T) }.",
+        "stands(H,P,t) :- at(t,P), along(t,H,D).\nviolation(short,t) :- path(H), 3 #count { P : "
+        "stands(H,P,T) }.",
         _short_paths,
         causal=False,
     ),
@@ -103,7 +107,8 @@ TOYS = (
 
 @st.composite
 def traces(draw: st.DrawFn, max_steps: int = 7) -> Trace:
-    """One to `max_steps` observations of two or three views, any actions in between, with or without stars."""
+    """One to `max_steps` observations of two or three views, any actions in between, with or
+    without stars."""
     steps = draw(st.integers(1, max_steps) | st.just(max_steps))
     views = draw(st.sampled_from(["ab", "abc"]))
     seen = draw(st.lists(st.sampled_from(views), min_size=steps, max_size=steps))
@@ -158,7 +163,10 @@ def _pairs(steps: int) -> st.SearchStrategy[list[tuple[int, int]]]:
 
 
 def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
-    """Values of a field of Theory that suit a topological theory of this trace. A field that this does not know fails every test that draws theories."""
+    """Values of a field of Theory that suit a topological theory of this trace.
+
+    A field that this does not know fails every test that draws theories.
+    """
     return {
         "level": st.just("topological"),
         "boundary": st.sampled_from(["none", "strict", "defeasible"]),
@@ -193,7 +201,9 @@ def choices_of(field: str, trace: Trace) -> st.SearchStrategy[Any]:
 
 @st.composite
 def theories(draw: st.DrawFn, trace: Trace, fixed: Collection[str] = ()) -> Theory:
-    """Any choice of axioms and preference that a theory of this trace may have. Without a preference every consistent map is minimal.
+    """Any choice of axioms and preference that a theory of this trace may have.
+
+    Without a preference every consistent map is minimal.
 
     fixed  fields that are left as they are in a new Theory
     """

@@ -20,8 +20,9 @@ VERBS = {
 WITH_THEORY = tuple(name for name, options in VERBS.items() if "--theory" in options)
 WITH_MAPS = tuple(name for name, options in VERBS.items() if "--maps" in options)
 WITH_MAP = tuple(name for name, options in VERBS.items() if "--map" in options)
-# The verbs that print what a module says, where that is not one verb of the module's name. All of them have each option that is named without a verb.
-# A sentence that other verbs print too names the verb: "write it with solve --json".
+# The verbs that print what a module says, where that is not one verb of the module's name. All of
+# them have each option that is named without a verb. A sentence that other verbs print too names
+# the verb: "write it with solve --json".
 SAID_BY = {
     "perception/places": ("import", "map"),
     "perception/readers": ("import", "map"),

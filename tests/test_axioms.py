@@ -160,7 +160,10 @@ def test_every_violation_in_the_encodings_belongs_to_an_axiom(level: str) -> Non
 
 
 def test_a_long_axiom_comment_goes_on_in_indented_lines() -> None:
-    text = "% @axiom(long) A sentence that\n%   goes on.\n%   [a source; X] if star=frame\n% Not of it.\n"
+    text = (
+        "% @axiom(long) A sentence that\n%   goes on.\n%   [a source; X] if star=frame\n% Not of "
+        "it.\n"
+    )
     (axiom,) = encodings.axioms_in(text, "own")
     assert axiom.sentence == "A sentence that goes on."
     assert axiom.source == "a source; X"

@@ -98,13 +98,15 @@ def agrees(backbone: Backbone, keys: set[Key], steps: int) -> None:
 @settings(max_examples=6)
 @given(st.data())
 def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
-    """From the list where it is complete, and by reasoning from one map where it was cut off: from prefixes that are too short to begin with."""
+    """From the list where it is complete, and by reasoning from one map where it was cut off: from
+    prefixes that are too short to begin with."""
     trace = data.draw(traces(max_steps=6), label="trace")
     theory = data.draw(theories(trace), label="theory")
     toys = [toy for toy in TOYS if toy.rules in theory.rules]
     counts, keys = minimal_maps(trace, theory, lambda key: all(toy.allows(key) for toy in toys))
     first_prefix = data.draw(st.sampled_from([1, prefixes.FIRST_PREFIX]), label="first prefix")
-    # Engines that settle dstates first are for longer traces, and those for places without frames only where clingo takes its time.
+    # Engines that settle dstates first are for longer traces, and those for places without frames
+    # only where clingo takes its time.
     few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
     frame_after = data.draw(st.sampled_from([0.0, choosing.STEPWISE]), label="frame after")
     with (
@@ -134,7 +136,8 @@ def test_the_backbone_is_what_the_brute_force_says(data: st.DataObject) -> None:
         (
             Theory(),
             4,
-            "the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ",
+            "the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 "
+            "differ",
         ),
         (
             Theory(star="none", prefer=("dstates", "places", "paths")),
@@ -173,7 +176,8 @@ def walk(world: Streets, place: str, steps: int, seed: int) -> Trace:
 
 @pytest.mark.parametrize(("frame_after", "engine"), [(60.0, StepEngine), (0.0, FramelessEngine)])
 def test_every_engine_leaves_what_it_takes_to_reason(frame_after: float, engine: type) -> None:
-    """32 maps that differ in dstates, too: found by a prefix of the readable encodings, or by labels that are settled before places and paths."""
+    """32 maps that differ in dstates, too: found by a prefix of the readable encodings, or by
+    labels that are settled before places and paths."""
     trace, theory = walk(TWO_BLOCKS, "a1", 60, 1), Theory(boundary="none", prefer=("dstates",))
     with patch.object(choosing, "STEPWISE", frame_after):
         every, first = solve(trace, theory, max_maps=None), solve(trace, theory, max_maps=1)
@@ -215,7 +219,8 @@ def test_what_is_listed_is_not_taken_for_proven_where_time_is_over() -> None:
     assert solution.backbone is not None
     assert not solution.backbone.proven
     assert solution.summary.startswith(
-        "at least 1 minimal map (listing was interrupted): the same dstates, places and paths, as far as"
+        "at least 1 minimal map (listing was interrupted): the same dstates, places and paths, as "
+        "far as"
     )
 
 
@@ -230,7 +235,10 @@ def test_a_share_of_the_time_is_kept_for_reasoning_where_the_list_does_not_end()
     assert solution.stopped == "time limit"
     assert solution.backbone is not None
     assert solution.backbone.proven
-    found = "the dstates of steps 4–14 differ; the places of steps 4–14 differ; the paths of steps 0 and 3–14 differ"
+    found = (
+        "the dstates of steps 4–14 differ; the places of steps 4–14 differ; the paths of steps 0 "
+        "and 3–14 differ"
+    )
     listed = f"at least {counted(count, 'minimal maps')} (listing was stopped by the time limit)"
     assert summary_of(solution, count, solution.backbone) == f"{listed}: {found}"
 
@@ -291,13 +299,15 @@ def test_while_the_robot_drives_the_backbone_is_that_of_the_maps_listed() -> Non
             Theory(),
             0,
             3,
-            "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ; and 7 with up to 3 more",
+            "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths "
+            "of steps 18–22 differ; and 7 with up to 3 more",
         ),
         (
             Theory(),
             4,
             3,
-            "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths of steps 18–22 differ",
+            "4 minimal maps: the same dstates; the places of steps 15–18 and 21 differ; the paths "
+            "of steps 18–22 differ",
         ),
         (Theory.causal(), 0, 0, "1 minimal map"),
         (Theory(same=[(0, 1)]), 0, 0, "no map satisfies the axioms"),

@@ -1,4 +1,5 @@
-"""Many traces at once: order, errors, killed processes, Ctrl-C; the same results here, in processes and on a Dask cluster."""
+"""Many traces at once: order, errors, killed processes, Ctrl-C; the same results here, in processes
+and on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ QUESTION = Question(
 
 
 class Deadly(Question):
-    """Kills the process that is to solve a trace of this name, as the system does when memory runs out."""
+    """Kills the process that is to solve a trace of this name, as the system does when memory runs
+    out."""
 
     def answer(self, number: int, path: str, *rest: Any) -> Answer:
         if "deadly" in path:
@@ -58,7 +60,10 @@ class Deadly(Question):
 
 
 class KilledOnce(MapQuestion):
-    """Writes down that it maps a log. The first time that it maps one of this name, the worker is killed whose process does so."""
+    """Writes down that it maps a log.
+
+    The first time that it maps one of this name, the worker is killed whose process does so.
+    """
 
     def answer(self, number: int, path: str, *rest: Any) -> MapAnswer:
         assert workers.serves()  # so the process that began this one is the worker
@@ -90,7 +95,8 @@ def traces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """The address of a Dask scheduler with one worker of one thread, in a process of its own, which may take long to come back where the machine is busy."""
+    """The address of a Dask scheduler with one worker of one thread, in a process of its own, which
+    may take long to come back where the machine is busy."""
     with (
         dask.config.set(
             {
@@ -130,9 +136,9 @@ def test_each_trace_has_its_line_in_order(traces: Path, capsys: pytest.CaptureFi
     )
     out, err = capsys.readouterr()
     comb, broken, quick, missing, impossible = out.splitlines()
-    assert (
-        without_seconds(comb)
-        == "comb.jsonl: optimal: 19 dstates, 10 places, 4 paths; 2 minimal maps; _ s, 22 of 22 steps given to clingo"
+    assert without_seconds(comb) == (
+        "comb.jsonl: optimal: 19 dstates, 10 places, 4 paths; 2 minimal maps; _ s, 22 of 22 "
+        "steps given to clingo"
     )
     assert broken.startswith(
         "broken.jsonl: error: broken.jsonl:2: line: expected one JSON object, got broken JSON"
@@ -226,11 +232,13 @@ def test_wrong_choices_are_one_line(
         ),
         (
             [*both, "--scheduler", nobody],
-            rf"--scheduler: expected a Dask scheduler at {nobody}, got none \(.*\); start one with: .*",
+            rf"--scheduler: expected a Dask scheduler at {nobody}, got none \(.*\); start one "
+            r"with: .*",
         ),
         (
             [*both, "--scheduler", "elsewhere"],
-            r"--scheduler: expected an address with a port, such as tcp://host:8786, got 'elsewhere'",
+            r"--scheduler: expected an address with a port, such as tcp://host:8786, got "
+            r"'elsewhere'",
         ),
     ):
         assert main(["solve", *words]) == 1
@@ -427,7 +435,8 @@ def test_memory_is_counted_for_each_trace(traces: Path) -> None:
             "--json",
         ]
     )
-    command += " --memory-limit 100; exit"  # run by a shell: a process inherits the peak of the one that starts it, which is large here
+    # run by a shell: a process inherits the peak of the one that starts it, which is large here
+    command += " --memory-limit 100; exit"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [line.get("stopped") for line in lines] == [None, "memory limit", None]
@@ -460,7 +469,8 @@ def test_ctrl_c_prints_what_waited_for_its_turn(
 def test_ctrl_c_ends_the_processes(
     jobs: str, send: Callable[[int, int], None], traces: Path
 ) -> None:
-    """What was found of the traces under way is printed, whether all processes hear of it, as from a terminal, or the first one alone."""
+    """What was found of the traces under way is printed, whether all processes hear of it, as from
+    a terminal, or the first one alone."""
     paths = ["quick.jsonl", "slow.jsonl", "quick.jsonl", "slow.jsonl", "slow.jsonl"]
     command = [sys.executable, "-m", "ssh_abduction", "solve", *paths, *ENDLESS, "--jobs", jobs]
     with subprocess.Popen(
@@ -518,6 +528,9 @@ def test_the_bar_is_on_the_terminal(seen: bool, traces: Path) -> None:
     os.close(master)
     text = shown.decode()
     assert "3/3" in text
-    whole = "quick.jsonl: optimal: 8 dstates, 4 places, 4 paths; 1 minimal map; _ s, 9 of 9 steps given to clingo"
+    whole = (
+        "quick.jsonl: optimal: 8 dstates, 4 places, 4 paths; 1 minimal map; _ s, 9 of 9 steps "
+        "given to clingo"
+    )
     assert (f"\x1b[2K{whole}" in without_seconds(text)) == seen  # where the bar was wiped away
     assert (whole in without_seconds(results)) == (not seen)

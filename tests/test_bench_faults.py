@@ -1,4 +1,5 @@
-"""The benchmark of faults measures what it says: truth is recognised, peers explain small traces, and a cell ends at its limit."""
+"""The benchmark of faults measures what it says: truth is recognised, peers explain small traces,
+and a cell ends at its limit."""
 
 from __future__ import annotations
 
@@ -137,9 +138,9 @@ def test_a_row_of_the_table() -> None:
     row = faults.table(
         [right, tie, cheaper, {**cheaper, "solver": "RC2", "status": "not installed"}]
     ).splitlines()[-2:]
-    assert (
-        row[0]
-        == f"| {family} | ssh-abduction | 1 of 3 | 2 of 3 | 2 of 3 | 3 of 6 | 3 | 0.000 | 2.00 | > 9 | 1 cheaper, 1 as cheap |"
+    assert row[0] == (
+        f"| {family} | ssh-abduction | 1 of 3 | 2 of 3 | 2 of 3 | 3 of 6 | 3 | 0.000 | 2.00 | "
+        "> 9 | 1 cheaper, 1 as cheap |"
     )
     assert row[1].startswith(f"| {family} | RC2 | not installed | – |")
     assert faults.contradictions([right, tie, cheaper]) == []

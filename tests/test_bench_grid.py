@@ -1,4 +1,5 @@
-"""The peers over all poses say what Bayes' rule says, the beam model is a distribution, and drives are driven in worlds whose truth is known."""
+"""The peers over all poses say what Bayes' rule says, the beam model is a distribution, and drives
+are driven in worlds whose truth is known."""
 
 from __future__ import annotations
 
@@ -42,7 +43,8 @@ def test_the_beam_model_expects_what_is_there_and_people_before_it() -> None:
 
 
 def test_the_ranges_of_a_grid_are_those_of_the_world() -> None:
-    """To within two cells, a little off the walls: near to one, a beam along it meets a cell of it too early."""
+    """To within two cells, a little off the walls: near to one, a beam along it meets a cell of it
+    too early."""
     chosen = np.array([i for i, at in enumerate(grid().centres) if WORLD.clearance(*at) > 0.3])
     exact = Laser().exact(WORLD, np.column_stack([grid().centres[chosen], np.zeros(len(chosen))]))[
         :, 5::10
@@ -54,7 +56,8 @@ def test_the_ranges_of_a_grid_are_those_of_the_world() -> None:
 
 
 def test_the_histogram_is_brute_force_bayes() -> None:
-    """A tiny grid, whose belief is computed once more by a sum over all pairs of poses, with one Gaussian of the displacement for each."""
+    """A tiny grid, whose belief is computed once more by a sum over all pairs of poses, with one
+    Gaussian of the displacement for each."""
     tiny = Grid.of(WORLD, 0.4)
     model, slipped = BeamModel(beams=30), 0.05
     belief = Histogram(tiny, model, slipped)
@@ -84,7 +87,11 @@ def _brute_moved(
     covariance: np.ndarray,
     slipped: float,
 ) -> np.ndarray:
-    """p(x') as a sum over x: Gaussians about where x leads to, whose covariance is that of the displacement, of the heading's bin, and of the least blur."""
+    """p(x') as a sum over x:
+
+    Gaussians about where x leads to, whose covariance is that of the displacement, of the heading's
+    bin, and of the least blur.
+    """
     dx, dy, turned = move
     xs, ys, headings = np.array(poses).T
     bin_ = math.tau / tiny.headings

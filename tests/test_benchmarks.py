@@ -1,4 +1,5 @@
-"""The benchmarks measure what they say: answers are checked, limits hold, and the pages show stored runs."""
+"""The benchmarks measure what they say: answers are checked, limits hold, and the pages show stored
+runs."""
 
 from __future__ import annotations
 
@@ -224,7 +225,8 @@ def test_a_stored_run_has_its_fields_and_no_contradiction(path: Path) -> None:
 def stored(page: str, name: str) -> Path:
     """The stored run that the named table of a page says it is from."""
     found = re.search(
-        rf"<!-- bench:begin {name} -->.*(benchmarks/results/[\w.-]+\.json)\).*<!-- bench:end {name} -->",
+        rf"<!-- bench:begin {name} -->.*(benchmarks/results/[\w.-]+\.json)\).*<!-- bench:end "
+        rf"{name} -->",
         page,
         re.DOTALL,
     )
@@ -287,7 +289,10 @@ def test_seconds_of_the_processor_are_what_a_search_is_limited_by() -> None:
 
 
 def test_following_is_no_speedup_of_a_user_and_can_be_left_out() -> None:
-    script = "from cell import all_but; from ssh_abduction.solver.engines.small_maps import SmallMaps as E; print(all_but('following'), list(E.from_beginning(None)))"
+    script = (
+        "from cell import all_but; from ssh_abduction.solver.engines.small_maps import SmallMaps "
+        "as E; print(all_but('following'), list(E.from_beginning(None)))"
+    )
     said = subprocess.run(
         [sys.executable, "-c", script],
         cwd=ROOT / "benchmarks",

@@ -1,6 +1,8 @@
-"""Every public function and method is called with wrong arguments: it answers with one of the package's errors, or the table says why the value is right.
+"""Every public function and method is called with wrong arguments: it answers with one of the
+package's errors, or the table says why the value is right.
 
-The callables are those of the reference. A new one is swept as soon as it is there. Where a parameter of it has no good value below, the test fails.
+The callables are those of the reference. A new one is swept as soon as it is there. Where a
+parameter of it has no good value below, the test fails.
 """
 
 from __future__ import annotations
@@ -76,10 +78,12 @@ WRONG: dict[str, Callable[[], Any]] = {
 }
 TEXTS = {"empty text", "nonsense", "half a character", "null character", "folder"}
 EMPTY = {"list", "generator"}
-# Whatever comes is right: `truth` is what JSON can hold, read by evaluation alone, and scikit-learn passes labels `y` to estimators that do not look at them.
+# Whatever comes is right: `truth` is what JSON can hold, read by evaluation alone, and scikit-learn
+# passes labels `y` to estimators that do not look at them.
 ANYTHING = {"truth", "y"}
 
-# Which of these are right, by what the parameter is. A parameter whose default is None takes None besides.
+# Which of these are right, by what the parameter is. A parameter whose default is None takes None
+# besides.
 RIGHT_BY_NAME: dict[str, set[str]] = {
     "time_limit": {"None", "3.5", "inf", "huge"},
     "memory_limit": {"None", "3.5", "inf", "huge"},
@@ -164,7 +168,8 @@ RIGHT: dict[str, set[str]] = {
     "tour.bend": {"-1"},
     "tour.scale": {"-1"},
 }
-# The package makes these values: nobody needs their constructors, which take what they are given. Their methods are swept.
+# The package makes these values: nobody needs their constructors, which take what they are given.
+# Their methods are swept.
 MADE_BY_THE_PACKAGE = {
     "Fault",
     "MapPath",
@@ -317,7 +322,8 @@ def receiver(name: str) -> Any:
 
 
 def good(call: str, parameter: inspect.Parameter) -> Any:
-    """A value that is right for a parameter: of this call, or of all calls that have one of this name, or its default."""
+    """A value that is right for a parameter: of this call, or of all calls that have one of this
+    name, or its default."""
     made = known()
     solution, trace, ssh_map, world = made["solution"], made["trace"], made["map"], made["world"]
     of_call: dict[str, Any] = {
@@ -431,7 +437,10 @@ def good(call: str, parameter: inspect.Parameter) -> Any:
 
 
 def calls() -> Iterator[tuple[str, Any]]:
-    """The public functions, constructors and methods, by name. Errors and enumerations are left out."""
+    """The public functions, constructors and methods, by name.
+
+    Errors and enumerations are left out.
+    """
     for path in itertools.chain.from_iterable(hooks.themes().values()):
         found = hooks.named(path)
         if not inspect.isclass(found):
@@ -468,7 +477,8 @@ def parameters(function: Any) -> list[inspect.Parameter]:
 
 
 def do(call: str, function: Any, arguments: dict[str, Any]) -> None:
-    """Call it, and, as checks may come with the first use, use what it returns: estimators are fitted, and generators begin."""
+    """Call it, and, as checks may come with the first use, use what it returns: estimators are
+    fitted, and generators begin."""
     if "self" in inspect.signature(function).parameters:
         result = function(receiver(call.partition(".")[0]), **arguments)
     else:
@@ -531,7 +541,8 @@ def test_wrong_arguments_are_refused_by_errors_of_the_package(call: str, functio
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("call", [call for call, _ in SWEPT])
 def test_right_arguments_are_accepted(call: str) -> None:
-    """A call that always fails would pass the sweep above. Two calls read files that no test has."""
+    """A call that always fails would pass the sweep above. Two calls read files that no test
+    has."""
     if call == "to_pandas":
         pytest.importorskip("pandas")
     function = dict(SWEPT)[call]

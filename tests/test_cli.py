@@ -146,7 +146,8 @@ def test_an_impossible_trace_says_which_axioms_clash_where(
     assert main(["solve", path]) == 20
     out = capsys.readouterr().out
     assert out.startswith(
-        "unsatisfiable: no map satisfies the axioms: in steps 2 to 5 these clash: functional_view (step 5)"
+        "unsatisfiable: no map satisfies the axioms: in steps 2 to 5 these clash: functional_view "
+        "(step 5)"
     )
     assert "turn_around_reverses (steps 4, 5)" in out
     assert f"from {path}:4 to {path}:7" in out
@@ -369,7 +370,8 @@ BAD_INPUT = {
     "binary": bytes(range(256)),
     "broken": b'{"format": "ssh-trace", "version": 1}\n{"view": }\n',
     "no view anywhere": b'{"format": "ssh-trace", "version": 1}\n{"image": [1, 2]}\n',
-    "no kind": b'{"format": "ssh-trace", "version": 1}\n{"view": "a", "action": "jump"}\n{"view": "b"}\n',
+    "no kind": b'{"format": "ssh-trace", "version": 1}\n{"view": "a", "action": "jump"}\n'
+    b'{"view": "b"}\n',
 }
 
 
@@ -592,7 +594,8 @@ def test_errors_say_what_mends_them(
     for words, message in [
         (
             ["show", str(many)],
-            "many.jsonl:2: expected one JSON value, got more after it; solve prints a line for each of several traces",
+            "many.jsonl:2: expected one JSON value, got more after it; solve prints a line for "
+            "each of several traces",
         ),
         (["show", str(none), "--map", "1"], "--map: expected a map, got none"),
         (["check", str(none), ACES], "maps: expected one to check, got none"),
@@ -611,7 +614,10 @@ def test_errors_say_what_mends_them(
 
 def test_a_closed_standard_error_is_no_error() -> None:
     """What would be said there is not said; what was asked for is."""
-    shell = f"{sys.executable} -m ssh_abduction solve {ACES} 2>&-; {sys.executable} -m ssh_abduction solve nosuch 2>&-"
+    shell = (
+        f"{sys.executable} -m ssh_abduction solve {ACES} 2>&-; {sys.executable} -m ssh_abduction "
+        "solve nosuch 2>&-"
+    )
     done = subprocess.run(shell, shell=True, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stdout.startswith("optimal: 19 dstates")

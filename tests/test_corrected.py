@@ -1,4 +1,5 @@
-"""Actions of which nothing is known, and maps with faults found by mending the trace: against the plain encodings and the brute force."""
+"""Actions of which nothing is known, and maps with faults found by mending the trace: against the
+plain encodings and the brute force."""
 
 from __future__ import annotations
 
@@ -60,7 +61,10 @@ def test_nothing_is_known_of_where_an_action_led_that_slipped(
 @settings(max_examples=6)
 @given(st.data())
 def test_maps_of_mended_traces_are_those_of_the_plain_encodings(data: st.DataObject) -> None:
-    """Where all is proven: the same maps. With a star that may be misread, and actions that may slip."""
+    """Where all is proven: the same maps.
+
+    With a star that may be misread, and actions that may slip.
+    """
     trace = data.draw(small_traces())
     slipped = data.draw(st.sampled_from([0.0, 1.2]))
     theory = Theory(

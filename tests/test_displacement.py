@@ -41,7 +41,8 @@ def circuit(
     scale: float = 0.0,
     bend: float = 0.0,
 ) -> Trace:
-    """A robot that drives round a regular polygon to the right, so many sides, all corners of which look alike.
+    """A robot that drives round a regular polygon to the right, so many sides, all corners of which
+    look alike.
 
     noise  standard deviations of its displacements, as a share of those that the odometry claims
     scale, bend  errors that repeat
@@ -82,7 +83,8 @@ def test_solver_and_checker_agree_with_matrices_written_out(data: st.DataObject)
 def test_sets_of_two_are_those_of_matrices_written_out(
     seed: int, corners: int, noise: float, bend: float
 ) -> None:
-    """Labels that need not be a map's: every second step is at one of few dstates, so that many returns share displacements."""
+    """Labels that need not be a map's: every second step is at one of few dstates, so that many
+    returns share displacements."""
     odometry = replace(WHITE, bend=bend)
     trace = circuit(corners, 5, noise, seed, odometry)
     theory = settle(trace, Theory.causal().replace(reject=0.3)).theory
@@ -194,7 +196,8 @@ def test_the_jacobian_of_a_fit_is_right(data: st.DataObject) -> None:
 
 
 def test_fits_of_true_maps_are_as_likely_as_they_say() -> None:
-    """Of 60 true maps, about half have a p-value above one half, and hardly any one below a thousandth."""
+    """Of 60 true maps, about half have a p-value above one half, and hardly any one below a
+    thousandth."""
     chances = []
     for seed in range(60):
         trace = circuit(5, 12, 1.0, seed)
@@ -235,7 +238,8 @@ def test_a_noise_model_that_is_off_is_noticed(factor: float, said: str | None) -
 
 
 def test_kilometres_are_noticed() -> None:
-    """Ways that are lost in the noise of the odometry, as are those of wheels that report nothing; not those of a robot that is small and says so."""
+    """Ways that are lost in the noise of the odometry, as are those of wheels that report nothing;
+    not those of a robot that is small and says so."""
     trace = circuit(4, 9)
 
     def scaled(by: float, **noise: float) -> Trace:
@@ -247,7 +251,10 @@ def test_kilometres_are_noticed() -> None:
         )
         return replace(trace, steps=tuple(steps), odometry=replace(WHITE, **noise))
 
-    said = "the odometry tells no travel from standing still: the longest displacement of one is 0.01 m, and its noise about 0.1 m; "
+    said = (
+        "the odometry tells no travel from standing still: the longest displacement of one is "
+        "0.01 m, and its noise about 0.1 m; "
+    )
     assert (solve(scaled(0.001)).support.odometry_warning or "").startswith(said)
     assert "the longest displacement of one is 0 m" in (
         solve(scaled(0.0)).support.odometry_warning or ""
@@ -340,7 +347,8 @@ def test_maps_with_a_fit_survive_a_round_trip(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kept", ["travels", "turns", "most", "few"])
 def test_fits_of_true_maps_are_as_likely_where_displacements_are_missing(kept: str) -> None:
-    """Of 20 true maps: where turns are not reported, headings are told by what places the stretches between them share, or not at all."""
+    """Of 20 true maps: where turns are not reported, headings are told by what places the stretches
+    between them share, or not at all."""
     squares = freedom = above = 0.0
     for seed in range(20):
         walk = maze(3, 3, steps=30, seed=seed, stars=True, follow=True, odometry=Odometry())

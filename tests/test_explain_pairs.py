@@ -231,7 +231,8 @@ def test_what_a_rival_costs_that_lost() -> None:
 
 
 def test_rivals_that_disagree_are_counted() -> None:
-    """Turned back, travel may stop at the place before, or skip it (G1 of docs/explanation/theory.md)."""
+    """Turned back, travel may stop at the place before, or skip it (G1 of
+    docs/explanation/theory.md)."""
     trace = Trace.from_steps(
         "batbbb".replace("t", "b"), ["travel", "travel", "around", "travel", "travel"]
     )

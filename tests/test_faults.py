@@ -1,4 +1,5 @@
-"""Faults: views that are misread, stars that are, and actions that slipped, against brute force, the checker, and machines whose faults are known."""
+"""Faults: views that are misread, stars that are, and actions that slipped, against brute force,
+the checker, and machines whose faults are known."""
 
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ def small_traces(draw: st.DrawFn, max_steps: int = 6) -> Trace:
     )
 
 
-# What the confidences of these traces make of a price, as a share of it: log(0.9 / 0.1) / log 99, and the least one.
+# What the confidences of these traces make of a price, as a share of it: log(0.9 / 0.1) / log 99,
+# and the least one.
 SHARE = {None: 1.0, 0.9: 0.478, 0.4: 0.1}
 
 
@@ -73,7 +75,8 @@ def partitions(steps: int) -> Iterator[tuple[int, ...]]:
 def votes(
     trace: Trace, labels: tuple[int, ...]
 ) -> tuple[dict[int, Counter[object]], dict[tuple[int, str], Counter[int]]]:
-    """How often each view is seen at each dstate, and how often each action done there leads where."""
+    """How often each view is seen at each dstate, and how often each action done there leads
+    where."""
     views, ends = defaultdict(Counter), defaultdict(Counter)
     for label, view in zip(labels, trace.views, strict=True):
         views[label][view] += 1
@@ -83,7 +86,8 @@ def votes(
 
 
 def cheapest(trace: Trace, misread: int, slipped: int) -> tuple[int | None, set[Told]]:
-    """The least cost in tenths, and all causal maps of it, by trying all labels, all views of dstates and all ends of actions."""
+    """The least cost in tenths, and all causal maps of it, by trying all labels, all views of
+    dstates and all ends of actions."""
     best: int | None = None
     maps: set[Told] = set()
     for labels in partitions(len(trace)):
@@ -168,7 +172,8 @@ def test_few_names_and_few_steps_at_first_change_no_answer(data: st.DataObject) 
 @settings(max_examples=5)
 @given(small_traces(max_steps=4), st.sampled_from([0.4, 1.0]))
 def test_topological_maps_are_those_of_corrected_traces(trace: Trace, misread: float) -> None:
-    """Every way to correct views is tried, and the corrected trace is mapped by the brute force, which knows nothing of faults."""
+    """Every way to correct views is tried, and the corrected trace is mapped by the brute force,
+    which knows nothing of faults."""
     theory = Theory(boundary="none", star="none")
     best: tuple[int, ...] | None = None
     expected: set[object] = set()
@@ -226,7 +231,8 @@ def test_the_faults_of_machines_are_found(seed: int) -> None:
 @settings(max_examples=10)
 @given(st.data())
 def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> None:
-    """Whatever map is known: here one dstate for each view, or one for each step, and all that disagrees is a fault."""
+    """Whatever map is known: here one dstate for each view, or one for each step, and all that
+    disagrees is a fault."""
     trace = data.draw(small_traces(max_steps=7))
     theory = Theory.causal().replace(
         misread=data.draw(st.sampled_from([0.4, 1.0])),
@@ -255,7 +261,8 @@ def test_bounds_by_blocks_are_no_more_than_the_minimum(data: st.DataObject) -> N
 
 @pytest.mark.parametrize("kind", ["misread", "slipped"])
 def test_many_faults_of_a_long_trace_are_proven(kind: str) -> None:
-    """A rectangle of eight dstates and five views, 1,200 steps, and twelve faults: disjoint blocks add up to what the map costs."""
+    """A rectangle of eight dstates and five views, 1,200 steps, and twelve faults: disjoint blocks
+    add up to what the map costs."""
     wrong = range(60, 1200, 100)
     at = list(
         accumulate(
@@ -355,7 +362,8 @@ def test_in_the_shell(
 
 
 def test_confidence_scales_what_a_fault_costs() -> None:
-    """0.99 costs the whole price, as does a step without one; the log odds of the others are its share, between a tenth and five times."""
+    """0.99 costs the whole price, as does a step without one; the log odds of the others are its
+    share, between a tenth and five times."""
     shares = {None: 15, 0.99: 15, 0.9: 7, 0.6: 2, 0.5: 2, 0.0: 2, 0.999: 23, 1.0: 75}
     assert {
         c: Theory(misread=1.5).fault_tenths("misread", Step("a", confidence=c)) for c in shares
@@ -412,8 +420,11 @@ def test_the_front_of_what_is_asserted_is_what_brute_force_finds(seed: int) -> N
 
 
 def test_a_dstate_whose_views_are_all_misread_has_a_view() -> None:
-    trace = Trace.from_steps([3, 0, 0, 0, 0], ["travel", "right", "travel", "right"],
-        displacements=[(7.9, -0.8, 0.0), (-0.0, 0.0, -1.6), (17.4, 0.6, -0.2), (0.0, -0.0, -0.8)])  # fmt: skip
+    trace = Trace.from_steps(
+        [3, 0, 0, 0, 0],
+        ["travel", "right", "travel", "right"],
+        displacements=[(7.9, -0.8, 0.0), (-0.0, 0.0, -1.6), (17.4, 0.6, -0.2), (0.0, -0.0, -0.8)],
+    )
     front = fault_front(trace, most=2)
     assert [point.dstates for point in front.points] == [5, 5, 5]
     assert all(set(point.map.labels) == set(range(5)) for point in front.points if point.map)

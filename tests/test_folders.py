@@ -1,4 +1,5 @@
-"""Each log of a batch has a folder that no other log has, whatever the logs are called and in which order they come."""
+"""Each log of a batch has a folder that no other log has, whatever the logs are called and in which
+order they come."""
 
 from __future__ import annotations
 
@@ -166,7 +167,10 @@ def test_an_interrupted_run_is_not_done(tmp_path: Path) -> None:
 def test_a_run_that_could_not_be_written_is_not_done(
     tmp_path: Path, at: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk is full at the first, second, … file. What is left of an earlier run does not stand beside what is new."""
+    """The disk is full at the first, second, … file.
+
+    What is left of an earlier run does not stand beside what is new.
+    """
     files = [(RUN, b"new"), ("trace.jsonl", b"new"), ("maps.json", b"new"), ("report.html", b"new")]
     write_run(tmp_path, [(name, b"old") for name in FILES])
     written: list[Path] = []
@@ -189,7 +193,8 @@ def test_a_run_that_could_not_be_written_is_not_done(
 def test_what_cannot_be_written_is_a_line_and_the_other_logs_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of four logs the folder of one cannot be made, as a file is there, and the disk is full for another one."""
+    """Of four logs the folder of one cannot be made, as a file is there, and the disk is full for
+    another one."""
     logs = [log_at(tmp_path / f"{name}.log", name) for name in ("good", "taken", "full", "fine")]
     log_at(tmp_path / "runs" / "taken", "a file")
     asked: list[str] = []
@@ -212,9 +217,11 @@ def test_what_cannot_be_written_is_a_line_and_the_other_logs_go_on(
     told = capsys.readouterr()
     runs = tmp_path / "runs"
     assert told.out.splitlines() == [
-        f"{logs[1]}: error: {runs / 'taken'}: expected a folder to write, got a file: {runs / 'taken'}; name another one",
+        f"{logs[1]}: error: {runs / 'taken'}: expected a folder to write, got a file: "
+        f"{runs / 'taken'}; name another one",
         f"{logs[0]}: mapped → {runs / 'good'}",
-        f"{logs[2]}: error: {runs / 'full' / 'maps.json'}: cannot be written: No space left on device; make room",
+        f"{logs[2]}: error: {runs / 'full' / 'maps.json'}: cannot be written: No space left on "
+        "device; make room",
         f"{logs[3]}: mapped → {runs / 'fine'}",
     ]
     assert asked == [logs[0], logs[2], logs[3]]

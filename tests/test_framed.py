@@ -1,4 +1,5 @@
-"""Dstates first, then places and paths, where places have frames: the same maps as the plain encoding of the axioms lists."""
+"""Dstates first, then places and paths, where places have frames: the same maps as the plain
+encoding of the axioms lists."""
 
 from __future__ import annotations
 
@@ -59,7 +60,8 @@ PLAIN = Speedups.without(SPEEDUPS)
 
 @st.composite
 def framed_traces(draw: st.DrawFn, most_steps: int = 9) -> Trace:
-    """Walks on a torus of few cells with any stars, so that views mislead; and stars that fit no frame."""
+    """Walks on a torus of few cells with any stars, so that views mislead; and stars that fit no
+    frame."""
     steps = draw(st.integers(1, most_steps))
     few = draw(
         st.sampled_from(
@@ -112,7 +114,8 @@ class Before(Beside):
 
 
 def always_proved(beside: GuessBeside, dstates: int) -> NearbySearch | None:
-    """The search beside, also where the other one has come to its end, as it soon does on a short trace."""
+    """The search beside, also where the other one has come to its end, as it soon does on a short
+    trace."""
     return beside.search if beside.search and beside.search.bound == dstates else None
 
 
@@ -128,7 +131,8 @@ def plainly_charted(
 def test_lists_the_maps_of_the_plain_encoding(
     trace: Trace, theory: Theory, off: set[str], data: st.DataObject
 ) -> None:
-    """With prefixes, cores and what is told in one go so small that all of it happens on short traces; and with any speed-ups off."""
+    """With prefixes, cores and what is told in one go so small that all of it happens on short
+    traces; and with any speed-ups off."""
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, engine.FIRST_PREFIXES]), label="first prefixes")
     at_a_time = data.draw(st.sampled_from([1, transitive.AT_A_TIME]), label="at a time")
@@ -196,7 +200,11 @@ def test_lists_the_maps_of_the_plain_encoding(
 def test_maps_that_a_search_beside_shows_to_be_minimal(
     trace: Trace, theory: Theory, sweeps: int
 ) -> None:
-    """From a guess of any quality. Names that do not fit a frame, or have no paths, are no maps; and clingo may need more names than it had."""
+    """From a guess of any quality.
+
+    Names that do not fit a frame, or have no paths, are no maps; and clingo may need more names
+    than it had.
+    """
     expected = solve(trace, theory, max_maps=None, speedups=PLAIN)
     with (
         patch.object(choosing, "FEW_STEPS", 0),
@@ -296,7 +304,8 @@ def test_a_trace_that_grows_has_the_maps_of_the_plain_encoding(
 
 
 def test_a_maze_is_mapped_while_it_is_explored() -> None:
-    """Long enough for cores, for visits told to be transitive, and for paths, all of which the longer trace keeps."""
+    """Long enough for cores, for visits told to be transitive, and for paths, all of which the
+    longer trace keeps."""
     trace = maze(3, 3, steps=60, seed=0, stars=True).trace
     first, *rest = trace.steps
     paths = set()
@@ -328,7 +337,8 @@ def test_a_maze_is_mapped_while_it_is_explored() -> None:
 
 
 def test_each_speedup_off_alone() -> None:
-    """On walks long enough for cores, for visits that have to be told to be transitive, and for maps that are found nearby."""
+    """On walks long enough for cores, for visits that have to be told to be transitive, and for
+    maps that are found nearby."""
     trace = maze(2, 2, steps=45, seed=0, stars=True).trace
     expected = solve(trace, Theory.topological(), max_maps=None, speedups=Speedups.without("names"))
     for off in ("", "clique", "core_guided", "sides"):
@@ -410,7 +420,10 @@ def test_a_visit_that_fits_no_frame_has_no_map() -> None:
 
 @pytest.mark.parametrize(("seed", "counts"), [(0, (32, 8, 4)), (2, (24, 6, 4)), (3, (16, 4, 2))])
 def test_mazes_are_mapped(seed: int, counts: tuple[int, int, int]) -> None:
-    """3 x 3 cells, of which the robot sees some. What the trace alone says of order and sides keeps the dstates of the last two apart."""
+    """3 x 3 cells, of which the robot sees some.
+
+    What the trace alone says of order and sides keeps the dstates of the last two apart.
+    """
     walk = maze(3, 3, steps=200, seed=seed, stars=True)
     search = Search(walk.trace, Theory.topological())
     maps = tuple(search)
@@ -453,7 +466,8 @@ def test_pinned_stretches_leave_all_maps(seed: int, pinned: int, stretches: int)
 
 
 def test_what_is_not_told_beforehand_is_found() -> None:
-    """Every answer is refused until clingo was told what order and sides forbid; the maps are the same."""
+    """Every answer is refused until clingo was told what order and sides forbid; the maps are the
+    same."""
     walk = maze(2, 2, steps=60, seed=1, stars=True)
     expected = solve(walk.trace, Theory.topological(), max_maps=None)
     for off, kind, asked in (
@@ -478,7 +492,8 @@ def test_what_is_not_told_beforehand_is_found() -> None:
     ],
 )
 def test_sides_and_streets_say_the_same(theory: Theory) -> None:
-    """sides_framed.lp, of one path and visits that are one, against paths_framed.lp, of all paths and settled dstates that may have none."""
+    """sides_framed.lp, of one path and visits that are one, against paths_framed.lp, of all paths
+    and settled dstates that may have none."""
     contradicted = 0
     for seed in range(3):
         trace = maze(3, 3, steps=60, seed=seed, stars=True).trace
@@ -569,7 +584,10 @@ def test_when_time_is_over_there_is_a_map_and_a_bound() -> None:
 
 
 def test_a_maze_half_explored_is_mapped() -> None:
-    """Few views tell little: order and sides have to. Some dstates have no paths though no single path shows it."""
+    """Few views tell little: order and sides have to.
+
+    Some dstates have no paths though no single path shows it.
+    """
     trace = maze(10, 10, steps=4000, seed=2, stars=True).trace.prefix(150)
     solution = solve(trace, Theory.topological(), max_maps=3)
     assert solution.status is Status.OPTIMAL
@@ -610,7 +628,8 @@ def test_the_engine_goes_on_where_a_limit_stopped_it() -> None:
 
 
 def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
-    """Else the time that is kept for any map would be spent on the engine of a shorter prefix, and its map be taken for the whole trace's."""
+    """Else the time that is kept for any map would be spent on the engine of a shorter prefix, and
+    its map be taken for the whole trace's."""
     walk = maze(3, 3, steps=120, seed=1, stars=True)
     search = Search(walk.trace, Theory.topological(), time_limit=100)
     engine = search._parts.prefixes.engine
@@ -629,7 +648,8 @@ def test_what_was_stopped_while_it_was_prepared_is_prepared_again() -> None:
 
 
 def test_ctrl_c_in_the_last_part_of_the_time_leaves_no_engine_to_go_on_with() -> None:
-    """Perhaps clingo was told half of a core: what it would say then of the longer trace may be wrong."""
+    """Perhaps clingo was told half of a core: what it would say then of the longer trace may be
+    wrong."""
     trace = maze(3, 3, steps=80, seed=1, stars=True).trace
     search = Search(trace.prefix(70), Theory.topological(), time_limit=100)
     with patch.object(

@@ -1,7 +1,9 @@
-"""No file makes a traceback: 1,000 damaged files, of every kind and through every verb that reads it, end as documented.
+"""No file makes a traceback: 1,000 damaged files, of every kind and through every verb that reads
+it, end as documented.
 
-Each is a small valid file with a few things changed: bytes, numbers, texts, types, whole branches of JSON, members of archives. What comes
-out is a proper answer, or one line on stderr that holds nothing that steers a terminal. The files are the same in every run.
+Each is a small valid file with a few things changed: bytes, numbers, texts, types, whole branches
+of JSON, members of archives. What comes out is a proper answer, or one line on stderr that holds
+nothing that steers a terminal. The files are the same in every run.
 """
 
 from __future__ import annotations
@@ -112,7 +114,8 @@ COMMANDS: dict[str, list[str]] = {
         "simulate FILE -o out --set start=1.5,1.5,0 --route right --set reach=0.6 --set stars=false"
     ],
     "map.pgm": [
-        "simulate map.yaml -o out --set start=1.5,1.5,0 --route right --set reach=0.6 --set stars=false"
+        "simulate map.yaml -o out --set start=1.5,1.5,0 --route right --set reach=0.6 --set "
+        "stars=false"
     ],
     "recogniser.skops": 2
     * [

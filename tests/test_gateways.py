@@ -1,4 +1,5 @@
-"""Stars of any number of gateways: as values, in tolerance, under the axioms of gateways.lp, and in worlds with streets at any angles."""
+"""Stars of any number of gateways: as values, in tolerance, under the axioms of gateways.lp, and in
+worlds with streets at any angles."""
 
 from __future__ import annotations
 
@@ -39,9 +40,11 @@ GATEWAYS = Theory(star="gateways")
 def test_a_star_survives_a_round_trip(tmp_path: Path) -> None:
     lines = [
         '{"format": "ssh-trace", "version": 1}',
-        '{"view": "a", "action": {"name": "r2", "kind": "turn", "turn": "right", "gateway": 2}, "star": [1, null, 0, 1]}',
+        '{"view": "a", "action": {"name": "r2", "kind": "turn", "turn": "right", "gateway": 2}, '
+        '"star": [1, null, 0, 1]}',
         '{"view": "b", "action": {"name": "veer", "kind": "turn", "turn": "left", "bearing": -60}, '
-        '"star": [30, {"bearing": 120.0, "spread": 5.0, "opposite": 2}, {"bearing": 270.0, "spread": 10.0}]}',
+        '"star": [30, {"bearing": 120.0, "spread": 5.0, "opposite": 2}, {"bearing": 270.0, '
+        '"spread": 10.0}]}',
         '{"view": "c", "star": [0, {"bearing": 180.0, "spread": 90.0, "open": null}]}',
     ]
     (tmp_path / "t.jsonl").write_text("\n".join(lines) + "\n")
@@ -90,7 +93,10 @@ def test_what_the_trace_tells_settles_the_star() -> None:
     assert settle(square, Theory(star="gateways")).theory.star == "gateways"
     with pytest.raises(
         TraceError,
-        match=r"step 0: star: expected bearings that fall into different quarters.*take star=gateways",
+        match=(
+            r"step 0: star: expected bearings that fall into different quarters.*take "
+            r"star=gateways"
+        ),
     ):
         settle(bend, Theory(star="pattern"))
 
@@ -226,7 +232,8 @@ TURNS: tuple[Any, ...] = (
     {"name": "first", "kind": "turn", "turn": "right", "gateway": 1},
     {"name": "second", "kind": "turn", "turn": "left", "gateway": 2},
 )
-# The axioms that may be left out: without a heading of its own a dstate would be turned in several ways.
+# The axioms that may be left out: without a heading of its own a dstate would be turned in several
+# ways.
 LEFT_OUT = (
     "gateway_frame",
     "gateway_turn",
@@ -240,7 +247,10 @@ LEFT_OUT = (
 
 @st.composite
 def traces(draw: st.DrawFn) -> Trace:
-    """Two to five observations at places of one or two shapes. Mostly the stars after a turn are those seen before it, turned as the action says."""
+    """Two to five observations at places of one or two shapes.
+
+    Mostly the stars after a turn are those seen before it, turned as the action says.
+    """
     shapes = draw(st.lists(st.sampled_from(SHAPES), min_size=1, max_size=2))
     noise = draw(st.sampled_from([0, 0, 7]))
     steps = draw(st.integers(2, 5))
@@ -299,7 +309,8 @@ def test_solver_and_checker_agree_with_the_brute_force(trace: Trace, data: st.Da
 @settings(max_examples=8)
 @given(traces(), st.data())
 def test_stars_of_dstates_alone(trace: Trace, data: st.DataObject) -> None:
-    """star=alike: solver and checker against the brute force, which tries all ways to pair gateways; the maps of the bare causal theory are judged by it, too."""
+    """star=alike: solver and checker against the brute force, which tries all ways to pair
+    gateways; the maps of the bare causal theory are judged by it, too."""
     theory = Theory.causal().replace(
         star="alike", prefer=data.draw(st.sampled_from([("dstates",), ()]))
     )
@@ -347,7 +358,8 @@ def test_an_opening_not_observed_matches_both() -> None:
 
 
 def test_the_axioms_agree_with_frames_of_four_slots() -> None:
-    """Where turns are named by their bearings, four gateways at right angles are a frame of four slots."""
+    """Where turns are named by their bearings, four gateways at right angles are a frame of four
+    slots."""
     from worlds import TOURS
     from worlds import drive as drive_streets
 
@@ -399,7 +411,10 @@ def test_worlds_of_any_gateways_are_mapped_right(name: str) -> None:
 
 
 def test_a_bend_ends_two_paths() -> None:
-    """Once round six bends of 120 degrees: six paths, though three pairs of them are parallel. Without the axiom some are taken for one."""
+    """Once round six bends of 120 degrees: six paths, though three pairs of them are parallel.
+
+    Without the axiom some are taken for one.
+    """
     tour = drive(planar.hexagon(), 0, 1, 12, random.Random(0))
     trace = tour.trace
     different = [(i, j) for j in range(12) for i in range(j)]
@@ -426,7 +441,8 @@ def test_streets_at_any_angles_are_mapped_right(noise: float, unseen: bool) -> N
 
 @pytest.mark.parametrize(("spokes", "noise", "unseen"), [(5, 0, False), (6, 9, True)])
 def test_no_axiom_forbids_the_true_map(spokes: int, noise: float, unseen: bool) -> None:
-    """Hubs with a ring road: bearings may be off by less than their spread, and gateways behind the robot need not be observed."""
+    """Hubs with a ring road: bearings may be off by less than their spread, and gateways behind the
+    robot need not be observed."""
     tour = drive(
         planar.wheel(spokes), "hub", 0, 24, random.Random(spokes), noise=noise, unseen=unseen
     )

@@ -1,4 +1,5 @@
-"""The fewest places where that needs no search: corridors of different landmarks, there and back."""
+"""The fewest places where that needs no search: corridors of different landmarks, there and
+back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Displacements that are wrong altogether: against all sets of steps whose displacements may be left out, the checker, and walks whose jumps are known."""
+"""Displacements that are wrong altogether: against all sets of steps whose displacements may be
+left out, the checker, and walks whose jumps are known."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ NOISE = Odometry(along=0.05, across=0.005, heading=0.002)
 
 
 def circuit(steps: int, jumps: tuple[int, ...] = ()) -> Trace:
-    """Round and round a square whose corners look alike; the displacements to some steps are wrong."""
+    """Round and round a square whose corners look alike; the displacements to some steps are
+    wrong."""
     moves = [AWAY if t in jumps else (AHEAD, LEFT)[(t - 1) % 2] for t in range(1, steps)]
     return Trace.from_steps(
         ["pq"[t % 2] for t in range(steps)],
@@ -95,9 +97,9 @@ def test_a_robot_that_was_carried_away_finds_its_circuit_again(speedups: Speedup
     assert [(len(m.dstates), len(m.places)) for m in solution.maps] == [(8, 4)]
     (fault,) = solution.maps[0].faults
     assert fault == Fault(9, "jumped", "25.0 m ahead, 7.0 m left, turned 52 degrees left")
-    assert (
-        str(fault)
-        == "the displacement that leads to step 9 is wrong: 25.0 m ahead, 7.0 m left, turned 52 degrees left"
+    assert str(fault) == (
+        "the displacement that leads to step 9 is wrong: 25.0 m ahead, 7.0 m left, turned 52 "
+        "degrees left"
     )
     assert SSHMap.from_dict(solution.maps[0].to_dict()).faults == (fault,)
     assert check(trace, solution.maps[0], solution.theory) == ()

@@ -1,4 +1,5 @@
-"""Odometers that jump, stand still, count another unit or are two: what becomes of the track and of the trace."""
+"""Odometers that jump, stand still, count another unit or are two: what becomes of the track and of
+the trace."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Limits are promises: time, memory, Ctrl-C and SIGTERM are heeded whatever clingo is at, and what is known by then is printed."""
+"""Limits are promises: time, memory, Ctrl-C and SIGTERM are heeded whatever clingo is at, and what
+is known by then is printed."""
 
 from __future__ import annotations
 
@@ -30,10 +31,12 @@ from ssh_abduction.solver.steps import certificate
 from ssh_abduction.solver.steps.noise import noise_in
 from ssh_abduction.theory.settle import settle
 
-# Seconds in which what has to end soon has ended also on a slow machine that has much else to do. What does not heed its limit takes longer than that. How many
-# seconds an end takes beyond the limit is measured by benchmarks/limits.py.
+# Seconds in which what has to end soon has ended also on a slow machine that has much else to do.
+# What does not heed its limit takes longer than that. How many seconds an end takes beyond the
+# limit is measured by benchmarks/limits.py.
 SOON = 100
-JOINS = "p(1..400). { q(X,Y) : p(X), p(Y) }. :- p(X), 1 = @go_on(X), q(X,Y), q(Y,Z), q(Z,X)."  # 64 million rules
+# 64 million rules
+JOINS = "p(1..400). { q(X,Y) : p(X), p(Y) }. :- p(X), 1 = @go_on(X), q(X,Y), q(Y,Z), q(Z,X)."
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="signals")
 
 # Sits in clingo, which cannot be stopped, under a guard.
@@ -42,7 +45,9 @@ import sys, clingo
 from ssh_abduction.cli.guard import Guard
 from ssh_abduction.cli.outcome import on_ctrl_c
 limit, memory = (float(word) or None for word in sys.argv[1:])
-with on_ctrl_c(lambda: None), Guard(lambda: None, lambda why: (f"known: {why}", 10), limit, memory) as guard:
+with on_ctrl_c(lambda: None), Guard(
+    lambda: None, lambda why: (f"known: {why}", 10), limit, memory
+) as guard:
     guard.say(lambda: "begun, ")
     print("ready", file=sys.stderr, flush=True)
     control = clingo.Control()
@@ -53,7 +58,8 @@ with on_ctrl_c(lambda: None), Guard(lambda: None, lambda why: (f"known: {why}", 
 
 @pytest.fixture
 def noisy(tmp_path: Path) -> Path:
-    """Circuits of a rectangle, of which the last view is wrong: as many dstates as steps, and far too many ways to lay streets through them."""
+    """Circuits of a rectangle, of which the last view is wrong: as many dstates as steps, and far
+    too many ways to lay streets through them."""
     trace = rectangle(40)
     *steps, last = trace.steps
     path = tmp_path / "noisy.jsonl"
@@ -119,7 +125,8 @@ def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
 )
 @POSIX
 def test_limits_hold_on_traces_with_flaws(case: Case, tmp_path: Path) -> None:
-    """A process that has not ended by itself half a minute after it should have is killed, and has no status then."""
+    """A process that has not ended by itself half a minute after it should have is killed, and has
+    no status then."""
     found = outcome(case, tmp_path)
     assert found.status in ("optimal", "feasible", "unsatisfiable", "unknown")
     assert found.mebibytes <= 1
@@ -131,7 +138,8 @@ def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(
 ) -> None:
     rules = tmp_path / "own.lp"
     rules.write_text(
-        "n(1..400). large(X,Y,Z) :- n(X), n(Y), n(Z).\n#program step(t).\n:- same(I,t), large(I,I,I)."
+        "n(1..400). large(X,Y,Z) :- n(X), n(Y), n(Z).\n#program step(t).\n:- same(I,t), "
+        "large(I,I,I)."
     )  # 64 million atoms
     command = [
         sys.executable,
@@ -334,7 +342,10 @@ def test_what_is_given_up_is_answered_and_nothing_begins() -> None:
 @POSIX
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "pid"
-    program = f"from ssh_abduction.solver.asp import workers; from test_limits import stay; list(workers.answers(stay, [(0, {str(path)!r})], 1, bool, None, 1.0))"
+    program = (
+        "from ssh_abduction.solver.asp import workers; from test_limits import stay; "
+        f"list(workers.answers(stay, [(0, {str(path)!r})], 1, bool, None, 1.0))"
+    )
     with subprocess.Popen(
         [sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     ) as parent:
@@ -351,7 +362,8 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
 
 
 def is_running(process: int) -> bool:
-    """Whether a process runs; one that has ended may still be listed, where nobody asks how it ended."""
+    """Whether a process runs; one that has ended may still be listed, where nobody asks how it
+    ended."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -364,7 +376,8 @@ VIEWS = [number % 4 for number in range(201)]
 ACTIONS = [number % 2 for number in range(200)]
 
 
-# Circuits of corridors, in which one view is seen in several places, and other things are done there.
+# Circuits of corridors, in which one view is seen in several places, and other things are done
+# there.
 CORRIDORS = [0, 1, 2, 1, 0, 2, 0, 1, 1, 3] * 20
 DONE = ([0, 1, 0, 0, 1, 1, 0, 1, 0, 1] * 20)[:-1]
 
@@ -421,8 +434,8 @@ def test_a_warning_names_the_step(noisy: Path) -> None:
     assert done.stderr == f"ssh-abduction: warning: {warning}\n"
     assert warning.startswith(f"{noisy}:{last + 2}: view ")
     assert (
-        f"looks like noise at step {last}: because of it {last} of the {last + 1} steps up to there have to be dstates of their own"
-        in warning
+        f"looks like noise at step {last}: because of it {last} of the {last + 1} steps up to "
+        "there have to be dstates of their own" in warning
     )
 
 

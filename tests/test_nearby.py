@@ -1,4 +1,5 @@
-"""Maps near a guess: each is a map, each has fewer dstates, and the last is minimal when the search says so, whatever the guess."""
+"""Maps near a guess: each is a map, each has fewer dstates, and the last is minimal when the search
+says so, whatever the guess."""
 
 from __future__ import annotations
 
@@ -65,7 +66,8 @@ def nearby_search(trace: Trace) -> NearbySearch:
 @settings(max_examples=25)
 @given(machines(most_steps=20), st.data())
 def test_from_any_guess_to_a_minimal_map(trace: Trace, data: st.DataObject) -> None:
-    """Guesses that are no maps, that merge what is apart, or say nothing; with as few conflicts as make most questions be asked again."""
+    """Guesses that are no maps, that merge what is apart, or say nothing; with as few conflicts as
+    make most questions be asked again."""
     trace = trace.without_displacements()
     if len(trace) == 1:
         return
@@ -148,7 +150,8 @@ def test_some_maps_where_the_search_near_a_guess_has_the_proof(seed: int) -> Non
 
 
 def either_or(parts: int) -> Trace:
-    """In each part of this world there have to be two dstates that show A, or two that show B: minimal maps have any number of either."""
+    """In each part of this world there have to be two dstates that show A, or two that show B:
+    minimal maps have any number of either."""
     views, actions = ["hall"], list[str]()
     for part in range(parts):
         p, c, d, e, f = (f"{name}{part}" for name in "pcdef")
@@ -167,7 +170,8 @@ def either_or(parts: int) -> Trace:
 
 
 def test_all_ways_are_listed_whichever_views_need_more_names() -> None:
-    """What one answer needs is not taken back for what the next one needs: that would go on for ever."""
+    """What one answer needs is not taken back for what the next one needs: that would go on for
+    ever."""
     trace = either_or(4)
     expected = solve(trace, CAUSAL, max_maps=None)
     searched = nearby_search(trace)
@@ -183,7 +187,8 @@ def test_all_ways_are_listed_whichever_views_need_more_names() -> None:
 
 
 def test_a_causal_maze_is_guessed_by_its_turns() -> None:
-    """Annealing, from views and turns alone, comes near what the robot was in; from there to the proof that no fewer dstates will do."""
+    """Annealing, from views and turns alone, comes near what the robot was in; from there to the
+    proof that no fewer dstates will do."""
     walk = maze(3, 3, steps=900, seed=1)
     log = Log(walk.trace, CAUSAL)
     chart = Chart.turned(walk.trace, log, len(log.seen))
@@ -201,7 +206,8 @@ def test_a_causal_maze_is_guessed_by_its_turns() -> None:
 
 @pytest.mark.parametrize("beside", [True, False])
 def test_a_limit_leaves_the_small_map_found_beside(beside: bool) -> None:
-    """It has no more dstates than the states that the robot was in; what is merged at once has more than twice as many."""
+    """It has no more dstates than the states that the robot was in; what is merged at once has more
+    than twice as many."""
     walk = maze(4, 4, steps=800, seed=1)
     best: list[int] = []
 
@@ -274,7 +280,8 @@ def test_where_clingo_would_prepare_for_too_long_the_search_beside_goes_on() -> 
 
 
 def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
-    """What is kept back is for that search; to begin it once more would throw away what it has come to. So it may use the whole limit from its start, and
+    """What is kept back is for that search; to begin it once more would throw away what it has come
+    to. So it may use the whole limit from its start, and
     where it is stopped before it has a map, no other search for any map follows.
     """
     trace = maze(10, 10, steps=1000, seed=0, stars=True).trace
@@ -282,7 +289,8 @@ def test_a_search_of_the_whole_trace_keeps_no_time_back() -> None:
     minimise = Prefixes.minimise
 
     def stop(self: Prefixes) -> Found | None:
-        """Before a prefix is searched, the clock is left alone; as soon as the whole trace is to be searched, the time is over."""
+        """Before a prefix is searched, the clock is left alone; as soon as the whole trace is to be
+        searched, the time is over."""
         if self.engine.size < len(trace):
             return minimise(self)
         begun.append((self._task.watch.has_reserve, self._known.best is None))
@@ -361,7 +369,8 @@ def fewest_dstates(trace: Trace) -> int:
 def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
     first: int, guessed: int, goes_on: bool
 ) -> None:
-    """Of 1,200 steps in a maze of 9 cells the map holds to the end, and of 300 or 600 it lacks links; of 20 and 40 steps it is of no use, but where
+    """Of 1,200 steps in a maze of 9 cells the map holds to the end, and of 300 or 600 it lacks
+    links; of 20 and 40 steps it is of no use, but where
     the trace is not too long all of it is guessed then.
     """
     trace = maze(3, 3, steps=1600, seed=0).trace
@@ -382,7 +391,8 @@ def test_a_guess_at_the_beginning_of_a_long_trace_goes_on_if_it_can(
 
 
 def test_of_a_long_trace_clingo_is_given_some_links_at_a_time() -> None:
-    """The simplest first, so that it comes to an end before it was given all; the map is that of a guess at the beginning, or clingo's."""
+    """The simplest first, so that it comes to an end before it was given all; the map is that of a
+    guess at the beginning, or clingo's."""
     walk = maze(3, 3, steps=1000, seed=1, loops=0.3)
     given: list[int] = []
     add = name_program.NameProgram.add

@@ -1,4 +1,5 @@
-"""A theory is open: what is added to it is obeyed everywhere, online and in one go, though no speed-up and no checker knows it."""
+"""A theory is open: what is added to it is obeyed everywhere, online and in one go, though no
+speed-up and no checker knows it."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ from ssh_abduction.theory.speedups import SPEEDUPS, TABLE, row
 EXAMPLES = Path(__file__).parent.parent / "examples"
 FORGETFUL = Rules(
     "forgetful.lp",
-    "% @axiom(forgetful) No dstate is seen twice more than 10 steps apart.\n#program step(t).\nviolation(forgetful,t) :- same(I,t), t-I > 10.",
+    "% @axiom(forgetful) No dstate is seen twice more than 10 steps apart.\n#program "
+    "step(t).\nviolation(forgetful,t) :- same(I,t), t-I > 10.",
 )
 THEORIES = {
     "causal": Theory.causal(),
@@ -59,7 +61,8 @@ def with_toy(toy: Toy, theory: Theory) -> Theory:
 @settings(max_examples=3)
 @given(data=st.data())
 def test_an_axiom_that_nothing_knows_is_obeyed(name: str, toy: Toy, data: st.DataObject) -> None:
-    """In one go and step by step, against the brute force; with first prefixes so short that replay would overlook it."""
+    """In one go and step by step, against the brute force; with first prefixes so short that replay
+    would overlook it."""
     theory = (
         with_toy(toy, THEORIES[name])
         if toy.causal or name != "causal"
@@ -125,9 +128,11 @@ def own_encodings(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture
 def wider(own_encodings: Path) -> type[Theory]:
-    """A folder of encodings with one file more, and a theory with one field more: all that somebody does who adds an axiom, and forgets the rest."""
+    """A folder of encodings with one file more, and a theory with one field more: all that somebody
+    does who adds an axiom, and forgets the rest."""
     (own_encodings / "forgetful.lp").write_text(
-        "% Toy.\n#program step(t).\n% @axiom(forgetful) No dstate is seen twice more than 10 steps apart. [a toy] if forgetful\n"
+        "% Toy.\n#program step(t).\n% @axiom(forgetful) No dstate is seen twice more than 10 "
+        "steps apart. [a toy] if forgetful\n"
         "violation(forgetful,t) :- axiom(forgetful), same(I,t), t-I > 10.\n"
     )
 
@@ -274,7 +279,8 @@ FAST = {
 @settings(max_examples=10)
 @given(data=st.data())
 def test_what_evidence_refuses_is_forbidden_in_every_engine(name: str, data: st.DataObject) -> None:
-    """An engine that settles dstates first is told of it, too, and its maps are those of the brute force."""
+    """An engine that settles dstates first is told of it, too, and its maps are those of the brute
+    force."""
     theory, kind = FAST[name]
     trace = data.draw(traces(max_steps=5), label="trace")
     if theory.star == "frame" and not trace.has_stars:
@@ -317,7 +323,8 @@ def test_an_explanation_names_assertions_and_own_axioms() -> None:
     assert {"asserted", "functional_view"} == set(said.axioms)
     rules = Rules(
         "own.lp",
-        "% @axiom(new) All dstates are seen again.\n#program step(t).\nviolation(new,t) :- t > 0, not same(0,t).",
+        "% @axiom(new) All dstates are seen again.\n#program step(t).\nviolation(new,t) :- t > 0, "
+        "not same(0,t).",
     )
     said = explain(trace, Theory.topological().replace(rules=[rules]))
     assert said
@@ -358,7 +365,8 @@ def test_an_explanation_names_assertions_and_own_axioms() -> None:
         ("#show same/2.", r"own\.lp:1: expected rules, got #show"),
         (
             "#program step(t).\n:- same(@first(1),t).",
-            r"own\.lp:2: expected what clingo works out by itself, got @first\(1\), a function of Python's",
+            r"own\.lp:2: expected what clingo works out by itself, got @first\(1\), a function of "
+            r"Python's",
         ),
         (
             "#program step(t).\n:- same(I,t,5).",
@@ -391,7 +399,10 @@ def test_rules_that_could_never_be_read_say_how_to_write_them(
     assert "\n" not in str(error.value)
 
 
-SOUND = "% @axiom(near) No step is seen again soon.\n#program step(t).\nviolation(near,t) :- same(I,t), t-I > 10.\n"
+SOUND = (
+    "% @axiom(near) No step is seen again soon.\n#program step(t).\nviolation(near,t) :- "
+    "same(I,t), t-I > 10.\n"
+)
 
 
 @pytest.mark.parametrize(
@@ -418,7 +429,10 @@ def test_rules_of_any_editor_are_read(data: bytes, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ("#program step(t).\n:- same(I,t), t-I > é.", r"own\.lp:2:21: expected ASCII outside of quotes and comments, got 'é' \(U\+00E9\); put it in quotes"),
+        ("#program step(t).\n:- same(I,t), t-I > é.", (
+            r"own\.lp:2:21: expected ASCII outside of quotes and comments, got 'é' \(U\+00E9\); "
+            r"put it in quotes"
+        )),
         ("%* a\n% *%\n*% é.", r"own\.lp:3:4: expected ASCII"),
         ("a(“x”).", r"own\.lp:1:3: expected ASCII .*U\+201C"),
         ("a.\u00a0b.", r"own\.lp:1:3: expected ASCII .*U\+00A0"),
@@ -507,7 +521,8 @@ def test_a_file_of_rules_without_end_is_an_error(
 def test_rules_may_read_facts_and_atoms_of_their_own() -> None:
     rules = Rules(
         "own.lp",
-        "#const most = 1.\nlimit(most).\nfar(I,T) :- pair(I,T).\npair(0,2).\n#program step(t).\n:- far(I,t), same(I,t), limit(1).",
+        "#const most = 1.\nlimit(most).\nfar(I,T) :- pair(I,T).\npair(0,2).\n#program "
+        "step(t).\n:- far(I,t), same(I,t), limit(1).",
     )
     assert (
         solve(Trace.from_steps("aaa", ["right", "right"]), Theory(rules=[rules])).cost
@@ -552,7 +567,8 @@ def test_a_replayed_map_that_breaks_an_axiom_is_an_internal_error_while_a_robot_
 
 
 def test_what_is_asserted_is_told_to_the_engine_with_names() -> None:
-    """More is then apart: the clique that dstates are pinned to is larger, and clingo need not find that out."""
+    """More is then apart: the clique that dstates are pinned to is larger, and clingo need not find
+    that out."""
     trace = Trace.from_steps("ab" * 20, ["travel"] * 39)
     cliques = []
     grow = CausalEngine.grow

@@ -1,4 +1,5 @@
-"""What is installed is what was tested: the wheel holds the encodings, and nothing shadows Python's own modules."""
+"""What is installed is what was tested: the wheel holds the encodings, and nothing shadows Python's
+own modules."""
 
 from __future__ import annotations
 
@@ -49,8 +50,10 @@ def test_the_wheel_holds_the_encodings_the_examples_and_the_wings(
         "simulator",
     }
     program = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import ssh_abduction; from ssh_abduction import *; from ssh_abduction.theory import encodings;"
-        "assert ssh_abduction.__file__.startswith(sys.argv[1]) and str(encodings.folder()).startswith(sys.argv[1]);"
+        "import sys; sys.path.insert(0, sys.argv[1]); import ssh_abduction; from ssh_abduction "
+        "import *; from ssh_abduction.theory import encodings;"
+        "assert ssh_abduction.__file__.startswith(sys.argv[1]) and "
+        "str(encodings.folder()).startswith(sys.argv[1]);"
         "print(solve(Trace.from_steps('aba', ['travel', 'around'])).cost.dstates)"
     )
     done = subprocess.run(
@@ -108,8 +111,8 @@ def test_examples_that_somebody_changed_are_not_overwritten(
     (folder / "adventure.py").unlink()
     assert main(["examples", "-o", str(folder)]) == 1
     assert (
-        "demo.py: expected no file, or the example of this name, got another one; nothing was copied"
-        in capsys.readouterr().err
+        "demo.py: expected no file, or the example of this name, got another one; nothing was "
+        "copied" in capsys.readouterr().err
     )
     assert (folder / "demo.py").read_text() == "mine"
     assert not (folder / "adventure.py").exists()

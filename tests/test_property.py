@@ -46,7 +46,8 @@ def agree(trace: Trace, theory: Theory) -> None:
 def test_solver_lists_the_maps_of_the_brute_force(data: st.DataObject) -> None:
     trace = data.draw(traces(), label="trace")
     theory = data.draw(theories(trace), label="theory")
-    # The traces are shorter than the solver's first prefix: a shorter one makes it replay and extend.
+    # The traces are shorter than the solver's first prefix: a shorter one makes it replay and
+    # extend.
     first_prefix = data.draw(st.sampled_from([1, 3, prefixes.FIRST_PREFIX]), label="first prefix")
     first_paths = data.draw(st.sampled_from([1, 2, prefixes.FIRST_PATHS]), label="first paths")
     few_steps = data.draw(st.sampled_from([0, choosing.FEW_STEPS]), label="few steps")
@@ -79,7 +80,10 @@ def test_excuses_alone_are_minimised_where_no_pair_of_paths_can_be_excused(
 @settings(max_examples=13)
 @given(st.data())
 def test_checker_rejects_what_the_brute_force_does_not_find(data: st.DataObject) -> None:
-    """The maps of one theory under the axioms of another. Where these allow the map, its witnesses may still have to change."""
+    """The maps of one theory under the axioms of another.
+
+    Where these allow the map, its witnesses may still have to change.
+    """
     trace = data.draw(traces(), label="trace")
     theory = data.draw(theories(trace, fixed=FOREIGN), label="theory of the maps")
     other = data.draw(theories(trace, fixed=FOREIGN), label="theory to check them by")

@@ -74,7 +74,8 @@ def too_hard() -> Trace:
 
 @contextmanager
 def clock() -> Iterator[Callable[[float], None]]:
-    """A clock that is put forward by so many seconds where the test says so, for which it would have to wait otherwise."""
+    """A clock that is put forward by so many seconds where the test says so, for which it would
+    have to wait otherwise."""
     now, ahead = time.perf_counter, [0.0]
     with patch.object(time, "perf_counter", lambda: now() + sum(ahead)):
         yield ahead.append
@@ -225,7 +226,8 @@ def test_a_thousand_circuits(theory: Theory) -> None:
 
 
 def test_a_surprise_after_many_circuits_is_not_missed() -> None:
-    """50 circuits and then another view: the closed map is wrong, and the surprise is in the answer."""
+    """50 circuits and then another view: the closed map is wrong, and the surprise is in the
+    answer."""
     circuits = rectangle(48)
     surprised = Trace.from_steps([*circuits.views[:-1], "surprise"], circuits.actions)  # type: ignore[list-item]
     solution = solve(surprised, Theory.causal(), max_maps=None)
@@ -256,7 +258,8 @@ def test_at_most_so_many_maps() -> None:
 
 
 def test_a_stream_of_millions_starts_at_once() -> None:
-    """One and a half circuits have 20,289 consistent maps without sides; three have far more than anyone waits for."""
+    """One and a half circuits have 20,289 consistent maps without sides; three have far more than
+    anyone waits for."""
     theory = Theory(boundary="none", path_order="partial", prefer=())
     search = Search(rectangle(24), theory, max_maps=None)
     first = list(itertools.islice(search, 100))
@@ -333,11 +336,14 @@ def test_memory_limit_stops_with_a_status() -> None:
 def test_ctrl_c_leaves_the_best_map() -> None:
     program = textwrap.dedent("""
         import signal, sys
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
+        # Ctrl-C is ignored if the tests run in the background.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.path.insert(0, sys.argv[1])
         from test_solver import too_hard
         from ssh_abduction import Theory, solve
-        solution = solve(too_hard(), Theory.causal(), on_progress=lambda _: print("searching", flush=True))
+        solution = solve(
+            too_hard(), Theory.causal(), on_progress=lambda _: print("searching", flush=True)
+        )
         print(solution.stopped, solution.status.value, solution.bound.dstates is not None)
     """)
     with subprocess.Popen(
@@ -467,7 +473,8 @@ def test_replay_stops_where_the_map_knows_nothing_or_is_wrong() -> None:
 
 
 def test_mutated_maps_fail_the_check() -> None:
-    """Two labels swapped, a link dropped, an order turned: each is a violation, whatever the map."""
+    """Two labels swapped, a link dropped, an order turned: each is a violation, whatever the
+    map."""
     mutants = 0
     for trace, theory, ssh_map in maps_of_all_tours():
         assert check(trace, ssh_map, theory) == ()
@@ -504,7 +511,8 @@ def test_nothing_that_infers_reads_the_truth() -> None:
 
 
 def test_a_prefix_that_grew_half_way_is_not_asked_for() -> None:
-    """A limit that stops the growth leaves no old horizon behind: growing on gives what growing at once gives."""
+    """A limit that stops the growth leaves no old horizon behind: growing on gives what growing at
+    once gives."""
     trace = drive(*TOURS["comb"])
     theory = settle(trace).theory
 
@@ -585,7 +593,8 @@ def test_a_search_runs_once() -> None:
 
 
 def test_costs_are_right_where_a_map_cannot_show_them() -> None:
-    """Without one_place a dstate may be at many places; the map shows the first, the cost counts all."""
+    """Without one_place a dstate may be at many places; the map shows the first, the cost counts
+    all."""
     solution = solve(
         Trace.from_steps("aaaaa", ["travel"] * 4),
         Theory(prefer=("places",), without=("one_place",)),

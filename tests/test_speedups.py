@@ -1,4 +1,5 @@
-"""No speed-up changes an answer: each switched off alone, all of them, and none, against each other and the un-accelerated encoding."""
+"""No speed-up changes an answer: each switched off alone, all of them, and none, against each other
+and the un-accelerated encoding."""
 
 from __future__ import annotations
 
@@ -51,7 +52,8 @@ PLAIN = Speedups.without(NAMES)
 
 @st.composite
 def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
-    """A walk in a random machine of few states, or any trace at all: maps that close, and maps that do not."""
+    """A walk in a random machine of few states, or any trace at all: maps that close, and maps that
+    do not."""
     if draw(st.booleans()):
         return draw(traces(max_steps=8))
     states = draw(st.integers(1, 6))
@@ -76,7 +78,8 @@ def machines(draw: st.DrawFn, most_steps: int = 14) -> Trace:
 def test_any_choice_of_speedups_lists_the_maps_of_the_plain_encoding(
     trace: Trace, off: set[str], data: st.DataObject
 ) -> None:
-    """With prefixes, patience and what is held back so small that all of it happens on short traces."""
+    """With prefixes, patience and what is held back so small that all of it happens on short
+    traces."""
     expected = solve(trace, Theory.causal(), max_maps=None, speedups=PLAIN)
     first = data.draw(st.sampled_from([2, 5, 32]), label="first prefixes")
     at_once = data.draw(st.sampled_from([4, 8000]), label="at once")
@@ -194,7 +197,8 @@ def test_each_speedup_that_is_read_off_alone(case: str) -> None:
 
 @pytest.mark.parametrize("most", [1, 2, 5])
 def test_as_many_maps_as_asked_for(most: int) -> None:
-    """Spurs off a ring that look alike: with what is lazy, and what is held back, the number asked for comes, and no map twice."""
+    """Spurs off a ring that look alike: with what is lazy, and what is held back, the number asked
+    for comes, and no map twice."""
     trace = Trace.from_steps(
         "abacabadabacab",
         ["travel", "right", "travel", "left", "right", "right", "travel"] + ["travel", "left"] * 3,
@@ -223,7 +227,8 @@ def test_merging_greedily_gives_a_map(trace: Trace) -> None:
 @settings(max_examples=25)
 @given(machines(most_steps=30))
 def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
-    """The matrix against its definition, step by step; and the cliques against all there are, as networkx finds them."""
+    """The matrix against its definition, step by step; and the cliques against all there are, as
+    networkx finds them."""
     log = Log(trace, Theory.causal())
     continuations = Continuations(log.seen, log.actions)
     apart, graph = continuations.apart(), nx.empty_graph(len(trace))
@@ -250,7 +255,8 @@ def test_apart_steps_are_apart_in_no_map_together(trace: Trace) -> None:
 
 @pytest.mark.parametrize("period", [1, 2, 7])
 def test_continuations_of_circuits(period: int) -> None:
-    """They have almost all of the trace in common, so that it takes many doublings to tell them apart."""
+    """They have almost all of the trace in common, so that it takes many doublings to tell them
+    apart."""
     seen = [step % period for step in range(1000)]
     continuations = Continuations(seen, [0] * 999)
     assert len(continuations.clique()) == period
@@ -303,7 +309,8 @@ def test_dstates_that_are_one_are_merged() -> None:
 
 
 def test_a_limit_leaves_a_map_of_merged_steps() -> None:
-    """Twice as good as one that is made at once, where clingo takes its time and no guess is annealed."""
+    """Twice as good as one that is made at once, where clingo takes its time and no guess is
+    annealed."""
     walk = maze(5, 5, steps=1600, seed=0)
     with (
         patch.multiple(name_search, PATIENCE=1, CORES=1),
@@ -340,7 +347,8 @@ def test_a_limit_leaves_the_small_map_of_a_guess(seed: int) -> None:
 
 @pytest.mark.parametrize("off", ["", "lazy"])
 def test_maps_found_before_a_limit_strikes_are_given(off: str) -> None:
-    """Though they are held back until it is known that the links that clingo was given are enough; and the one that showed what is minimal, too."""
+    """Though they are held back until it is known that the links that clingo was given are enough;
+    and the one that showed what is minimal, too."""
     found = named.NamedLabels._answers_of
 
     def stopped(self: named.NamedLabels, spares: int) -> Iterator[dict[int, int]]:
@@ -367,7 +375,10 @@ def test_a_guess_that_takes_too_much_memory_is_not_begun() -> None:
 
 
 def test_what_cannot_be_stopped_is_not_begun_where_time_is_short() -> None:
-    """clingo is not told where names lead, if the limit would be over before it can be stopped. The clique is a bound by then."""
+    """clingo is not told where names lead, if the limit would be over before it can be stopped.
+
+    The clique is a bound by then.
+    """
     walk = moore(8, 2, steps=100, seed=0)
     with (
         patch.object(name_program, "SECONDS_A_CHARACTER", 1.0),

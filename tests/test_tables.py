@@ -1,4 +1,5 @@
-"""The tables of docs/explanation/theory.md: minimal maps of known traces under known theories, each solved, counted and checked."""
+"""The tables of docs/explanation/theory.md: minimal maps of known traces under known theories, each
+solved, counted and checked."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ Expected = int | tuple[int, ...]
 
 
 def answer(trace: Trace, theory: Theory, expected: Expected) -> tuple[Expected, int | None]:
-    """The counts of the minimal maps in the table's form, and how many maps there are; each map is checked."""
+    """The counts of the minimal maps in the table's form, and how many maps there are; each map is
+    checked."""
     solution = solve(trace, theory, max_maps=None)
     assert solution.status is Status.OPTIMAL
     assert solution.complete
@@ -263,7 +265,8 @@ NOTCHED += [
 
 
 def cornered(trace: Trace) -> Trace:
-    """The notched rectangle with the stars of its corners: open ahead after the turn, and to the right before it."""
+    """The notched rectangle with the stars of its corners: open ahead after the turn, and to the
+    right before it."""
     stars = [(0, 1, 1, 0), (1, 1, 0, 0)]
     return Trace.from_steps(
         trace.views, trace.actions, stars=[stars[i % 2] for i in range(len(trace))]

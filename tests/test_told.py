@@ -1,4 +1,5 @@
-"""What commands tell beside their answers: the log, -q and -v, lines of progress, names that were perhaps meant, completions."""
+"""What commands tell beside their answers: the log, -q and -v, lines of progress, names that were
+perhaps meant, completions."""
 
 from __future__ import annotations
 
@@ -111,7 +112,8 @@ def test_quiet_leaves_errors_alone(noisy: str, capsys: pytest.CaptureFixture[str
     assert lines(capsys, "-q", "solve", noisy, "--theory", "causal")[1] == []
     _, wrong = lines(capsys, "-q", "solve", "no such file", code=1)
     assert wrong == [
-        "ssh-abduction: no such file: expected a readable trace file: No such file or directory; check the path"
+        "ssh-abduction: no such file: expected a readable trace file: No such file or directory; "
+        "check the path"
     ]
 
 
@@ -153,7 +155,10 @@ def test_lines_of_progress_come_now_and_then(
     assert all(MESSAGE.fullmatch(line) for line in lines(capsys, "solve", ACES, "-v")[1])
 
 
-EAGER = "import sys; from ssh_abduction.cli import main, verbosity; verbosity.EVERY = 0.0; sys.exit(main(sys.argv[1:]))"
+EAGER = (
+    "import sys; from ssh_abduction.cli import main, verbosity; verbosity.EVERY = 0.0; "
+    "sys.exit(main(sys.argv[1:]))"
+)
 
 
 @pytest.mark.parametrize(("words", "mixed"), [((), True), (("--json",), False)])
@@ -244,7 +249,8 @@ def test_bash_completes(
     program = (
         "source ./complete.bash; "
         f"COMP_WORDS=(ssh-abduction {' '.join(words)}); COMP_CWORD={len(words)}; "
-        "$(complete -p ssh-abduction | sed 's/.*-F \\([^ ]*\\).*/\\1/'); printf '%s\\n' \"${COMPREPLY[@]}\""
+        "$(complete -p ssh-abduction | sed 's/.*-F \\([^ ]*\\).*/\\1/'); printf '%s\\n' "
+        '"${COMPREPLY[@]}"'
     )
     done = subprocess.run(
         ["bash", "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
@@ -265,7 +271,8 @@ def test_without_shtab_it_is_named(
     monkeypatch.setattr(builtins, "__import__", without)
     _, told = lines(capsys, "completion", "bash", code=1)
     assert told == [
-        "ssh-abduction: completion: expected the package shtab, got none; pip install 'ssh-abduction[completion]'"
+        "ssh-abduction: completion: expected the package shtab, got none; pip install "
+        "'ssh-abduction[completion]'"
     ]
 
 

@@ -61,7 +61,8 @@ def test_the_route_of_aces_is_recognised_and_another_is_refused() -> None:
 
 
 def test_a_trace_with_the_names_of_true_places_has_the_true_map() -> None:
-    """The route of examples/aces3-route.jsonl, laid onto scans: its names come back, and so does what evaluate says of it."""
+    """The route of examples/aces3-route.jsonl, laid onto scans: its names come back, and so does
+    what evaluate says of it."""
     shipped = Trace.load(ROOT / "examples" / "aces3-route.jsonl")
     poses = aces_poses()
     truth = Truth.of_aces(poses)
@@ -117,7 +118,8 @@ def test_events_are_matched_to_visits_one_by_one() -> None:
 def test_passes_without_an_event_are_noticed() -> None:
     way = [*range(14), *range(13, -1, -1), *range(14)]
     truth = Truth(np.array([(float(x), 0.0, 0.0) for x in way]))
-    # To 6 m it came back twice, and has an event one of these times, as seen from either event there; to 13 m it came back once, without one.
+    # To 6 m it came back twice, and has an event one of these times, as seen from either event
+    # there; to 13 m it came back once, without one.
     assert passes(Events((6, 13, 34), ("a", "b", "a")), truth) == (5, 2)
 
 
@@ -197,7 +199,8 @@ def test_a_narrow_part_of_an_edge_is_a_door() -> None:
 
 
 def crossing() -> RobotLog:
-    """A robot drives along two corridors that cross, 3 m wide and 20 m long: there, back to the crossing, and along the other."""
+    """A robot drives along two corridors that cross, 3 m wide and 20 m long: there, back to the
+    crossing, and along the other."""
     ways = [(float(x), 0.0, 0.0) for x in np.arange(-8, 8.5, 0.5)]
     ways += [(float(x), 0.0, math.pi) for x in np.arange(8, -0.5, -0.5)]
     ways += [(0.0, float(y), math.pi / 2) for y in np.arange(0.5, 8.5, 0.5)]

@@ -1,4 +1,5 @@
-"""Maps are judged by poses, and by relative poses: the pairs are counted naively, too, and relations lead where they were made to lead."""
+"""Maps are judged by poses, and by relative poses: the pairs are counted naively, too, and
+relations lead where they were made to lead."""
 
 from __future__ import annotations
 
@@ -125,7 +126,8 @@ def test_a_turn_is_no_return_and_neither_is_the_next_door() -> None:
 
 
 def circle(turns: int) -> tuple[list[Pose], list[Relation]]:
-    """Poses once a second on a circle of 20 m, the relations from each to the next, and one that closes it after each turn."""
+    """Poses once a second on a circle of 20 m, the relations from each to the next, and one that
+    closes it after each turn."""
     poses = [
         (20 * math.sin(a), 20 * (1 - math.cos(a)), a)
         for a in (math.radians(3 * t) for t in range(120 * turns + 1))
@@ -148,9 +150,8 @@ def test_relations_are_composed_along_the_shortest_way() -> None:
             math.radians(90.75),
         )
         assert pose == pytest.approx(between(start, poses[int(time)]), abs=0.01)
-        assert (
-            way < 60
-        )  # not the way that was driven, of up to 215 m, but over the relation that closes the circle
+        # not the way that was driven, of up to 215 m, but over the relation that closes the circle
+        assert way < 60
     assert seen[4] is None  # long after the last time
 
 
@@ -161,7 +162,8 @@ def test_relations_judge_where_poses_are_missing(
     (tmp_path / "relations").write_text(
         "# seconds, metres, radians\n"
         + "".join(
-            f"{r.first} {r.second} {r.displacement[0]} {r.displacement[1]} 0 0 0 {r.displacement[2]}\n"
+            f"{r.first} {r.second} {r.displacement[0]} {r.displacement[1]} 0 0 0 "
+            f"{r.displacement[2]}\n"
             for r in related
         )
     )
@@ -203,7 +205,8 @@ def test_relations_judge_where_poses_are_missing(
     assert main(arguments) == 0
     first, left_out, _, row = capsys.readouterr().out.splitlines()
     assert first.startswith(
-        "judged by relations: of 9 pairs of different visits 3 are returns to one place: within 2 m, and"
+        "judged by relations: of 9 pairs of different visits 3 are returns to one place: within 2 "
+        "m, and"
     )
     assert left_out == "left out: 1 pair, as relations do not tell how far apart they are"
     assert row.split()[:6] == ["1", "2", "4", "1", "0.250", "0.333"]
@@ -223,7 +226,8 @@ def test_relations_of_another_log_are_noticed(
     labelled(range(5), range(5)).save(tmp_path / "map.json")
     (tmp_path / "relations").write_text(
         "".join(
-            f"{r.first} {r.second} {' '.join(map(str, r.displacement[:2]))} 0 0 0 {r.displacement[2]}\n"
+            f"{r.first} {r.second} {' '.join(map(str, r.displacement[:2]))} 0 0 0 "
+            f"{r.displacement[2]}\n"
             for r in related
         )
     )
@@ -277,7 +281,8 @@ def test_names_and_poses_are_judged_where_both_are_asked_for(
     [
         (
             "1 2 0.5 0 0 0 0",
-            "relations:1: expected the numbers time1 time2 x y z roll pitch yaw, got '1 2 0.5 0 0 0 0'",
+            "relations:1: expected the numbers time1 time2 x y z roll pitch yaw, got '1 2 0.5 0 0 "
+            "0 0'",
         ),
         ("# none\n\n1 2 x 0 0 0 0 0", "relations:3: expected the numbers"),
         ("1 2 nan 0 0 0 0 0", "relations:1: expected finite numbers"),
@@ -296,7 +301,8 @@ def test_poses_and_times_that_cannot_be_used() -> None:
     ssh_map = labelled([0, 1], [0, 1])
     with pytest.raises(
         TraceError,
-        match=r"^step 1: truth.pose: expected \[x, y, heading\] in metres and radians, got \[1, 2\]",
+        match=r"^step 1: truth.pose: expected \[x, y, heading\] in metres and radians, "
+        r"got \[1, 2\]",
     ):
         evaluate_visits([ssh_map], posed([[0, 0, 0], [1, 2]], ["travel"]))
     with pytest.raises(

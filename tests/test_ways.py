@@ -1,4 +1,5 @@
-"""The full theory where places have no frames: dstates settled before places and paths, against the plain encoding, and in mazes."""
+"""The full theory where places have no frames: dstates settled before places and paths, against the
+plain encoding, and in mazes."""
 
 from __future__ import annotations
 
@@ -57,7 +58,8 @@ def bare_theories(draw: st.DrawFn) -> Theory:
 @settings(max_examples=5)
 @given(st.data())
 def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
-    """Told of paths that an answer contradicts, or only of links that do not go together; with few names at first; a minimal map known, or not."""
+    """Told of paths that an answer contradicts, or only of links that do not go together; with few
+    names at first; a minimal map known, or not."""
     trace = data.draw(traces(max_steps=8), label="trace").without_stars().without_displacements()
     theory = data.draw(bare_theories(), label="theory")
     contrary = data.draw(st.sampled_from([0, 1, ways.CONTRARY]), label="contrary")
@@ -86,7 +88,8 @@ def test_the_maps_of_the_plain_encoding(data: st.DataObject) -> None:
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(st.data())
 def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.DataObject) -> None:
-    """Two returns of a minimal map, to dstates or to places, are forbidden: the maps that are left are those of the readable encodings, which are told the same."""
+    """Two returns of a minimal map, to dstates or to places, are forbidden: the maps that are left
+    are those of the readable encodings, which are told the same."""
     trace = data.draw(traces(max_steps=9), label="trace").without_stars()
     task = Task.of(settle(trace, data.draw(bare_theories(), label="theory")))
     plain, engine = (
@@ -125,7 +128,8 @@ def test_what_is_refused_together_is_what_the_plain_encoding_is_told(data: st.Da
 
 
 def test_a_limit_while_labels_are_listed_is_a_limit() -> None:
-    """Labels with the fewest dstates are listed after a map with so few is known: that it is known ends the search for it, and not the list."""
+    """Labels with the fewest dstates are listed after a map with so few is known: that it is known
+    ends the search for it, and not the list."""
     trace = maze(3, 3, steps=30, seed=0).trace
     theory = settle(trace).theory
     known = solve(trace, theory).maps[0].labels
@@ -173,7 +177,8 @@ def test_the_route_of_a_robot() -> None:
 
 @pytest.mark.parametrize("settled", [False, True], ids=["step by step", "dstates first"])
 def test_maps_that_are_refused_do_not_count_among_those_that_are_listed(settled: bool) -> None:
-    """Two steps may not be at one place, which they are in most of the minimal maps: few maps are no complete list, and all that are left are found."""
+    """Two steps may not be at one place, which they are in most of the minimal maps: few maps are
+    no complete list, and all that are left are found."""
     trace, theory = (
         Trace.load(EXAMPLES / "aces3-route.jsonl"),
         Theory(star="none", prefer=("dstates", "places", "paths")),
@@ -232,7 +237,8 @@ def test_what_ends_the_settling_of_dstates_leaves_the_map(name: str) -> None:
 
 
 def test_a_robot_that_goes_on_where_that_ended() -> None:
-    """The first search of a mapper may be of many steps; what it proved holds for the steps that come."""
+    """The first search of a mapper may be of many steps; what it proved holds for the steps that
+    come."""
     trace = maze(2, 2, steps=36, seed=1).trace
     first = trace.prefix(32)
     with patch.object(choosing, "STEPWISE", -1.0):

@@ -99,7 +99,8 @@ def test_the_true_map_of_the_real_route_is_within_three_dstates() -> None:
 
 
 def test_without_an_order_behind_dstates_all_maps_of_so_few_dstates_are_listed() -> None:
-    """Then the levels are what clingo counts of maps with dstates, at most one more than the least."""
+    """Then the levels are what clingo counts of maps with dstates, at most one more than the
+    least."""
     solution = solve(Trace.load(ACES3), Theory(prefer=("dstates",)), max_maps=None, within=1)
     assert [(level.cost.dstates, level.count) for level in solution.levels] == [(19, 68), (20, 158)]
 
@@ -123,14 +124,20 @@ def test_maps_come_in_the_order_of_their_cost_up_to_as_many_as_are_asked_for(
 def test_near_minimal_maps_of_a_longer_trace_are_those_that_a_rule_for_their_number_lets_pass(
     theory: Theory,
 ) -> None:
-    """The minimal maps are replayed from a prefix; for the others the whole trace is asked. The rule is one of a user's own, which no speed-up knows."""
+    """The minimal maps are replayed from a prefix; for the others the whole trace is asked.
+
+    The rule is one of a user's own, which no speed-up knows.
+    """
     trace = Trace.load(EXAMPLE).prefix(30)
     if theory.star == "frame":
         trace = Trace.load(ACES3)
     solution = solve(trace, theory, within=1, max_maps=None)
     assert solution.complete
     least, more = solution.levels
-    text = f"% @axiom(number) Just so many dstates.\n#program check(t).\nviolation(number,t) :- query(t), #count {{ S : is(S,S) }} != {more.cost.dstates}."
+    text = (
+        "% @axiom(number) Just so many dstates.\n#program check(t).\nviolation(number,t) :- "
+        f"query(t), #count {{ S : is(S,S) }} != {more.cost.dstates}."
+    )
     asked = solve(trace, theory.replace(rules=(Rules("number.lp", text),)), max_maps=None)
     assert asked.cost == more.cost
     assert set(solution.maps[least.count :]) == set(asked.maps)
@@ -219,7 +226,7 @@ def test_a_map_that_does_not_cost_what_it_is_said_to_cost_is_found(near: dict[st
     trace = Trace.load(ACES3)
     false = false_claims(near | {"maps": wrong}, maps, len(trace), settle(trace).theory, 19)
     assert len(false) == 7
-    assert (
-        false[0]
-        == "maps[4].cost: expected 20 dstates, 10 places, 4 paths, as the map has these, got 19 dstates, 10 places, 4 paths"
+    assert false[0] == (
+        "maps[4].cost: expected 20 dstates, 10 places, 4 paths, as the map has these, got 19 "
+        "dstates, 10 places, 4 paths"
     )

@@ -1,4 +1,5 @@
-"""Small street maps for tests: places on a grid, streets between neighbours, a robot that drives and sees the openings."""
+"""Small street maps for tests: places on a grid, streets between neighbours, a robot that drives
+and sees the openings."""
 
 from __future__ import annotations
 
@@ -13,14 +14,18 @@ Streets = dict[str, dict[str, str]]
 
 
 def written(text: str) -> Trace:
-    """A trace in the notation of the tables: views and actions in turn, such as "a T b R c". T followed by letters is a travel of its own."""
+    """A trace in the notation of the tables: views and actions in turn, such as "a T b R c".
+
+    T followed by letters is a travel of its own.
+    """
     words = text.split()
     actions = [ACTIONS.get(a) or {"name": a, "kind": "travel"} for a in words[1::2]]
     return Trace.from_steps(words[0::2], actions)
 
 
 def rectangle(actions: int, views: int = 4, turn: str = "R") -> Trace:
-    """The notched rectangle after so many actions: a turn and a travel in turn, the views repeating after `views`."""
+    """The notched rectangle after so many actions: a turn and a travel in turn, the views repeating
+    after `views`."""
     kinds = [ACTIONS[turn], "travel"]
     return Trace.from_steps(
         [f"v{i % views}" for i in range(actions + 1)], [kinds[i % 2] for i in range(actions)]
@@ -39,7 +44,8 @@ def streets(*edges: tuple[str, str, str]) -> Streets:
 def drive(
     world: Streets, place: str, heading: str, actions: Iterable[str], stars: bool = False
 ) -> Trace:
-    """The trace of a robot that drives through a world; its views name the openings ahead, right, back and left."""
+    """The trace of a robot that drives through a world; its views name the openings ahead, right,
+    back and left."""
     facing = HEADINGS.index(heading)
     seen: list[list[int]] = []
 
