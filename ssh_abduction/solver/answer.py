@@ -1,4 +1,4 @@
-"""Make the Solution of a search from what was given and what is known."""
+"""Make the Solution of a search from its maps and its knowledge."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ssh_abduction.theory.speedups import row
 
 
 class Answer:
-    """Remembers the maps that a search gave, as far as the Solution needs them."""
+    """Remembers what the Solution needs to know about the maps that a search gave."""
 
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
@@ -34,11 +34,11 @@ class Answer:
 
     @property
     def cost(self) -> Cost | None:
-        """The cost of the map that was given last."""
+        """The cost of the last map given."""
         return None if self._last is None else cost_as_counted(*self._last, self._parts.task.theory)
 
     def take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-        """Remember a map that is given, and count it in its level."""
+        """Remember a map given to the caller, and count it in its level."""
         theory = self._parts.task.theory
         self._first, self._last = self._first or ssh_map, (ssh_map, cost)
         if not self._levels or self._levels[-1].cost.preferred_by(theory) != cost:
@@ -46,7 +46,7 @@ class Answer:
         self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
 
     def count_apart(self) -> None:
-        """Raise the bound of a search that was stopped to the steps that are pairwise apart."""
+        """After a stop, raise the bound to the number of pairwise distinct steps."""
         known = self._parts.known
         self._basis = self._basis_of(len(self._parts.task.trace))
         if self._basis:
@@ -88,10 +88,10 @@ class Answer:
         )
 
     def _support(self) -> Support:
-        """What the certificate and the warnings are made from."""
+        """The basis of the certificate and of the warnings."""
         parts, trace = self._parts, self._parts.task.trace
-        # A search that ran out may have ended while the prefix was grounded. All steps are then
-        # searched for what shows the bound.
+        # A search that ran out may have ended while the prefix was grounded. Then look for a
+        # proof of the bound in all steps.
         ran_out = parts.known.stopped not in (None, "maps limit")
         size = len(trace) if ran_out else parts.prefixes.engine.size
         warning = None
@@ -100,9 +100,9 @@ class Answer:
         return Support(self._basis or self._basis_of(size), warning)
 
     def in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:
-        """Sort maps, if they are all that were given and no minimal map is missing.
+        """Sort maps, if they are all maps given and no minimal map is missing.
 
-        The order is the same in each run. Each level then costs what its first map does.
+        The order is the same in each run. The cost of a level is that of its first map.
         """
         parts, theory = self._parts, self._parts.task.theory
         is_all = parts.known.complete or parts.rivals.listed
@@ -117,7 +117,7 @@ class Answer:
         return ordered
 
     def _basis_of(self, size: int) -> Basis | None:
-        """What shows that no map of the first `size` steps has fewer dstates."""
+        """The proof that no map of the first `size` steps has fewer dstates."""
         task = self._parts.task
         if not row("clique").holds_for(task.theory):
             return None

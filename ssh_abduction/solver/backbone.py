@@ -1,10 +1,10 @@
 """What all minimal maps of a trace share, without listing them.
 
-Some minimal maps are known. What they share may not hold for all: two steps that are one in all
-known maps may be two in another minimal map, and the other way round. So clingo looks for a minimal
-map in which any of these doubts is true. If there is one, it is added, and fewer doubts are left.
-If there is none, what is shared is proven. This is brave and cautious reasoning in one. Each answer
-is a map that can be checked.
+Some minimal maps are known. What they share may not hold for all. Two steps may be one dstate in
+all known maps, but not in some other minimal map, and vice versa. Each such possibility is a doubt.
+clingo looks for a minimal map in which any doubt is true. If there is one, it is added, and fewer
+doubts are left. If there is none, what is shared is proven. This combines brave and cautious
+reasoning. Each answer is a map that can be checked.
 
 *Prefixes.* clingo looks for maps of a prefix that cost at most as much as minimal maps of the
 trace. The cuts of minimal maps are among these (`prefixes.py`). So a found map that replays to the
@@ -14,9 +14,9 @@ deterministic, so these classes replay like a map. If they replay to the end, ea
 the class of a step of the prefix in every minimal map, and no doubt about it is left. Else the
 prefix grows.
 
-*Labels.* An engine that settles dstates before places and paths knows all labels of minimal maps.
-They are few, even if there are thousands of maps. Then dstates are not in doubt. Doubts about
-places and paths are resolved for each labelling in turn.
+*Labels.* An engine that finds dstates before places and paths knows all labels of minimal maps.
+There are few labels, even for thousands of maps. So dstates are not in doubt. Doubts about places
+and paths are resolved for each labelling in turn.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Rivals:
 
         Args:
             task: The task of the search that lists the maps.
-            judging: Knows which maps the evidence refuses.
+            judging: Knows which maps the evidence rejects.
         """
         self.sharing = Sharing()
         self.listed = False
@@ -77,7 +77,7 @@ class Rivals:
     def reason(self) -> None:
         """Find out what all minimal maps share, unless all are listed.
 
-        It ends early if a limit of the search is over, or with Ctrl-C.
+        This ends early if a limit is over, or with Ctrl-C.
         """
         if self.listed or self._proven or not self.reasons or not self.sharing.maps:
             return
@@ -108,14 +108,14 @@ def prove_backbone(
 
     Args:
         task: The task of the search.
-        judging: Knows which maps the evidence refuses.
+        judging: Knows which maps the evidence rejects.
         cost: The preferred counts of minimal maps, the most important one first.
         sharing: What at least one known minimal map shares. New maps are added to it.
         engine: The engine that proved them minimal, if it is still available.
 
     Returns:
-        Whether it is proven. This is impossible for a theory in which a dstate may be at several
-        places, or along several courses.
+        Whether the sharing is proven. It never is if a dstate may be at several places, or along
+        several courses.
 
     Raises:
         LimitError: A limit of the search is over.
@@ -129,7 +129,7 @@ def prove_backbone(
 
 
 class _Reasoning:
-    """Finds minimal maps that differ from all known ones in which steps are one."""
+    """Finds minimal maps in which other steps are one than in all known ones."""
 
     def __init__(
         self, task: Task, judging: Judging, cost: tuple[int, ...], sharing: Sharing
@@ -239,7 +239,7 @@ class _Reasoning:
         )
 
     def _doubts(self, size: int) -> Iterator[Doubt]:
-        """The doubts about a prefix: which steps may be one after all, or may not be."""
+        """The doubts about a prefix: steps that may be one, or may be different, after all."""
         firsts = self._sharing.firsts()
         yield from (
             ("dstates", firsts[self._sharing.classes[t]], t, False) for t in self._entering(size)

@@ -30,10 +30,10 @@ _log = log_of(__name__)
 # Maps with frames are sought for this many seconds at most, and for this many times as long until
 # there is any map.
 FRAMING, UNMAPPED = 30.0, 2.0
-# A sketch and its check may take this share of the time that is left for all sketches.
+# A sketch and its check may take this share of the time left for all sketches.
 SKETCH_SHARE = 0.4
-# The most reliable sketch may take this many seconds even if less time is left. Else a slow machine
-# would find no map at all.
+# The most reliable sketch may take this many seconds even if less time is left. Otherwise a slow
+# machine finds no map.
 SUREST = 1.5
 
 
@@ -61,10 +61,10 @@ class Candidates:
     def sketch(self, seconds: float = math.inf) -> None:
         """If no map of the whole trace is known, make one without a search.
 
-        It goes on from the best map of a prefix, or begins anew. The map that takes no step for
-        seen before is large, but the checker accepts it most often and fastest. So it comes first.
-        Then smaller maps are tried, the smallest first. If time is short, the first one that the
-        checker accepts is enough.
+        It continues the best map of a prefix, or begins anew. The map with a new dstate for each
+        step is large, but the checker accepts it most often and fastest. So it comes first. Then
+        smaller maps are tried, the smallest first. If time is short, the first accepted map is
+        enough.
 
         Args:
             seconds: The time for all sketches. Each may use a share of what is left.
@@ -94,10 +94,10 @@ class Candidates:
                     return
 
     def sketch_least(self) -> bool:
-        """Offer a sketch with as few dstates as any map: as many as steps are pairwise apart.
+        """Offer a sketch whose number of dstates reaches the bound by pairwise distinct steps.
 
         This works if the robot drives there and back, and most views are different. Then only
-        places and paths remain to be found.
+        places and paths are still unknown.
 
         Returns:
             Whether there is such a sketch.

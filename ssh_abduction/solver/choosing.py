@@ -17,14 +17,14 @@ READABLE = 60
 # After this many seconds with the step engine, check whether the dstates are known without a
 # search. The check loads numpy.
 SETTLE_AFTER = 0.15
-# After this many seconds with the step engine, or this share of the time that is left, go on with
-# an engine that settles dstates first. Most traces are solved by then.
+# After this many seconds with the step engine, or this share of the time left, go on with an
+# engine that finds dstates first. Most traces are solved by then.
 STEPWISE = 1.0
 STEPWISE_SHARE = 0.4
 
 
 def may_name(task: Task) -> bool:
-    """Whether dstates can be settled before places and paths, and the trace is long enough."""
+    """Whether dstates can be found before places and paths, and the trace is long enough."""
     return task.speedups.names and len(task.trace) > FEW_STEPS
 
 
@@ -34,7 +34,7 @@ def takes_all(task: Task) -> bool:
 
 
 def new_engine(task: Task) -> Engine:
-    """The engine for the theory and the length of the trace. It was given no steps yet."""
+    """The engine for the theory and the length of the trace, still without steps."""
     if may_name(task):
         # Imported here, as loading numpy takes longer than solving a short trace.
         from ssh_abduction.solver.engines.causal import CausalEngine
@@ -49,7 +49,7 @@ def new_engine(task: Task) -> Engine:
 
 
 def step_engine(task: Task) -> StepEngine:
-    """The engine that takes any theory. It begins with few names for paths, if that is allowed."""
+    """The engine for any theory. It begins with few names for paths, if that is allowed."""
     most = readable.most_paths(task.trace, task.theory, len(task.trace))
     names = min(prefixes.FIRST_PATHS, most) if task.speedups.path_names else most
     return StepEngine(task, names)

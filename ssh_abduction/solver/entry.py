@@ -159,7 +159,7 @@ def _is_known_by_mending_alone(task: Task) -> bool:
 
 
 def _labelling_engine(task: Task, solution: Solution) -> Engine | None:
-    """An engine that settles dstates before places and paths; None if the search needed none."""
+    """An engine that finds dstates before places and paths; None if the search needed none."""
     engine = new_engine(task)
     if isinstance(engine, StepEngine):
         # The search needed only a prefix, or the theory has no such engine.

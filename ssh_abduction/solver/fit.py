@@ -14,7 +14,7 @@ of each dstate, and two errors of all displacements with a prior: their scale, a
 heading. Each displacement of the trace gives equations, divided by its standard deviations. The
 best poses have the least sum of squares (Lu & Milios 1997, "Globally consistent range scan
 alignment"). That sum is chi-square distributed if the map is true and the odometry is as good as it
-claims. It ranks equally minimal maps, and may cause a warning. It refuses no map.
+claims. It ranks equally minimal maps, and may cause a warning. It rejects no map.
 """
 
 from __future__ import annotations

@@ -50,11 +50,11 @@ class Judging:
 
     @property
     def may_refuse(self) -> bool:
-        """Whether some evidence may refuse whole maps."""
+        """Whether some evidence may reject whole maps."""
         return bool(self._evidence)
 
     def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """Equalities of a map that contradict some evidence; None if no evidence refuses the map.
+        """Equalities of a map that contradict some evidence; None if no evidence rejects the map.
 
         The map may be one of a prefix.
         """
@@ -62,19 +62,19 @@ class Judging:
         return refusal[1] if refusal else None
 
     def refusal(self, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
-        """The same, with the name of the first kind of evidence that refuses the map."""
+        """The same, with the name of the first kind of evidence that rejects the map."""
         for evidence in self._evidence:
             if found := evidence.refuse(self._trace, ssh_map):
                 return evidence.name, found
         return None
 
     def allows_grown(self, trace: Trace, ssh_map: SSHMap, since: int) -> bool:
-        """Whether no evidence refuses a map of a trace that has grown.
+        """Whether no evidence rejects a map of a trace that has grown.
 
         Args:
             trace: The trace.
             ssh_map: The map.
-            since: The number of first steps whose map no evidence refused.
+            since: The number of first steps whose map no evidence rejected.
         """
         self._trace = trace
         return not any(evidence.refuse(trace, ssh_map, since) for evidence in self._evidence)

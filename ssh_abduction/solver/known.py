@@ -24,7 +24,7 @@ class Known:
         stopped: Why the search ended before it was complete; None if it did not.
         complete: Whether no further minimal map exists.
         count: The number of minimal maps that were given.
-        refused: The number of sets of equalities that each kind of evidence refused.
+        refused: The number of sets of equalities that each kind of evidence rejected.
     """
 
     def __init__(self, theory: Theory) -> None:

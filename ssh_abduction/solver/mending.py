@@ -1,14 +1,14 @@
 """Maps with faults in theories with places: guess the faults, mend the trace, and solve that.
 
-To disbelieve a view is to believe another one. To disbelieve an action is to know nothing about it.
-A displacement that is disbelieved may as well be missing. So a map with faults is a map without
+To ignore a view is to replace it by another one. An ignored action becomes an unknown action.
+An ignored displacement may as well be missing. So a map with faults is a map without
 faults of a mended trace, which all fast engines can solve. The places of faults are guessed in two
 ways: by robust merging of visits (`guesses/voting.py`), if places have frames, and by the causal
 theory with faults (`engines/faulty.py`). Any map with places, without its places, is one of its
 maps.
 
 *Displacements.* Labels that ignore displacements show which of these may be wrong
-(`guesses/outliers.py`), and so do the labels of the maps that follow. A map need not disbelieve all
+(`guesses/outliers.py`), and so do the labels of the maps that follow. A map need not ignore all
 that were guessed: those that agree with it are believed again.
 
 *Bound.* A map of the theory, without its places, is a causal map with the same dstates and with no
@@ -69,8 +69,8 @@ class Mending:
         self._cheapest: list[Trace] = []  # traces mended by all cheapest causal maps
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
         self._causal_labels: tuple[int, ...] = ()  # the labels of the last causal map
-        # The log is that of the theory with places. So stars and pairs at different places tell
-        # dstates apart.
+        # The log is that of the theory with places. So stars and pairs at different places
+        # distinguish dstates.
         self._causal = FaultyEngine(replace(task, problem=task.problem.changed(theory=causal)))
 
     @property
@@ -133,8 +133,8 @@ class Mending:
     def _by_merging(self, trace: Trace) -> Iterator[Found]:
         """Yield maps of what robust merging mends, and merge again from each better map's places.
 
-        The merged groups are almost a map, which is given at once. A share of the time is spent on
-        a better one.
+        The merged groups are almost a map. It is yielded at once. A share of the time goes into a
+        better one.
 
         Args:
             trace: The trace of the task, perhaps without some displacements.
@@ -165,7 +165,7 @@ class Mending:
     def _by_missing_displacements(
         self, labels: Sequence[int], places: Sequence[int | None]
     ) -> Iterator[Found]:
-        """Yield maps that disbelieve displacements that do not fit the labels, then those of each
+        """Yield maps that ignore displacements that do not fit the labels, then those of each
         better map.
         """
         trace, tried = self._task.trace, set()
@@ -229,7 +229,7 @@ class Mending:
                 yield from self._improving(self._minimal(slipped)[0], slipped)
 
     def _mended(self, causal: SSHMap) -> Trace:
-        """The trace without what a causal map disbelieves.
+        """The trace without what a causal map ignores.
 
         A wrong view is replaced by that of another step at the same dstate, and a wrong action by
         an unknown one.
@@ -280,7 +280,7 @@ class Mending:
         return list(maps), proven
 
     def _believed_again(self, ssh_map: SSHMap, mended: Trace) -> Trace:
-        """The mended trace with each missing displacement that the map agrees with put back."""
+        """The mended trace, with the missing displacements that fit the map put back."""
         for t, (step, other) in enumerate(zip(self._task.trace.steps, mended.steps, strict=True)):
             if step.displacement == other.displacement:
                 continue
@@ -305,7 +305,7 @@ class Mending:
 
 
 def _has_frames(task: Task) -> bool:
-    """Whether the fast engine for frames is exact for this task."""
+    """Whether the engine with frames finds all minimal maps here."""
     return row("visits").holds_for(task.theory)
 
 

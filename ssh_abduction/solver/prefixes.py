@@ -61,9 +61,8 @@ FIRST_PREFIX = 8  # steps of the first prefix, which is solved at once
 # At most this many maps are held until a prefix proves long enough. Further maps stream, so that
 # memory stays constant.
 HELD_BACK = 1000
-# If all maps are wanted and evidence may refuse some, at most this many are remembered. Up to then,
-# a refused set is forbidden, and maps are listed anew. After that, refused maps are left out one by
-# one.
+# If all maps are wanted and evidence may reject some, remember at most this many. Up to then,
+# forbid each rejected set and list anew. After that, leave out rejected maps one by one.
 REMEMBERED = 10_000
 # Names for paths to begin with. Few traces need more, and grounding grows with their square.
 FIRST_PATHS = 8
@@ -145,7 +144,7 @@ class Prefixes:
             size = self.engine.next_size(len(replayed.labels))
 
     def minimise(self) -> Found | None:
-        """A minimal map of the prefix that no evidence refuses; None if it has no map."""
+        """A minimal map of the prefix that no evidence rejects; None if it has no map."""
 
         def why_refused(found: Found) -> frozenset[Equality] | None:
             refusal = self._judging.refusal(found.map)
@@ -179,7 +178,7 @@ class Prefixes:
         return can_be_told and self.engine.forbid(equalities)
 
     def _minimise_as_told(self) -> Found | None:
-        """A minimal map of the prefix under the constraints that clingo has; None if it has no map.
+        """A minimal map of the prefix under clingo's constraints; None if the prefix has none.
 
         Better maps of the whole trace are kept on the way.
         """
@@ -207,7 +206,7 @@ class Prefixes:
                 return minimal
 
     def _predicts_all(self, found: Found, replayed: Replay) -> bool:
-        """Whether a map of the prefix is one of the whole trace and no evidence refuses it."""
+        """Whether a map of the prefix is one of the whole trace and no evidence rejects it."""
         whole = replayed.outcome is Outcome.PREDICTED
         return whole and not self._judging.why_refused(self._whole(found.map, replayed))
 
@@ -256,7 +255,7 @@ class Prefixes:
         asked = self._most and self._most + 1
         streaming = self.engine.size == len(self._task.trace)
         stuck, telling = 0, True
-        given = set[SSHMap]()  # or held back, if some maps may be refused
+        given = set[SSHMap]()  # or held back, if some maps may be rejected
         while True:
             came, refusal = 0, None
             for found in self.engine.maps_of_cost(self._known.cost, asked):
@@ -290,13 +289,13 @@ class Prefixes:
                     streaming = True
                     yield from held
                     held.clear()
-            if refusal:  # list anew; forbid the refused maps if the engine can
+            if refusal:  # list anew; forbid the rejected maps if the engine can
                 telling = self._tell(refusal)
                 continue
             if stuck or not asked or came < asked:
                 break
-            # as many maps came as were asked for, but some of these were refused: there may be
-            # others
+            # clingo stopped at the number of maps asked for, but evidence rejected some of
+            # them: there may be others
             asked *= 2
         if stuck and streaming:
             streamed.append(self.engine.size)

@@ -53,7 +53,7 @@ class Stages:
     def find_minimum(self) -> None:
         """Find the minimal cost.
 
-        Where that takes long, change to an engine that settles dstates before places and paths.
+        If this takes long, change to an engine that finds dstates before places and paths.
         """
         parts, task = self._parts, self._parts.task
         engine, steps = parts.prefixes.engine, len(task.trace)
@@ -61,7 +61,7 @@ class Stages:
             return
         if self.mends and steps > choosing.READABLE:
             raise LimitError("no proof")
-        if parts.known.status is Status.OPTIMAL:  # another search proved a map to be minimal
+        if parts.known.status is Status.OPTIMAL:  # another search proved a map minimal
             if not engine.size:
                 engine.grow(steps if engine.lists_least else min(steps, prefixes.FIRST_PREFIX))
             return
@@ -119,11 +119,11 @@ class Stages:
         return bool(self.mended_maps)
 
     def _find_minimum_soon(self, seconds: float) -> bool:
-        """Find the minimal cost step by step, if that is done soon.
+        """Try to find the minimal cost step by step within a time.
 
         Args:
-            seconds: The time it may take, from the start of the search. A share of the time that
-                is left is the limit if that is less.
+            seconds: The time limit, from the start of the search. The limit is a share of the
+                time left if that is less.
         """
         parts, watch = self._parts, self._parts.watch
         watch.end_stage_after(
@@ -139,7 +139,7 @@ class Stages:
         return True
 
     def _settle_dstates_first(self) -> None:
-        """If some map is known, go on with an engine that settles dstates first."""
+        """If some map is known, go on with an engine that finds dstates first."""
         parts, best = self._parts, self._parts.known.best
         labels = best.labels if best else ()
         parts.candidates.sketch()

@@ -97,7 +97,7 @@ class Bound:
 
     Attributes:
         dstates: Lower bound on the dstates. A search that was stopped also takes it from the
-            steps that are pairwise apart.
+            steps that are pairwise distinct.
         places: Lower bound on the places.
         paths: Lower bound on the paths.
         excuses: Lower bound on the excused pairs of paths.
@@ -152,7 +152,7 @@ class Effort:
         seconds: The time it took.
         grounding: The ground program that clingo solved last.
         evidence: For each kind of evidence, how many pairs of steps it excluded and how many sets
-            of equalities it refused.
+            of equalities it rejected.
     """
 
     prefix: int

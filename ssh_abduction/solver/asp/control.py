@@ -1,4 +1,4 @@
-"""Asks clingo under limits, for all engines and searches."""
+"""Runs clingo under limits, for all engines and searches."""
 
 from __future__ import annotations
 
@@ -18,21 +18,20 @@ from ssh_abduction.solver.values import Grounding
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import Speedups
 
-# After grounding, clasp prepares the program and cannot be stopped meanwhile. That takes about this
-# share of the time, and of the memory, that grounding took. So no search is begun if a limit would
-# be over by then.
+# After grounding, clasp prepares the program and cannot be stopped. It takes about this share of
+# the time and memory of grounding. So no search begins if a limit would be reached meanwhile.
 PREPARING = 0.6, 1.0
 
-SLOW = 0.05  # seconds of grounding from which on the log mentions it
+SLOW = 0.05  # the log mentions grounding that takes more seconds
 _log = log_of(__name__)
 _ONE = clingo.Number(1)
 _grounding = threading.Lock()
-_under_way: set[clingo.SolveHandle] = set()  # the searches that clingo does now, each in a thread
+_under_way: set[clingo.SolveHandle] = set()  # the running searches of clingo, each in a thread
 
 
 @atexit.register
 def _end_all() -> None:
-    """End the searches of streams that somebody still holds, when Python ends.
+    """End the searches of unfinished streams when Python exits.
 
     Their threads would abort Python.
     """
@@ -44,7 +43,7 @@ def _end_all() -> None:
 def _held_back_interrupts() -> Iterator[None]:
     """Hold back Ctrl-C and SIGTERM until this context ends.
 
-    Raised while clingo starts a thread, they would leave the thread without an owner.
+    If they came while clingo starts a thread, the thread would have no owner.
     """
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     held = {number: handler for number, handler in handlers.items() if callable(handler)}
@@ -70,13 +69,13 @@ Made = TypeVar("Made")
 class Control(clingo.Control):
     """A clingo control without warnings.
 
-    Only one control at a time reads or grounds. Two threads that do so side by side wait for each
-    other at each symbol, which takes three times as long.
+    Only one control at a time reads or grounds. Two threads at once would wait for each other at
+    each symbol and take three times as long.
 
     Attributes:
         preparing: As PREPARING.
         seconds: How long clingo has grounded since it last began to solve.
-        mebibytes: By how much the process has grown meanwhile.
+        mebibytes: How much memory that grounding added.
     """
 
     def __init__(
@@ -89,8 +88,8 @@ class Control(clingo.Control):
 
         Args:
             options: Of clingo.
-            check: Called now and then while clingo grounds, if an encoding has `@go_on`. What it
-                raises ends the grounding; the control is of no use then.
+            check: Called now and then while clingo grounds, if an encoding has `@go_on`. An
+                exception ends the grounding and makes the control unusable.
             preparing: As PREPARING.
         """
         super().__init__(["--warn=none", *options])
@@ -100,7 +99,7 @@ class Control(clingo.Control):
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Let no other control read or ground meanwhile; wait while one does, under the limits."""
+        """Be the only control that reads or grounds; wait for others, under the limits."""
         while not _grounding.acquire(timeout=POLL):
             self._check()
         try:
@@ -113,7 +112,7 @@ class Control(clingo.Control):
             super().load(path)
 
     def load_encodings(self, *names: str) -> None:
-        """Load these encodings, with the files that they share with others."""
+        """Load these encodings, and the files that they include."""
         for name in names:
             for path in encodings.paths(name):
                 self.load(path)
@@ -156,7 +155,7 @@ class Control(clingo.Control):
 
 
 class _Asked:
-    """Answers what clingo asks while it grounds (`@go_on`): whether to go on."""
+    """Answers `@go_on`: clingo asks while it grounds whether to go on."""
 
     def __init__(self, check: Callable[[], None]) -> None:
         self.raised: BaseException | None = None
@@ -182,8 +181,8 @@ class Asker:
     """One clingo control, and the questions to it under limits.
 
     Attributes:
-        control: The control that is asked; a new one may take its place.
-        watch: The limits; another search may go on under others.
+        control: The control that is asked; it may be replaced.
+        watch: The limits; they may be replaced.
         ground_seconds: How long clingo has grounded so far.
         solve_seconds: How long clingo has solved so far.
     """
@@ -205,9 +204,9 @@ class Asker:
 
     @property
     def grounding(self) -> Grounding:
-        """The size of the program in the last call of clingo that came to an end.
+        """The size of the program in the last call of clingo that ended.
 
-        To ask takes a millisecond, as clingo returns all its statistics.
+        This takes a millisecond, as clingo returns all its statistics.
         """
         try:
             program = self.control.statistics["problem"]["lp"]
@@ -228,21 +227,21 @@ class Asker:
         until: Callable[[], bool] = lambda: False,
         ahead: bool = False,
     ) -> Generator[Answer, None, bool]:
-        """The answers of clingo, each read as soon as it comes.
+        """Yield the answers of clingo, each read as soon as it comes.
 
         Args:
-            read: Makes a value of an answer, which clingo may change afterwards.
+            read: Reads a value from an answer, which clingo may change afterwards.
             mode: Clingo's opt-mode.
             models: How many answers to ask for; 0 for all.
-            assumptions: What has to hold in each answer.
+            assumptions: These hold in each answer.
             conflicts: The limit; -1 for none.
             on_bound: Called with each bound that clingo proves.
             control: Another control than this one's own.
-            until: Asked now and then; the search ends once it is true.
+            until: Called now and then; the search ends once it is true.
             ahead: Let clingo search for the next answer while the caller uses this one.
 
         Returns:
-            Whether these are all: neither the limit of conflicts nor `until` ended the search.
+            Whether the answers are complete: neither `conflicts` nor `until` ended the search.
         """
         project = "no" if mode.partition(",")[0] == "opt" else "project"
         with self._solving(
@@ -270,7 +269,7 @@ class Asker:
         mode: str = "ignore",
         until: Callable[[], bool] = lambda: False,
     ) -> tuple[Answer | None, list[int] | None]:
-        """An answer in which these literals are true, or else a core of them.
+        """An answer in which these literals are true, or an unsat core of them.
 
         Both are None if the limit of conflicts or `until` ended the search.
 
@@ -328,10 +327,10 @@ class Asker:
                 handle.cancel()
 
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
-        """Wait until clingo has come to an answer or to an end, or until `until` holds.
+        """Wait until clingo has an answer or ends, or until `until` holds.
 
         Returns:
-            Whether clingo has come to an answer or to an end.
+            Whether clingo has an answer or ended.
         """
         began = time.perf_counter()
         try:
@@ -366,7 +365,7 @@ def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
     """How a search ended.
 
     Raises:
-        LimitError: It was interrupted from outside, and not ended by the limit of conflicts.
+        LimitError: It was interrupted from outside, not ended by the limit of conflicts.
     """
     result = handle.get()
     if result.interrupted and conflicts < 0:
@@ -393,6 +392,6 @@ def has_processors(speedups: Speedups) -> bool:
     """Whether a search may have two threads."""
     if not speedups.threads:
         return False
-    from joblib import cpu_count  # takes its time to load
+    from joblib import cpu_count  # loads slowly
 
     return bool(cpu_count() > 1)

@@ -11,11 +11,11 @@ from typing import Literal, TypeAlias
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
 
-# The search for minimal maps of prefixes ends when this share of the time limit is left. The rest
-# of the time is for finding any map of the whole trace, minimal or not.
+# The search for minimal maps of prefixes ends when this share of the time limit is left. That
+# share is for finding any map of the whole trace, minimal or not.
 RESERVE = 0.2
 # A search of the whole trace that has found no map ends when this share of the time limit is left.
-# The rest of the time is for making a map without a search.
+# That share is for making a map without a search.
 LAST = 0.05
 # Seconds between two checks of the clock and of Ctrl-C while clingo is busy. A limit may be overrun
 # by a second, and a check takes far less than this.
@@ -40,14 +40,14 @@ def check_limit(name: str, unit: str, limit: object) -> None:
 
 
 class LimitError(Exception):
-    """A limit of a search is reached, or it was interrupted. The incumbent is the answer."""
+    """A search reached a limit or was interrupted. The incumbent is the answer."""
 
     def __init__(self, reason: Stop) -> None:
         self.reason = reason
 
 
 class StageTimeError(Exception):
-    """The time of one stage of a search is over, and the next stage begins."""
+    """The time of a stage is over. The next stage begins."""
 
 
 class Watch:
@@ -70,8 +70,8 @@ class Watch:
             limit: Seconds; None for no limit.
             memory: MiB that the process may use; None for no limit.
             on_tick: Called now and then, to report progress.
-            beside: The watch of another search that this one runs beside, and that ends this one.
-                Its time limit only keeps this one from beginning what would outlast it.
+            beside: The watch of the main search, if this is one beside it. The main search ends
+                this one. Its time limit only rejects work that would outlast it.
         """
         self._beside = beside
         self._on_tick = on_tick
@@ -88,7 +88,7 @@ class Watch:
         self._started = time.perf_counter()
 
     def begin_anew(self) -> None:
-        """Count time from now, as if none were spent, up to the whole limit."""
+        """Restart the clock at 0, with the whole time limit."""
         self._spent, self._next_tick, self._stage_ends, self.interrupted = (
             0.0,
             TICK,
@@ -100,7 +100,7 @@ class Watch:
 
     @property
     def has_reserve(self) -> bool:
-        """Whether a share of the time limit is still kept for finding any map by a search."""
+        """Whether the last share of the time limit is still reserved for any map."""
         return self._allowed is not None and self._allowed <= self.reserve_begins
 
     @property
@@ -108,10 +108,10 @@ class Watch:
         return self._started is not None
 
     def use_reserve(self, last: float = 0.0) -> None:
-        """From now on the whole time limit may be used.
+        """Allow the search to use the whole time limit.
 
         Args:
-            last: A share of the limit that is still kept, unless it is in use already.
+            last: A share of the limit to keep reserved, unless it is in use already.
         """
         if self._limit is not None and self._allowed is not None:
             self._allowed = max(self._allowed, self._limit * (1 - last))
@@ -125,29 +125,29 @@ class Watch:
         return math.inf if self._limit is None else self._limit * (1 - RESERVE)
 
     def part(self, seconds: float) -> Watch:
-        """A watch for so many seconds from now, which ends earlier if this one does."""
+        """A watch that ends after this many seconds, or when this one does."""
         part = Watch(seconds, self._memory, self.check)
         part.use_reserve()
         part.start()
         return part
 
     def shorten(self, seconds: float) -> None:
-        """Set the time limit to this, if that is less."""
+        """Lower the time limit to this many seconds."""
         self._limit = self._allowed = seconds if self._limit is None else min(seconds, self._limit)
 
     def end_stage_after(self, seconds: float) -> None:
-        """Let `check` raise StageTimeError, once, after so many seconds of search."""
+        """Let `check` raise StageTimeError once, after this many seconds of search."""
         self._stage_ends = seconds
 
     def elapsed(self) -> float:
         return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
 
     def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
-        """Raise if a limit is reached, or will be by something that cannot be interrupted.
+        """Raise if a limit is reached, or coming work that cannot be interrupted would reach it.
 
         Args:
-            ahead: Seconds that it will take.
-            mebibytes: Memory that it will take.
+            ahead: Seconds that the work takes.
+            mebibytes: Memory that the work takes.
 
         Raises:
             LimitError: A limit is reached, or the search was interrupted.
@@ -167,7 +167,7 @@ class Watch:
             raise StageTimeError
 
     def allows(self, seconds: float) -> bool:
-        """Whether there is time for so many seconds that cannot be interrupted."""
+        """Whether there is time for work of this length that cannot be interrupted."""
         if self._allowed is not None and self.elapsed() + seconds > self._allowed:
             return False
         return not seconds or self._beside is None or self._beside.left() >= seconds

@@ -1,7 +1,7 @@
 """Checks whether a map keeps a user's own rules.
 
-The rules are grounded with all that the map says as facts. The checker does not know such rules. If
-a rule reads only what a map shows, clingo chooses only what the rules leave open themselves. So the
+The checker does not know such rules. They are grounded with the content of the map as facts. If a
+rule reads only what a map shows, clingo chooses only what the rules themselves leave open. So the
 check takes hardly longer than grounding.
 
 >>> from ssh_abduction import Theory, Trace, solve
@@ -31,7 +31,7 @@ from ssh_abduction.solver.asp.rules import read_by
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 
-# What rules may read of a map and of a trace, if a map alone is to say whether they hold.
+# What rules may read of a map and a trace, so that the map alone shows whether they hold.
 SHOWN = frozenset(
     {
         "is",
@@ -74,7 +74,7 @@ def can_be_asked(theory: Theory) -> bool:
 
 
 def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
-    """Whether a map of a whole trace keeps the user's own rules, which `can_be_asked`.
+    """Whether a map of a whole trace keeps the user's own rules. Ask `can_be_asked` first.
 
     Args:
         problem: The trace and its settled theory.

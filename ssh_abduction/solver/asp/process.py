@@ -1,7 +1,7 @@
 """Runs Python work in a process of its own, so that it can use a second processor.
 
-Guesses are mostly Python, and so is the search that goes on meanwhile. As two threads, both would
-take three times as long, as one thread at a time runs Python. One thread at a time grounds, too
+Guesses and the search beside them are mostly Python. As two threads, both would take three times
+as long, as only one thread at a time runs Python. Only one thread at a time grounds
 (`asp/control.py`).
 """
 
@@ -48,7 +48,7 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
             raise error
         return result
     if code < 0:
-        # A signal ended it, as the system does when memory is short.
+        # A signal ended it, as when the system is short of memory.
         raise LimitError("memory limit")
     return work(*arguments, watch)
 
@@ -56,9 +56,9 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
 def _run(
     work: Callable[..., object], arguments: tuple[object, ...], watch: Watch
 ) -> tuple[int, bytes]:
-    """The exit code and the output of a process that does this work.
+    """The exit code and the output of a child process that does this work.
 
-    If this process ends first, the input of the other one ends, and so does the other one.
+    If this process exits first, the child's stdin closes and the child exits.
     """
     # A program that embeds Python cannot be run as Python.
     if "python" not in os.path.basename(sys.executable or "").lower():
@@ -97,7 +97,7 @@ def end_all() -> None:
 
 def serve() -> None:
     """Do the work that comes in, and write its result or error to the output."""
-    # Ctrl-C is meant for the process that waits for this one.
+    # The parent process handles Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     work, arguments, memory = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_end_with_input, daemon=True).start()
@@ -109,13 +109,13 @@ def serve() -> None:
         except Exception as error:
             answer = None, error
         output.seek(0)
-        output.truncate()  # something may have greeted there as Python began
+        output.truncate()  # Python may have printed something at its start
         pickle.dump(answer, output)
     os._exit(0)
 
 
 def _end_with_input() -> None:
-    """End this process when its input ends, that is when its parent ends."""
+    """Exit when stdin closes: the parent process has exited."""
     while os.read(0, 1):
         pass
     os._exit(1)

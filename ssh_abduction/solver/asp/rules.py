@@ -52,12 +52,12 @@ def check_rules(theory: Theory) -> None:
         others = tuple(other for other in theory.rules if other is not rules)
         _check(rules, others, encodings.needed_by(vars(theory)))
     if len(theory.rules) > 1:
-        _check_safety(*theory.rules)  # a constant may have one definition, in all files together
+        _check_safety(*theory.rules)  # together, as only one file may define a constant
 
 
 @lru_cache(maxsize=64)
 def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> None:
-    """Check one file of rules, which may use what the others and these encodings define."""
+    """Check a file of rules. It may use what the others and these encodings define."""
     of_steps, known, numbers = _predicates(files)
     statements = _statements(rules)
     own = {
@@ -150,7 +150,7 @@ def read_by(rules: Rules, every: Iterable[Rules]) -> frozenset[str]:
     """The predicates that rules read and that none of these files defines.
 
     Args:
-        rules: The rules, which `check_rules` found to be in order.
+        rules: The rules, which passed `check_rules`.
         every: All files of rules.
     """
     own = {
@@ -203,7 +203,7 @@ def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
 
 
 def _said(rules: Rules, messages: list[str]) -> str:
-    """What clingo said of rules, on one line."""
+    """Clingo's messages about rules, on one line."""
     said = " ".join(messages[0].split()) if messages else "clingo cannot read them"
     said = re.sub(r"^<[^>]*>", lambda _: rules.name, said)
     said = said if said.startswith(rules.name) else f"{rules.name}: {said}"
@@ -234,8 +234,8 @@ def _predicates(
     """The predicates of these encodings.
 
     Returns:
-        Those about steps, all that the encodings define, and for each that they define or read the
-        numbers of arguments that it may have.
+        The predicates about steps, all predicates that the encodings define, and the possible
+        numbers of arguments of each that they define or read.
     """
     of_steps = set(OF_STEPS)
     defined, numbers = set[str](), dict[str, set[int]]()
@@ -284,9 +284,9 @@ def _derived(head: ast.AST) -> Iterator[ast.AST]:
 
 
 def _atoms(statement: ast.AST) -> Iterator[tuple[ast.AST, bool]]:
-    """The atoms that a rule reads, and whether it reads that they hold.
+    """The atoms in a rule's body and in the conditions of its head.
 
-    They are in its body and in the conditions of its head.
+    Each comes with whether the rule reads that it holds.
     """
     derived = list(_derived(statement.head))
     for literal in statement.body:
@@ -323,7 +323,7 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _functions_of_python(node: ast.AST) -> Iterator[ast.AST]:
-    """All terms below a node that clingo would ask Python for."""
+    """All terms below a node that call Python functions."""
     if node.ast_type is ast.ASTType.Function and node.external:
         yield node
     for child in _children(node):

@@ -1,9 +1,9 @@
 """Processes that do one piece of work after another.
 
-Each process is begun anew rather than forked: one that is forked while a thread grounds may wait
-for ever. The processes end when the process that began them ends, as their input ends then. One
-that is killed loses the piece that it was at, and no other. Their temporary files lie in one
-folder, which is deleted with them.
+Processes are started anew, not forked: a process forked while a thread grounds may hang. They exit
+when their stdin closes, which happens when the parent process exits. A process that is killed loses
+only its current piece of work. Their temporary files lie in one folder, which is deleted with
+them.
 """
 
 from __future__ import annotations
@@ -26,11 +26,10 @@ from ssh_abduction.runtime.program import command, search_path
 
 # A process may take at most this many seconds to begin, on a machine that has much else to do.
 STARTING = 10.0
-# Seconds between two looks at whether to stop: short against the two seconds in which Ctrl-C has to
-# take effect.
+# Seconds between two checks whether to stop. Ctrl-C has to take effect within two seconds.
 POLL = 0.05
 
-_BEGIN = b"\0ssh-abduction answers\n"  # what is printed before, as Python begins, is no answer
+_BEGIN = b"\0ssh-abduction answers\n"  # whatever Python prints before this is no answer
 
 
 class Lost(NamedTuple):
@@ -66,7 +65,7 @@ class Worker:
         self.kill()
         self._process.wait()
         for end in (self._process.stdin, self._process.stdout):
-            with suppress(OSError):  # what was not read by then
+            with suppress(OSError):  # unread output
                 assert end
                 end.close()
 
@@ -79,9 +78,9 @@ class Worker:
 
         Args:
             number: Of the piece of work.
-            work: A function that can be pickled. Its last argument says whether the work is given
-                up.
-            arguments: All others.
+            work: A function that can be pickled. Its last argument is called to ask whether to
+                stop.
+            arguments: Its other arguments.
         """
         self._send((work, arguments))
         output = self._process.stdout
@@ -104,7 +103,7 @@ class Worker:
         return Lost(number, self._late)
 
     def give_up(self) -> None:
-        """Let the work under way end soon, and none begin."""
+        """End the current work soon, and begin no other."""
         self._send(None)
 
     def end_if_late(self) -> None:
@@ -155,7 +154,7 @@ def answers(
                 task = waiting.get_nowait()
                 before = workers[place]
                 worker = workers[place] = _living(before, folder.name)
-                if over.is_set():  # whoever ended the others has perhaps not seen this one
+                if over.is_set():  # this worker may have begun after the others were ended
                     worker.end()
                     break
                 if seconds is not None:
@@ -234,7 +233,7 @@ class _Work:
                     self._given_up = True
                 else:
                     self._waiting.put(message)
-        finally:  # whoever waits for the answers is gone
+        finally:  # the parent process has exited
             shutil.rmtree(self._folder, ignore_errors=True)
             os._exit(1)
 
@@ -245,17 +244,17 @@ class _Work:
         return self._waiting.get()
 
 
-_outputs: list[BinaryIO] = []  # where the answers go, in a process that does such work
+_outputs: list[BinaryIO] = []  # the stream for answers, in a worker process
 
 
 def reply(answer: object) -> None:
-    """Send the answer of the work under way. Another thread that does so then ends the process."""
+    """Send the answer of the current work. Another thread has to end the process then."""
     pickle.dump(answer, _outputs[0])
     _outputs[0].flush()
 
 
 def serves() -> bool:
-    """Whether this process does such work."""
+    """Whether this process is a worker."""
     return bool(_outputs)
 
 
@@ -264,7 +263,7 @@ def serve() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(
             number, signal.SIG_IGN
-        )  # they are meant for the process that waits for this one, which says what is to end
+        )  # the parent process handles these signals, and decides when this one ends
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # nothing else is written there
     output.write(_BEGIN)

@@ -1,1 +1,1 @@
-"""What asks clingo for maps of a growing prefix of a trace."""
+"""Engines ask clingo for maps of a growing prefix of a trace."""

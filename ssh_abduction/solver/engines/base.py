@@ -19,10 +19,9 @@ from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
 # An engine with a chart tries a prefix of this many steps before one of AT_ONCE steps: most traces
-# are settled by then.
+# are solved by then.
 FIRST_PREFIXES = 32
-# Compare at most this many steps in pairs: the matrix of the pairs has the square of that many
-# bytes.
+# Compare at most this many steps in pairs: the matrix has the square of this number of bytes.
 AT_ONCE = 8000
 
 
@@ -52,7 +51,7 @@ class Task:
         problem: The whole trace, the settled theory and its evidence.
         log: The trace as integers.
         watch: The limits of the search.
-        speedups: Those that are on and hold for the theory.
+        speedups: The speed-ups that are on and hold for the theory.
     """
 
     problem: Problem
@@ -74,7 +73,7 @@ class Task:
     def of(problem: Problem, watch: Watch | None = None, speedups: Speedups | None = None) -> Task:
         """A task for all speed-ups that hold for the theory, or for these of them."""
         speedups = (speedups or Speedups()).that_hold_for(problem.theory)
-        # `sides` takes all that links two visits for a travel, so no action may have slipped.
+        # `sides` treats each link between visits as a travel, so no action may have slipped.
         if speedups.sides and any(action.slipped for action in problem.trace.actions):
             speedups = replace(speedups, sides=False)
         return Task(
@@ -91,15 +90,15 @@ class Task:
 
 
 class Engine(Protocol):
-    """What the search may tell an engine, and ask it.
+    """What the search may call on an engine.
 
     An engine holds the axioms for the first `size` steps of a trace, the prefix.
 
     Attributes:
         asker: Asks clingo.
-        intact: False after an error that may have left its control half told.
+        intact: False after an error during which clingo may have missed rules.
         lists_least: Whether it can list only maps with the fewest dstates of the prefix.
-        goes_on: Whether it can go on with a trace that its own has grown to.
+        goes_on: Whether it can go on when its trace has grown.
     """
 
     asker: Asker
@@ -132,7 +131,7 @@ class Engine(Protocol):
 
     @property
     def size_to_go_on(self) -> int:
-        """The size to grow to first when a search was stopped and the trace has grown since."""
+        """The first size to grow to after a stop, when the trace has grown since."""
         ...
 
     def with_paths(self, paths: int) -> Engine:
@@ -140,7 +139,7 @@ class Engine(Protocol):
         ...
 
     def over(self, task: Task) -> Engine:
-        """An engine for a trace that this one's has grown to, under other limits."""
+        """An engine for the grown trace of this one, under other limits."""
         ...
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
@@ -149,18 +148,18 @@ class Engine(Protocol):
         When the iteration ends, the last one is minimal.
 
         Args:
-            most: What they cost at most, if that is known.
+            most: An upper bound on their cost, if one is known.
         """
         ...
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        """All maps of the prefix that cost this and no more; or `enough` of them, if not 0."""
+        """All maps of the prefix of this cost; or `enough` of them, if not 0."""
         ...
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled] | None:
-        """All labels of maps of the prefix that cost this and no more, each once.
+        """All labels of maps of the prefix of this cost, each once.
 
-        None if the engine does not settle dstates before places and paths.
+        None if the engine does not find dstates before places and paths.
         """
         ...
 
@@ -168,14 +167,14 @@ class Engine(Protocol):
         """From now on no map has all of these equalities of steps of the prefix.
 
         Returns:
-            Whether the engine can be told of such equalities.
+            Whether the engine can forbid such equalities.
         """
         ...
 
     def settle(self) -> None:
-        """End what is still under way in clingo, when a search is over.
+        """End what clingo still does, when a search is over.
 
-        A thread left behind would abort Python at its end.
+        A running thread would abort Python at its exit.
         """
         ...
 
@@ -183,7 +182,7 @@ class Engine(Protocol):
 def next_charted_size(size: int, failed: int, steps: int) -> int:
     """The size to grow to, for an engine that charts a prefix.
 
-    To chart all steps takes little, unless they are too many to be compared in pairs.
+    Charting all steps is cheap, unless they are too many to be compared in pairs.
 
     Args:
         size: How many steps the engine has.

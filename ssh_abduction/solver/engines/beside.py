@@ -15,8 +15,8 @@ class Beside:
     Threads help, as numpy and clingo release Python's lock while they work.
 
     Attributes:
-        labels: Those of the last map found, if any.
-        bound: That of the search, once the search is over.
+        labels: The labels of the last map found, if any.
+        bound: The bound of the search, once it is over.
     """
 
     def __init__(self, search: NearbySearch, watch: Watch, found: Iterator[Labels]) -> None:
@@ -42,7 +42,7 @@ class Beside:
         """Stop the search, and wait until the thread has ended."""
         self._watch.interrupted = True
         self._thread.join()
-        # To free clingo's control may take seconds. Nobody has to wait for that.
+        # Freeing clingo's control may take seconds. Nobody has to wait.
         threading.Thread(target=self._held.clear).start()
 
     def _run(self, search: NearbySearch, found: Iterator[Labels]) -> None:

@@ -10,7 +10,7 @@ with N dstates needs. Blocks that share no step add up:
 
 The blocks may be other ones for each N. With few dstates short blocks take a fault, and there are
 many of them. With many dstates a block has to be long to take one, but then the dstates alone cost
-much. A block takes a fault if more than N of its steps would be pairwise apart without one
+much. A block takes a fault if more than N of its steps would be pairwise distinct without one
 (a clique, `steps/apart.py`). If faults of a known map are too near to each other for that, clingo
 is asked whether the block has a cheaper map of N dstates.
 """
@@ -28,13 +28,13 @@ from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.theory.evidence import Pairs
 
-# A block that clingo is asked of begins and ends this many steps from the faults for each dstate
-# that there may be, if there is room.
+# For each possible dstate, a block for clingo begins and ends this many more steps from the faults,
+# if there is room.
 MARGIN = 3
-# Find the shortest block to within a step, and one more for each COARSE dstates beyond those of the
-# known map.
+# Find the length of the shortest block to within a step, and one more step for each COARSE dstates
+# more than the known map has.
 COARSE = 5
-# Ask clingo only of blocks up to this length, and with at most this many names for dstates.
+# Ask clingo only about blocks up to this length, with at most this many names for dstates.
 MOST_STEPS = 200
 MOST_NAMES = 80
 CONFLICTS = 20_000  # After this many conflicts a question is left open.
@@ -59,7 +59,7 @@ class Blocks:
     faults: Mapping[str, Sequence[int]]
     dstates: int
     watch: Watch
-    # Of blocks, with how many dstates which cost is proven.
+    # The proven costs, by block and number of dstates.
     _proven: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
 
     @property
@@ -74,7 +74,7 @@ class Blocks:
         while most > 0:
             least = self.least_faults(most)
             bound = min(bound, 10 * most + least)
-            # The same blocks do for all numbers in between.
+            # The same blocks serve all numbers in between.
             most = min(most, -(-(bound - least) // 10)) - 1
         return bound
 
@@ -91,7 +91,7 @@ class Blocks:
         reach = 0  # how far behind a fault the last block ended
         while begin < steps:
             following = begin
-            if most >= self.dstates:  # the known map shows that there is none before its next fault
+            if most >= self.dstates:  # the known map has no block before its next fault
                 number = bisect_left(places, begin)
                 if number == len(places):
                     return total
@@ -132,7 +132,7 @@ class Blocks:
         return end > low and not self._takes_fault(begin, end, most)
 
     def _takes_fault(self, begin: int, end: int, most: int) -> bool:
-        """Whether these steps take more dstates than `most` if they have no fault."""
+        """Whether these steps need more dstates than `most` if they have no fault."""
         self.watch.check()
         return (
             end - begin > most
@@ -143,7 +143,7 @@ class Blocks:
     def _wider(
         self, begin: int, end: int, places: Sequence[int], most: int
     ) -> tuple[int, int] | None:
-        """A wider block, if faults of the known map are too near to each other for own blocks.
+        """A wider block, if faults of the known map are too close for blocks of their own.
 
         Returns:
             The end of the block, and what its faults cost; None if that is not proven.

@@ -1,9 +1,8 @@
 """Asks for maps that contradict what the known maps share.
 
-This serves every engine. Steps that are one dstate, place, path or course in all known maps need
-not be so in all maps, and steps that are so in none may be so in another. A *doubt* is one such
-pair. Clingo is told once what it takes for a doubt to hold. Then it is asked for an answer in which
-some open doubt holds.
+This serves every engine. Steps may share a dstate, place, path or course in all known maps, but not
+in all maps; or in no known map, but in another. A *doubt* is one such pair. Clingo gets the rule
+for a doubt once. Then it is asked for an answer in which some open doubt holds.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ from ssh_abduction.solver.asp.facts import path_reader, questions
 from ssh_abduction.solver.sharing import Sort
 
 Answer = TypeVar("Answer")
-# What is compared, two steps or two dstates of some labels, and whether they are one after all.
+# What is compared, two steps or two dstates, and whether the doubt is that they are one.
 Doubt: TypeAlias = tuple[Sort, int, int, bool]
 
 
 class Doubts:
-    """The doubts that one control was told of."""
+    """The doubts that one control was given."""
 
     def __init__(
         self,
@@ -42,7 +41,7 @@ class Doubts:
                 if they never are.
         """
         self._asker, self._control, self._condition = asker, control, condition
-        self._told: dict[Doubt, int] = {}  # all that clingo knows, by their numbers
+        self._told: dict[Doubt, int] = {}  # the number of each doubt that clingo has
         self._open: set[Doubt] = set()
         self._parts = 0
 
@@ -78,7 +77,7 @@ class Doubts:
 
 
 class Settled:
-    """The best maps of some labels, for engines that settle dstates before places and paths."""
+    """The best maps of some labels, for engines that find dstates before places and paths."""
 
     def __init__(
         self,
@@ -93,9 +92,9 @@ class Settled:
         Args:
             asker: Asks clingo.
             control: It has the places and paths of the labels.
-            mode: Clingo's opt-mode for the best of them.
+            mode: Clingo's opt-mode for the best maps.
             reader: Reads the answers.
-            map_of: Makes a map of an answer.
+            map_of: Makes a map from an answer.
         """
         self._asker, self._control, self._mode = asker, control, mode
         self._reader, self._map_of = reader, map_of
@@ -103,7 +102,7 @@ class Settled:
         self._any: SSHMap | None = None
 
     def has_map(self) -> bool:
-        """Whether there is one."""
+        """Whether a map exists."""
         return self.any_map() is not None
 
     def any_map(self) -> SSHMap | None:
@@ -116,6 +115,6 @@ class Settled:
         return self._any
 
     def map_with(self, doubts: Collection[Doubt]) -> SSHMap | None:
-        """A map in which any of these doubts about its dstates holds; None where there is none."""
+        """A map in which any of these doubts about its dstates holds; None if there is none."""
         answer = self._doubts.answer(doubts, self._reader.read, self._mode)
         return None if answer is None else self._map_of(answer)

@@ -28,7 +28,7 @@ from ssh_abduction.theory.evidence import Equality
 
 FEW = 80  # steps below which no map is guessed, as clingo is fast
 AT_FIRST = 1000  # steps at the beginning that clingo is given at once
-PLACES = 12  # steps disbelieved by the Viterbi pass around which more are given at once
+PLACES = 12  # steps ignored by the Viterbi pass around which more are given at once
 SPARE = 3  # names of each view beside those of the best guess; with 1 the rests are used
 GUESSING = 5.0  # seconds after which no start of EM begins,
 GUESSING_SHARE = 0.1  # or a share of the time left
@@ -238,7 +238,7 @@ class FaultyEngine:
         """Explain the whole trace by the dstates of an answer, with the fewest faults.
 
         Returns:
-            The map, if allowed, and the first steps not given that it disbelieves or lacks.
+            The map, if allowed, and the first steps not given that it ignores or lacks.
         """
         _, machine = self._machine(answer)
         if not machine.shows:  # all given steps are lost

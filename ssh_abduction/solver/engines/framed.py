@@ -3,7 +3,7 @@
 It finds dstates first, then places and paths. Its maps are all minimal ones, and its bound on the
 dstates is proven.
 
-Frames tell so much that the dstates are almost settled before any place or path is. A turn rotates
+Frames tell so much that the dstates are almost found before any place or path is. A turn rotates
 by known quarters, so whole visits are the same or not (`steps/chart.py`). Which ones are is asked
 of visits.lp (`engines/visit_labels.py`), which knows the causal axioms and how turns rotate, but
 not the order of places on a path, or its sides. For the dstates that are left, paths_framed.lp

@@ -26,7 +26,7 @@ SOON_SHARE = 0.05
 # With one processor, look for a map near a guess after this many seconds, as clingo waits
 # meanwhile.
 GUESS_FIRST = 5.0
-# Wait this many times as long if clingo was not told of all visits: it is soon told of more.
+# Wait this many times as long if clingo was not given all visits: it is soon told of more.
 LATER = 4
 # Or this share of the time limit, if that is less.
 LATER_SHARE = 0.25

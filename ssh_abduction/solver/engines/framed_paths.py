@@ -23,7 +23,7 @@ from ssh_abduction.solver.engines.refusing import smaller
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality
 
-# Tell clingo of this many clashes in one go: each spares a question, and one control of paths lists
+# Give clingo this many clashes in one go: each spares a question, and one control of paths lists
 # them all.
 CLASHES = 30
 # Try labels with more dstates than this with separate paths first, as to ground all ways to merge

@@ -30,7 +30,7 @@ from ssh_abduction.solver.steps.chart import Link
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 
-# Tell clingo of this many paths, or pairs of dstates, in one go: with fewer it would be asked more
+# Give clingo this many paths, or pairs of dstates, in one go: with fewer it would be asked more
 # often, and most of more would not be needed.
 CONTRARY = 8
 # After this many conflicts better paths are no longer looked for one after another; the bound is
@@ -120,7 +120,7 @@ class PlacesAndPaths:
         # Sets of equalities that do not all hold, and some of which are of places.
         self._refused: list[Collection[Equality]] = []
         self._forbidden = 0  # how many sets of links were forbidden
-        # Dstates whose paths clingo was told of, as keys of `NameProgram.names`.
+        # Dstates whose paths clingo was given, as keys of `NameProgram.names`.
         self._told: set[tuple[int, int]] = set()
         # The last labels, and the control for their places and paths.
         self._asked: tuple[_Question, clingo.Control] | None = None

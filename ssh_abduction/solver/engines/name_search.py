@@ -112,7 +112,7 @@ class _Answer:
     """An answer of clingo.
 
     Attributes:
-        names: The names of the nodes that clingo was told of.
+        names: The names of the nodes that clingo was given.
         labels: The labels of all nodes, once the answer was followed.
     """
 

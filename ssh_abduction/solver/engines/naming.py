@@ -3,8 +3,8 @@
 This serves the causal engine and the frameless one. It finds labels of the first steps with the
 fewest dstates, proves that there are none with fewer, and lists all that have as few.
 
-Steps that are pairwise apart (`steps/apart.py`) are pinned to names of their own. Their number is
-a lower bound on the dstates. It also leaves no two ways to name these dstates, and lets every
+Pairwise distinct steps (`steps/apart.py`) are pinned to names of their own. Their number is a
+lower bound on the dstates. It also leaves no two ways to name these dstates, and lets every
 other step choose only among the names that it is not apart from. A view has a few spare names, at
 the cost of one dstate each, and a *rest*, which stands for all dstates of the view beyond them. Of
 several largest cliques, the one whose steps are apart from most others is pinned. That leaves the
@@ -96,7 +96,7 @@ class NamedLabels:
 
     @property
     def clique(self) -> Sequence[int]:
-        """Steps that are pairwise apart, which have names of their own."""
+        """Steps that are pairwise distinct, which have names of their own."""
         return self._pinned.clique if self._pinned else []
 
     @property

@@ -19,7 +19,7 @@ class Pinned:
 
     Attributes:
         chart: The nodes and the links between them.
-        clique: Nodes that are pairwise apart.
+        clique: Nodes that are pairwise distinct.
         may_be: For each node, the names of the clique that it is not apart from.
     """
 

@@ -1,7 +1,7 @@
-"""The loop that asks for an answer, refuses it for a reason, forbids that, and asks again.
+"""The loop that asks for an answer, rejects it for a reason, forbids that, and asks again.
 
 What is forbidden takes away only answers that are no maps. So what clingo solves is a relaxation
-until nothing is refused, its bounds hold, and the first answer that is accepted is as good as any.
+until nothing is rejected, its bounds hold, and the first answer that is accepted is as good as any.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ def first_accepted(
     refuse: Callable[[Answer], Reason | None],
     forbid: Callable[[Reason], None],
 ) -> Answer | None:
-    """The first answer that is not refused; None if there is no answer left.
+    """The first answer that is not rejected; None if there is no answer left.
 
     Args:
         ask: Gives the next answer by what is forbidden so far; None if there is none.
-        refuse: Why an answer is refused; None if it is accepted.
+        refuse: Why an answer is rejected; None if it is accepted.
         forbid: Keeps answers from being given again for this reason.
     """
     while (answer := ask()) is not None:
@@ -60,11 +60,11 @@ def all_accepted(
     key: Callable[[Answer], Hashable],
     known: set[Hashable],
 ) -> Generator[Answer, None, None]:
-    """All answers that are not refused, each once.
+    """All answers that are not rejected, each once.
 
     Args:
         ask: Lists the answers by what is forbidden so far.
-        refuse: Why an answer is refused; None if it is accepted.
+        refuse: Why an answer is rejected; None if it is accepted.
         forbid: Keeps answers from being given again for this reason.
         key: Equal for answers that are the same.
         known: The keys of answers to leave out. Those of accepted answers are added.

@@ -51,7 +51,7 @@ class FramedSides:
         labels: Sequence[int],
         standing: Mapping[int, tuple[int, int]],
     ) -> bool:
-        """Tell clingo of a path that these labels contradict.
+        """Give clingo a path that these labels contradict.
 
         Args:
             paths: The axioms of places and paths.
@@ -60,7 +60,7 @@ class FramedSides:
             standing: The visit and slot of some node at each dstate, as far as clingo knows any.
 
         Returns:
-            Whether there was such a path that clingo was not told of.
+            Whether there was such a path that clingo was not given.
         """
         contrary, twice = next(
             self._asker.answers(

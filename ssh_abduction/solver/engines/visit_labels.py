@@ -1,33 +1,32 @@
 """Labels with the fewest dstates where places have frames, without naming any dstate.
 
 This serves the framed engine. Clingo is asked which visits are at one place (visits.lp). It finds
-labels of all nodes with the fewest dstates, proves that there are none with fewer, and lists all
-that have as few. That order and sides allow them is checked by `engines/framed.py`.
+labels of all nodes with the fewest dstates, proves that none have fewer, and lists all that have
+as few. `engines/framed.py` checks whether order and sides allow them.
 
-Names are poor knowledge if many dstates are known from few visits. What is learned of one spare
-name has to be learned again of the next, and each is a choice for nodes all over the world. That
-two visits are the same is only about these two. A node is *alone* if no node before it, in an order
-of choice, is at its dstate; there are as many dstates as lone nodes.
+Names help little if many dstates have few visits. What clingo learns about one spare name it has
+to learn again about the next, and nodes all over the world may choose each name. An equality of
+visits is only about these two. A node is *alone* if no node before it, in an order of choice, is
+at its dstate; there are as many dstates as lone nodes.
 
-*Order.* A clique of nodes that are apart comes first, then the nodes that fit few others. What is
-new when the trace grows comes last, so what clingo was told and what it learned still holds. When
-nodes are a tenth more, a new control is taken, as a clique first is the better order.
+*Order.* A clique of nodes comes first, then the nodes that fit few others. New nodes of a trace
+that grows come last, so the rules that clingo has, and what it learned, still hold. If the number
+of nodes has grown by a tenth, a new control begins with a new clique.
 
-*Transitive.* If I is J and J is K, then I is K. Clingo is told so only of visits at which an answer
-fails to be transitive (`engines/transitive.py`). Until no answer fails, what clingo solves is a
-relaxation, so its bounds hold.
+*Transitive.* If I is J and J is K, then I is K. Clingo gets this rule only for visits at which an
+answer violates it (`engines/transitive.py`). Until no answer does, clingo solves a relaxation, so
+its bounds hold.
 
-*Lazily.* Of a long trace clingo is told of the first visits, until many of them may be one, and of
-the visits of the clique. An answer says where the others are, too (`steps/localising.py`). If it
-does not, clingo is told of these visits, and of as many before them as it takes. Fewer visits are a
-relaxation, and an answer that says where all visits are is an answer for all of them.
+*Lazily.* Of a long trace clingo is given the visits of the clique and the first visits, until many
+of them may be one. An answer mostly says where the other visits are (`steps/localising.py`). If it
+does not, clingo is given these visits, and as many before them as needed. Fewer visits are a
+relaxation, and an answer that locates all visits is an answer for all of them.
 
 *From below.* Cores raise the bound (`Cores`). Clasp has that built in, but begins anew with each
 call, and an answer that fails to be transitive is a call.
 
-*Near a guess.* If that takes long, clingo is asked for answers in which visits are one that are one
-in the map made of a guess. They need not have the fewest dstates. But if they have as few as the
-bound, they do.
+*Near a guess.* If the search takes long, clingo is asked for answers that keep the equalities of a
+guessed map. These answers need not have the fewest dstates, unless they have as few as the bound.
 """
 
 from __future__ import annotations
@@ -55,25 +54,25 @@ from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
 from ssh_abduction.solver.steps.localising import Located, states_of
 
-# Tell clingo of the first visits with this many pairs that may be one, and of others as answers
-# need them.
+# Give clingo the first visits with this many pairs that may be one, and others as answers need
+# them.
 FIRST_PAIRS = 10_000
-# After this many conflicts it is left open whether fewer places still clash.
+# After this many conflicts, stop asking whether fewer places still clash.
 TRY_CONFLICTS = 100
-# After this many tries in vain a set of places that clash is kept as it is.
+# After this many failed tries, stop shrinking a set of places that clash.
 FAILED_TRIES = 20
-# If there are this many times as many nodes as at first, take a new control: the order of choice
-# was made for the first nodes.
+# If the number of nodes has grown by this factor, take a new control: the order of choice was made
+# for the first nodes.
 GROWN = 1.1
-# After this many answers found one by one look for the next ones nearby, which pays if there are
-# many.
+# After this many answers found one by one, look for the next ones near the last. That pays if there
+# are many.
 MANY = 5
-# After this many failures to be transitive no answer is nearby, and one is asked for anew.
+# After this many intransitive answers nearby, ask for one anew.
 FAR = 200
 
 
 class Open(Enum):
-    """Stands for an answer that is not known yet, as something else is to be done first."""
+    """Stands for an answer that is unknown because the search was interrupted."""
 
     OPEN = "open"
 
@@ -82,14 +81,14 @@ OPEN: Final = Open.OPEN
 
 
 class VisitLabels:
-    """Labels of the nodes of the first steps with the fewest dstates.
+    """Finds labels with the fewest dstates for the first steps of a trace.
 
     Attributes:
-        size: How many steps these are.
-        bound: No labels have fewer dstates.
-        clique: Nodes that are pairwise apart.
-        known: Labels of a map, if one is known; set by the engine that finds one near a guess.
-        has_forbidden: Whether evidence forbade something that was found out of a map.
+        size: The number of these steps.
+        bound: A lower bound on the dstates.
+        clique: Nodes that are pairwise distinct.
+        known: Labels of the best known map, or None. The engine sets them.
+        has_forbidden: Whether evidence has rejected equalities of a map.
     """
 
     def __init__(
@@ -106,7 +105,7 @@ class VisitLabels:
             asker: It asks clingo.
             charted: Makes the chart of the first steps, from one of fewer steps if there is one;
                 None if they fit no frame.
-            sides: It is told of new controls and of batches.
+            sides: Called for new controls and batches.
         """
         self.bound: int | None = None
         self.clique: list[int] = []
@@ -117,7 +116,7 @@ class VisitLabels:
         self._program: VisitProgram | None = None
         self._first_nodes = 0  # how many nodes there were when the control was new
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
-        self._excluded = 0  # clingo will not find this many of them again
+        self._excluded = 0  # the number of these that clingo will not find again
 
     @property
     def program(self) -> VisitProgram:
@@ -135,9 +134,9 @@ class VisitLabels:
         self._task = task
 
     def grow(self, size: int) -> bool:
-        """Chart the first steps, and tell clingo what is new of their visits.
+        """Chart the first steps, and give clingo their new visits.
 
-        If that is much, take a new control.
+        If there are many, take a new control.
 
         Returns:
             Whether visits fit a frame.
@@ -163,7 +162,7 @@ class VisitLabels:
             return True
 
     def _order_of_choice(self, chart: FramedChart) -> list[int]:
-        """The nodes, those first that are pairwise apart, then those that fit few others."""
+        """The nodes, those first that are pairwise distinct, then those that fit few others."""
         apart = chart.apart()
         self._asker.watch.check()
         self.clique = clique(apart, chart.seen) if self._task.speedups.clique else []
@@ -174,14 +173,14 @@ class VisitLabels:
         ]
 
     def _first_visits(self, chart: FramedChart) -> set[int]:
-        """The visits that clingo is told of first: all, unless too many may be one."""
+        """The visits that clingo is given first: all, unless too many may be one."""
         first = chart.visits_with(FIRST_PAIRS) if self._task.speedups.lazy else len(chart.stars)
         return {*range(first), *(chart.facing[node][0] for node in self.clique)}
 
     def _give(
         self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False
     ) -> None:
-        """Tell clingo what it does not know yet of these visits of a chart."""
+        """Give clingo what it lacks about these visits of a chart."""
         known = 0 if anew else len(self.program.fits)
         fits = fits_in_time(self._asker.watch, chart, visits, known)
         size, self.size = self.size, 0  # until clingo was told all of it
@@ -194,9 +193,9 @@ class VisitLabels:
         self.size = size
 
     def _give_more(self, visits: Iterable[int]) -> None:
-        """Tell clingo of these visits, too."""
+        """Give clingo these visits, too."""
         more = {*self.program.visits, *visits}
-        assert more != self.program.visits  # else that would go on without end
+        assert more != self.program.visits  # else the search would never end
         with self._asker.grounding_timed():
             self._give(self.chart, more, range(len(self.chart.seen)))
 
@@ -207,8 +206,8 @@ class VisitLabels:
         """Labels of all nodes with the fewest dstates.
 
         Returns:
-            The labels; None if clingo was told more than any labels can satisfy; OPEN if `until`
-            holds before that is known.
+            The labels; None if no labels satisfy all constraints; OPEN if `until` held before
+            they were found.
         """
         while not self._found:
             if self.known and self.bound == len(set(self.known)):
@@ -225,7 +224,7 @@ class VisitLabels:
         return list(self._found[0])
 
     def _tell_why(self, reason: Refusal) -> None:
-        """Tell clingo why an answer was refused."""
+        """Tell clingo why an answer was rejected."""
         if reason.threes:
             self.program.close(reason.threes)
         else:
@@ -259,10 +258,10 @@ class VisitLabels:
 
         Yields None between queries, so that the caller can do other work.
 
-        At first clingo is asked for labels in which visits are at one place exactly if they are so
-        in the guess, as far as that can be. Visits of places that cannot all be as guessed become
-        free. Once the caller takes such labels for `known`, clingo is asked for no lone nodes. If
-        a core shows that these are too many, one of them may be alone.
+        At first clingo is asked for labels that put visits at one place exactly if the guess does,
+        if possible. If some places of the guess contradict each other, their visits become free.
+        Once the caller sets `known` to such labels, clingo is asked for no lone nodes. If a core
+        shows that some node has to be alone, one of the core may be.
         """
         program = self.program
         yield tuple(numbered(guess))
@@ -321,8 +320,8 @@ class VisitLabels:
     def all_of(self, dstates: int) -> Generator[list[int], None, None]:
         """All labels with this many dstates, each once.
 
-        Clingo is told not to find again what was found, and asked as for the fewest dstates. So it
-        soon shows that there are no others. If there are many, the next one is near, and a
+        Clingo is forbidden to find labels twice, and asked as for the fewest dstates. So it soon
+        shows that there are no others. If there are many, the next ones are near the last, and a
         propagator keeps answers transitive (`_nearby`).
         """
         program = self.program
@@ -351,10 +350,10 @@ class VisitLabels:
                     return
 
     def _nearby(self, dstates: int) -> Generator[list[int], None, bool]:
-        """Labels that clingo finds one from another.
+        """Labels that clingo finds near the ones before.
 
         Returns:
-            Whether these are all that were not excluded.
+            Whether these are all labels left.
         """
         program = self.program
         transitive = program.transitive
@@ -400,7 +399,7 @@ class VisitLabels:
         return None if answer is None else self.program.labels(answer.located)
 
     def _asking_for(self, dstates: int) -> tuple[str, list[int]]:
-        """How clingo is asked for at most this many dstates: its opt-mode, and assumptions."""
+        """The opt-mode and the assumptions that allow at most this many dstates."""
         cores = self.program.cores
         if self._task.speedups.core_guided and cores.least == dstates:
             return "ignore", list(cores.avoided)
@@ -439,10 +438,10 @@ class VisitLabels:
     def forbid_together(
         self, pairs: Collection[tuple[int, int]], places: Collection[tuple[int, int]] = ()
     ) -> None:
-        """Forbid that these pairs of nodes are all one dstate while those are at one place.
+        """Forbid that all `pairs` are one dstate while all `places` are at one place.
 
-        Labels alone do not tell which nodes are at one place. So if places are given, labels that
-        were found stay; the search for their paths refuses them.
+        Labels alone do not show which nodes are at one place. So if places are given, known labels
+        stay; the search for their paths rejects them.
 
         Args:
             pairs: Pairs of nodes that are one dstate.

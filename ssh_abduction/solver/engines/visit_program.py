@@ -1,6 +1,6 @@
 """Talks to clingo about which visits are at one place (visits.lp), for the engine with frames.
 
-Clingo is told of some visits at first, and of others as answers need them. Fewer visits are a
+Clingo is given some visits at first, and of others as answers need them. Fewer visits are a
 relaxation, so what clingo proves of them holds of the trace.
 """
 
@@ -106,14 +106,14 @@ class Answer:
 
     @property
     def located(self) -> Located:
-        """Where all visits are, in an answer that was not refused."""
+        """Where all visits are, in an answer that was not rejected."""
         assert self.everywhere is not None
         return self.everywhere
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why an answer is refused.
+    """Why an answer is rejected.
 
     Attributes:
         threes: Visits on which it is not transitive.
@@ -129,7 +129,7 @@ class _Known:
     """What the control knows of a chart.
 
     Attributes:
-        visits: The visits that it was told of.
+        visits: The visits that it was given.
         place_of: For each node, its position in the order of choice.
         ends: The visits whose end it knows.
         turns: The turns that it knows.
@@ -148,7 +148,7 @@ class VisitProgram:
 
     Attributes:
         chart: Of the first steps.
-        batch: The number of the last visits that clingo was told of in one go.
+        batch: The number of the last visits that clingo was given in one go.
         cores: The lower bound, and what is assumed for it.
         transitive: The propagator, with the literals that were read.
     """
@@ -159,7 +159,7 @@ class VisitProgram:
         Args:
             task: The trace and the speed-ups that are on.
             asker: It asks the control.
-            chart: The first one that visits are told of.
+            chart: The first one that visits are given.
             sides: It is told of new controls and of batches.
         """
         self.chart = chart
@@ -178,12 +178,12 @@ class VisitProgram:
 
     @property
     def visits(self) -> Set[int]:
-        """The visits that clingo was told of."""
+        """The visits that clingo was given."""
         return self._known.visits
 
     @property
     def knows_all(self) -> bool:
-        """Whether clingo was told of all visits."""
+        """Whether clingo was given all visits."""
         return len(self._known.visits) == len(self.chart.stars)
 
     @property
@@ -308,7 +308,7 @@ class VisitProgram:
         )
 
     def why_not(self, answer: Answer) -> Refusal | None:
-        """Why an answer is refused; None if it is not."""
+        """Why an answer is rejected; None if it is not."""
         if answer.is_open:
             return None
         threes = self.intransitive(answer.pairs)

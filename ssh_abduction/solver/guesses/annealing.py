@@ -23,9 +23,9 @@ models"). Stars, and visits that are apart from pinned ones, rule out states fro
 axiom says that travels are reversible, but each travel counts as if the way back had been seen,
 too.
 
-Places have names, as dstates have in `engines/causal.py`. Visits that are pairwise apart are pinned
-to places of their own, and each kind of place has spare names. There have to be many spare names:
-if names are short, different places are merged and do not separate again.
+Places have names, as dstates have in `engines/causal.py`. Pairwise distinct visits are pinned to
+places of their own. Each kind of place has spare names. There have to be many spare names: with too
+few, different places are merged and do not separate again.
 
 A causal trace with actions other than turns and travels is annealed in the same way. Each step is
 then a visit to a place in which the robot can stand in only one way.
@@ -171,7 +171,7 @@ def annealed_steps(
 
     Args:
         chart: The steps.
-        clique: Steps that are pairwise apart.
+        clique: Steps that are pairwise distinct.
         may_be: For each step, the numbers of the steps of the clique that it may be one dstate
             with.
         check: Called now and then; may raise.

@@ -58,7 +58,7 @@ def merged(
     Args:
         apart: Which nodes are apart, as a matrix of nodes x nodes.
         links: The links of the chart.
-        clique: Nodes that are pairwise apart.
+        clique: Nodes that are pairwise distinct.
         check: Called now and then; may raise.
     """
     classes = Classes(apart, links, check)

@@ -8,7 +8,7 @@ displacement with the most votes is taken to be wrong, and returns across it vot
 repeats as long as any displacement has votes.
 
 The result is a guess. Wrong labels vote, too, so each vote is bounded, and a map has to pay for
-what it disbelieves.
+what it ignores.
 """
 
 from __future__ import annotations

@@ -113,8 +113,8 @@ class Explained:
     Attributes:
         machine: The machine.
         labels: The dstate of each step.
-        misread: The steps whose views are disbelieved.
-        slips: The steps whose actions are disbelieved.
+        misread: The steps whose views are ignored.
+        slips: The steps whose actions are ignored.
         unknown: The steps whose actions the machine does not know.
         tenths: The cost of dstates and faults, in tenths of a dstate.
     """
@@ -214,7 +214,7 @@ class Explainer:
     def read_off(self, labels: Sequence[int]) -> Machine:
         """The machine that labels make.
 
-        A dstate shows the view that is most expensive to disbelieve, and an action leads where it
+        A dstate shows the view that is most expensive to ignore, and an action leads where it
         leads most often.
         """
         labels = numbered(labels)

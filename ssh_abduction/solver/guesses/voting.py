@@ -2,7 +2,7 @@
 
 Where places have frames, the steps between two travels are a visit. A place is a group of visits,
 each turned by some quarters. The cost of a group is the cost of its dstates, plus the cost of
-disbelieving each view and star that differs from what most of its steps show. Groups are merged
+ignoring each view and star that differs from what most of its steps show. Groups are merged
 while that lowers the total cost, those with the largest gain first. If two visits of a group leave
 by the same action, the next visits are merged, too, as actions are deterministic. This is
 evidence-driven state merging (Lang, Pearlmutter & Price 1998) with votes instead of contradictions.
@@ -55,8 +55,8 @@ class _Group:
 
     Attributes:
         members: For each visit, the quarters by which it is turned.
-        views: For each slot and view, the cost of disbelieving all steps that show it.
-        stars: For each star as seen from slot 0, the cost of disbelieving all steps that show it.
+        views: For each slot and view, the cost of ignoring all steps that show it.
+        stars: For each star as seen from slot 0, the cost of ignoring all steps that show it.
     """
 
     def __init__(

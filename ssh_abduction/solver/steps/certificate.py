@@ -34,7 +34,7 @@ class Certificate:
     """A certificate that no map has fewer dstates.
 
     Attributes:
-        clique: Steps that are pairwise apart, so each is a dstate of its own.
+        clique: Steps that are pairwise distinct, so each is a dstate of its own.
         refuted: Numbers of dstates, from the size of the clique upwards, for which clingo found
             that there is no map.
     """

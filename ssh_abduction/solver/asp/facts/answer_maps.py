@@ -16,7 +16,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
-    """The map that an answer set describes, for the steps it speaks of."""
+    """The map that an answer set describes, for the steps in it."""
     is_at: dict[int, int] = {}
     place: dict[int, int] = {}
     course: dict[int, tuple[int, int]] = {}
@@ -141,7 +141,7 @@ def faults_of(
     trace: Trace,
     theory: Theory,
 ) -> tuple[Fault, ...]:
-    """The faults as a map tells them."""
+    """The faults in the form that maps use."""
     found = []
     for t, kind in sorted(faults):
         cost = theory.fault_tenths(kind, trace.steps[t]) / 10

@@ -17,7 +17,7 @@ def constant(value: str | int) -> str:
 def read_atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
     """The name and the arguments of an atom of a map.
 
-    They are cached, as maps have most atoms in common and each part takes a call to clingo.
+    Results are cached, as maps share most atoms and each part takes a call to clingo.
     """
     return symbol.name, tuple(
         arg.number if arg.type is SymbolType.Number else COURSE[arg.name]
@@ -25,7 +25,7 @@ def read_atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
     )
 
 
-_number = cache(Number)  # takes half the time of making a number anew, where there are many
+_number = cache(Number)  # takes half the time of making a number anew
 
 
 def numbers(*arguments: int) -> list[Symbol]:

@@ -25,13 +25,13 @@ def conclusion(name: str, *steps: int) -> Symbol:
 
 
 def read_conclusion(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
-    """The name of such a conclusion, and its steps."""
+    """The name of a conclusion, and its steps."""
     said = symbol.arguments[0]
     return said.name, tuple(argument.number for argument in said.arguments)
 
 
 def conclusions_of(control: Control) -> list[Symbol]:
-    """All conclusions that some answer may have."""
+    """All conclusions that an answer may have."""
     return [atom.symbol for atom in control.symbolic_atoms.by_signature("so", 1)]
 
 
@@ -54,7 +54,7 @@ def read_argument(model: Model) -> tuple[frozenset[Symbol], frozenset[Symbol], f
 
 
 def picked(symbol: Symbol) -> Symbol:
-    """The external atom that a conclusion is among those of which some are to fail."""
+    """The external atom that picks a conclusion; some picked one is to fail."""
     return Function("picked", [symbol])
 
 
@@ -64,7 +64,7 @@ def some_fail() -> Symbol:
 
 
 def may_fail(conclusions: Iterable[Symbol]) -> str:
-    """The rules that say so."""
+    """The rules that let these conclusions fail."""
     return "\n".join(
         f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}. "
         f"#heuristic {c} : {picked(c)}. [1,false]"

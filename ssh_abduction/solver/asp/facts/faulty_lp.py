@@ -32,12 +32,12 @@ def faulty_rests(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
 
 
 def at_most_faults(most: int) -> str:
-    """That the steps given so far have so many faults at most, as a rule for faulty.lp."""
+    """A rule for faulty.lp: the steps given so far have at most this many faults."""
     return f":- #count {{ T,misread : misreads(T); T,slipped : slips(T) }} > {most}."
 
 
 def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
-    """Rules for faulty.lp: at most so many dstates, and faults of at most this cost."""
+    """Rules for faulty.lp: at most this many dstates, and faults of at most this cost."""
     faults = (
         "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
     )
@@ -83,9 +83,9 @@ def faulty_batch(
         actions: The action after each step, as a number.
         steps: The new steps, in the order in which they are given.
         known: The steps given before, in their order.
-        pairs: What evidence says of pairs of steps.
+        pairs: Evidence about pairs of steps.
         price: Tenths of dstates for each kind of fault, at each step.
-        full: Steps that may be at any dstate, even if misread.
+        full: The steps that may be at any dstate, even if misread.
     """
     given = {*known, *steps}
     new = set(steps)
@@ -114,7 +114,7 @@ def faulty_batch(
 
 
 def not_all_one(equalities: Collection[Equality]) -> str:
-    """That these equalities of given steps do not all hold, as a rule for faulty.lp."""
+    """A rule for faulty.lp: these equalities of given steps do not all hold."""
     body = (f"is({e.first},S{k}), is({e.second},S{k})" for k, e in enumerate(equalities))
     return f":- {', '.join(body)}."
 

@@ -26,7 +26,7 @@ def name_facts(
         links: Links of the nodes, with their actions.
         choices: For each node, the names that it can have.
         ordered: Whether spare names are used in the order of nodes. If not, a question may
-            assume that.
+            assume so.
     """
     view_of = dict(names)
     rests = {spare[-1] for spare in spares}
@@ -107,7 +107,7 @@ def read_names(model: Model) -> dict[int, int]:
 def _named(symbol: Symbol) -> tuple[int, int]:
     """A step and its name.
 
-    They are cached, as successive answers have most atoms in common.
+    Results are cached, as successive answers share most atoms.
     """
     step, name = symbol.arguments
     return step.number, name.number
@@ -160,7 +160,7 @@ def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
     """The rule that these pairs of steps are not all one dstate, unless they are at a rest.
 
     Args:
-        number: Another one for each such rule.
+        number: A new number for each such rule.
         pairs: Pairs of steps with names.
     """
     together = [

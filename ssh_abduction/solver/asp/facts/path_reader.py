@@ -26,8 +26,8 @@ class PathAnswer:
     """An answer of paths_framed.lp or paths_frameless.lp.
 
     Attributes:
-        at: For each place of the turns, the place of the map, and how it is turned to it.
-        part: For each segment, its path, and its direction on that.
+        at: For each place of the turns, the place of the map, and the turn between the two.
+        part: For each segment, its path, and its direction on the path.
         order: For each path, its places in order.
     """
 
@@ -39,8 +39,8 @@ class PathAnswer:
 class PathReader:
     """Reads maps from answers of paths_framed.lp or paths_frameless.lp, for fixed labels.
 
-    It asks an answer for the atoms that can be in it, those of the last answer first. That takes
-    a third of the time of reading all atoms. What follows from the labels is computed once.
+    It asks whether an atom is in the answer, atoms of the last answer first. That takes a third of
+    the time of reading all atoms. What follows from the labels is computed once.
     """
 
     def __init__(
@@ -70,12 +70,12 @@ class PathReader:
         }
         self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
         self._total = theory.path_order == "total"
-        self._before: dict[_Ahead, int] = {}  # the literal that says so, 0 for what is never so
+        self._before: dict[_Ahead, int] = {}  # its literal; 0 if it is never true
         self._order: dict[
             int, list[int]
         ] = {}  # for each path, its places in the answer that was read last
         self._placed: _Placed | None = (
-            None  # what the places of the last map tell, as they are mostly the same in the next
+            None  # the dstates of the last map by place: mostly the same in the next map
         )
         self._made: dict[
             tuple[object, ...], DState
@@ -114,7 +114,7 @@ class PathReader:
         if self._total:
             for i, place in enumerate(
                 order
-            ):  # insertion sort takes few questions where places are nearly in order
+            ):  # insertion sort asks few questions if places are nearly in order
                 to = i
                 while to and not self._is_before(model, (path, order[to - 1], place)):
                     to -= 1
@@ -165,7 +165,7 @@ class PathReader:
         )
 
     def _placed_at(self, at: dict[int, tuple[int, int]]) -> _Placed:
-        """What the places of an answer tell of a map."""
+        """Read the place of each dstate from `at`."""
         arrived: dict[
             int, tuple[int, int]
         ] = {}  # for each place, its number in the map, and the slot that is faced first
@@ -186,7 +186,7 @@ class PathReader:
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """The part of a map that follows from the places of an answer.
+    """The part of a map that the places of an answer determine.
 
     Attributes:
         at: As in PathAnswer.
@@ -214,7 +214,7 @@ class _Choices:
     def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
         """The other two arguments that an answer chooses for each first argument."""
         made = {}
-        for a, among in self._among.items():  # what the last answer chose is asked for first
+        for a, among in self._among.items():  # ask first for the choices of the last answer
             if len(among) > 1 and not model.is_true(among[0][0]):
                 taken = next(i for i, (literal, _) in enumerate(among) if model.is_true(literal))
                 among.insert(0, among.pop(taken))

@@ -120,7 +120,7 @@ def settled_facts(
     ]
     for label, node in {
         label: node for node, label in enumerate(labels)
-    }.items():  # all nodes of a dstate see one star, so any of them will do
+    }.items():  # all nodes of a dstate see one star (its openings)
         visit, slot = chart.facing[node]
         star = chart.stars[visit]
         facts += [f"open({label},{k})." for k in range(4) if star[(slot + k) % 4]]
@@ -143,10 +143,10 @@ def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
 
 @dataclass(frozen=True)
 class Segments:
-    """What paths_frameless.lp says of segments and places before any two of them are one.
+    """What paths_frameless.lp derives about segments and places before merging any.
 
     Attributes:
-        places: The places that turns tell apart.
+        places: The places that turns distinguish.
         elsewhere: Pairs of places that are not one.
         travels: A segment, and two places that a travel along it leads between, in its direction.
         segments: All segments.
@@ -161,7 +161,7 @@ class Segments:
 
     @classmethod
     def read(cls, control: Control) -> Segments:
-        """What a control says in which the parts base and segments are grounded."""
+        """Read a control in which the parts base and segments are grounded."""
         symbols = control.symbolic_atoms
 
         def atoms(name: str, arity: int) -> list[tuple[int, ...]]:
@@ -191,8 +191,8 @@ def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int
     """Read what follows from labels of nodes.
 
     Returns:
-        Whether they have no places and paths. If they may have: the pairs of dstates at
-        different places, and the pairs that are one.
+        Whether the labels have no places and paths. If they may have some: the pairs of dstates
+        at different places, and the pairs that are one.
     """
     found: dict[str, list[tuple[int, int]]] = {"elsewhere": [], "one": []}
     for name, args in map(read_atom, model.symbols(shown=True)):
@@ -208,7 +208,7 @@ def is_violated(control: Control) -> bool:
 
 
 def loose(labels: Iterable[int]) -> str:
-    """Dstates that may turn out to be others, as facts."""
+    """Dstates whose labels may be wrong, as facts."""
     return "\n".join(f"loose({label})." for label in labels)
 
 
@@ -218,7 +218,7 @@ def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """Labels of nodes of which clingo chooses some that have no places and paths."""
+    """Labels of nodes. clingo chooses some that have no places and paths."""
     return "\n".join(
         [
             *(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)),

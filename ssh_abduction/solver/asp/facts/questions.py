@@ -25,7 +25,7 @@ def forbidden_equalities(
     Args:
         equalities: The equalities.
         where: An atom; the rule holds only if the atom does. None for always.
-        excusable: The rule does not hold where a displacement between the steps is disbelieved.
+        excusable: The rule does not hold where a displacement between the steps is ignored.
     """
     atoms = [str(where)] if where else []
     if excusable:
@@ -37,12 +37,12 @@ def forbidden_equalities(
 
 
 def rests_on(axiom: str, t: int, other: str) -> str:
-    """The rule that where an axiom is active at step t, another one holds at every step."""
+    """The rule that if an axiom is active at step t, another one holds at every step."""
     return f":- {active(axiom, t)}, violation({other},T)."
 
 
 def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
-    """The rules that some doubt holds if this one is open and two things are one, or are not.
+    """The rules that make a doubt hold if it is open and two things are one, or are not.
 
     Args:
         number: The number of the doubt.
@@ -66,7 +66,7 @@ def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
 
 
 def doubts_before(part: int) -> str:
-    """The rule that some doubt holds where some doubt of an earlier part does."""
+    """The rule that some doubt holds if some doubt of an earlier part does."""
     return (
         f"{some_doubt(part)} :- {some_doubt(part - 1)}."
         if part > 1
@@ -75,9 +75,9 @@ def doubts_before(part: int) -> str:
 
 
 def steps_are_one(sort: str, i: int, j: int) -> str:
-    """The condition that two steps share a dstate, place, path or course.
+    """The condition that two steps, the earlier first, share a dstate, place, path or course.
 
-    The earlier step comes first. For a step and itself: that it is along a path.
+    For a step and itself: the condition that it is along a path.
     """
     return {
         "dstates": f"same({i},{j})",
@@ -98,7 +98,7 @@ def some_doubt(part: int) -> Symbol:
 
 
 def exactly(number: int, count: Count) -> str:
-    """The rule that a map has just so many dstates, places or paths, while `of_number` is true."""
+    """The rule that a map has this many dstates, places or paths, while `of_number` is true."""
     counted = {
         "dstates": "T : is(T,T)",
         "places": "T : at(T,T)",
@@ -109,5 +109,5 @@ def exactly(number: int, count: Count) -> str:
 
 
 def of_number(number: int, count: Count) -> Symbol:
-    """The external atom that says that maps have just so many dstates, places or paths."""
+    """The external atom that fixes the number of dstates, places or paths of maps."""
     return Function("of_number", [Function(count), *numbers(number)])

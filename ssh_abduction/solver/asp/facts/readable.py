@@ -23,7 +23,7 @@ def encoding_names(theory: Theory) -> tuple[str, ...]:
 
 
 def theory_facts(theory: Theory, paths: int) -> str:
-    """The axioms and the preference of a theory, and names for so many paths, as facts."""
+    """The axioms and the preference of a theory, and names for paths, as facts."""
     facts = [f"axiom({name})." for name in theory.axioms]
     facts += [f"path(1..{paths})."] if theory.level == "topological" else []
     facts += preferred(theory)
@@ -33,7 +33,7 @@ def theory_facts(theory: Theory, paths: int) -> str:
 
 
 def preferred(theory: Theory) -> list[str]:
-    """Which counts a theory prefers to be small, the first one at the highest level."""
+    """The counts that a theory minimises, the first one at the highest level."""
     return [
         f"prefer({count},{len(theory.priorities) - i})."
         for i, count in enumerate(theory.priorities)
@@ -46,7 +46,7 @@ def own_rules(theory: Theory) -> str:
 
 
 def run_by_steps() -> Symbol:
-    """The external atom that program parts of steps are grounded. Without it there is no answer."""
+    """The external atom that allows answers: parts of steps are grounded."""
     return Function("run_by_steps")
 
 
@@ -145,7 +145,7 @@ def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
 
 
 def _evidence_facts(problem: Problem, start: int, stop: int) -> Iterator[str]:
-    """What evidence says of these steps, and of pairs of them with earlier ones."""
+    """Evidence about these steps, and about their pairs with earlier steps."""
     trace, theory = problem.trace, problem.theory
     for evidence in problem.evidence:
         pairs = evidence.pairs(trace)

@@ -1,4 +1,4 @@
-"""Facts for `fast/sides_*.lp`: what the sides of paths demand of labels."""
+"""Facts for `fast/sides_*.lp`, the axioms that the sides of paths impose."""
 
 from __future__ import annotations
 

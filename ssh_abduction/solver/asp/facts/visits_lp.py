@@ -24,7 +24,7 @@ def visit_facts(
         nodes: Number, visit and slot of each node.
         leaves: Visits that end: the visit, the slot and the action.
         fits: Pairs of visits that may be at one place, and how they are turned.
-        unfit: Such pairs of earlier batches that no longer may be.
+        unfit: Pairs of earlier batches that may no longer be.
     """
     new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit}
     return "\n".join(
@@ -56,7 +56,7 @@ def first(place: int) -> Symbol:
 
 
 def over(core: int, count: int) -> Symbol:
-    """The atom that at least so many members of a core are true."""
+    """The atom that at least `count` members of a core are true."""
     return Function("over", numbers(core, count))
 
 
@@ -73,7 +73,7 @@ def core_facts(core: int, members: Iterable[Symbol]) -> str:
 
 
 def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
-    """Threes of visits for which clingo is to keep that to be at one place is transitive."""
+    """Threes of visits for which "is at one place" has to be transitive."""
     return "\n".join(f"via({batch},{','.join(map(str, three))})." for three in threes)
 
 
