@@ -18,7 +18,7 @@ from perception.errors import ImageWarning, PerceptionError, equal_length
 
 NOISE = -1  # The label that clusterers give to an image in no cluster.
 # An image with less confidence is doubtful. Good images of the paper's worlds have 0.93 or more,
-# those with a person in front of the laser 0.5.
+# images with a person before the laser 0.5.
 SURE = 0.8
 # If the median view has at least SEEN images, a view is doubtful that has at most FEW images or at
 # most RARE times as many as the median view. While a robot explores, views that were seen once are

@@ -40,7 +40,7 @@ from perception.recognition import PlaceRecogniser
 from ssh_abduction.data.errors import brief
 
 # The spread within a place is at least this share of the spread of all images, so that images
-# without noise, such as those of a test, do not give infinite certainty.
+# without noise, as in a test, do not give infinite certainty.
 LEAST_SPREAD = 1e-6
 # Number of images to compare with all remembered ones at once.
 AT_ONCE = 256

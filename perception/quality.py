@@ -388,7 +388,7 @@ def _wider(images: Floats, best: float) -> float:
     """The diameter of the images if it exceeds `best`; otherwise any number of at most `best`."""
     centred = images - images.mean(axis=0)
     radii = np.sqrt(_squares(centred))
-    margin = 1 + 1e-12  # The radii are rounded, too.
+    margin = 1 + 1e-12  # Radii are also rounded.
     kept = np.flatnonzero((radii + radii.max()) * margin > best)
     if len(kept) < 2:
         return 0.0

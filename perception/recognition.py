@@ -93,14 +93,13 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return np.asarray(held._fit_X), np.asarray(self.classes_)[np.asarray(held._y)]
 
     def learnt_again(self) -> PlaceRecogniser:
-        """Learn the remembered images and labels from scratch; the result answers the same.
+        """Learn the remembered images and labels from scratch; the answers stay equal.
 
         scikit-learn's compiled search trusts its tables, and a table that was damaged in a file can
         crash the process. Learning again checks the tables.
 
         Raises:
-            PerceptionError, ValueError: The tables are not sound. Other errors of numpy are
-                possible.
+            PerceptionError, ValueError: The tables are not sound. Numpy may raise others.
         """
         return PlaceRecogniser(self.n_neighbors).fit(*self.remembered())
 
@@ -152,8 +151,8 @@ class LearningCurve:
         lowest: (s,) lowest share over the folds.
         highest: (s,) highest share over the folds.
         folds: Number of folds.
-        untested: Classes with a single image. They cannot be tested, since nothing is known of them
-            once that image is left out.
+        untested: Classes with a single image. They are not tested, since leaving out that image
+            leaves none to learn from.
     """
 
     sizes: tuple[int, ...]

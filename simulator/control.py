@@ -87,7 +87,7 @@ class Driver:
         return np.median(scans, axis=0) if images > 1 else scans[0]
 
     def see(self, images: int = 1) -> Sight:
-        """What the median of this many scans shows."""
+        """The walls in the median of this many scans."""
         return sight(self.look(images), self.world.reach, self.laser.reach)
 
     def go(self, forward: float, turn: float = 0.0) -> None:
@@ -208,7 +208,7 @@ class Corridors:
 
     Args:
         driver: The robot.
-        looks_behind: Whether to look behind at the start, where the robot has not arrived yet.
+        looks_behind: Whether to look behind at the start, as no path led there.
     """
 
     def __init__(self, driver: Driver, looks_behind: bool = False) -> None:

@@ -167,7 +167,7 @@ class Recorder:
     def drive(self, name: str, laser: Laser, odometer: Odometer, seed: int) -> Drive:
         """Make the drive, with a scan also at its end.
 
-        Scans and odometer have noise of their own, which does not change where the robot goes.
+        Scans and odometer have their own noise, which does not change the drive.
 
         Args:
             name: Name of the drive.

@@ -142,7 +142,7 @@ class Pilot:
         """
         robot, reach = self.driver.robot, self.reach
         course = robot.odometry[2]  # Direction of the street by odometry.
-        # Whether there were walls on both sides, and where they ended.
+        # Whether walls were on both sides, and their end positions.
         closed, opened = False, None
         while robot.driven - began <= LONGEST_TRAVEL:
             image = self.driver.look()

@@ -85,7 +85,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tupl
 
 
 class _Reader:
-    """Reads the XML of a plan, and says what is wrong with it.
+    """Reads the XML of a plan, and reports its faults.
 
     Args:
         where: Name of the file, for errors.

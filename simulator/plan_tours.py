@@ -124,7 +124,7 @@ class Floor:
 
     Attributes:
         plan: The plan, as returned by Plan.told_apart.
-        spread: Error of the bearings that a star states, in degrees. The bearings are exact.
+        spread: Stated error of a star's bearings in degrees; the bearings are exact.
     """
 
     plan: Plan
@@ -136,7 +136,7 @@ class Floor:
         return Stand(self.plan.connected[0], 0)
 
     def sight(self, stand: Stand) -> Step:
-        """What the robot sees: a step with a view and a star, but no truth."""
+        """What the robot sees: a step with view and star, without truth."""
         bearings = _bearings(self.plan, stand)
         return Step(_view(bearings), star=_star(self.plan, stand, bearings, self.spread))
 

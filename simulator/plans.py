@@ -33,8 +33,7 @@ Leg = tuple[int, int]  # A room that the robot leaves, and the door that it goes
 # Two doors of a room are opposite if the path through its middle bends by at most this many
 # degrees.
 STRAIGHT = 20.0
-# Doors within this many degrees of each other are one door for the robot. One of them is open on a
-# tour.
+# The robot cannot distinguish doors within this many degrees. Only one is open on a tour.
 APART = 3.0
 
 
@@ -117,7 +116,7 @@ class Plan:
 
     @cached_property
     def paths(self) -> tuple[tuple[Leg, ...], ...]:
-        """The paths from end to end. A path goes on where doors are opposite."""
+        """The paths from end to end. Opposite doors of a room continue a path."""
         found: list[tuple[Leg, ...]] = []
         taken: set[int] = set()
         for number, door in enumerate(self.doors):

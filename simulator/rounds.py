@@ -40,7 +40,7 @@ METRES = 200.0
 APPROACH = 0.45
 # Distance from walls of the middle of a room in metres, if there is enough room.
 MIDDLE = 0.8
-# The scanner in buildings, which sees as far as those of the recorded logs.
+# The scanner in buildings, with the reach of those in recorded logs.
 LASER = Laser(noise=0.01, reach=30.0)
 
 
@@ -247,7 +247,7 @@ def record_plan(
 
     Args:
         plan: The plan of the building.
-        tours: Number of times that the same round is driven.
+        tours: Number of times that the round is driven.
         seed: Seed of the round and of the noise.
         metres: Length of a round before the robot goes home.
         laser: The scanner.

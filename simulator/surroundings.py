@@ -1,4 +1,4 @@
-"""Finds walls, streets and places in laser images where streets meet at any angles.
+"""Finds walls, streets and places in laser images; streets meet at any angles.
 
 It does not know the true pose. A wall is a straight stretch of points. A street lies between two
 walls that face each other, about twice `reach` apart. The fixed point of a place is where the
@@ -221,7 +221,7 @@ class Place:
         return min(self.headings, key=lambda heading: apart(heading, about))
 
     def beside(self, heading: float, side: int) -> float | None:
-        """Radians to the next street at the left (side=1) or right (-1), if there is one."""
+        """Radians to the next street at the left (side=1) or right (-1); None without one."""
         turns = [side * (street.bearing - heading) % math.tau for street in self.streets]
         return min(
             (side * turn for turn in turns if STRAIGHT < turn < math.pi - STRAIGHT),

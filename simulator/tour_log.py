@@ -86,9 +86,9 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
     Each reported motion has an error proportional to it, so the relative error of many motions
     together is smaller. The shares here reproduce the mean covariance of the reports.
 
-    A map describes fixed points. Hill-climbing ends within its tolerance of them at both ends of a
-    step; the model assumes a uniform distribution. A wrong heading at the beginning also moves the
-    end sideways.
+    A map describes fixed points. At both ends of a step, hill-climbing ends near them, within its
+    tolerance; the model assumes a uniform distribution. A wrong heading at the beginning also moves
+    the end sideways.
 
     Args:
         reports: Reports between steps.

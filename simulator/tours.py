@@ -94,7 +94,7 @@ def simulate(
     driver = _driver(world, tours, seed, laser, body, tolerance)
     body, tolerance = driver.robot.body, driver.tolerance
     log = Log(driver.robot)
-    # The camera has noise of its own, so that the drive is the same without it.
+    # The camera has its own noise, so that it does not change the drive.
     eye = Eye(
         camera, len(world.segments), np.random.default_rng([seed, 1]), tours * len(world.route)
     )
@@ -245,8 +245,8 @@ def _at_dstates(
     done = ""
     for number, action in _legs(driver, world, tours, pilot):
         image, displacement = driver.look(STILL), log.displacement()
-        # Where streets meet at any angles, the robot turns by different amounts to look around, so
-        # each displacement has its own covariance.
+        # If streets meet at any angles, turns to look around differ. So each displacement has its
+        # own covariance.
         has_covariance = displacement is not None and not is_square
         yield Step(
             image=eye.image(driver, image, number),

@@ -184,7 +184,7 @@ class World:
         return float(distances_to(self.segments, (x, y)).min())
 
     def nearest(self, pose: Sequence[float]) -> TrueDState | None:
-        """The true dstate nearest to a pose, where a radian counts as a metre.
+        """The true dstate nearest to a pose; a radian counts as a metre.
 
         None if the world has no true dstates.
         """

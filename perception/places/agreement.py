@@ -10,7 +10,7 @@ motions has an angle: the difference of the directions of motion.
 
 Matching scans starts from the odometry, so in a corridor it hardly shows that the laser points
 elsewhere. Pairs of scans show it: moved by the odometry, their points coincide only if the
-direction of the laser is right. The field of view is tested in the same way.
+direction of the laser is right. The field of view is tested likewise.
 """
 
 from __future__ import annotations
@@ -266,7 +266,7 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
 
 
 def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
-    """Pairs of scans near enough that the odometry is accurate and that both see the same."""
+    """Pairs of scans near enough for accurate odometry and a shared view."""
     kept = moving(log.scans)
     pairs = []
     for i, scan in enumerate(kept):

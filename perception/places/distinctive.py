@@ -142,7 +142,7 @@ def _supported(votes: list[_Vote], asked: list[int], track: Track, scale: Scale)
     """Group votes into places with enough support, once for each pass of the robot."""
     groups: list[list[_Vote]] = []
     for vote in votes:
-        # Only recent groups are candidates: an earlier one is another pass, even at the same place.
+        # Only recent groups are candidates: an earlier group is another pass of the place.
         for group in groups[:-4:-1]:
             last = track.way[vote.scan] - track.way[group[-1].scan]
             if last < scale.radius and math.dist(vote.middle, _middle(group)) < SAME * scale.radius:
@@ -236,7 +236,7 @@ def _with_turnings(found: list[Visit], track: Track, scale: Scale) -> list[Visit
 
 
 def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
-    """Add a visit where the robot came back or changed direction between two visits.
+    """Add a visit at each reversal or change of direction between two visits.
 
     A path between two neighbouring places should lead straight on.
     """
@@ -278,7 +278,7 @@ def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
 
 
 def _described(visit: Visit, log: RobotLog, track: Track, scale: Scale, maps: LocalMaps) -> Visit:
-    """Add to a visit its exits, those that the robot took, and the direction of walls."""
+    """Add to a visit its exits, which ones the robot took, and the direction of walls."""
     patch = maps.around(visit.scan, visit.middle, scale.half)
     ways = _ways(patch, visit.middle, scale)
     ways, arrived = _taken(ways, _crossing(track, visit, scale.radius, -1), visit.middle)
@@ -321,7 +321,7 @@ def _outlook(patch: Patch, middle: Array, width: float, radius: float) -> Outloo
 
 
 def _unseen(patch: Patch, seen: Outlook, scale: Scale) -> list[float]:
-    """Bearings where drivable space ends in unobserved space at least a gateway wide."""
+    """Bearings at which drivable space meets unobserved space at least a gateway wide."""
     unknown = ~patch.free & ~patch.occupied
     # Cells next to a wall also border on the unknown behind it. The border counts only away from
     # walls.
@@ -345,7 +345,7 @@ def _unseen(patch: Patch, seen: Outlook, scale: Scale) -> list[float]:
 
 
 def _crossing(track: Track, visit: Visit, radius: float, side: int) -> Array | None:
-    """Where the robot entered (side -1) or left (side 1) the radius of a place.
+    """The point of entering (side -1) or leaving (side 1) the radius of a place.
 
     None if the log begins or ends before that.
     """

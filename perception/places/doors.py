@@ -33,8 +33,8 @@ DOOR, WIDER, BESIDE = 1.6, 1.33, 2.0
 # Two doors are at least this many metres apart along the trajectory, and the space between is at
 # least WIDER times as wide as either.
 DEEP = 0.5
-# A building is one of rooms if most of the trajectory is wider than WIDE metres and the robot
-# drives through at least one door in OFTEN metres.
+# A building has rooms if most of the trajectory is wider than WIDE metres and the robot drives
+# through at least one door in OFTEN metres.
 WIDE, OFTEN = 2.2, 30.0
 # Two consecutive doors are the same if their middles are nearer than SAME metres. A narrow part
 # within WITHIN metres of a door belongs to that door if the robot returned through the door right
@@ -102,8 +102,7 @@ def _doors_of_span(log: RobotLog, track: Track) -> tuple[Door, ...]:
         ]
     widths = np.array([width for width, _ in gaps])
     found: list[Door] = []
-    # Start with the narrowest: each door is found where it is narrowest, and nearby finds are the
-    # same door.
+    # Start with the narrowest position, the middle of a door. Nearby finds are the same door.
     for k in np.argsort(widths, kind="stable"):
         if widths[k] > DOOR:
             break
@@ -149,7 +148,7 @@ def are_frequent(doors: Sequence[Door], track: Track) -> bool:
 
 
 def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
-    """The visits to doors, in order; entering and leaving a room by one door is one visit.
+    """The visits to doors, in order. Entering and leaving by one door counts once.
 
     Corrected poses are not read.
     """

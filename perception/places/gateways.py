@@ -1,8 +1,7 @@
 """Finds the exits of the free space around a point, and the point where they meet.
 
 An exit is a part of the free space, one radius away by the shortest drivable path, that can be
-reached at full width. So an alcove is no exit, and a corridor is one even if something stands in
-it.
+reached at full width. So an alcove is no exit. A corridor with an obstacle is one.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ class Exit:
 
     Attributes:
         bearing: Direction from the middle, in radians counterclockwise in the frame of the track.
-        cells: Mask of the cells of the ring that belong to it.
+        cells: Mask of the ring's cells that form this exit.
     """
 
     bearing: float

@@ -1,9 +1,8 @@
 """Turns a robot's log into a trace, one line a stage.
 
-The robot did not stop at distinctive states. Where its trajectory passes a junction, a corner or a
-dead end, or where it turned around, the local map shows what the robot would have seen from the
-middle of the place. Kuipers & Beeson (2002) planned this: to localise without physical motion to
-the actual location.
+The robot did not stop at distinctive states. If it passed a junction, corner or dead end, or turned
+around, the local map shows what the robot would have seen from the middle of the place. Kuipers &
+Beeson (2002) planned this: to localise without physical motion to the actual location.
 """
 
 from __future__ import annotations
@@ -82,8 +81,8 @@ def import_log(
         radius: Distance in metres that an exit must lead from the middle of a place; None estimates
             it.
         name: Name of the trace.
-        doors: Whether places are the doors that the robot drives through, instead of where
-            corridors fork or bend. None means False if gateway or radius is given (they describe
+        doors: Whether places are the doors that the robot drives through, instead of forks and
+            bends of corridors. None means False if gateway or radius is given (they describe
             corridors). Otherwise, the log decides.
 
     Returns:

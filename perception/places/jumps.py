@@ -28,7 +28,7 @@ LONG = 5.0
 # Odometry stands still up to STILL metres and radians. For a robot that stands still, less than
 # MOVED of the beams change by more than CHANGED metres plus CHANGED_SHARE of the range.
 STILL, MOVED, CHANGED, CHANGED_SHARE = 1e-3, 0.35, 0.2, 0.03
-# The same share after a pause, when the robot may be far away in a corridor that looks similar.
+# This share after a pause, as the robot may be far away in a corridor that looks similar.
 MOVED_UNSEEN = 0.15
 # Odometry that stands still in more than this share of the steps is missing.
 MISSING = 0.5
@@ -97,7 +97,7 @@ def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan
 
 
 def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> list[str]:
-    """Describe where a track is cut or broken.
+    """Describe the cuts and breaks of a track.
 
     Args:
         log: The log that was followed.
@@ -221,7 +221,7 @@ class Unknown:
     still: tuple[tuple[int, int], ...] = ()
 
     def without(self, standing: frozenset[int]) -> Unknown:
-        """The same without the scans in which the robot really stood still."""
+        """A copy without the scans in which the robot really stood still."""
         return replace(self, unknown=self.unknown - (standing - self.carried), still=())
 
 
@@ -272,7 +272,7 @@ def _impossible(
 def _moved_while_still(
     log: RobotLog, paused: NDArray[np.bool_]
 ) -> tuple[frozenset[int], tuple[tuple[int, int], ...]]:
-    """Find where the odometer stood still while the laser saw changes.
+    """Find stretches in which only the laser noticed a motion.
 
     Returns:
         Scans after a pause, and the first and last scan of other stretches. Both are empty if the

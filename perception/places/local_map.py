@@ -1,9 +1,9 @@
 """Makes the local perceptual map: free space around the robot, from a short stretch of scans.
 
-A window of scans moves along the log. Each cell of a grid counts how many scans of the window saw
-through it and how many hit something in it. Scans that leave the window are subtracted. The grid is
-a torus that scrolls with the robot. There is no global map, so drift matters only within a window
-(Beeson, Modayil & Kuipers 2010).
+A window of scans moves along the log. Each grid cell counts how many scans of the window saw
+through it, and how many hit an obstacle in it. Scans that leave the window are subtracted. The grid
+is a torus that scrolls with the robot. There is no global map, so drift matters only within a
+window (Beeson, Modayil & Kuipers 2010).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Cell = tuple[int, int]
 
 # Side of a cell in metres.
 CELL = 0.1
-# Beams are ignored beyond this many metres, where they are too far apart to show what is between.
+# Beams are ignored beyond this many metres, as gaps between them grow too wide.
 SIGHT = 12.0
 # A cell is occupied if at least this share of the scans that looked there hit something. So passing
 # people soon disappear.

@@ -32,7 +32,7 @@ AGREE = 0.2
 # Standard deviations between two visits of the middle of a place, in metres, and of the direction
 # of an exit, in radians.
 MIDDLE, DIRECTION = 0.4, 0.1
-# The same for the middle of a door, which is more exact, and for the straight line between doors.
+# These deviations for the middle of a door (more exact), and for the line between doors.
 THRESHOLD, ACROSS = 0.05, 0.05
 # Additional standard deviations of each displacement, beside those of scan matching, in metres and
 # radians.

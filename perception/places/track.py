@@ -2,12 +2,12 @@
 
 A scan is matched from points to lines (Chen & Medioni 1992; Censi 2008): the pose moves until the
 points of the scan lie on the walls that the last scans saw. Odometry is a prior. In a bare
-corridor, where walls do not show how far the robot went, the odometer decides. Nothing is global:
-errors accumulate along the trajectory, as the covariances of the increments state.
+corridor, walls do not show how far the robot went. The odometer decides. Nothing is global: errors
+accumulate along the trajectory, as the covariances of the increments state.
 
-Where an odometer jumps, it is ignored (`jumps`), and the scan is matched near the previous pose. If
-it matches, the track goes on, and only the increment is unknown. If nothing in the scan was seen
-before, the robot may be anywhere, and the track is broken: a new trajectory begins.
+If an odometer jumps (`jumps`), the scan is matched near the previous pose without it. If it
+matches, the track goes on. Only the increment is unknown. If nothing in the scan was seen before,
+the robot may be anywhere, and the track is broken: a new trajectory begins.
 """
 
 from __future__ import annotations
@@ -50,8 +50,7 @@ POOR, HEADINGS = 0.5, 24
 # A scan is of an unseen place if less than STRANGE of its points lies on walls, in IN_A_ROW scans
 # in a row.
 STRANGE, IN_A_ROW = 0.3, 3
-# A robot that went at most this many metres, by odometry, still sees something of what it saw
-# before.
+# After at most this many metres, by odometry, a robot still sees some earlier walls.
 NEARBY = 1.0
 # Standard deviations of the motion without odometry, in metres and radians.
 UNKNOWN = (0.5, 0.5, 0.5)

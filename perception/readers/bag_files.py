@@ -1,7 +1,7 @@
 """Finds and opens the files of a bag: one file or several parts of a drive, packed or not.
 
 rosbags reads complete files with an index. Other files are read record by record (`salvage`), up to
-where they were cut.
+the cut.
 """
 
 from __future__ import annotations

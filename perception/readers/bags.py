@@ -212,7 +212,7 @@ def _odometer(
 
 
 def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Track, str, str]:
-    """The same as `_odometer`, from the transforms from `odom` to the robot. Raises LogError."""
+    """As `_odometer`, but by the transforms from `odom` to the robot. Raises LogError."""
     chain = [(child, parent_of(frames, child)) for child in ancestors(frames, frame)]
     moving = [(child, one) for child, one in chain if one.track is not None]
     found = next(
@@ -259,7 +259,7 @@ class _ScanPoses:
         corrections: Transforms above the frame of the odometry, the nearest first.
         mounts: For each frame of scans, the pose of the laser in the frame of the robot, and
             whether it hangs upside down.
-        by_stamp: Whether times are those of the headers.
+        by_stamp: Whether to use the times of headers.
     """
 
     odometry: Poses

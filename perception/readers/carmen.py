@@ -19,17 +19,17 @@ A log does not say what its poses mean. The reader therefore goes through it twi
 (`carmen_survey`) finds the poses of the odometer, the mount of the laser, and the range that means
 "nothing near". The second pass yields the scans.
 
-- If the poses of the scans are those of vertices, they are corrected, and odometry is the chain of
+- If the poses of the scans equal those of vertices, they are corrected. Odometry is the chain of
   the edges from each vertex to the next.
 - If the first ODOM line after each scan repeats the pose of the scan, whatever the ODOM line before
   the scan said, then the poses of the scans are corrected. GMapping writes such logs, with a NEFF
   line after each scan. Its ODOM lines add the increments of the odometer to the corrected pose of
-  the last scan. Odometry is then the chain of these increments, from the line that repeats the pose
-  of one scan to the last line before the next scan, which has the time of that scan. The jump from
-  that line to the pose of the scan is the correction, which is left out.
+  the last scan. Odometry is then the chain of these increments, from the line that repeats a pose
+  to the last line before the next scan, whose time is equal. The jump from that line to the scan's
+  pose is a correction. It is left out.
 - If the first pose of the scans wanders from the second, the first is corrected, and the second is
   the odometer's.
-- Otherwise the second pose is the odometer's, and the first is that of the laser, or the same.
+- Otherwise the second pose is the odometer's. The first is the laser's, or equals the second.
 
 TRUEPOS lines, which CARMEN's simulator writes, give the true pose of the robot.
 """
@@ -199,7 +199,7 @@ class _Odometer:
         before: Pose and time of the ODOM line before that.
         restarts: Whether the next ODOM line starts from a corrected pose, and gives no motion.
         vertex: Index of the last vertex.
-        truth: A corrected pose, and the odometer's at the same time.
+        truth: A corrected pose, and the odometer's at that time.
         news: A corrected pose that waits for the odometry of the next scan.
     """
 
@@ -216,7 +216,7 @@ class _Odometer:
     news: Pose | None = None
 
     def read_line(self, tag: bytes, tokens: list[bytes]) -> None:
-        """Take in a line that is not a scan. Raises Damaged."""
+        """Process a line that is no scan. Raises Damaged."""
         if tag == b"ODOM":
             pose = pose_at(tokens, 1)
             self.behind = self.chain
@@ -271,7 +271,7 @@ class _Odometer:
         )
 
     def with_pose(self, item: Scan | Damage) -> Scan | Damage:
-        """Give a scan without a pose one between those of the last two ODOM lines."""
+        """Interpolate a missing pose of a scan from the last two ODOM lines."""
         if self.meaning != "lines" or isinstance(item, Damage) or self.last is None:
             return item
         (start, began), (end, ended) = self.before or self.last, self.last

@@ -36,11 +36,11 @@ MEANINGS = ("free", "unknown")
 KINDS = ("0", "NaN", "below 0", "below the laser's least range")
 # Largest distance in metres from the robot's middle to a laser.
 FARTHEST_MOUNT = 100.0
-# A standing robot sees the same ranges again. So only scans after a motion of this many metres or
+# A standing robot repeats its ranges. So only scans after a motion of this many metres or
 # radians are surveyed, and at most MOST_SURVEYED of them.
 APART, TURNED, MOST_SURVEYED = 0.3, math.radians(20), 500
-# A repeated range that means "nothing" occurs in this share of these scans, in at least LEAST_SCANS
-# of them, and in this share of their beams. A wall has the same distance from few poses only.
+# A repeated range that means "nothing" occurs in this share of surveyed scans, at least
+# LEAST_SCANS, and in this share of their beams. A wall has the same distance from few poses only.
 SCANS, LEAST_SCANS, BEAMS = 0.1, 5, 0.005
 # Noise of the repeated range, as shares of it, to try in turn.
 NOISES = (1e-5, 0.001, 0.004, 0.016)
@@ -56,7 +56,7 @@ LONG = 0.8
 
 @dataclass(frozen=True)
 class Told:
-    """What the user says about the laser. None means as the log says, or as it seems.
+    """What the user says about the laser. None leaves it to the log and the survey.
 
     Attributes:
         fov: Degrees from the first beam to the last, counterclockwise, around the same middle as in

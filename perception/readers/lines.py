@@ -102,7 +102,7 @@ def is_full(error: BaseException) -> bool:
 
 
 def packer(file: IO[bytes]) -> str | None:
-    """What packed a file (gzip, bzip2, xz or zstd), by its first bytes; None for a plain file."""
+    """The packer of a file (gzip, bzip2, xz, zstd), by its first bytes; None for a plain file."""
     file.seek(0)
     head = file.read(max(map(len, PACKERS)))
     return next((name for magic, (name, _) in PACKERS.items() if head.startswith(magic)), None)

@@ -82,7 +82,7 @@ def read_log(
             f"damaged, first: {damaged[0].what if damaged else 'none'}"
         )
     meant, found_out = interpret_log(scans, told)
-    # What the user said need not be assumed.
+    # The user's settings need no assumption.
     assumed = (note for option, note in reading.assumed.items() if getattr(told, option) is None)
     log = RobotLog(
         meant,

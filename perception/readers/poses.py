@@ -26,7 +26,7 @@ SAME_CLOCK = 1.0
 # medians, since a single message may be late.
 COMPARED, TIMES = 2.0, 100
 # Poses come from several sources if the source changes at this share of the messages and each
-# source has this share of them.
+# source sends this share.
 ALTERNATING = 0.1
 # Largest number of sources to distinguish.
 SOURCES = 4
@@ -125,7 +125,7 @@ def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
 
 
 def _wrong_stamps(name: str, stamps: Array) -> str | None:
-    """What is wrong with the stamps of one topic; None if nothing is."""
+    """The fault of the stamps of one topic; None if there is none."""
     none = int((stamps == 0).sum())
     if none == len(stamps) or none > 2:  # A simulated clock may begin at 0.
         return f"{none} of {len(stamps)} messages of {name} have none"
@@ -141,7 +141,7 @@ def _wrong_stamps(name: str, stamps: Array) -> str | None:
 
 
 def _wrong_recording(name: str, times: Array, stamps_are_wrong: bool) -> str | None:
-    """What is wrong with the times of recording of one topic; None if nothing is.
+    """The fault of the times of recording of one topic; None if there is none.
 
     They are wrong if they stand still while the times of the headers go on.
     """

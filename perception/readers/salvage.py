@@ -1,7 +1,7 @@
 """Reads the intact part of a bag without an index, which rosbags cannot open.
 
 Such a bag was cut or never closed. Records are read from the beginning up to the first damaged one.
-Messages before the cut in a packed chunk are read, too.
+Messages before a cut within a chunk are also read.
 """
 
 from __future__ import annotations

@@ -289,7 +289,7 @@ class _Maker:
     def odometry(self, pose: Pose, covariance: NDArray[np.float64]) -> Any:
         """An Odometry message with a covariance in the plane."""
         geometry, unknown = "geometry_msgs/msg/", np.zeros(36)
-        # ROS has six dimensions; only those of the plane are known.
+        # ROS has six dimensions; only three (plane) are known.
         known = np.zeros((6, 6))
         known[np.ix_(PLANAR, PLANAR)] = covariance
         at = self.types[geometry + "Pose"](
