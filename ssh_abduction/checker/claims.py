@@ -57,7 +57,7 @@ def false_claims(
 def contradictions(
     answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory
 ) -> Iterator[str]:
-    """Find where an answer contradicts itself.
+    """Find contradictions in an answer.
 
     Its certificate is taken for granted, as it takes the trace to check it.
 
@@ -179,7 +179,7 @@ class _Claims:
                 because = "as map 1 has these" if self.maps else "as there is no map"
                 yield f"cost: expected {_text(expected)}, {because}, got {_text(cost)}"
         if self.theory.without:
-            return  # where axioms are left out, clingo may count more than the maps show
+            return  # if axioms are left out, clingo may count more than the maps show
         if "within" in self.answer:
             yield from self._costs_within(self.answer["within"])
             return

@@ -1,6 +1,6 @@
 """Places whose stars cannot be those of one place (star=gateways).
 
-A map does not show which gateway is which. So where no frame fits the stars of a place, a smallest
+A map does not show which gateway is which. So if no frame fits the stars of a place, a smallest
 set of sights that no frame fits is reported, under each axiom whose removal would make one fit.
 """
 

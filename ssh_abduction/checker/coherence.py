@@ -68,7 +68,7 @@ def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | N
 
 
 def dstates_look_as_seen(m: Reading) -> Found:
-    """The view of a dstate is the first one there that is known and not misread.
+    """The view of a dstate is the first one there that is known and not ignored.
 
     The axiom functional_view covers the views of its other steps.
     """

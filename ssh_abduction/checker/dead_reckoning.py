@@ -104,7 +104,7 @@ class ErrorFilter:
         return moved
 
     def covariance(self, first: Any, last: Any) -> Array:
-        """The covariance of closings, enlarged where errors of the heading are not small."""
+        """The covariance of closings, enlarged if errors of the heading are not small."""
         white, repeated = self.since(first, last), self.repeated_since(first, last)
         heading = self.lost(first, last)
         moved = self._moved_by_heading(first, last) + (repeated[..., :2, 1] ** 2).sum(-1)
@@ -141,9 +141,9 @@ class ErrorFilter:
         return moved
 
     def is_known(self, first: Any, last: Any) -> NDArray[np.bool_]:
-        """Whether the closings of loops are known.
+        """For each loop, whether its closing is known.
 
-        No displacement is missing, and the heading is not lost along the loop.
+        It is known if no displacement is missing and the heading is not lost along the loop.
         """
         known: NDArray[np.bool_] = (self.broken[first] == self.broken[last]) & (
             self.lost(first, last) <= LOST**2
@@ -151,7 +151,7 @@ class ErrorFilter:
         return known
 
     def closing(self, first: Any, last: Any) -> Array:
-        """How far off loops close, m x 3."""
+        """The error at the end of each loop, m x 3."""
         off: Array = self.pose[last] - self.pose[first]
         off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
         return off

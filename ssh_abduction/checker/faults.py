@@ -1,4 +1,4 @@
-"""Checks the faults of a map: the views, stars, actions and displacements it disbelieves."""
+"""Checks the faults of a map: the views, stars, actions and displacements it ignores."""
 
 from __future__ import annotations
 

@@ -31,12 +31,12 @@ from ssh_abduction.theory.theory import Theory
 Steps: TypeAlias = NDArray[np.int_]
 # Two steps, and the degrees of freedom: 2 at one place, 3 at one dstate.
 Return: TypeAlias = tuple[int, int, int]
-# Returns that are refused, their chi-square, and the threshold.
+# Returns that are rejected, their chi-square, and the threshold.
 _Found: TypeAlias = tuple[tuple[Return, ...], float, float]
 
 # The number of sets that numpy works on at once.
 AT_A_TIME = 50_000
-# If the bound does not pass more sets of two returns than this, only so many are checked, evenly
+# If the bound does not pass more sets of two returns than this, only this many are checked, evenly
 # spread. That takes a second or two.
 MOST_SETS = 300_000
 # A bound has to pass a set by this margin, because numbers are rounded.
@@ -64,7 +64,7 @@ class Closing:
 
 @dataclass(frozen=True)
 class Refused:
-    """One return or two returns of a map that displacements refuse.
+    """One return or two returns of a map that displacements reject.
 
     Attributes:
         returns: The steps and degrees of freedom of each.
@@ -100,7 +100,7 @@ class Refused:
 
 
 def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Refused]:
-    """Find the return that is refused most clearly, and the pair of returns.
+    """Find the return that is rejected most clearly, and the pair of returns.
 
     Args:
         trace: The whole trace.
@@ -182,14 +182,14 @@ def _returns(
 
 
 def _most(theory: Theory, freedom: int, together: bool) -> float:
-    """The chi-square above which returns are refused."""
+    """The chi-square above which returns are rejected."""
     share = theory.reject / 2 if theory.joint > 1 else theory.reject
     tests = theory.returns * (theory.returns - 1) / 2 if together else theory.returns
     return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
 
 def _refused_alone(returns: Sequence[Return], drifts: Drifts, theory: Theory) -> Iterator[_Found]:
-    """The single return that is refused most clearly."""
+    """The single return that is rejected most clearly."""
     for freedom in (2, 3) if returns else ():
         rows = np.array([r for r in returns if r[2] == freedom], dtype=int).reshape(-1, 3)
         most, least = _most(theory, freedom, together=False), np.full(len(rows), np.inf)
@@ -213,9 +213,9 @@ def _refused_alone(returns: Sequence[Return], drifts: Drifts, theory: Theory) ->
 def _refused_together(
     returns: Sequence[Return], drifts: Drifts, theory: Theory
 ) -> Iterator[_Found]:
-    """The pair of returns that is refused most clearly.
+    """The pair of returns that is rejected most clearly.
 
-    If the bound does not pass more than MOST_SETS pairs, as many are checked, evenly spread.
+    If the bound does not pass more than MOST_SETS pairs, MOST_SETS are checked, evenly spread.
     """
     if len(returns) < 2:
         return
@@ -251,7 +251,7 @@ def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Ste
     Args:
         filtered: The poses.
         rows: The returns, by last step.
-        most: The least chi-square at which a pair may be refused.
+        most: The least chi-square at which a pair may be rejected.
     """
     alone = _Alone(filtered, rows)
     found = []
@@ -328,7 +328,7 @@ def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
     Args:
         share: A bound on the share of the covariance that both rows have in common.
         squares: The sum of their chi-squares.
-        most: The least chi-square at which a pair may be refused.
+        most: The least chi-square at which a pair may be rejected.
     """
     left = 1 - squares / most
     safe: NDArray[np.bool_] = (left > 0) & (share + MARGIN <= left**2)

@@ -120,7 +120,7 @@ class Order:
     def _follows(self, p: int, direction: int) -> list[int]:
         """The places that a travel puts after p or, if the order is total, the list does.
 
-        Where they disagree, the travel counts.
+        If they disagree, the travel counts.
         """
         travelled = self._next[direction].get(p, {})
         later = self._later(p, direction) if self._total else ()

@@ -293,7 +293,7 @@ def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
 
 
 def _orders(gateways: Sequence[Arm], told: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
-    """All clockwise orders of gateways, the first one first, in which `told` sequences hold."""
+    """All clockwise orders of gateways that agree with the `told` sequences, the first first."""
     orders: list[tuple[Arm, ...]] = [()]
     for gateway in gateways:
         longer = (

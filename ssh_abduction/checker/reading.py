@@ -33,9 +33,9 @@ class Reading:
         axioms: Names of the axioms that hold.
         records: The dstates of each id. A map that is wrong may have several.
         first: The first step of each label.
-        views: The first step of each pair of label and view, without disbelieved views.
-        stars: The first step of each pair of label and openings, without disbelieved stars.
-        links: The first step of each link, without disbelieved actions.
+        views: The first step of each pair of label and view, without ignored views.
+        stars: The first step of each pair of label and openings, without ignored stars.
+        links: The first step of each link, without ignored actions.
     """
 
     def __init__(self, trace: Trace, ssh_map: SSHMap, theory: Theory) -> None:

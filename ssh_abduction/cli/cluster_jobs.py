@@ -224,7 +224,7 @@ def _on_workers(
 
 
 def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
-    """Answer on a Dask worker, and stop if the client goes away."""
+    """Answer on a Dask worker; stop if the client disconnects."""
     from distributed import get_worker
 
     worker = get_worker()

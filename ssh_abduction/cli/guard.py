@@ -151,7 +151,7 @@ class _Signals:
 
     def __init__(self) -> None:
         self._ends: tuple[socket.socket, socket.socket] | None = None
-        self._before = -1  # the file that was told of signals before
+        self._before = -1  # the file that received signals before
 
     def open(self) -> None:
         """Begin to listen. Only the main thread may call it."""

@@ -84,7 +84,7 @@ def answers_here(
     """Yield answers from processes of this machine, as they are ready.
 
     If a process is killed, only its own file is lost. The processes do not receive Ctrl-C; `stop`
-    tells them of it. After that, files under way still yield what is known.
+    says so to them. After that, unfinished files still yield what is known.
 
     Args:
         question: The question.

@@ -178,7 +178,7 @@ class MapQuestion:
             return known[0] if known else self._given_up(number, path), interrupted_code()
 
         guard = Guard(interrupt, last_words, None, None, given_up=given_up, print_last=answer_last)
-        # A worker process does not handle Ctrl-C: its parent tells it when to stop.
+        # A worker process does not handle Ctrl-C: its parent stops it.
         with contextlib.nullcontext() if workers.serves() else on_ctrl_c(end):
             with guard:
                 from perception.readers.logs import read_log
@@ -371,7 +371,7 @@ def _say(answer: MapAnswer, folder: Path) -> None:
 def _theory(options: argparse.Namespace) -> tuple[Theory | None, dict[str, Any]]:
     """The theory that is named, and what is laid over it.
 
-    Where none is named, it is None, as it then depends on the log. Raises TheoryError.
+    If none is named, it is None, as it then depends on the log. Raises TheoryError.
     """
     asked = theory_of(options)
     choices = {name: getattr(asked, name) for name in choices_of(options)}

@@ -1,4 +1,4 @@
-"""ssh-abduction next MAPS TRACE: what the robot should do to tell these maps apart."""
+"""ssh-abduction next MAPS TRACE: what the robot should do to distinguish these maps."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def _tree(plan: Plan, indent: str) -> Iterator[str]:
 
 
 def _untried(plan: Plan) -> str:
-    """Lines about what to try if known links tell no more about several rivals."""
+    """Lines about what to try if known links cannot distinguish several rivals."""
     if len(plan.rivals) == 1 or plan.branches:
         return ""
     if plan.untried is None:

@@ -255,7 +255,7 @@ def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
     default = Theory.causal() if theory.level == "causal" else Theory.topological()
     flags = ["--theory", "causal"] if theory.level == "causal" else []
     if trace is not None:
-        # The theory may have been settled for another trace, with other evidence.
+        # The theory may have been made for another trace, with other evidence.
         with suppress(AbductionError):
             default = settle(trace, default).theory
     for field in fields(Theory):

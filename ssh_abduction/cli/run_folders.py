@@ -199,7 +199,7 @@ def _content(path: str) -> str | None:
 
 
 def _key(folder: Path) -> str:
-    """A key that is equal for names that some file systems do not tell apart."""
+    """A key that is equal for names that some file systems do not distinguish."""
     return unicodedata.normalize("NFC", os.path.abspath(folder)).casefold()
 
 

@@ -77,7 +77,7 @@ def _handled(log: logging.Logger, handler: logging.Handler, level: int) -> Itera
 
 
 def _is_one_file() -> bool:
-    """Whether stdout and stderr are one file, where lines of progress would mix with the answer."""
+    """Whether stdout and stderr are one file, so that progress would mix with the answer."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         return os.path.samestat(os.fstat(sys.stdout.fileno()), os.fstat(sys.stderr.fileno()))
     return False
@@ -110,6 +110,6 @@ class _NowAndThen(logging.Handler):
 
 
 def _say(text: str) -> None:
-    # Whoever reads the log may leave: the command goes on.
+    # The reader of the log may quit: the command goes on.
     with contextlib.suppress(OSError, ValueError):
         print(f"ssh-abduction: {printable(text)}", file=sys.stderr, flush=True)

@@ -19,9 +19,7 @@ if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
 
-ASSUMING = (
-    3.0  # For so many seconds it is sought what assumptions cost that the page may be asked about.
-)
+ASSUMING = 3.0  # Seconds to compute the costs of assumptions that the page may ask about.
 
 
 def add_parser(verbs: Verbs) -> None:

@@ -129,7 +129,7 @@ class Action:
         return value if isinstance(value, Action) else parse_action(value, "action")
 
     def to_json(self) -> Any:
-        """The name, or an object where the name does not say everything."""
+        """The name, or an object if the name does not say everything."""
         if self == STANDARD_ACTIONS.get(self.name, Action(self.name)) and not self.extra:
             return self.name
         known = {name: getattr(self, name) for name in _FIELDS}

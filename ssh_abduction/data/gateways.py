@@ -9,7 +9,7 @@
 frozenset()
 
 The heading of a dstate is in degrees. Headings match gateways across steps only up to the spreads
-of their bearings, and not where a gateway was not observed. So `fit` searches, at each place, for a
+of their bearings, and not if a gateway was not observed. So `fit` searches, at each place, for a
 frame and a shift of slots for each sight such that all axioms hold. A sight is a dstate together
 with a star that is seen there.
 """

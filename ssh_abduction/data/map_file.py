@@ -143,7 +143,7 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
 
     Args:
         data: The JSON.
-        where: What messages call it.
+        where: Its name in messages.
 
     Returns:
         The arguments of SSHMap.
@@ -256,7 +256,7 @@ def _pair(read: FieldReader, value: Any, name: str) -> tuple[int, int]:
 
 
 def _fault(read: FieldReader, value: Any, steps: int, name: str) -> Fault:
-    """A fault at one of so many steps."""
+    """A fault at one of the steps."""
     record = read.mapping(value, name)
     if record.get("kind") not in FAULTS:
         raise read.wrong(f"{name}.kind", " or ".join(FAULTS), record.get("kind"))
@@ -272,7 +272,7 @@ def _fault(read: FieldReader, value: Any, steps: int, name: str) -> Fault:
 
 
 def _fit(read: FieldReader, record: Mapping[str, Any], dstates: int) -> Fit | None:
-    """The fit of a map with so many dstates, with their poses."""
+    """The fit of a map, with the poses of its dstates."""
     if record.get("fit") is None:
         return None
     found = read.mapping(record["fit"], "fit")

@@ -54,7 +54,7 @@ class MapPath:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What a map disbelieves at a step.
+    """What a map ignores at a step.
 
     Attributes:
         step: The step.

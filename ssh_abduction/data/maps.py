@@ -72,7 +72,7 @@ class SSHMap:
         excused: With boundary=defeasible, the pairs of paths that are exempt from the default
             side_of_branch.
         fit: How well the map agrees with the displacements; None if none were used.
-        faults: What the map disbelieves, by step.
+        faults: What the map ignores, by step.
     """
 
     labels: tuple[int, ...]
@@ -110,7 +110,7 @@ class SSHMap:
         card: str = in_output("map_card")(self)
         return card
 
-    if not TYPE_CHECKING:  # so that type checkers still refuse unknown attributes
+    if not TYPE_CHECKING:  # so that type checkers still reject unknown attributes
 
         def __getattr__(self, name):
             """Find a method of version 0.1.0 that is a function of `ssh_abduction.output` now."""
@@ -223,7 +223,7 @@ class SSHMap:
 
         Args:
             data: The plain data.
-            where: What messages call it.
+            where: Its name in messages.
 
         Raises:
             MapError: If a field is wrong; it names the field.

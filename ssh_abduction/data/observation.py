@@ -14,7 +14,7 @@ def checked_view(value: Any, where: str) -> View:
 
     Args:
         value: The view; numpy's whole numbers are fine.
-        where: What messages call it.
+        where: Its name in messages.
     """
     if is_whole(value):
         value = int(value)

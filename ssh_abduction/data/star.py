@@ -214,7 +214,7 @@ def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
 
     Args:
         value: What the trace or the caller gives.
-        where: What messages call it.
+        where: Its name in messages.
 
     Raises:
         TraceError: If it is no star.

@@ -33,7 +33,7 @@ class Step:
     Attributes:
         view: The name or number of the view; None if it is unknown, or only an image is known.
         action: The action taken next; None on the last step of a trace.
-        star: The openings ahead, right, back and left as four 0/1, None where not observed; or
+        star: The openings ahead, right, back and left as four 0/1, None if not observed; or
             their bearings in degrees, clockwise from ahead; or Gateways.
         displacement: (dx, dy, dtheta) from the step before, in metres and radians, in the frame
             that the robot had there: x ahead, y left, counterclockwise. It has no meaning on the
@@ -43,7 +43,7 @@ class Step:
         truth: For evaluation only; nothing that infers reads it.
         extra: Fields of the trace file that this package does not know.
         confidence: The probability, from 0 to 1, that the view and the star are right. If faults
-            are allowed, it scales the cost of disbelieving them.
+            are allowed, it scales the cost of ignoring them.
     """
 
     view: View | None = None

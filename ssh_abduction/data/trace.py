@@ -191,7 +191,7 @@ class Trace:
 
     @property
     def views(self) -> tuple[View | None, ...]:
-        """The view of each step; None where it is unknown."""
+        """The view of each step; None if it is unknown."""
         return tuple(step.view for step in self.steps)
 
     @cached_property
@@ -247,11 +247,11 @@ class Trace:
         """A trace from views and the actions between them.
 
         Args:
-            views: n + 1 views; None where one is unknown.
+            views: n + 1 views; None if one is unknown.
             actions: n actions, as `Action.of` takes them.
-            stars: n + 1 stars, as in Step; None where none was observed.
-            displacements: n of [dx, dy, dtheta], in metres and radians; None where one is unknown.
-            covariances: n of (3, 3), of the displacements; None where the odometry gives it.
+            stars: n + 1 stars, as in Step; None if none was observed.
+            displacements: n of [dx, dy, dtheta], in metres and radians; None if one is unknown.
+            covariances: n of (3, 3), of the displacements; None if the odometry gives it.
             odometry: The noise of displacements without a covariance.
             name: What the trace is called.
 
@@ -321,8 +321,8 @@ class Trace:
         """The same trace with other views.
 
         Args:
-            views: The view of each step; None where it is unknown.
-            confidences: The probability that each view is right; None where it is unknown.
+            views: The view of each step; None if it is unknown.
+            confidences: The probability that each view is right; None if it is unknown.
 
         Raises:
             TraceError: If a value is wrong, or there is not one for each step.

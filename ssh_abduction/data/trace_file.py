@@ -1,4 +1,4 @@
-"""Reading trace files: JSON lines, of which the first is the header and each other one a step.
+"""Reading trace files: JSON lines. The first is the header and each other line is a step.
 
 See docs/reference/formats.md.
 """
@@ -19,7 +19,7 @@ from ssh_abduction.data.step import Step
 
 FORMAT, VERSION = "ssh-trace", 1
 # Bytes of a line. A step with a panorama of 100,000 numbers fits. A file without line ends is
-# refused before it fills the memory.
+# rejected before it fills the memory.
 LONGEST_LINE = 16 * 2**20
 # How files of maps and robots' logs begin. People name them instead of a trace.
 _MAPS = (b'{"format": "ssh-solution"', b'{"format": "ssh-map"')
@@ -137,7 +137,7 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
 
 
 def _refuse_other_files(raw: bytes, where: str) -> None:
-    """Refuse a file whose first line is that of a robot's log or of maps."""
+    """Reject a file whose first line is that of a robot's log or of maps."""
     log = next((kind for magic, kind in _LOGS.items() if raw.startswith(magic)), None)
     if log is None and LINE_OF_A_LOG.match(raw):
         log = "lines of CARMEN or g2o"
@@ -165,7 +165,7 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
             f'{where}: format: expected "{FORMAT}" in a header, got {came}; '
             f'put {{"format": "{FORMAT}", "version": {VERSION}}} on the first line'
         )
-    version = record.get("version")  # True equals 1, so check the type, too
+    version = record.get("version")  # True equals 1, so also check the type
     if version != VERSION or isinstance(version, bool):
         raise TraceError(
             f"{where}: version: expected {VERSION}, got {brief(version)}; "

@@ -36,7 +36,7 @@ class Rung:
     Attributes:
         name: What the rung adds.
         solution: The minimal maps by all evidence up to this rung.
-        evaluation: How right they are; None if the trace has no truth, or there is no map.
+        evaluation: Their accuracy; None if the trace has no truth, or there is no map.
     """
 
     name: str

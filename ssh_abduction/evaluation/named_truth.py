@@ -1,4 +1,4 @@
-"""How right maps are, where the steps of a trace name their true dstates, places and paths.
+"""The accuracy of maps, if the steps of a trace name their true dstates, places and paths.
 
 >>> from dataclasses import replace
 >>> from ssh_abduction import Theory, Trace, evaluate, solve
@@ -42,7 +42,7 @@ from ssh_abduction.data.words import counted
 
 @dataclass(frozen=True, slots=True)
 class MapEvaluation:
-    """How right one map is. Shares are from 0 to 1; what cannot be said is None.
+    """The accuracy of one map. Shares are from 0 to 1; what cannot be said is None.
 
     An edge joins the places at both ends of a travel, in either direction. Edges are counted for
     travels that were driven, from one step to the next: the edges of TOPO-Bench (Wang et al., arXiv
@@ -100,7 +100,7 @@ class MapEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """How right maps of one trace are.
+    """The accuracy of maps of one trace.
 
     Attributes:
         maps: Each map, in the order given.
@@ -140,7 +140,7 @@ class Evaluation:
 
 
 def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
-    """How right maps of a trace are.
+    """The accuracy of maps of a trace.
 
     Args:
         maps: Maps of the trace.
@@ -178,7 +178,7 @@ def tells_names(trace: Trace) -> bool:
 
 
 class _Truth:
-    """The true names of dstates, places, paths and courses, one a step; None if not told.
+    """The true names of dstates, places, paths and courses, one a step; None if unknown.
 
     Raises TraceError if no step has a name, or one dstate has two places, paths or courses.
     """
@@ -195,7 +195,7 @@ class _Truth:
                 'some step, got none; write "truth": {"dstate": …, "place": …} on the steps, '
                 'or {"pose": [x, y, heading]}'
             )
-        # The first step at each dstate that tells its place, path or course.
+        # The first step at each dstate that names its place, path or course.
         first: dict[tuple[Hashable, str], tuple[int, Hashable]] = {}
         for t, step in enumerate(told):
             dstate = step.get("dstate")
@@ -214,11 +214,11 @@ class _Truth:
                     )
 
     def dstate_hops(self) -> list[int]:
-        """The steps at which the dstates of this and the next step are told."""
+        """The steps with a true dstate at this and the next step."""
         return _hops(self.dstates)
 
     def place_hops(self) -> list[int]:
-        """The steps before a travel at which the places of this and the next step are told."""
+        """The steps before a travel with a true place at this and the next step."""
         return [t for t in _hops(self.places) if self.trace.actions[t].kind == "travel"]
 
 
@@ -228,7 +228,7 @@ _SORTS = ("dstate", "place", "path", "course")
 def _told(value: Any, where: str) -> dict[str, Hashable]:
     """The true names of a step, by sort.
 
-    Names become JSON texts, so that lists and objects can be names, too. Raises TraceError for what
+    Names become JSON texts, so that lists and objects can also be names. Raises TraceError for what
     JSON cannot hold.
     """
 
@@ -279,7 +279,7 @@ def checked_map(ssh_map: object, where: str, trace: Trace) -> SSHMap:
 
 
 def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
-    """How right a map is."""
+    """The accuracy of a map."""
     at = [ssh_map.dstates[label] for label in ssh_map.labels]
     dstates = _Sort([s.id for s in at], truth.dstates)
     places = _Sort([s.place for s in at], truth.places)
@@ -316,7 +316,7 @@ class _Sort:
 
     Args:
         said: What the map says each step is at; None for nothing.
-        true: What each step truly is at; None if it is not told.
+        true: What each step truly is at; None if unknown.
     """
 
     def __init__(self, said: Sequence[Hashable], true: Sequence[Hashable]) -> None:
@@ -329,7 +329,7 @@ class _Sort:
 
     @property
     def right(self) -> bool | None:
-        """Whether map and truth tell the same steps apart; None if one of them tells nothing."""
+        """Whether map and truth distinguish the same steps; None if either says nothing."""
         if not self.of_map:
             return None
         # A step that is at nothing in the map makes a pair too many.

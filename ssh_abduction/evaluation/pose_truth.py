@@ -1,4 +1,4 @@
-"""How right maps are, where the truth is poses: are visits at one place of the map truly at one?
+"""The accuracy of maps by true poses: are visits at one place of the map truly at one?
 
 >>> from dataclasses import replace
 >>> from ssh_abduction import Theory, Trace, solve
@@ -46,7 +46,7 @@ from ssh_abduction.evaluation.trajectory import checked_pose, checked_time
 # By default two poses within this many metres are one place.
 NEAR = 2.0
 # They are one dstate if their headings also differ by at most this many degrees: half of a right
-# angle tells the directions of a corridor apart, and lets a robot swerve.
+# angle distinguishes the directions of a corridor, and lets a robot swerve.
 TURNED = 45.0
 # A distance by composed relations is in doubt by this many metres, and by this share of the way
 # along which they were composed. Relations and corrected poses of Freiburg differ by at most that
@@ -56,8 +56,8 @@ DOUBT, DOUBT_OF_WAY = 0.2, 0.01
 Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]
 Verdicts: TypeAlias = NDArray[np.uint8]
-# What is true of a pair: it is unknown; it is apart; it is a return; or it is near, but the robot
-# was not away in between.
+# The truth about a pair: unknown; distinct places; a return; or near each other, but the robot was
+# not away in between.
 UNKNOWN, APART, RETURN, STAYED = range(4)
 JUDGED = APART, RETURN
 
@@ -71,7 +71,7 @@ class Pairs:
         returns: The judged pairs that are one.
         stayed: Pairs left out because they are near each other, but the robot was not farther away
             in between.
-        unknown: Pairs left out because the truth does not tell how far apart they are.
+        unknown: Pairs left out because the truth does not say how far apart they are.
     """
 
     judged: int
@@ -119,7 +119,7 @@ class MapPairs:
 
 @dataclass(frozen=True, slots=True)
 class MapVisits:
-    """How right one map is, by pairs.
+    """The accuracy of one map, by pairs.
 
     Attributes:
         places: Pairs of visits; None for a map without places, as of a causal theory.
@@ -132,18 +132,18 @@ class MapVisits:
 
 @dataclass(frozen=True, slots=True)
 class VisitsEvaluation:
-    """How right maps of one trace are, judged by poses.
+    """The accuracy of maps of one trace, judged by poses.
 
     Attributes:
-        judge: What has the truth: "poses" of the trace, or "relations".
+        judge: Where the truth is from: "poses" of the trace, or "relations".
         near: Metres within which two poses are one place.
         turned: Degrees by which the headings of one dstate differ at most.
         visits: How many visits the trace has.
         places: Pairs of visits.
         dstates: Pairs of steps of different visits.
         maps: Each map, in the order given.
-        by_both: Of the pairs of visits that relations judge: how many the poses of the trace judge,
-            too, and how many of these they judge alike. None if poses judge.
+        by_both: The number of pairs of visits that relations and poses both judge, and the number
+            that they judge alike. None if only poses judge.
     """
 
     judge: str
@@ -186,7 +186,7 @@ def evaluate_visits(
     turned: float = TURNED,
     relations: Relations | None = None,
 ) -> VisitsEvaluation:
-    """How right maps of a trace are, by the pairs that they have at one place, and at one dstate.
+    """The accuracy of maps of a trace, by the pairs that they have at one place, and at one dstate.
 
     Args:
         maps: Maps of the trace.
@@ -241,7 +241,7 @@ def evaluate_visits(
 
 
 def told_poses(trace: Trace) -> list[Pose | None]:
-    """The true pose of each step, (x, y, heading) in metres and radians; None if not told.
+    """The true pose of each step, (x, y, heading) in metres and radians; None if unknown.
 
     Raises TraceError for one that is malformed.
     """
@@ -288,7 +288,7 @@ class _Poses:
 
         Returns:
             Distances in metres, (n,), differences of headings in degrees, (n,), and the doubt of
-            the distances in metres, (n,). NaN where a pose is unknown.
+            the distances in metres, (n,). NaN if a pose is unknown.
         """
         dx, dy, turned = (self._poses - self._poses[step]).T
         return np.hypot(dx, dy), _degrees(turned), np.zeros(len(dx))

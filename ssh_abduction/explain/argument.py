@@ -159,7 +159,7 @@ class Argument:
     def _draw_all(self) -> None:
         """Order the links such that each one, with those before it, gives a new conclusion.
 
-        First conclude what holds in every map. If that does not settle the pair, or only by several
+        First conclude what holds in every map. If that does not decide the pair, or only by several
         links at once, suppose the opposite and go on until there is a contradiction.
         """
         goal = facts.conclusion("one_dstate" if self._one else "two_dstates", *self._pair)
@@ -185,7 +185,7 @@ class Argument:
                 if goal in self._born:
                     if len(self._support(goal)[1]) == len(group):
                         return
-                    # Several links at once settle the pair. The supposition gives smaller steps.
+                    # Several links at once decide the pair. The supposition gives smaller steps.
                     self._lines, self._born, left = [], {}, list(self._links)
                     break
 

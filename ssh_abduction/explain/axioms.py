@@ -18,7 +18,7 @@ from ssh_abduction.theory.settle import displacement_of
 POLL = 0.05
 # Steps that are grounded between two calls of `stop`.
 AT_A_TIME = 8
-# At most this many refused returns that end at one step get a sentence.
+# At most this many rejected returns that end at one step get a sentence.
 MOST_SENTENCES = 3
 
 # An atom and whether it is true.
@@ -72,13 +72,13 @@ class _Seen(NamedTuple):
 
 
 def _forget(_: clingo.Model) -> None:
-    """Ignore a model, where only its existence matters."""
+    """Ignore a model, if only its existence matters."""
 
 
 class Axioms:
     """The axioms of a piece of a trace, in clingo.
 
-    Some evidence can only refuse a whole map. Such a refusal is added as a constraint, and clingo
+    Some evidence can only reject a whole map. Such a rejection is added as a constraint, and clingo
     is asked again.
     """
 
@@ -307,7 +307,7 @@ class Axioms:
     def _refused(
         self, answer: _Answer, active: Collection[tuple[str, int]]
     ) -> tuple[str, Refusal] | None:
-        """Equalities of a model that some evidence refuses, with the name of its axiom.
+        """Equalities of a model that some evidence rejects, with the name of its axiom.
 
         If the axioms are relaxed, the axiom has to be active at the last of the steps.
         """
@@ -335,13 +335,13 @@ class Axioms:
         return None
 
     def _judged_at(self, axiom: str, refusal: Refusal) -> int:
-        """The step at which the axiom has to be active for this refusal."""
+        """The step at which the axiom has to be active for this rejection."""
         return len(self._trace) - 1 if axiom == Planar.axiom else _last_step(refusal)
 
     def _refused_together(
         self, displacement: Displacement, answer: _Answer, step: int
     ) -> Refusal | None:
-        """Two returns of a model that are refused together, of which the later ends at `step`."""
+        """Two returns of a model that are rejected together; the later one ends at `step`."""
         if displacement.joint == 1:
             return None
         return displacement.returns_of(self._trace).refused_at(answer.labels, answer.places, step)
@@ -356,8 +356,8 @@ class Axioms:
     def sentences(self, clash: Sequence[tuple[str, int]]) -> tuple[str, ...]:
         """What displacements say about the returns in a clash, as `Explanation.sentences`.
 
-        The other axioms of the clash have models, and each of them has a return that is refused.
-        The clearest refused return is forbidden until no model is left.
+        The other axioms of the clash have models, and each of them has a return that is rejected.
+        The clearest rejected return is forbidden until no model is left.
         """
         displacement = displacement_of(self._problem)
         steps = [t for axiom, t in clash if displacement and axiom == displacement.axiom]

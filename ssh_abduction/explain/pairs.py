@@ -167,7 +167,7 @@ class PairQuestion(Question[PairExplanation]):
         return side.cost.preferred_by(self.theory) > by.cost.preferred_by(self.theory)
 
     def _find_out(self) -> None:
-        # if a few steps around the pair rule out a side, the whole trace does, too
+        # if a few steps around the pair rule out a side, so does the whole trace
         for one in (True, False):
             self._ask_pieces(one, SMALL)
             if self._sides[one].possible is False:
@@ -254,7 +254,7 @@ class PairQuestion(Question[PairExplanation]):
     def _list_minimal_maps(self, settled: bool) -> None:
         """List minimal maps, and count those of each side.
 
-        If the verdict is settled, only ask whether there is any map.
+        If the verdict is final, only ask whether there is any map.
         """
         left = self._watch.left()
         seconds = (

@@ -70,7 +70,7 @@ class PairExplanation:
         derivation: The argument for what holds in every map; None if there is none in time.
         clash: Why the trace has no map, if it has none.
         stopped: The limit that ended the search, if one did.
-        theory: The theory, settled for the trace.
+        theory: The theory, without `auto`.
     """
 
     first: int

@@ -35,7 +35,7 @@ def labels_of(
 ) -> NDArray[np.intp]:
     """The label of each step, (n,): its dstate in the chosen map, or in the first.
 
-    If no map is chosen the label is -1 where the maps disagree. They agree on a step if the first
+    If no map is chosen the label is -1 if the maps disagree. They agree on a step if the first
     step at its dstate is the same in all maps. An AmbiguousMapWarning says if they do not agree
     everywhere, if there may be more maps, or if they are not proven minimal.
 
@@ -100,7 +100,7 @@ def labels_of_all(
     views: NDArray[np.intp],
     features: Any = None,
 ) -> NDArray[np.intp]:
-    """The label of each step of several traces, (n,); -1 where there is none.
+    """The label of each step of several traces, (n,); -1 if there is none.
 
     The longest trace has its own labels, as the map was made for it. The others are followed on the
     map. An AmbiguousMapWarning names each trace that cannot be placed on it.
@@ -109,7 +109,7 @@ def labels_of_all(
         ssh_map: The map of the longest trace.
         labels: The labels of the longest trace.
         traces: Traces with n steps in all.
-        views: The view of each step, (n,); -1 where an image has none. Such a step has no label.
+        views: The view of each step, (n,); -1 if an image has none. Such a step has no label.
         features: Makes of images what is compared, as in `recogniser`.
     """
     if len(traces.each) == 1:
@@ -139,13 +139,13 @@ def labels_of_all(
 def labels_on(
     ssh_map: SSHMap, traces: Traces, views: NDArray[np.intp], looks: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """The dstate of each step of all traces, (n,), where the map tells it; else -1.
+    """The dstate of each step of all traces, (n,); -1 if the map does not say it.
 
     Args:
         ssh_map: The map.
         traces: Traces with n steps in all.
-        views: The view of each step, (n,); -1 where there is none.
-        looks: The dstate that each image looks like, (n,). Others are not told.
+        views: The view of each step, (n,); -1 if there is none.
+        looks: The dstate that each image looks like, (n,).
     """
     parts = zip(traces.each, traces.parts(views), traces.parts(looks), strict=True)
     found = np.concatenate(
@@ -159,10 +159,9 @@ def _followed(
 ) -> NDArray[np.intp]:
     """The dstate of each step of a trace that may begin anywhere on a map, (m,).
 
-    Of all beginnings that no view contradicts, the one that fits most images is taken. A way is
-    lost where an action was never tried in a dstate: from there on it tells nothing (-1) and
-    contradicts nothing. If two ways fit equally many images, or none fits half of the images that
-    it tells of, nothing is told.
+    Of all beginnings that no view contradicts, take the one that fits most images. After an action
+    that was never tried in a dstate, the dstates are unknown (-1) and contradict no view. All
+    steps are -1 if two beginnings fit equally many images, or none fits half of its images.
     """
     leads = {(here, action): there for here, action, there in ssh_map.links}
     ways = []
@@ -177,7 +176,7 @@ def _followed(
                 at = None if at is None else leads.get((at, trace.actions[step].name))
         else:
             ways.append(np.array(way, np.intp))
-    # Take the way that fits most images, if no other fits as many.
+    # Take the way that fits most images, unless there is a tie.
     ways.sort(key=lambda way: -np.count_nonzero(way == looks))
     fits = [np.count_nonzero(way == looks) for way in ways[:2]]
     sure = (

@@ -49,7 +49,7 @@ _log = log_of(__name__)
 
 
 class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
-    """Learns to recognise places from images and actions, without being told any place.
+    """Learns to recognise places from images and actions, without knowing any place.
 
     It is an estimator, as scikit-learn has them. Of several traces all images make the views, the
     longest trace makes the map, and the others are followed on it.
@@ -57,9 +57,9 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     Args:
         theory: The axioms; Theory.topological() by default.
         clusterer: Makes views of images: a ViewClusterer, or a clusterer of scikit-learn. It is
-            cloned. By default ViewClusterer(random_state=0). Where the theory allows misread views
+            cloned. By default ViewClusterer(random_state=0). If the theory allows misread views
             it has `isolated=10`: then images that are like no others have no view, and
-            disbelieving them costs little.
+            ignoring them costs little.
         choose: Index of the map to take if several are minimal; None takes the labels on which all
             of them agree.
         time_limit: Seconds for finding the map; None for no limit.
@@ -76,7 +76,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         map_: The map that is learnt from.
         second_map_: The map of the runner-up, if another number of views is about as good and gives
             another map; else None.
-        labels_: The dstate of each step, (n,); -1 where the maps disagree or the image has no view.
+        labels_: The dstate of each step, (n,); -1 if the maps disagree or the image has no view.
         recogniser_: The recogniser. It learns from no image that the map says is misread.
 
     Reference:
@@ -122,7 +122,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         self.second_map_ = warn_of_second_map(longest, self.solution_.maps, theory, self.time_limit)
         _log.info("a map of %d dstates", len(self.map_.dstates))
 
-        # 3. Labels: the map tells the dstate of each image.
+        # 3. Labels: the map gives the dstate of each image.
         self.labels_ = labels_of_all(self.map_, own_labels, seen, self.views_, self.features_)
 
         # 4. Recogniser: learn from the images whose label is sure.
@@ -157,8 +157,8 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         Args:
             X: Images, (m, d), or traces with m steps in all.
             y: The true dstates, (m,). Without them each trace is followed on the map: of the ways
-                that no view contradicts, the one that fits most images tells the dstates. Steps
-                whose dstate it does not tell do not count.
+                that no view contradicts, the one that fits most images gives the dstates. Steps
+                without a dstate do not count.
 
         Raises:
             LearnerError: The dstate of no step is known, or `y` has another shape.
@@ -195,7 +195,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         return ViewClusterer(random_state=0, isolated=ISOLATED if theory.misread else None)
 
     def _followed(self, traces: Traces, looks: NDArray[np.intp]) -> NDArray[np.intp]:
-        """The dstate of each step by the map, (m,); -1 where it does not tell.
+        """The dstate of each step by the map, (m,); -1 if unknown.
 
         Args:
             traces: Traces with m steps in all.

@@ -1,7 +1,7 @@
 """The map of the runner-up: does the second best number of views give another map?
 
-The number of views is chosen by how well they separate the images, and no map tells whether that
-was right: too few views give a small, proven and wrong map. So where a second number of views is
+The number of views is chosen by how well they separate the images. No map shows whether it is
+right: too few views give a small, proven and wrong map. So if a second number of views is
 nearly as good, its views are kept beside the chosen ones, in the field `runner_up` of each step,
 and their map is compared.
 """
@@ -29,7 +29,7 @@ class RunnerUpWarning(UserWarning):
 
 @dataclass(frozen=True)
 class SecondMap:
-    """The map of the runner-up, where it is another one.
+    """The map of the runner-up, if it is another one.
 
     Attributes:
         views: How many views were chosen.

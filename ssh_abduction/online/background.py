@@ -32,7 +32,7 @@ class BackgroundTask(Generic[Result]):
         return self._found.done()
 
     def result(self) -> Result | None:
-        """Wait for the result; None where nothing was found or the work was interrupted."""
+        """Wait for the result; None if nothing was found or the work was interrupted."""
         return self._found.result()
 
 

@@ -50,7 +50,7 @@ class MapGuess(BackgroundTask[SSHMap]):
     Args:
         steps: The steps of the trace so far. The caller may append more.
         odometry: The odometry of the trace.
-        theory: The settled theory.
+        theory: The theory without `auto`.
         speedups: Which speed-ups are on.
         known: A map of the first steps to mend; None makes one from a guess.
     """
@@ -73,7 +73,7 @@ class MapGuess(BackgroundTask[SSHMap]):
         speedups: Speedups,
         known: SSHMap | None = None,
     ) -> MapGuess | None:
-        """Begin a guess; None without a second processor, or where guesses are switched off."""
+        """Begin a guess; None without a second processor, or if guesses are switched off."""
         wanted = speedups.annealed and speedups.processes and has_processors(speedups)
         return MapGuess(steps, odometry, theory, speedups, known) if wanted else None
 

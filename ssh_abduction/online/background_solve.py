@@ -61,7 +61,7 @@ class BackgroundSolve(BackgroundTask[Solved]):
     def begun(
         trace: Trace, theory: Theory, maps: int | None, speedups: Speedups
     ) -> BackgroundSolve | None:
-        """Begin to solve; None without a second processor, or where processes are switched off."""
+        """Begin to solve; None without a second processor, or if processes are switched off."""
         can_begin = speedups.processes and has_processors(speedups)
         return BackgroundSolve(trace, theory, maps, speedups) if can_begin else None
 
@@ -73,7 +73,7 @@ def _solve(
 
 
 class FaultSolver:
-    """Solves a growing trace with faults anew when that is due.
+    """Solves a growing trace with faults again when that is due.
 
     Args:
         options: What a step may use.
@@ -89,7 +89,7 @@ class FaultSolver:
         self.background: BackgroundSolve | None = None
         self._options = options
         self._next_search = 0  # no search before the trace has this many steps
-        # clingo cannot be stopped while it grounds a step. Where that took too long once, later
+        # clingo cannot be stopped while it grounds a step. If that took too long once, later
         # searches run in the background.
         self._is_slow = False
 
@@ -98,7 +98,7 @@ class FaultSolver:
         return len(trace) >= self._next_search
 
     def make_due(self) -> None:
-        """Search at the next step: the cost was proven, so the next one may be soon."""
+        """Search at the next step: the last search proved the cost."""
         self._next_search = 0
 
     def solve(self, trace: Trace, theory: Theory, has_map: bool) -> Solved | None:
@@ -106,11 +106,11 @@ class FaultSolver:
 
         Args:
             trace: The steps so far.
-            theory: The settled theory.
+            theory: The theory without `auto`.
             has_map: Whether some map is known. Then a slow search may run in the background.
 
         Returns:
-            What was found; None where the search goes on in the background.
+            What was found; None if the search goes on in the background.
         """
         steps, options = len(trace), self._options
         limit = options.time_limit

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.errors import LocaliserError
 
-# The robot is located where one dstate has this probability.
+# The robot is located if one dstate has this probability.
 LOCATED = 0.9
 # A belief has collapsed if an observation is so much less probable than at a place of which nothing
 # is known: evidence of ten to one against the belief, which Jeffreys calls strong.
@@ -47,11 +47,11 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observation:
-    """What a robot observes, as far as it tells dstates apart. `localiser.py` has f and q.
+    """What a robot observes, as far as it distinguishes dstates. `localiser.py` has f and q.
 
     Attributes:
         where: Some dstates.
-        ratio: f(o|x) / q(o) of each of these dstates. It is 0 for all others.
+        ratio: f(o|x) / q(o) of each of these dstates; 0 for all others.
         novel: Probability that the place looks like none of the dstates, given this observation.
             Before it, to look like any dstate or like none was equally likely.
     """
@@ -127,7 +127,7 @@ class Belief:
         """Whether a belief collapsed, and the robot has not been found since.
 
         It is found if it is located, or if the belief is as sure as it was before. The second
-        matters if nothing that a robot sees and does tells some dstates apart.
+        matters if nothing that a robot sees and does distinguishes some dstates.
         """
         return self.sure is not None
 

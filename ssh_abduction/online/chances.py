@@ -44,6 +44,6 @@ class Chances:
     def none(cls) -> Chances:
         """The map holds without exception (equation 4 of `localiser.py`).
 
-        An observation that the map does not allow then begins localisation anew.
+        An observation that the map does not allow then restarts localisation.
         """
         return cls(misread=0.0, slipped=0.0, unmapped=0.0, reentered=1.0)

@@ -24,7 +24,7 @@ DRAFTS = 3
 
 @dataclass(slots=True)
 class Draft:
-    """A sketch, and how many of its first steps make a map that no evidence refuses."""
+    """A sketch, and how many of its first steps make a map that no evidence rejects."""
 
     sketch: Sketch
     passed: int = 0
@@ -34,7 +34,7 @@ class Drafts:
     """Drafts and sketches of the steps so far.
 
     Args:
-        problem: The steps so far, and the settled theory.
+        problem: The steps so far, and the theory without `auto`.
         judging: Evidence and the checker, for this theory.
     """
 

@@ -2,14 +2,14 @@
 
     see  ->  minimal maps of all that was seen  ->  next experiment  ->  do its actions  ->  see …
 
-`OnlineMapper` keeps the maps. A new experiment is sought when the last one is done, when clingo was
-asked, and when rivals were refuted:
+`OnlineMapper` keeps the maps. The explorer looks for a new experiment when the last one is done,
+when clingo was asked, and when rivals were refuted:
 
-1. Where known links tell minimal maps apart, the actions that do (`rivals/explore.py`).
+1. If known links distinguish minimal maps, the actions that do (`rivals/explore.py`).
 2. Else the shortest tour through all that is untried in the first map (`rivals/tour.py`). It looks
    around where it comes back to, and not at once.
-3. Else an untried action of which minimal maps say something different.
-4. Else what tells the map from one without one of its returns (`return_doubts.py`).
+3. Else an untried action for which minimal maps predict different outcomes.
+4. Else actions that distinguish the map from one without one of its returns (`return_doubts.py`).
 
 When it is done
 ---------------
@@ -19,12 +19,12 @@ When it is done
 3. *Beyond doubt.* A minimal map may still have too few dstates, as it merges whatever may be one.
    So each return of the map is doubted. The best map in which the two visits are not at one place
    (by the causal theory: the two steps are not one dstate) is a rival if it has at most `margin`
-   dstates more. An experiment tells it from the minimal map, and then the doubt is weighed again.
+   dstates more. An experiment distinguishes the two maps, and then the doubt is weighed again.
    The cost of such a map can only grow with the trace, so a dispelled doubt stays dispelled until
    the minimal maps themselves have more dstates.
 
-Where no experiment tells such a rival from the minimal map, there are two cases. Both may be the
-same map from here on and differ in where the robot was at first; that is no doubt. Or the rival is
+If no experiment distinguishes such a rival from the minimal map, there are two cases. Both may be
+the same map and differ only in the past of the robot; that is no doubt. Or the rival is
 another map, as closed as the minimal one, that predicts the same for ever: a symmetric world has
 such maps. Then the exploration ends as `inseparable`, and not as `done`.
 
@@ -55,7 +55,7 @@ from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Solution, Status, check_limit, find_backbone, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-# Where nothing is left to do but the map is not proven minimal, it is solved for this many times
+# If nothing is left to do but the map is not proven minimal, it is solved for this many times
 # the time limit of a step.
 LONGER = 5
 # A place that has shown at most this many dstates on a tour may still be another one than the map
@@ -82,7 +82,7 @@ class Robot(Protocol):
         """
 
     def can(self) -> Collection[Action | str]:
-        """The actions that the robot can do here. They should be the same where all looks alike."""
+        """The actions that the robot can do here. They should be the same if all looks alike."""
 
     def do(self, action: Action) -> None:
         """Do an action."""
@@ -95,13 +95,13 @@ class Exploration:
     Attributes:
         steps: How many actions were done.
         ending: Why it ended. "done": one map is left, nothing in it is untried, and no return is in
-            doubt. "inseparable": nothing that the robot can do tells the rivals that are left
-            apart, or the minimal map from `rival`. "steps": all steps are spent. "time": there was
+            doubt. "inseparable": nothing that the robot can do distinguishes the rivals that are
+            left, or the minimal map from `rival`. "steps": all steps are spent. "time": there was
             no time to prove which maps are minimal, or to weigh a doubt. "contradicted": no map
             explains what was seen.
         is_unique: Whether all minimal maps have the same dstates and the same places.
         is_true: Whether the map is unique and its dstates and places are the true ones, as far as
-            the robot drove. None where its looks do not tell the truth.
+            the robot drove. None if its looks hold no truth.
         solution: The minimal maps of all that was seen.
         rival: A map with more dstates that also explains all, is closed, and predicts the same for
             ever, if one was found. Then the world may be larger than the unique minimal map.
@@ -214,10 +214,10 @@ class Explorer:
         self._abilities = Abilities()
         self._abilities.note(first, robot.can())
         self._doubts = ReturnDoubts(int(margin), time_limit)
-        # The answer for all steps, where the mapper had too little time for it.
+        # The answer for all steps, if the mapper had too little time for it.
         self._longer: Solution | None = None
         self._plan: list[str] = []  # actions to do
-        self._is_stuck = False  # nothing was left to do when a plan was last sought
+        self._is_stuck = False  # the last plan found nothing left to do
 
     def __repr__(self) -> str:
         steps, maps = counted(len(self.trace) - 1, "steps"), counted(self.solution.count, "maps")
@@ -304,7 +304,7 @@ class Explorer:
         return "done" if unique else "inseparable" if self.solution.complete else "time"
 
     def _is_true(self, unique: bool) -> bool | None:
-        """Whether the unique map is true; None where the robot's looks do not tell the truth."""
+        """Whether the unique map is true; None if the robot's looks hold no truth."""
         if all(truth is None for truth in self._truths):
             return None
         if not unique:
@@ -337,7 +337,7 @@ class Explorer:
         """The actions of the next experiment; none if nothing is left to find out."""
         maps = list(self.solution.maps)
         found = self._experiment(maps)
-        # No known links tell the maps apart: try what is untried.
+        # No known links distinguish the maps: try what is untried.
         if not found.plan.branches and (tour := self._tour(maps[0])):
             return tour
         # Nothing is left to do, but there may be more minimal maps: look for them longer.
@@ -361,7 +361,7 @@ class Explorer:
         return found
 
     def _doubting_plan(self, best: SSHMap) -> tuple[str, ...]:
-        """The actions that tell the map from one without one of its returns."""
+        """Actions that test the map against one without one of its returns."""
         trace, theory, dstates = self.mapper.trace, self.mapper.theory, len(best.dstates)
         for doubt in self._doubts.open(best, trace):
             rival = self._doubts.rival(doubt, trace, theory, dstates)
@@ -370,14 +370,14 @@ class Explorer:
             experiment = self._experiment([best, rival])
             if experiment.actions:
                 return experiment.actions
-            # Either nothing tells the two apart, or they are one map and differ in the past.
+            # Either nothing distinguishes the two, or they are one map and differ in the past.
             if len(experiment.alike) > 1:
                 self._doubts.twins[doubt] = rival
             self._doubts.dispel(doubt, dstates)
         return ()
 
     def _experiment(self, maps: list[SSHMap]) -> Experiment:
-        """The experiment that tells maps apart, or tries what is untried in them."""
+        """The experiment that distinguishes maps, or tries what is untried in them."""
         return next_experiment(
             maps,
             self.mapper.trace,

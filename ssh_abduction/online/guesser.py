@@ -1,4 +1,4 @@
-"""Guesses and mends maps while the robot drives, where clingo finds no minimal map in time."""
+"""Guesses and mends maps while the robot drives, if clingo finds no minimal map in time."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Guesser:
 
         Args:
             trace: The steps so far.
-            theory: The settled theory.
+            theory: The theory without `auto`.
             contradicted: The best map so far, if the last step contradicts it.
             began: When the step began, by `time.perf_counter`.
 

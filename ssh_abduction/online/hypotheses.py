@@ -1,24 +1,24 @@
 """Rival explanations of a trace with faults while it grows, and the probability of each.
 
-A rival is a map of all steps so far, with its faults. Where it predicts a new step it goes on in
-one way. Where it does not, it goes on in each way that it allows:
+A rival is a map of all steps so far, with its faults. If it predicts a new step it goes on in
+one way. If it does not, it goes on in each way that it allows:
 
     contradicted  the observation is misread, and the robot is where the link leads; or the action
                   slipped, to each dstate that looks like this, or to a new one
     unknown       a new link leads to each dstate that looks like this, or to a new one
 
-Links to known dstates and new dstates are for the causal theory alone. Where there are places and
+Links to known dstates and new dstates are for the causal theory alone. If there are places and
 paths, only the axioms say what a new link may be.
 
 Rivals are weighed. The price of a fault says how it compares with a dstate, and the cheapest kind
-is as probable as `Chances` of the localiser take a fault to be. A price does not say how many ways
+has the probability of a fault in `Chances` of the localiser. A price does not say how many ways
 there were: a link, and an action that slipped, leads to one of N dstates, and a misread view is one
 of V. Let λ be the logarithm of the odds that a dstate is worth. Then
 
     weight = exp(-λ cost) N^-(links and slips) V^-(misreadings)
 
-What happens after a fault decides between its explanations: each link that one of them has to
-assume, where another one predicts, is evidence against it.
+What happens after a fault decides between its explanations: a link that one explanation has to
+assume and another one predicts is evidence against the first.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver import Cost, observation
 from ssh_abduction.theory.theory import Theory
 
-# As `observation` returns it: the view, and the star where the theory uses stars.
+# As `observation` returns it: the view, and the star if the theory uses stars.
 Seen = tuple[object, object]
 # What a dstate costs, in tenths of dstates.
 DSTATE = 10
@@ -47,8 +47,8 @@ class Rival:
         map: A map of the first steps, or of all.
         labels: The dstate of each step.
         shows: What each dstate looks like.
-        links: Where an action leads from a dstate.
-        faults: What is disbelieved.
+        links: The dstate that an action leads to, by dstate and action.
+        faults: What is ignored.
         cost: The counts that the theory prefers, first to last.
     """
 
@@ -85,7 +85,7 @@ class Rival:
 
     @property
     def places(self) -> list[int | None]:
-        """The place of each dstate; None where it has none."""
+        """The place of each dstate; None if it has none."""
         known = self.map.dstates
         return [s.place for s in known] + [None] * (len(self.shows) - len(known))
 
@@ -144,7 +144,7 @@ class Rival:
             action: The name of the action before the step.
             step: The step.
             seen: What the step shows.
-            theory: The settled theory.
+            theory: The theory without `auto`.
         """
         t, there = len(self.labels), self.links.get((self.here, action))
         alike = [s for s, shown in enumerate(self.shows) if shown == seen]
@@ -190,7 +190,7 @@ class Rival:
             there: The dstate of the step.
             link: The action of a new link to it, if there is one.
             new: What the dstate shows, if it is new.
-            faults: What is disbelieved besides.
+            faults: What is ignored besides.
             tenths: What these faults cost, in tenths of dstates.
         """
         tenths += DSTATE if new else 0

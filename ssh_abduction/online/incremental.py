@@ -16,7 +16,7 @@ PAUSE = 2
 
 
 class IncrementalSolver:
-    """Searches anew, and goes on from the last search.
+    """Searches again, going on from the last search.
 
     Args:
         options: What a step may use.
@@ -36,11 +36,11 @@ class IncrementalSolver:
         self._next_search = 0  # no search before the trace has this many steps
 
     def is_due(self, trace: Trace) -> bool:
-        """Whether the trace has grown enough since a search that was stopped."""
+        """Whether the trace has grown enough for the next search."""
         return len(trace) >= self._next_search
 
     def make_due(self) -> None:
-        """Search at the next step: the cost was proven, so the next one may be soon."""
+        """Search at the next step: the last search proved the cost."""
         self._next_search = 0
 
     def maps(self, trace: Trace, theory: Theory, known: SSHMap | None) -> tuple[SSHMap, ...]:
@@ -48,7 +48,7 @@ class IncrementalSolver:
 
         Args:
             trace: The steps so far.
-            theory: The settled theory.
+            theory: The theory without `auto`.
             known: A map that is known to be minimal; only the others remain to be found.
 
         Returns:

@@ -1,4 +1,4 @@
-"""Keeps the minimal maps of a trace without faults current, for one settled theory."""
+"""Keeps the minimal maps of a trace without faults current, for one theory without `auto`."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class MapKeeper:
     """Keeps the minimal maps current, or else the best map that can be had in time.
 
     Args:
-        problem: The steps so far, and the settled theory, without faults.
+        problem: The steps so far, and the theory without `auto`, without faults.
         options: What a step may use.
-        before: The keeper that this one follows. Its theory was settled for fewer steps.
+        before: The keeper that this one follows. It has fewer steps.
     """
 
     standing = None  # only a theory with faults has one
@@ -53,19 +53,19 @@ class MapKeeper:
 
     @property
     def theory(self) -> Theory:
-        """The settled theory."""
+        """The theory without `auto`."""
         return self._problem.theory
 
     @property
     def searches(self) -> int:
-        """How often clingo was asked."""
+        """The number of calls of clingo."""
         return self.solver.searches
 
     def restarted(self, problem: Problem) -> MapKeeper:
-        """A keeper for the theory as one more step settles it.
+        """A keeper for the theory that fits one more step.
 
         Minimal maps of fewer steps need not be minimal by that theory. They go on as drafts, if
-        they were judged by displacements, too.
+        displacements also judged them.
         """
         trace = problem.trace
         keeper = MapKeeper(problem, self._options, before=self)
@@ -112,7 +112,7 @@ class MapKeeper:
         return self.drafts.first()
 
     def _find(self, began: float) -> None:
-        """Ask clingo for the minimal maps; where it has no time for them, guess maps."""
+        """Ask clingo for the minimal maps; if it has no time for them, guess maps."""
         if not self.minimal.is_settled(self._options.max_maps) and self.solver.is_due(self.trace):
             self._ask()
         guessed = self.guesser.finished()

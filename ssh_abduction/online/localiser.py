@@ -29,11 +29,11 @@ is nowhere that the map knows. Let f be (3) or (4), or what a recogniser's dista
     p(o|x)        = (1 - misread) f(o|x) + misread q(o)
     q(o)          = (Σ_x f(o|x) + g(o)) / (N + 1)
     p(x'|x,a)     = (1 - slipped) f(x'|x,a) + slipped e(x')
-                    or e(x') where the map has no link for a at x
+                    or e(x') if the map has no link for a at x
     p(x'|nowhere) = reentered / N
     e(x')         = (1 - unmapped) / N,  e(nowhere) = unmapped
 
-e is the prior of global localisation. q is the observation at a place of which nothing is known:
+e is the prior of global localisation. q is the observation at an unknown place:
 it looks like one of the N dstates, or like none of them (g), each as likely.
 
 Nowhere is of two kinds, equally likely when the robot gets there. A *strange* place: nothing
@@ -217,7 +217,7 @@ class Localiser:
     def _spread(self, ratios: NDArray[np.float64]) -> Observation:
         """An image as an observation, by f(o|x) / q(o) of the recogniser's classes.
 
-        A dstate of which the recogniser has no image is like a place that is not in the map: it is
+        A dstate without an image in the recogniser is like a place that is not in the map: it is
         not known how it looks.
         """
         assert self._seen is not None
@@ -299,7 +299,7 @@ class Localiser:
         unknown = expected.akin * alike + 1 - expected.akin  # p(o|nowhere) / q(o)
         nowhere = expected.nowhere * unknown
         normaliser = total = float(weights.sum()) + nowhere
-        # No dstate allows this after what was believed, so localisation begins anew.
+        # No dstate allows this after what was believed, so localisation restarts.
         if not total:
             weights, nowhere = self._products(self.prior, seen), self.prior.nowhere
             total = float(weights.sum()) + nowhere

@@ -27,7 +27,7 @@ contradiction.) So R predicts the step, and F is the replayed R, by (3). ∎
 
 Otherwise clingo is asked, in the one control that is kept. It is asked for all maps of cost c if
 some map of M predicts the step, and else for the minimum, which is at least the last proven bound.
-If prefixes are not exact for a theory (`theory/speedups.py`), each step is solved anew.
+If prefixes are not exact for a theory (`theory/speedups.py`), solve the trace again at each step.
 
 *Evidence* may also contradict a map that predicts the step: the new step is not where the map says,
 or cannot be there together with other returns. The proof stays the same, as what evidence says of
@@ -35,12 +35,12 @@ fewer steps it also says of more. So evidence is asked about returns to the new 
 
 A theory that depends on the trace
 ----------------------------------
-Two parts of a theory are settled by the whole trace, so they may change as it grows. Displacements
+Two parts of a theory depend on the whole trace, so they may change as it grows. Displacements
 are used from the first one on; from then on places are preferred to paths. And the probability of
-refusing a true map is shared among the returns that may be true; their number is rounded up to a
-power of two. When either changes, minimal maps of fewer steps need not be minimal any more, so
-they are sought anew. That happens once for each doubling. Then less is refused, so the maps so far
-go on as drafts.
+rejecting a true map is shared among the returns that may be true; their number is rounded up to a
+power of two. When either changes, the minimal maps so far may not be minimal any more, so
+they are searched again. That happens once for each doubling. Then less is rejected, so the maps
+so far go on as drafts.
 
 When time is short
 ------------------
@@ -48,10 +48,10 @@ A map that predicts the step is minimal even if there is no time to look for oth
 predicts the step and time is short, the answer is feasible: a consistent map, and the last bound,
 which holds for the longer trace by (1). The map is a draft (`drafts.py`), or one that is guessed or
 mended (`guesser.py`). clingo is asked again when the trace has grown (`incremental.py`). It goes on
-where it was stopped, and may prove a map minimal again.
+from the state in which it stopped, and may prove a map minimal again.
 
-Where faults are allowed
-------------------------
+If faults are allowed
+---------------------
 Then `recovery.py` keeps the maps. If all maps are contradicted, it says what broke, keeps a belief
 over what may be true, and restores the map. `standing` says how sure it is.
 """
@@ -86,8 +86,8 @@ class OnlineMapper:
     Args:
         view: What is seen at first.
         theory: Which axioms and which preference; Theory.topological() by default. With faults
-            (misread, slipped) `standing` says how sure the map is. The first step settles
-            star=auto, and the first displacement settles displacement=auto.
+            (misread, slipped) `standing` says how sure the map is. The first step decides
+            star=auto, and the first displacement decides displacement=auto.
         star: The openings seen at first, as in Step, if the theory uses stars.
         confidence: Probability that the first view and star are right, as in Step. For theories
             with faults.
@@ -100,7 +100,7 @@ class OnlineMapper:
 
     Attributes:
         trace: The steps so far.
-        theory: The theory, settled for the steps so far.
+        theory: The theory, without `auto`.
         solution: The answer for the steps so far.
     """
 
@@ -147,12 +147,12 @@ class OnlineMapper:
 
     @property
     def theory(self) -> Theory:
-        """The theory, settled for the steps so far."""
+        """The theory for the steps so far, without `auto`."""
         return self._problem.theory
 
     @property
     def searches(self) -> int:
-        """How often clingo was asked."""
+        """The number of calls of clingo."""
         return self._keeper.searches
 
     @property
@@ -195,7 +195,7 @@ class OnlineMapper:
                 if it is unknown.
             covariance: Of the displacement, (3, 3); None takes it from the odometry.
             confidence: Probability that the view and the star are right, as in Step. It scales
-                what it costs to disbelieve them.
+                what it costs to ignore them.
 
         Raises:
             TraceError: The step does not fit the theory or the trace. The mapper stays as it was.
@@ -210,7 +210,7 @@ class OnlineMapper:
             covariance=covariance,
         )
         self._append(done, replace(step, confidence=confidence))
-        # A longer trace may settle the theory anew; then the maps are sought anew.
+        # A longer trace may change the theory; then search for the maps again.
         if self._settler.is_settled(self._problem, self.trace):
             self._problem = self._problem.changed(self.trace)
             self._keeper.take(self._problem)
@@ -221,7 +221,7 @@ class OnlineMapper:
         return self.solution
 
     def _append(self, action: Action, step: Step) -> None:
-        """Append a step to the trace. Raises TraceError where it does not fit."""
+        """Append a step to the trace. Raises TraceError if it does not fit."""
         last, number = replace(self._steps[-1], action=action), len(self._steps)
         known = self._actions.get(action.name, action)
         if known != action:
@@ -239,7 +239,7 @@ class OnlineMapper:
 
 
 def _known(view: View, step: int) -> View:
-    """The view of a step. Raises TraceError where it is unknown, which only whole traces allow."""
+    """The view of a step. Raises TraceError if it is unknown, which only whole traces allow."""
     if view is None:
         raise TraceError(
             f"step {step}: view: expected one while a robot drives, got none; "

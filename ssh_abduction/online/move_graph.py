@@ -92,7 +92,7 @@ class MoveGraph:
         self, here: AbstractSet[Node], there: AbstractSet[Node], closed: AbstractSet[Node]
     ) -> list[Node] | None:
         """The shortest way from some nodes to others without closed ones; None if none exists."""
-        # A place is closed where all its dstates are. Then its other courses are closed, too.
+        # A place is closed if all its dstates are. Then its other courses are also closed.
         closed_places = {
             self._place(node)
             for node in closed
@@ -118,18 +118,18 @@ class MoveGraph:
         return action
 
     def is_known(self, source: Node, target: Node) -> bool:
-        """Whether a link says a move, and not only the paths of the map."""
+        """Whether a link gives this move, and not only the paths of the map."""
         return not self._graph.edges[source, target]["implied"]
 
     def course(self, node: Node) -> tuple[int | None, int | None, int | None]:
-        """The place, path and direction of a node; None where it has none."""
+        """The place, path and direction of a node; None if it has none."""
         if isinstance(node, tuple):
             return node
         s = self.map.dstates[node]
         return s.place, s.path, s.direction
 
     def metres(self, source: Node, target: Node) -> float | None:
-        """The length of a move in a straight line; None where the map has no poses."""
+        """The length of a move in a straight line; None if the map has no poses."""
         if self._poses is None:
             return None
         a, b = (self._pose(node, self._poses) for node in (source, target))

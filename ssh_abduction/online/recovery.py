@@ -21,9 +21,9 @@ the logical representation can be restored" (Kuipers & Beeson 2002). Here these 
 
 * **Minimal maps**, proven, with their faults. While some of them predict what is seen they stay
   minimal, by the claim in `mapper.py`, which also holds with faults: a minimal map of the longer
-  trace that disbelieves the last step would, without that step, cost less than the minimum. By the
-  causal theory no minimal map is lost where an action was never tried, because only a link to a
-  dstate that looks right costs nothing. If no minimal map goes on, the trace is solved anew: in the
+  trace that ignores the last step would, without that step, cost less than the minimum. By the
+  causal theory no minimal map is lost if an action was never tried, because only a link to a
+  dstate that looks right costs nothing. If no minimal map goes on, solve the trace again: in the
   time of a step, and else in another process while the robot drives (`background_solve.py`).
 * **Rivals** (`rival_maps.py`): besides the minimal maps, all explanations that cost a little more,
   each with its probability (`hypotheses.py`).
@@ -50,9 +50,9 @@ class Recovery:
     """Keeps the maps with faults current, and says how sure they are.
 
     Args:
-        problem: The steps so far, and the settled theory, with faults.
+        problem: The steps so far, and the theory without `auto`, with faults.
         options: What a step may use.
-        before: The keeper that this one follows. Its theory was settled for fewer steps.
+        before: The keeper that this one follows. It has fewer steps.
 
     Attributes:
         standing: How sure the maps are; None before the first answer.
@@ -74,11 +74,11 @@ class Recovery:
 
     @property
     def searches(self) -> int:
-        """How often the trace was solved anew, in a step."""
+        """How often the trace was solved again in a step."""
         return self.solver.searches
 
     def restarted(self, problem: Problem) -> Recovery:
-        """A keeper for the theory as one more step settles it, with nothing proven."""
+        """A keeper for the theory with one more step, with nothing proven."""
         return Recovery(problem, self._options, before=self)
 
     def take(self, problem: Problem) -> None:
@@ -93,7 +93,7 @@ class Recovery:
         self._confidence.note(len(trace) - 1, change.broke)
 
     def answer(self, began: float) -> Solution:
-        """Solve the trace anew if that is due, and say what is known of it.
+        """Solve the trace again if that is due, and return what is known.
 
         Args:
             began: When the step began, by `time.perf_counter`.

@@ -59,11 +59,11 @@ class MinimalMaps:
 
     Args:
         trace: The steps so far.
-        theory: The settled theory.
+        theory: The theory without `auto`.
         judging: Evidence and the checker, for this theory.
 
     Attributes:
-        maps: The minimal maps; those that clingo found, where each step is solved anew.
+        maps: The minimal maps; those that clingo found, if each step is solved again.
         status: UNKNOWN until clingo has proven which maps are minimal.
         complete: Whether `maps` are all minimal maps.
         cost: What a minimal map costs.
@@ -80,7 +80,7 @@ class MinimalMaps:
         self._seen: list[object] = [observation(step, theory) for step in trace.steps]
 
     def follow(self, action: Action, trace: Trace, pairs: Pairs) -> list[ReplayedMap]:
-        """Keep the maps that predict the last step. Where none does, nothing is proven any more.
+        """Keep the maps that predict the last step. If none does, nothing is proven any more.
 
         Args:
             action: The action before the last step.
@@ -88,7 +88,7 @@ class MinimalMaps:
             pairs: What evidence says of pairs of these steps.
 
         Returns:
-            The maps in which the last action was never tried, where no map is kept.
+            The maps in which the last action was never tried, if no map is kept.
         """
         self._seen.append(observation(trace.steps[-1], self._theory))
         outcomes = [(m, self._outcome(m, trace, action.name, pairs)) for m in self.maps]

@@ -25,7 +25,7 @@ class ReturnDoubts:
 
     Attributes:
         undecided: Doubts that could not be weighed in time.
-        twins: For some doubts, a map without the return that no experiment tells apart.
+        twins: For some doubts, a map without the return that no experiment distinguishes.
     """
 
     def __init__(self, margin: int, time_limit: float | None) -> None:
@@ -61,7 +61,7 @@ class ReturnDoubts:
         Args:
             doubt: The return.
             trace: The steps so far.
-            theory: The settled theory.
+            theory: The theory without `auto`.
             dstates: How many dstates a minimal map has.
         """
         kind = "different" if theory.level == "causal" else "elsewhere"

@@ -41,7 +41,7 @@ class RivalMaps:
     """The rivals of the steps so far, the best one first.
 
     Args:
-        problem: The steps so far, and the settled theory, with faults.
+        problem: The steps so far, and the theory without `auto`, with faults.
         max_maps: Keep at most this many minimal maps; None keeps all.
         judging: Evidence and the checker, for this theory.
 
@@ -95,7 +95,7 @@ class RivalMaps:
 
     @property
     def is_settled(self) -> bool:
-        """Whether solving anew could add nothing."""
+        """Whether solving again would add nothing."""
         return self.is_impossible or (
             self.is_proven and (self.is_complete or len(self.minimal) == self._max_maps)
         )
@@ -182,8 +182,8 @@ class RivalMaps:
     def undecided(self) -> tuple[list[Rival], list[float]]:
         """The rivals that evidence has to decide between, and their probabilities.
 
-        Among rivals with the same faults the preference of the theory decides, as it does where
-        nothing is disbelieved: no evidence ever refutes a dstate more than are needed.
+        Among rivals with the same faults the preference of the theory decides, as it does if
+        nothing is ignored: no evidence ever refutes a superfluous dstate.
         """
         least: dict[frozenset[Fault], tuple[int, ...]] = {}
         for rival in self.rivals:
@@ -200,7 +200,7 @@ class RivalMaps:
         new = [
             way for rival in rivals for way in rival.ways_on(done.name, step, seen, self._theory)
         ]
-        # Evidence is asked of the new step only: it refuses no more of the earlier ones.
+        # Evidence is asked of the new step only: it rejects no more of the earlier ones.
         if self._has_evidence:
             trace = self._trace.prefix(t + 1)
             pairs = self._problem.changed(trace, self._theory.of_steps(0, t + 1)).pairs
@@ -215,7 +215,7 @@ class RivalMaps:
     def _ranked(self, rivals: list[Rival]) -> list[Rival]:
         """The rivals that are probable enough, the best first.
 
-        All of the cheapest stay, or as many as maps are listed.
+        All of the cheapest stay, up to the limit of listed maps.
         """
         if not rivals:
             return []

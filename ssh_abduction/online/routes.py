@@ -119,7 +119,7 @@ class Route:
 
     @property
     def metres(self) -> float | None:
-        """The length of the route; None where the map has no poses."""
+        """The length of the route; None if the map has no poses."""
         lengths = [move.metres for move in self.moves]
         return math.fsum(x for x in lengths if x is not None) if None not in lengths else None
 

@@ -1,4 +1,4 @@
-"""Settles a theory for a trace that grows."""
+"""Chooses the `auto` options for a growing trace."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 class TheorySettler:
-    """Settles `star` by the first step, and `displacement` and `returns` by the steps so far.
+    """Chooses `star` by the first step, and `displacement` and `returns` by the steps so far.
 
     Args:
         theory: The theory as the user gave it.
@@ -22,13 +22,13 @@ class TheorySettler:
     """
 
     def __init__(self, theory: Theory, first: Trace) -> None:
-        # The first step has no displacement, so its star is settled without displacements.
+        # The first step has no displacement, so `star` is chosen without displacements.
         settled = settle(first, theory.replace(displacement="none")).theory
         self._refuses_stars = theory.star == "auto" and settled.star == "none"
         self._theory = theory.replace(star=settled.star)
 
     def settled(self, trace: Trace, known: Problem | None = None) -> Problem:
-        """The theory settled for the steps so far, with what is known about fewer steps."""
+        """The theory for the steps so far, with what is known about fewer steps."""
         theory = self._theory
         if theory.displacement == "auto":
             theory = theory.replace(displacement="use" if trace.has_displacements else "none")
@@ -37,7 +37,7 @@ class TheorySettler:
         return settle(trace.prefix(1), theory, known).changed(trace)
 
     def is_settled(self, problem: Problem, trace: Trace) -> bool:
-        """Whether a theory that was settled for the steps but the last is settled for all."""
+        """Whether the theory for the steps before the last also fits all steps."""
         theory = problem.theory
         if theory.displacement == "none":
             return self._theory.displacement == "none" or trace.steps[-1].displacement is None

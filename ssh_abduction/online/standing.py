@@ -1,4 +1,4 @@
-"""How sure a mapper is of its map where faults are allowed, and what may be true."""
+"""How sure a mapper is of its map if faults are allowed, and what may be true."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Hypothesis:
     Attributes:
         weight: Its probability. The weights of all hypotheses sum to 1.
         map: A map of all steps so far, with its faults; None for all other hypotheses together.
-        said: What it disbelieves since the mapper was last certain, and where the robot is.
+        said: What it ignores since the mapper was last certain, and where the robot is.
     """
 
     weight: float
@@ -49,9 +49,9 @@ class Standing:
     Attributes:
         certain: Whether the first map of the solution is proven minimal, and evidence leaves no
             other from here on. The past need not be certain: two hypotheses may have the same map
-            and the robot in the same dstate, and differ in the step that they disbelieve.
+            and the robot in the same dstate, and differ in the step that they ignore.
         broke: A sentence for each step at which the best map expected something else, since the
-            mapper was last certain. Where this step makes it certain again, they are still listed.
+            mapper was last certain. If this step makes it certain again, they are still listed.
         hypotheses: What may be true, the most probable first.
         where: Where the robot is in the first map, or nowhere, by Markov localisation since
             something broke; None if nothing broke.
@@ -97,7 +97,7 @@ class Confidence:
     """Says how sure the mapper is, from step to step.
 
     Args:
-        theory: The settled theory, with faults.
+        theory: The theory without `auto`, with faults.
 
     Attributes:
         known: The map that was certain last, or else the best before anything broke.
@@ -165,7 +165,7 @@ class Confidence:
         return tuple(told)
 
     def _said(self, rival: Rival) -> str:
-        """What a rival disbelieves since the mapper was certain, and where the robot is."""
+        """What a rival ignores since the mapper was certain, and where the robot is."""
         excused = set(self.known.faults) if self.known else set()
         new = sorted(set(rival.faults) - excused, key=lambda fault: fault.step)
         faults = ", ".join(str(fault) for fault in new) or "nothing else is disbelieved"

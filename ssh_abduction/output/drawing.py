@@ -14,7 +14,7 @@ Point: TypeAlias = tuple[float, float]
 # In units of the page: the margin around the picture, and the radius of a place.
 MARGIN, RADIUS = 80.0, 17.0
 # The colours of paths, in turn. The first six are of the palette of Okabe & Ito, which people with
-# colour blindness can tell apart.
+# colour blindness can distinguish.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#8c564b")
 ALARM = "#b00020"  # of faults
 
@@ -79,7 +79,7 @@ def text(
 
 
 def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
-    """A red diamond with an exclamation mark, for what a map disbelieves."""
+    """A red diamond with an exclamation mark, for what a map ignores."""
     u = 8 * size
     diamond = element(
         "path",
@@ -92,7 +92,7 @@ def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
 
 
 def faults_of(ssh_map: SSHMap) -> dict[int, str]:
-    """What a map disbelieves, by the dstate of the step."""
+    """What a map ignores, by the dstate of the step."""
     faults: dict[int, list[str]] = {}
     for fault in ssh_map.faults:
         faults.setdefault(ssh_map.labels[fault.step], []).append(str(fault))

@@ -23,7 +23,7 @@ from ssh_abduction.output.turns import SURE
 Course: TypeAlias = tuple[int, ...]
 
 # Radians: a turn that a drawing misses by more may go to the wrong side. The first is for turns by
-# known degrees, the second for turns of which only the side is known.
+# known degrees, the second for turns with a known side only.
 WRONG, WRONG_GUESS = math.radians(46), math.radians(61)
 # Sweeps of averaging, and how often the turns get new weights.
 SWEEPS, REWEIGHTED = 60, 15

@@ -114,7 +114,7 @@ def _nearest(spots: list[tuple[float, float]]) -> float:
 
 
 def _new_axes(spots: list[tuple[float, float]], unit: float) -> Any:
-    """Axes large enough for spots of which the nearest are a unit apart."""
+    """Axes large enough for spots if the nearest are a unit apart."""
     try:
         from matplotlib import pyplot
     except ImportError:

@@ -39,7 +39,7 @@ BEAM = 3
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """A drawing in the search that puts streets apart.
+    """A drawing in the search that separates streets.
 
     Attributes:
         value: What it costs.
@@ -55,7 +55,7 @@ class _State:
 
 
 class StreetProgram:
-    """The linear program that puts spots along the headings of streets and keeps streets apart.
+    """The linear program that puts spots along the headings of streets and separates streets.
 
     Its variables are x and y of each spot, then for each street how far it leaves its heading, and
     then how much it is too short.

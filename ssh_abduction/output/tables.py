@@ -1,4 +1,4 @@
-"""A map as a table of pandas, where that is installed."""
+"""A map as a table of pandas, if that is installed."""
 
 from __future__ import annotations
 

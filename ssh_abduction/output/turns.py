@@ -11,9 +11,9 @@ from ssh_abduction.data.trace import Trace
 
 Turns: TypeAlias = Mapping[str, "str | float"]
 
-# Degrees clockwise of turns of which only the side is known.
+# Degrees clockwise of turns with a known side only.
 SIDES = {"right": 90.0, "around": 180.0, "left": 270.0}
-# The weights of a turn by known degrees, and of one of which only the side is known.
+# The weights of a turn with known degrees, and of one with a known side only.
 SURE, GUESSED = 1.0, 0.2
 
 

@@ -36,7 +36,7 @@ class _Counts:
         self._numbers: dict[Steps, int] = {}  # of the steps along a path, as numbers hash faster
 
     def add(self, ssh_map: SSHMap, count: int) -> None:
-        """Count a map so many times."""
+        """Count a map this many times."""
         at = [ssh_map.dstates[label] for label in ssh_map.labels]
         of_dstate = _members(ssh_map.labels)
         of_place = _members([s.place for s in at])

@@ -14,7 +14,7 @@ from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.page.images import drawn_images
 
 BELIEVING = 5.0  # seconds of the processor for beliefs in all maps but the first
-# Dstates of a belief that are shown: so many at most, each of this probability at least.
+# At most this many dstates of a belief are shown, each of this probability at least.
 BELIEVED, LEAST = 12, 0.01
 
 

@@ -217,7 +217,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, json.dumps(told).encode(), "application/json")
 
     def _asked(self) -> str | None:
-        """The question of a request; None if the request is refused."""
+        """The question of a request; None if the request is rejected."""
         hosts = [f"{name}:{self.server.port}" for name in ("127.0.0.1", "localhost")]
         origin = self.headers.get("Origin")
         if self.headers.get("Host") not in hosts or (
@@ -227,7 +227,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server.is_known(self.path)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Refuse a malformed request without saying what is wrong."""
+        """Reject a malformed request without saying what is wrong."""
         self._refuse()
 
     def _refuse(self) -> None:
@@ -250,7 +250,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing, as addresses hold the token."""
+        """Log nothing: the URLs contain the secret token."""
 
 
 @contextmanager

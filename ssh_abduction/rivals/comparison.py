@@ -13,7 +13,7 @@ the paths of steps 18–22 differ
 >>> print(found.deciding[0])
 steps 17–18 and 21 are at the place of step 14
 
-Maps are told apart by questions (`rivals/questions.py`). Some of these decide
+Maps are distinguished by questions (`rivals/questions.py`). Some of these decide
 (`rivals/factors.py`): the answers to all others follow from them. They are asked in the order of
 causes: faults, dstates, places, paths, directions. Questions that do not depend on each other
 belong to different choices, and each combination of options of the choices is a map.
@@ -151,8 +151,8 @@ class Comparison:
         choices: The independent choices that make the listed maps: each combination of their
             options is a map.
         together: For each sort the steps that depend on several choices together.
-        deciding: Questions that tell all listed maps apart, in the order in which to ask them. The
-            first ones tell all labelings apart. None is superfluous, but a smaller set may exist.
+        deciding: Questions that distinguish all listed maps, in the order in which to ask them. The
+            first ones distinguish all labelings. None is superfluous, but a smaller set may exist.
         sizes: For each triple of numbers of dstates, places and paths, how many maps have it.
         fits: The least and the greatest chi-square, if maps have fits.
         others: How the maps compare with another list.
@@ -399,7 +399,7 @@ def _contradiction(told: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[i
     """Find two steps about which the backbone is wrong.
 
     Args:
-        told: The backbone: steps that are one in all maps, or in some.
+        told: The backbone: steps that are one dstate in all maps, or in some.
         seen: The same for the listed maps.
         in_one: A number for each step. Steps with the same number are skipped.
 

@@ -5,8 +5,8 @@ The axioms, or the order of a path, may imply the end of an action that was neve
 - a turn, if places have frames: it leads to the slot that many quarters on (turn_rotates). Its
 dstate
   is known (one_dstate_per_heading), or at least its star, which is that of the place, turned;
-- a turn around along a path: it leads back along the path (turn_around_reverses), where at most one
-  dstate is (one_dstate_per_course);
+- a turn around along a path: it leads back along the path (turn_around_reverses), and at most one
+  dstate is there (one_dstate_per_course);
 - a travel along a path: it leads to the next place in the order of the path. This is only expected,
   as the order of a map is one of several, and there may be an unseen place between.
 """

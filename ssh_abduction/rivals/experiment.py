@@ -1,4 +1,4 @@
-"""Experiments that tell rival maps apart, as values."""
+"""Experiments that distinguish rival maps, as values."""
 
 from __future__ import annotations
 
@@ -72,11 +72,11 @@ class Plan:
 
     Attributes:
         rivals: The rivals that are left, by number from 1.
-        actions: Actions along links that all of these know; empty if known links do not tell them
-            apart.
+        actions: Actions along links that all of these know; empty if known links do not
+            distinguish them.
         branches: For each predicted observation after the last action, the plan for the rivals that
             are left.
-        untried: The most informative untried action, if known links do not tell the rivals apart or
+        untried: The most informative untried action, if no known link distinguishes the rivals or
             one rival is left; None if there is none.
     """
 
@@ -152,7 +152,7 @@ class Experiment:
     def actions(self) -> tuple[str, ...]:
         """The actions up to the first difference in predictions.
 
-        If known links do not tell the rivals apart, the way to the untried action, and that action.
+        If no known link distinguishes the rivals, the way to the untried action, then the action.
         """
         untried = self.plan.untried
         return self.plan.actions or ((*untried.way, untried.action) if untried else ())
@@ -166,7 +166,7 @@ class Experiment:
     def is_settled(self) -> bool:
         """Whether there is nothing left to try.
 
-        No known link tells rivals apart, and the robot cannot reach an untried action.
+        No known link distinguishes rivals, and the robot cannot reach an untried action.
         """
         return not self.actions and self.stopped is None
 

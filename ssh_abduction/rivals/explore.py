@@ -1,4 +1,4 @@
-"""Find the next experiment: actions that tell rival maps apart.
+"""Find the next experiment: actions that distinguish rival maps.
 
 >>> from ssh_abduction import Trace, next_experiment, solve
 >>> actions = ["travel", "travel", "around", "travel"]
@@ -26,17 +26,17 @@ fewest actions after which the predictions differ, or proves that they never do.
 
 *Many rivals.* The experiment that leaves the fewest rivals in the worst case is PSPACE-complete
 (Lee & Yannakakis 1994, "Testing finite-state machines: state identification and verification"). The
-plan is greedy: it takes a sequence up to the first difference that gains most per action, where to
-leave at worst m of n rivals gains log(n / m), and goes on with each part. So it may leave more than
-the best plan.
+plan is greedy: it takes the sequence up to a first difference that gains most per action. Leaving
+at worst m of n rivals gains log(n / m). Then it plans for each part. So it may leave more than the
+best plan.
 
 Untried actions
 ---------------
-Rivals that known links do not tell apart see the same forever along the links that all of them
-know; rivals that differ only in paths are like that. They may be told apart by an action that not
-all of them have tried: if two of them are sure of different outcomes, one is refuted. The most
-informative action leaves the fewest in the worst case. Ties go to the action of which most pairs of
-rivals expect something different, then to the nearest.
+Rivals that known links do not distinguish see the same forever along the links that all of them
+know, for example rivals that differ only in paths. An action that some of them have not tried may
+distinguish them: if two rivals are sure of different outcomes, one is refuted. The most informative
+action leaves the fewest rivals in the worst case. Ties go to the action for which most pairs of
+rivals expect different outcomes, then to the nearest.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def next_experiment(
             of untried actions. If None, stars are read unless some map has a dstate with two.
         complete: Whether these are all minimal maps.
         actions: Actions that the robot can do, beside those that some map has a link for.
-        can: Names of the actions that the robot can do where this is seen; if None, any action that
+        can: Names of the actions that the robot can do when it sees this; if None, any action that
             the star allows.
         implied: Whether the experiment may follow links that no rival has but the axioms imply.
         time_limit: Seconds. When a limit ends the search, the answer is the plan so far.
@@ -262,8 +262,7 @@ class Laboratory:
 
         Returns:
             The actions, and for each observation after them the machines that predict it (as
-            indices of `machines`) with their states; None if known links do not tell the machines
-            apart.
+            indices of `machines`) with their states; None if known links do not distinguish them.
         """
         weights = np.array([len(self._groups[m]) for m in machines])
         total, least = int(weights.sum()), int(weights.max())
@@ -408,7 +407,7 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
                 f"maps[{i}]: labels: expected {len(trace)}, one for each step of the trace, "
                 f"got {len(labels)}; solve this trace"
             )
-        # a disbelieved view or action may differ from the map
+        # an ignored view or action may differ from the map
         wrong = {(fault.step, fault.kind) for fault in ssh_map.faults}
         links = set(ssh_map.links)
         for t, step in enumerate(trace.steps):

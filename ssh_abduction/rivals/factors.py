@@ -2,7 +2,7 @@
 
 A question is a column of truth values, one for each map. Some questions *decide* if no two maps
 give the same answers to all of them. They are chosen greedily: the next one splits most pairs of
-maps that are not told apart yet, and ties go to the earliest. Then superfluous ones are dropped. A
+maps not distinguished yet, and ties go to the earliest. Then superfluous ones are dropped. A
 smaller set may exist: to find the smallest is NP-hard (minimum test set, Garey & Johnson 1979,
 SP6).
 
@@ -34,7 +34,7 @@ from ssh_abduction.rivals.table import Bools
 
 
 def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] = ()) -> list[int]:
-    """Choose questions that tell apart all maps that can be told apart.
+    """Choose questions that distinguish all maps that can be distinguished.
 
     Args:
         columns: For each question the answers of the maps. Earlier questions win ties.

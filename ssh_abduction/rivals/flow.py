@@ -26,7 +26,7 @@ def shortest_walk(
     """The shortest walk that makes these moves and visits these stances, up to an unknown move.
 
     Empty if there is no such walk, or if none is found in time. The order of the moves is Fleury's:
-    of those that do not cut off the rest, one with an unknown end goes first, as it tells most.
+    of the moves that do not cut off the rest, one with an unknown end goes first: it says most.
     """
     times = shortest_flow(moves, start, due, unseen)
     if times is None:
@@ -67,7 +67,7 @@ def shortest_flow(
 
     A walk is a flow on the graph of moves: each stance is entered as often as it is left, except
     for the first and the last one. `milp` of scipy finds a flow of least cost. If a part of it is
-    not connected to the start, a constraint forbids that, and the flow is sought again, as Dantzig,
+    not connected to the start, a constraint forbids that and the flow is solved again, as Dantzig,
     Fulkerson & Johnson (1954) did for the travelling salesman.
 
     Args:

@@ -46,7 +46,7 @@ class Seen:
 
     Attributes:
         view: The view; None if unknown.
-        star: The star as a trace writes it; None if stars are not used.
+        star: The openings as a trace has them; None if stars are not used.
     """
 
     view: View | None
@@ -63,7 +63,7 @@ class Seen:
         )
 
 
-# Names of the actions that a robot can do where this is seen.
+# Names of the actions that a robot can do when it sees this.
 Can: TypeAlias = Callable[[Seen], Iterable[str]]
 
 
@@ -91,11 +91,11 @@ def _star_text(star: Sequence[Any]) -> str:
 class Sights:
     """What the dstates of rival maps look like.
 
-    Two dstates have the same number if and only if one look cannot tell them apart. Without a trace
-    only views count. Stars are read as the theory reads them: as four openings; or turned in any
-    way, if the theory does not say how stars are turned. Where stars agree in tolerance only, stars
-    that could be one, directly or through others, count as one, so that no predicted difference may
-    be invisible. Without a theory, stars are read unless some map has a dstate with two stars.
+    Two dstates have the same number if and only if one look cannot distinguish them. Without a
+    trace only views count. Stars are read as in the theory: as four openings; or turned in any
+    way, if the theory does not say how stars are turned. If stars agree in tolerance only, stars
+    that could be equal, directly or through others, count as equal: the robot can see each
+    predicted difference. Without a theory, stars are read unless a map has a dstate with two stars.
 
     Attributes:
         seen: What is seen, by number.
@@ -132,7 +132,7 @@ class Sights:
 class _Reading:
     """Reads the star of a step.
 
-    A call gives a key, which stars share that are not told apart, and the star itself.
+    A call gives the star and its key. Stars that are not distinguished have the same key.
     """
 
     def __init__(self, trace: Trace, theory: Theory, steps: Sequence[int] = ()) -> None:

@@ -1,4 +1,4 @@
-"""Questions that tell maps of one trace apart.
+"""Questions that distinguish maps of one trace.
 
 A question asks whether two steps are one dstate, at one place, along one path, or along one path in
 one direction. Questions to which all maps give the same answers, or opposite ones, are one
@@ -25,10 +25,10 @@ MATTERS: tuple[Matter, ...] = ("faults", *SORTS)  # in the order of causes
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A question that tells maps apart.
+    """A question that distinguishes maps.
 
     It asks whether two steps are one dstate, at one place, along one path, or along one path in one
-    direction; or whether the map disbelieves a step.
+    direction; or whether the map ignores a step.
 
     Attributes:
         sort: What the question is about.
@@ -109,7 +109,7 @@ class Asked:
 
 
 def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> list[Asked]:
-    """All questions that tell maps apart, each once.
+    """All questions that distinguish maps, each once.
 
     Args:
         table: The maps as arrays.

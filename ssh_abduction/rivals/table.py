@@ -1,6 +1,6 @@
 """Maps of one trace as arrays, so that thousands of them are compared in seconds.
 
-Steps that are one dstate in all maps are a *class*, which its first step stands for. For each sort
+Steps that are one dstate in all maps are a *class*, named by its first step. For each sort
 (dstates, places, paths, courses) the table has, for each map and class, the first class that is one
 with it. So the numbers that maps give to their dstates, places and paths do not matter.
 
@@ -81,7 +81,7 @@ class Table:
         return first[inverse.reshape(-1)].astype(np.int32)
 
     def questions(self, sort: Sort) -> Iterator[tuple[int, int, Bools]]:
-        """Questions that tell maps apart.
+        """Questions that distinguish maps.
 
         Only pairs are asked about whose earlier class is the first of its kind in some map. That is
         enough: if two maps differ in what a class is one with, they differ in the first such class.

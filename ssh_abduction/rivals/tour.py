@@ -60,9 +60,9 @@ def next_tour(
         trace: The trace.
         theory: The theory of the map; Theory.topological() if None.
         actions: Actions that the robot can do, beside those of the trace.
-        can: Names of the actions that the robot can do where this is seen; if None, any action that
+        can: Names of the actions that the robot can do when it sees this; if None, any action that
             the star allows.
-        margin: A return to a place is believed once more than so many dstates are seen there; 0
+        margin: A return to a place is believed once more dstates than this are seen there; 0
             believes each return at once. Only returns in maps with places are doubted.
 
     Returns:

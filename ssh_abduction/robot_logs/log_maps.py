@@ -1,8 +1,8 @@
 """From a robot's log to the minimal maps of the building, and to a folder with the whole run.
 
 A building whose walls meet at right angles is mapped by the topological theory with stars.
-Elsewhere stars are too often misread, and the sides of a path that bends are not defined. There
-displacements tell places apart, and the theory has no sides. The same theory is used if doors are
+Elsewhere openings are too often misread, and the sides of a path that bends are not defined. There
+displacements distinguish places, and the theory has no sides. The same theory is used if doors are
 the places, as a path may lead across a room in any direction, and if no map fits the stars: a
 junction may have been passed unnoticed, or a star misread.
 """

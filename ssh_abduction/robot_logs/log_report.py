@@ -230,7 +230,7 @@ def _ladder(rungs: Sequence[Rung]) -> str:
 
 
 def _faults(solution: Solution) -> str:
-    """What the first map disbelieves."""
+    """What the first map ignores."""
     faults = solution.maps[0].faults
     if not faults:
         allowed = solution.theory.misread or solution.theory.slipped or solution.theory.jumped

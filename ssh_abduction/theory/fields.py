@@ -25,7 +25,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
 # Readings of stars that compare the directions of gateways within their spreads.
 IN_TOLERANCE = ("alike", "gateways")
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
-# The default preferences. With displacements, which tell places apart, the fewest places are seldom
+# The default preferences. Displacements distinguish places, so the fewest places are seldom
 # too few. Without them, the fewest paths are the better choice (docs/measurements/truth.md).
 AUTO: tuple[Count, ...] = ("auto",)
 PREFERRED: tuple[Count, ...] = ("dstates", "paths", "places")

@@ -19,7 +19,7 @@ from ssh_abduction.data.errors import TheoryError, brief, is_writable
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.theory.encodings import Axiom, axioms_in
 
-# Bytes that a file of rules may have at most. This refuses devices that never end.
+# Bytes that a file of rules may have at most. This rejects devices that never end.
 LARGEST = 2**24
 # Outside of block comments: strings, line comments and the start of a block comment, which may hold
 # any character. The group matches what rules must not have: a character that is not ASCII, and

@@ -1,4 +1,4 @@
-"""Settle a theory for one trace: replace each `auto` by the choice that fits the trace.
+"""Settle a theory for one trace: replace each `auto` by the value that fits the trace.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.theory.settle import settle
@@ -25,11 +25,11 @@ Star: TypeAlias = Literal["auto", "none", "alike", "pattern", "frame", "gateways
 
 @dataclass(frozen=True)
 class Problem:
-    """A trace and the theory that is settled for it. All code that works on a trace gets it.
+    """A trace, and its theory without `auto`. All code that works on a trace gets it.
 
     Attributes:
         trace: The trace.
-        theory: The theory, with `star`, `displacement`, `prefer` and `returns` settled.
+        theory: The theory, with `star`, `displacement`, `prefer` and `returns` chosen.
         evidence: The kinds of evidence that this theory uses. They remember what they computed
             about the trace.
     """
@@ -40,7 +40,7 @@ class Problem:
 
     @classmethod
     def of(cls, trace: Trace, theory: Theory) -> Problem:
-        """The problem of a theory that is settled for the trace already."""
+        """The problem of a theory that has no `auto`."""
         return cls(trace, theory, evidence_of(theory))
 
     @cached_property
@@ -50,18 +50,18 @@ class Problem:
         return Pairs.joined([e.pairs(self.trace) for e in self.evidence if e.axiom in hard])
 
     def changed(self, trace: Trace | None = None, theory: Theory | None = None) -> Problem:
-        """A problem with another trace or settled theory, which keeps what is known.
+        """A problem with another trace or theory. It keeps what is known.
 
         Args:
             trace: Another trace, such as this one with more steps, or a part of it.
-            theory: Another theory that is settled for that trace.
+            theory: Another theory, without `auto`.
         """
         theory = theory or self.theory
         return Problem(trace or self.trace, theory, evidence_of(theory, self.evidence))
 
 
 def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = None) -> Problem:
-    """Settle a theory for a trace, and check that the trace has what the axioms need.
+    """Replace each `auto`, and check that the trace has what the axioms need.
 
     A step whose view is unknown may be at any dstate.
 
@@ -118,7 +118,7 @@ def displacement_of(problem: Problem) -> Displacement | None:
 
 
 def _star_of(trace: Trace, theory: Theory) -> Star:
-    """How stars are read in a trace."""
+    """How to read stars (the openings seen at a place)."""
     star = theory.star
     if star == "auto":
         star = "frame" if trace.has_stars else "none"

@@ -73,7 +73,7 @@ class Speedups:
         return cls(**dict.fromkeys(off, False))
 
     def that_hold_for(self, theory: Theory) -> Speedups:
-        """Those of these speed-ups that hold for a theory with settled star."""
+        """The speed-ups that hold for a theory; `star` must not be auto."""
         theory = checked_theory(theory)
         valid = {speedup.switch for speedup in TABLE if speedup.holds_for(theory)}
         return replace(self, **{name: False for name in SPEEDUPS if name not in valid})
@@ -116,7 +116,7 @@ class Speedup:
     keeps: Callable[[], frozenset[str]] | None
 
     def holds_for(self, theory: Theory) -> bool:
-        """Whether it changes no answer for a theory with settled star."""
+        """Whether it changes no answer for a theory (without star=auto)."""
         return (
             self.suits(theory)
             and not self.rests_on & theory.given_up

@@ -41,7 +41,7 @@ from ssh_abduction.theory.fields import (
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.rules import Rules
 
-# Disbelieving a step costs at least LEAST_SURE times the price, and at most MOST_SURE times: even a
+# Ignoring a step costs at least LEAST_SURE times the price, and at most MOST_SURE times: even a
 # very confident view may be wrong.
 LEAST_SURE, MOST_SURE = 0.1, 5.0
 LARGEST_TOML = 2**20  # bytes
@@ -76,9 +76,9 @@ class Theory:
     Attributes:
         level: The maps to find: causal ones (dstates only), or topological ones (dstates, places
             and paths).
-        boundary: How the axioms about left and right of a path hold: not at all (none), strictly
-            (strict), or with exceptions for pairs of paths at a cost (defeasible).
-        symmetric_sides: Whether paths cross at a turn, so that a turn tells four relations of
+        boundary: Whether the axioms about left and right of a path hold. none: they do not. strict:
+            without exception. defeasible: with exceptions for pairs of paths, each at a cost.
+        symmetric_sides: Whether paths cross at a turn, so that a turn gives four relations of
             sides, not one.
         path_order: Whether the places of a path have a partial or a total order.
         next_place: Whether a travel leads to the next place of its path.
@@ -89,14 +89,16 @@ class Theory:
             any directions within tolerance. auto: frame if the trace has stars, else none. frame
             becomes gateways if stars or turns do not fit right angles.
         displacement: Whether displacements are evidence; auto uses them if the trace has any.
-        reject: The maximum probability that displacements refuse a true map of the trace.
+        reject: Significance level: the largest probability of rejecting the true map because of
+            its displacements.
         joint: The number of returns to places that are tested together: 1 or 2.
         returns: The number of returns of the trace that may be true, among which `reject` is
             shared; 0 counts them in the trace.
-        misread: Cost in dstates of disbelieving a view or star, in steps of 0.1; 0 forbids it.
+        misread: Cost in dstates, in tenths, of treating a view or a star (the openings seen at a
+            place) as wrong; 0 forbids it.
         slipped: Cost in dstates of an action that did not do what its name says; 0 forbids it.
-        jumped: Cost in dstates of disbelieving a displacement, as when the robot was carried away;
-            0 forbids it.
+        jumped: Cost in dstates of ignoring a displacement, for example because the robot was
+            carried; 0 forbids it.
         planar: Whether paths meet at places only, so that the map can be drawn in the plane
             without a crossing, with right turns to the right.
         prefer: What to minimise, most important first, out of dstates, paths, places and excuses.
@@ -190,7 +192,7 @@ class Theory:
 
     @property
     def has_faults(self) -> bool:
-        """Whether a map may disbelieve parts of the trace."""
+        """Whether a map may ignore parts of the trace."""
         return any(getattr(self, kind) > 0 for kind in EXCUSED)
 
     def without_faults(self) -> Theory:
@@ -198,7 +200,7 @@ class Theory:
         return replace(self, **dict.fromkeys(EXCUSED, 0.0))  # type: ignore[arg-type]
 
     def fault_tenths(self, kind: str, step: Step) -> int:
-        """The cost of disbelieving a step, in tenths of dstates; 0 if the theory forbids it.
+        """The cost of ignoring a step, in tenths of dstates; 0 if the theory forbids it.
 
         The cost of a view or star grows with the log odds of the step's confidence. A confidence of
         0.99, or none, costs the full price.
@@ -291,7 +293,7 @@ class Theory:
         )
 
     def require(self, step: Step, where: str) -> None:
-        """Check that a step has what the axioms need. `star` must be settled.
+        """Check that a step has what the axioms need. `star` must not be auto.
 
         Args:
             step: The step.

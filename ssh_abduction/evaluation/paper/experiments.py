@@ -59,7 +59,7 @@ EXPERIMENTS = {
         "taylor-hall", tours=10, k_max=24, views=10, dstates=20, places=7, paths=4
     ),
 }
-# The paper's robot has no odometry that would tell places apart.
+# The paper's robot has no odometry that would distinguish places.
 VIEWS_ALONE = Theory.topological().replace(star="none", displacement="none")
 WITH_STARS = Theory.topological().replace(displacement="none")
 
@@ -120,10 +120,10 @@ class Labelling:
 
 @dataclass(frozen=True)
 class Contrast:
-    """What comes out where the method is not followed.
+    """The result if the method is not followed.
 
     Attributes:
-        alone_uncertainty: U of as many clusters as there are dstates.
+        alone_uncertainty: U for one cluster per dstate.
         alone_distinct: How many dstates have a cluster of their own then.
         even_quality: M at the chosen k for images at even distances.
         even_uncertainty: U at the chosen k for images at even distances.
@@ -149,7 +149,7 @@ class Run:
         curve: The learning curve on these labels.
         rates: Recognition of the true dstate by labels from clustering alone, from the map, and
             from the truth.
-        contrast: What comes out where the method is not followed.
+        contrast: The result if the method is not followed.
         spread: The largest distance of a pose from its dstate's mean, (circuits, 3), in x and y
             (metres) and heading (radians).
     """
@@ -260,13 +260,13 @@ def _labelling(learner: BootstrapLearner, truth: NDArray[Any]) -> Labelling:
 
 
 def _contrast(e: Experiment, seed: int, trace: Trace, alone: NDArray[Any], k: int) -> Contrast:
-    """Cluster into as many views as dstates, and cluster images at even distances.
+    """Cluster into one view per dstate, and cluster images at even distances.
 
     Args:
         e: The experiment.
         seed: The seed of all noise.
         trace: The trace at dstates.
-        alone: The clusters of its images, as many as there are dstates.
+        alone: The clusters of its images, one per dstate.
         k: The chosen number of views.
     """
     truth = true_dstates(trace)
@@ -284,7 +284,7 @@ def _contrast(e: Experiment, seed: int, trace: Trace, alone: NDArray[Any], k: in
 
 
 def _step(trace: Trace) -> float:
-    """Metres between two dstates on average, so that as many images are at even distances."""
+    """Metres between two dstates on average, for one image per dstate at even distances."""
     poses = np.array([step.truth["pose"][:2] for step in trace.steps])
     return round(float(np.abs(np.diff(poses, axis=0)).sum() / len(poses)), 2)
 

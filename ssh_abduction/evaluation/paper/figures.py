@@ -64,7 +64,7 @@ def _save(figure: Any, path: str | Path) -> None:
 def draw_quality(
     path: str | Path, quality: Mapping[int, float], uncertainty: Mapping[int, float], chosen: int
 ) -> None:
-    """M, and U where it is known, against the number of clusters k."""
+    """M, and U if it is known, against the number of clusters k."""
     # M on the left axis, U on the right one.
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
     axes.plot(list(quality), list(quality.values()), "o-", color=BLUE, label="M")
@@ -233,7 +233,7 @@ def draw_telling(
     labels: NDArray[Any],
     found: Mapping[tuple[int, int], TellingFeatures],
 ) -> None:
-    """Which beams tell pairs of dstates apart, over the median scan of each of the two.
+    """Which beams distinguish pairs of dstates, over the median scan of each of the two.
 
     Each pair has a row, and each method a column.
 
@@ -241,13 +241,13 @@ def draw_telling(
         path: The file to write.
         ranges: Ranges in metres, (n, d), over the half circle ahead, the first at the right.
         labels: The dstate of each scan, (n,).
-        found: For each pair what tells it apart.
+        found: For each pair what distinguishes it.
     """
     methods = list(next(iter(found.values())).methods)
     figure, grid = _pyplot().subplots(
         len(found), len(methods), figsize=(3.2 * len(methods), 2.3 * len(found)), squeeze=False
     )
-    # A beam that tells the two apart has a dot, the larger the more it tells.
+    # A beam that distinguishes the two has a dot, larger if it distinguishes them better.
     bearings = np.radians((np.arange(ranges.shape[1]) + 0.5) * 180 / ranges.shape[1] - 90)
     for row, ((a, b), telling) in zip(grid, found.items(), strict=True):
         scans = [np.median(ranges[labels == name], axis=0) for name in (a, b)]

@@ -323,12 +323,12 @@ All can be made again: <code>configuration.json</code> says with what.</p>
 
 
 def claimed(row: dict[str, Any]) -> str:
-    """A claim, marked where the paper does not make it."""
+    """A claim, marked if the paper does not make it."""
     return f"ours: {row['claim']}" if row["ours"] else str(row["claim"])
 
 
 def spread_of(row: dict[str, Any]) -> str:
-    """What came out: one text where the seeds agree, else the commonest texts."""
+    """The result: one text if the seeds agree, else the commonest texts."""
     values = list(row["here"].values())
     counted = sorted(set(values), key=values.count, reverse=True)
     if len(counted) == 1:

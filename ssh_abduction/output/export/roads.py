@@ -22,7 +22,7 @@ Way: TypeAlias = tuple[str | None, int | None, int | None]
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Where a robot can be sent.
+    """A destination for a robot.
 
     Attributes:
         id: The number of the place or of the dstate.
@@ -65,7 +65,7 @@ class Road:
 
     @property
     def cost(self) -> float:
-        """The length for a planner: above 0, as Nav2 refuses edges that cost nothing."""
+        """The length for a planner: above 0, as Nav2 rejects edges that cost nothing."""
         return self.length + TURN if self.turns else max(self.length, LEAST)
 
 

@@ -51,7 +51,7 @@ def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidenc
     """Make the kinds of evidence that a theory uses.
 
     Args:
-        theory: The settled theory.
+        theory: The theory without `auto`.
         known: Evidence that was made before. What it remembers about traces is kept.
     """
     made = [kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms]
@@ -67,10 +67,10 @@ def said_by(
     Args:
         kinds: The evidence.
         trace: The trace.
-        refused: The number of refused sets of equalities, by the name of the kind.
+        refused: The number of rejected sets of equalities, by the name of the kind.
 
     Returns:
-        By the name of the kind, the number of excluded pairs of steps and of refused sets.
+        By the name of the kind, the number of excluded pairs of steps and of rejected sets.
     """
     return {
         kind.name: {

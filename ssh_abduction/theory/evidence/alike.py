@@ -1,4 +1,4 @@
-"""Stars as evidence about dstates alone: steps whose stars differ are different dstates.
+"""Stars (the openings seen at places) as evidence: steps with other stars are other dstates.
 
 This needs neither places nor right angles.
 """

@@ -3,19 +3,19 @@
 A *return* is a pair of visits that a map takes for one place, or a pair of steps that it takes for
 one dstate. The displacements between the two steps make a loop. The loop fails to close by some
 distance, and the covariance says how likely that is (`loops.py`). The axiom `one_pose` demands that
-no set of at most `joint` returns is refused.
+no set of at most `joint` returns is rejected.
 
-*One return* does not depend on others. So the search knows beforehand which returns are refused:
+*One return* does not depend on others. So the search knows the rejected returns beforehand:
 pairs of steps at different places, or of different dstates. They prune the domains of all engines.
 
 *Two returns* are tested together if both are between first steps of visits, and their loops share
-displacements. Each answer is checked for refused sets.
+displacements. Each answer is checked for rejected sets.
 
-*How often a true map is refused.* A true map has many returns, and each is tested. So half of
+*How often a true map is rejected.* A true map has many returns, and each is tested. So half of
 `reject` is shared among all returns that may be true, and the other half among all sets of two.
-Then a true map is refused with probability `reject` at most. Half of the true returns have a
+Then a true map is rejected with probability `reject` at most. Half of the true returns have a
 p-value above one half (Storey 2002, "A direct approach to false discovery rates"), so about twice
-as many returns as that may be true. The number is rounded up to a power of two, so that it seldom
+that number of returns may be true. The number is rounded up to a power of two, so that it seldom
 changes while a robot drives.
 """
 
@@ -116,7 +116,7 @@ class Displacement:
 
 
 def jumped(ssh_map: SSHMap) -> tuple[int, ...]:
-    """The steps whose displacements a map disbelieves."""
+    """The steps whose displacements a map ignores."""
     return tuple(fault.step for fault in ssh_map.faults if fault.kind == "jumped")
 
 

@@ -47,14 +47,14 @@ from ssh_abduction.data.trace import Trace
 Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]
 
-# A test that refuses a true map once in a thousand traces allows about this many standard
+# A test that rejects a true map once in a thousand traces allows about this many standard
 # deviations.
 SIGMAS = 6.0
 # Loops with a more uncertain heading than this, in radians, are not tested: the covariance that is
 # added for it exceeds any error.
 LOST = 1.0
 # Values of the steady drift of heading that are tried for each of its standard deviations. A loop
-# is refused if it closes badly with each of them.
+# is rejected if it closes badly with each of them.
 BENDS_A_SIGMA = 2
 # Drifts of more standard deviations than this are too unlikely to try.
 MOST_BENDS = 6

@@ -6,7 +6,7 @@
 [2, 1]
 
 A travel leads along an edge from a gateway of one place to a gateway of another, and passes no
-place unseen. So a gateway leads to exactly one other gateway. Turns tell the order of the gateways
+place unseen. So a gateway leads to exactly one other gateway. Turns give the order of the gateways
 around a place; in frames, stars do too. If the order is not known, any order will do. A map is
 planar if *some* orders allow a drawing. The first steps of a planar map are planar as well: they
 have fewer edges, and no other orders.
@@ -55,8 +55,8 @@ class Planar:
     """The field `planar` of a theory.
 
     Attributes:
-        frames: Whether places have frames of four slots. Turns then tell the number of slots
-            between the headings of two dstates; else they tell sides only.
+        frames: Whether places have frames of four slots. Turns then give the number of slots
+            between the headings of two dstates; else they give sides only.
         turns: Whether the turns can be relied on.
         stars: Whether stars of a place agree when turned by their headings.
         distinct: Whether different dstates face different slots.
@@ -297,9 +297,9 @@ def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int],
 
 
 def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
-    """Whether some orders of gateways allow the edges to be drawn, if turns tell sides only.
+    """Whether some orders of gateways allow the edges to be drawn, if turns give sides only.
 
-    A turn tells which gateway is to the right of an edge, if both dstates are at an edge. After
+    A turn says which gateway is to the right of an edge, if both dstates are at an edge. After
     turning around, a robot faces the gateway that was behind it.
 
     Args:
@@ -385,7 +385,7 @@ def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Seque
 
 
 def _is_clockwise(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
-    """Whether the gateways that are in this order already agree with it."""
+    """Whether `told` is clockwise in this order; arms that it lacks are ignored."""
     positions = [order.index(arm) for arm in told if arm in order]
     if len(set(told)) < len(told):
         return False

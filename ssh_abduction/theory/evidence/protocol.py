@@ -58,7 +58,7 @@ class Evidence(Protocol):
         Args:
             trace: The trace.
             ssh_map: A map of its first steps.
-            since: The map of the steps before this one is known not to be refused. So only later
+            since: The map of the steps before this one is known not to be rejected. So only later
                 steps need to be checked.
 
         Returns:

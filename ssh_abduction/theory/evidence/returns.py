@@ -1,6 +1,6 @@
 """The returns of a trace: which pairs of steps displacements allow to be one place or dstate.
 
-`displacement.py` says what a return is, and how often a true one is refused.
+`displacement.py` says what a return is, and how often a true one is rejected.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 _Tested: TypeAlias = "dict[bool, tuple[Steps, Steps]]"
 # Loops that are computed at once. Their sums take some hundred megabytes.
 AT_A_TIME = 200_000
-# Accepted maps and refused sets that are remembered. Accepted maps may be checked again, or grow
-# with the trace. The next maps mostly contain the same refused sets.
+# Accepted maps and rejected sets that are remembered. Accepted maps may be checked again, or grow
+# with the trace. The next maps mostly contain the same rejected sets.
 REMEMBERED = 64
 
 
 class Returns:
-    """The returns of a trace, and the tests that refuse some of them."""
+    """The returns of a trace, and the tests that reject some of them."""
 
     def __init__(
         self,
@@ -132,7 +132,7 @@ class Returns:
         )
 
     def _pairs_of(self, tested: _Tested, since: int = 0) -> Pairs:
-        """The pairs of steps that these returns tell apart, because they are refused alone.
+        """The pairs of steps that these returns distinguish, because they are rejected alone.
 
         Args:
             tested: All returns, or those that end at new steps.
@@ -158,7 +158,7 @@ class Returns:
         return likely
 
     def threshold(self, freedom: int, together: bool) -> float:
-        """The chi-square above which a return, or a set of two, is refused.
+        """The chi-square above which a return, or a set of two, is rejected.
 
         Args:
             freedom: The degrees of freedom.
@@ -172,7 +172,7 @@ class Returns:
         return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
     def _refused_among(self, first: Steps, last: Steps, places: bool) -> list[tuple[int, int]]:
-        """The returns that are refused alone: they close badly for every drift of heading."""
+        """The returns that are rejected alone: they close badly for every drift of heading."""
         import numpy as np
 
         from ssh_abduction.theory.evidence.loops import chi_squares
@@ -198,7 +198,7 @@ class Returns:
     def _steps_of_visits(self, elsewhere: Earlier, since: int) -> Iterator[tuple[int, int]]:
         """The pairs of steps with the same view in visits to different places.
 
-        Steps with different views are apart anyway.
+        Steps with different views are distinct anyway.
 
         Args:
             elsewhere: The first steps of visits to different places.
@@ -251,9 +251,9 @@ class Returns:
         return ordered
 
     def refused_together(self, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        """Two returns of a map that are refused together; None if there are none.
+        """Two returns of a map that are rejected together; None if there are none.
 
-        It prefers a set that was refused in an earlier map, then the clearest one.
+        It prefers a set that was rejected in an earlier map, then the clearest one.
 
         Args:
             ssh_map: The map.
@@ -293,7 +293,7 @@ class Returns:
     def refused_at(
         self, labels: Sequence[int], places: Sequence[int | None], step: int
     ) -> frozenset[Equality] | None:
-        """The two returns that are most clearly refused together, but not alone.
+        """The two returns that are most clearly rejected together, but not alone.
 
         Args:
             labels: The dstate of each step. It need not be that of a map.
@@ -321,7 +321,7 @@ class Returns:
     def refused_alone_at(
         self, labels: Sequence[int], places: Sequence[int | None], step: int
     ) -> list[Equality]:
-        """The returns that are refused alone and end at a step.
+        """The returns that are rejected alone and end at a step.
 
         Args:
             labels: The dstate of each step.

@@ -1,4 +1,4 @@
-"""Which pairs of returns of a map are refused together, though neither is refused alone.
+"""Which pairs of returns of a map are rejected together, though neither is rejected alone.
 
 Let the loops of two returns be off by o1 and o2, with covariances S1 and S2, and C between them.
 Their joint chi-square is
@@ -84,7 +84,7 @@ class Together:
 
         Args:
             reckoning: The dead reckoning of the trace.
-            thresholds: The chi-square above which a pair is refused, by its degrees of freedom.
+            thresholds: The chi-square above which a pair is rejected, by its degrees of freedom.
             rows: The returns.
             before: The same for the first of these rows and steps, whose results are kept.
         """
@@ -99,13 +99,13 @@ class Together:
             self._number, self._chosen_among = self._likeliest(), len(rows)
 
     def worst(self, new: Mask) -> tuple[Steps, Steps] | None:
-        """The pair that is refused most clearly, out of those with a new return.
+        """The pair that is rejected most clearly, out of those with a new return.
 
         Args:
             new: Whether each return is new.
 
         Returns:
-            The two rows; None if no pair is refused.
+            The two rows; None if no pair is rejected.
         """
         rows = self.rows
         worst, most = None, 0.0
@@ -164,7 +164,7 @@ class Together:
         return later[these], earlier[others]
 
     def _is_safe(self, share: Array, squares: Array, number: int) -> Mask:
-        """Whether a bound shows that pairs are not refused.
+        """Whether a bound shows that pairs are not rejected.
 
         Args:
             share: A bound on the largest eigenvalue of what both returns share.
