@@ -20,9 +20,8 @@ NOISE = -1  # The label that clusterers give to an image in no cluster.
 # An image with less confidence is doubtful. Good images of the paper's worlds have 0.93 or more,
 # images with a person before the laser 0.5.
 SURE = 0.8
-# If the median view has at least SEEN images, a view is doubtful that has at most FEW images or at
-# most RARE times as many as the median view. While a robot explores, views that were seen once are
-# normal.
+# If the median view has at least SEEN images, a view with at most FEW images, or at most RARE times
+# the median number, is doubtful. While a robot explores, views seen once are normal.
 FEW, RARE, SEEN = 2, 0.1, 6
 # Largest number of images to name in a warning.
 NAMED = 8
@@ -34,8 +33,8 @@ def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
     Let `own` be the distance from an image to the centre of the other images of its view, and
     `next` its distance to the nearest centre of another view. The confidence is next² / (own² +
     next²): 1 at its own centre, 0.5 half way. This is the membership of fuzzy c-means with two
-    centres (Bezdek 1981). An image that is alone in its view has 0.5. Noise has 0. If there is only
-    one view, all of its images have 1.
+    centres (Bezdek 1981). An image alone in its view has 0.5. Noise has 0. If there is only one
+    view, all its images have 1.
 
     Args:
         X: (n, d) images, finite.

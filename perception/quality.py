@@ -53,7 +53,7 @@ BATCH = 64
 # Images on each side of a block when a cluster is compared with itself. A float32 block of
 # distances takes 16 MB.
 BLOCK = 2048
-# Quantiles of distances are estimated on at most this many images, whose distances take 32 MB.
+# Quantiles of distances are estimated on at most this many images (32 MB of distances).
 SAMPLE = 2_000
 # If the median cluster has at least SEEN images, trimmed M ignores the width of clusters of at most
 # FEW images, because clusterers often put unlike strange images together.

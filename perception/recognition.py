@@ -64,7 +64,7 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
                 f"n_neighbors: expected a whole number from 1 to the {len(images)} images, "
                 f"got {number!r}"
             )
-        # If many labels occur once or twice, scikit-learn warns that they might be numbers.
+        # If many labels are rare, scikit-learn warns that labels might be numbers.
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "The number of unique classes")
             check_classification_targets(labels)

@@ -21,7 +21,7 @@ from simulator.world import World, distances_to
 Array = NDArray[np.float64]
 # Width of a door, and distance from the corners of its rooms, in metres.
 DOOR, OFF = 1.0, 0.1
-# Metres on both sides of a door that are kept free of drawn walls, which would close it.
+# Metres on both sides of a door without drawn walls, since these would close the door.
 DEPTH = 0.25
 
 
@@ -151,11 +151,11 @@ def _across(flat: Opening, wall: Array, along: float) -> float:
 
 
 def _cut(walls: Array, opening: Opening) -> Array:
-    """Remove the parts of walls in an opening, by clipping to a rectangle (Liang and Barsky)."""
+    """Remove the parts of walls in an opening, clipped to a rectangle (Liang and Barsky)."""
     starts, ends = opening.frame(walls[:, :2]), opening.frame(walls[:, 2:])
     half = np.array([opening.width / 2, opening.depth / 2 + DEPTH])
     way = ends - starts
-    # Shares of each wall at which it enters and leaves the slab of each axis.
+    # Shares of each wall's length at its entry and exit of each axis' slab.
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half - starts) / way, (half - starts) / way
     still = way == 0

@@ -69,10 +69,10 @@ class Drive:
         Args:
             places: (x, y) of each place in metres.
             scans: Place of each scan; None between places.
-            more: Other fields of the truth.
+            more: Other fields of `truth`.
         """
         visits: list[dict[str, Any]] = []
-        # Consecutive scans at one place are one visit.
+        # Consecutive scans at a place form a visit.
         for number, place in enumerate(scans):
             if place is not None:
                 if not visits or visits[-1]["place"] != place:
@@ -101,7 +101,7 @@ class Recorder:
         every: Metres between scans.
         turn: Radians between scans.
         poses: Poses after each motion.
-        scans: For each arrangement of the world, indices of the poses with a scan.
+        scans: For each arrangement of the clutter, indices of poses with a scan.
         metres: Distance driven so far.
     """
 
@@ -127,7 +127,7 @@ class Recorder:
         return sum(len(numbers) for _, numbers in self.scans)
 
     def note(self, world: World, pose: Pose) -> None:
-        """Record the pose after a motion in an arrangement of the world.
+        """Record the pose after a motion in this world.
 
         A long motion is cut into parts, so that scans are taken on its way.
         """

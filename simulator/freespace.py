@@ -32,7 +32,7 @@ CELL = 0.1
 LARGEST = 200_000
 # Metres around start and goal, and around the part that is searched.
 MARGIN = 2.0
-# More distance from walls than ROOM metres is not better. A metre along a wall costs NARROW metres.
+# More than ROOM metres from walls is not better. A metre along a wall costs NARROW metres.
 ROOM, NARROW = 1.0, 4.0
 # Cells around start and goal in which a route may be nearer to walls than elsewhere.
 LEEWAY = 2
@@ -158,7 +158,7 @@ class Part:
 
     @cached_property
     def regions(self) -> Cells:
-        """Number of the connected region of each cell; 0 if the robot cannot be there."""
+        """Connected region of each cell as a number; 0 if the robot cannot be there."""
         numbered: Cells = label(self.clearance >= self.least, structure=np.ones((3, 3)))[0]
         return numbered
 

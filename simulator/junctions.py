@@ -54,7 +54,7 @@ class Here:
 
     Attributes:
         ranges: (360,) panorama in metres.
-        place: What the panorama shows.
+        place: Streets in the panorama.
         heading: Heading of the robot in the panorama, in radians.
     """
 
@@ -134,8 +134,8 @@ class Pilot:
         """Follow the midline until a wall is ahead, or to the end of an open side.
 
         Args:
-            began: Distance driven at the beginning of the travel.
-            heed: Distance driven before which walls and open sides are ignored.
+            began: Odometer reading in metres at the beginning.
+            heed: Odometer reading up to which walls and open sides are ignored.
 
         Returns:
             Metres for which a side was open; 0 for a wall ahead.

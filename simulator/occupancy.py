@@ -169,7 +169,7 @@ def _fields(data: bytes) -> dict[str, str | list[str]]:
 
 
 class _Reader:
-    """Checks the fields of a map file, and names the wrong one.
+    """Checks the fields of a map file; errors name the field.
 
     Args:
         fields: Fields by name.

@@ -39,10 +39,10 @@ FLOOR, WHITE = np.array([0.30, 0.27, 0.24]), np.array([0.62, 0.62, 0.60])
 LAMPS, LAMPLIGHT = 0.3, np.array([1.15, 1.0, 0.7])
 # Colours of the sun at noon, and at sunrise.
 DAYLIGHT, SUNRISE = np.array([0.95, 1.0, 1.1]), np.array([1.3, 0.95, 0.6])
-# Share by which a wall that faces the sun at noon is brighter, and one that faces away is darker.
+# Share by which a wall is brighter facing the sun at noon, and darker facing away.
 SIDEWAYS = 0.35
-# Value of a wall of albedo 1 at noon without adaptation, and the mean to which a camera adapts,
-# which is that of a grey wall at noon.
+# Value of a wall of albedo 1 at noon without adaptation, and the mean to which a camera adapts: a
+# grey wall at noon.
 WHITE_VALUE, GREY_VALUE = 330.0, 120.0
 # Number of waves in the pattern of a texture.
 WAVES = 6

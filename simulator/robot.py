@@ -16,7 +16,7 @@ from ssh_abduction.data.odometry import Displacement
 # Largest systematic errors, as a share and in radians a metre. Beyond them, the robot does not
 # notice that it left a place.
 WORST = 0.5
-# Options of the verb `simulate` for these errors.
+# Options of `simulate` for these errors.
 OPTIONS = {"odometry": "odometry-noise", "scale": "scale-error", "bend": "bend-error"}
 
 

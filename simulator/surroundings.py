@@ -186,7 +186,7 @@ class Place:
 
     Attributes:
         streets: Streets that lead away, clockwise from straight behind the robot.
-        fixed: The fixed point; None if a single street goes straight on, which is no place.
+        fixed: Fixed point; None if a single street goes straight on, as this is no place.
     """
 
     streets: tuple[Street, ...]

@@ -28,7 +28,7 @@ from ssh_abduction.data.trace import Action, Step, Trace
 from ssh_abduction.data.words import counted
 
 Array = NDArray[np.float64]
-# More tours than this are a mistake: they take days, and all steps are kept in memory.
+# More tours than this would take days, and all steps are kept in memory.
 MOST_TOURS = 100_000
 
 
@@ -163,7 +163,7 @@ def _place(world: World, pose: Array) -> str | None:
 
 
 def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
-    """Drive to the places of the route on all tours; yield number and name before each."""
+    """Drive to the places of all tours; yield number and name of each place before it."""
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
@@ -266,7 +266,7 @@ def _evenly(
 ) -> list[Step]:
     """Log images every `every` metres of odometry.
 
-    Points within that distance along the route count as one spot on all tours.
+    Points within this distance along the route are one spot on all tours.
     """
     logged: list[Step] = []
     leg_began = due = 0.0

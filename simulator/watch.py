@@ -64,8 +64,7 @@ class Watch:
             name: The action.
 
         Raises:
-            SimulatorError: It ends at another place than the world says, or a tour ends elsewhere
-                than it began.
+            SimulatorError: The action ends at a wrong place, or a tour does not end at its start.
         """
         before = self.driver.robot.pose
         self._home = self._home or before
@@ -114,7 +113,7 @@ class Watch:
         return max(NEAR, self.world.reach)
 
     def _is_elsewhere(self, place: str, pose: Pose) -> bool:
-        """Whether a robot is nearer to another place, or far from all places."""
+        """Whether a pose is nearer to another place, or far from all places."""
         far = {name: math.dist(at, pose[:2]) for name, at in self.world.places.items()}
         return far[place] > min(2 * self._near, *far.values())
 

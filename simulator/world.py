@@ -1,8 +1,7 @@
 """Worlds: walls, clutter that may move between tours, and the true dstates if known.
 
 A world is a JSON file that a user can write (docs/reference/worlds.md), or an occupancy map of ROS
-(a YAML
-file and an image).
+(YAML file and image).
 
 >>> from simulator.world import World
 >>> World.named("notched-rectangle").segments.shape[1]
@@ -275,10 +274,9 @@ class World:
 
     @classmethod
     def from_occupancy(cls, path: str | os.PathLike[str]) -> World:
-        """Make a world from an occupancy map of ROS, a YAML file and its image
-        (docs/reference/worlds.md).
+        """Make a world from an occupancy map of ROS (docs/reference/worlds.md).
 
-        The robot starts in the mean of the ends of all walls.
+        The map is a YAML file and its image. The robot starts in the mean of the ends of all walls.
         """
         name, segments = read_occupancy(Path(a_path("path", path, SimulatorError)))
         middle = segments.reshape(-1, 2).mean(0)

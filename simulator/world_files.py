@@ -76,7 +76,7 @@ def are_square(walls: Array) -> bool:
 
 
 class WorldReader:
-    """Checks the fields of a world, and names the wrong one.
+    """Checks the fields of a world; errors name the field.
 
     Args:
         where: Name of the file, for errors.

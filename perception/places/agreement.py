@@ -65,9 +65,9 @@ class Agreement:
     Attributes:
         odometry: Metres by odometry, over all stretches.
         scans: Metres by scan matching.
-        angle: Radians by which the motion by scans points farther to the left than by odometry.
+        angle: Direction of motion by scans minus that by odometry; radians to the left.
         turning: Median ratio of turns by scans to turns by odometry; None if there are few turns.
-        parted: Number of stretches in which they diverge.
+        parted: Number of stretches that diverge.
         of: Number of stretches.
     """
 
@@ -85,7 +85,7 @@ class Agreement:
 
     @property
     def is_askew(self) -> bool:
-        """Whether the direction of motion by scans differs from that by odometry."""
+        """Whether scans and odometry differ in the direction of motion."""
         return abs(self.angle) > ANGLE
 
     @property

@@ -24,7 +24,7 @@ from perception.readers.scans import RobotLog
 BEND = math.radians(40)
 # Largest distance in metres from the robot to a drivable cell of the local map.
 ASTRAY = 1.5
-# Shares of the radius. SAME: largest distance between votes for the same middle. PASSING: largest
+# Shares of the radius. SAME: largest distance between votes for one middle. PASSING: largest
 # distance at which the robot passes a place. ASKED: milestones this near are counted for the
 # support.
 SAME, PASSING, ASKED = 0.5, 0.6, 0.8
@@ -43,8 +43,7 @@ class Way:
 
     Attributes:
         bearing: Radians counterclockwise in the frame of the track.
-        sure: Whether it is certainly a gateway. An uncertain one is narrow or leads into unknown
-            space.
+        sure: Whether the exit surely is a gateway. Others are narrow or lead into unknown space.
     """
 
     bearing: float
@@ -56,10 +55,10 @@ class Visit:
     """A stay at a distinctive place.
 
     Attributes:
-        scan: The scan nearest to the middle of the place.
+        scan: Index of the scan nearest to the middle.
         middle: (x, y) middle of the place in metres, in the frame of the track.
-        begin: First scan of the stay.
-        end: Last scan of the stay.
+        begin: Index of the first scan.
+        end: Index of the last scan.
         ways: Exits, counterclockwise.
         arrived: Index of the exit by which the robot came; None at the beginning of the log.
         left: Index of the exit by which it left; None at the end of the log.

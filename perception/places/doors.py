@@ -47,10 +47,10 @@ class Door:
     """A door that the robot drove through.
 
     Attributes:
-        scan: First scan behind the door.
+        scan: Index of the first scan behind the door.
         middle: (x, y) in metres, in the frame of the track.
         width: Metres.
-        way: Metres that the robot drove up to the door.
+        way: Metres driven up to the door.
     """
 
     scan: int

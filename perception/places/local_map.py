@@ -45,7 +45,7 @@ class Patch:
 
     Attributes:
         free: Mask of cells that were seen to be free.
-        occupied: Mask of cells with an obstacle. A cell that is neither was not observed.
+        occupied: Mask of cells with an obstacle. Other cells that are not free are unobserved.
         trail: Mask of cells that the robot drove over within the window.
         corner: (x, y) centre of cell (0, 0) in metres, in the frame of the track.
     """
@@ -57,12 +57,12 @@ class Patch:
 
     @cached_property
     def clearance(self) -> Array:
-        """Metres from each cell to the nearest cell that is not free."""
+        """(rows, columns) metres to the nearest cell that is not free."""
         return np.asarray(ndimage.distance_transform_edt(np.pad(self.free, 1))[1:-1, 1:-1]) * CELL
 
     @cached_property
     def room(self) -> Array:
-        """Metres from each cell to the nearest occupied cell."""
+        """(rows, columns) metres to the nearest occupied cell."""
         return np.asarray(ndimage.distance_transform_edt(~self.occupied)) * CELL
 
     @cached_property

@@ -18,7 +18,7 @@ EVERY = 0.5
 ASIDE = 6.0
 # Percentiles of the width along the trajectory for narrow passages and for corridors.
 NARROW, CORRIDOR = 5, 20
-# Percentile that most of the trajectory exceeds in width.
+# Percentile of the width that most of the track exceeds.
 MOST = 30
 # A gateway is at least this share of a narrow passage wide. Walls look thicker in a grid than they
 # are, and the robot needs less room than it had.
@@ -48,7 +48,7 @@ class Scale:
 
     @property
     def doubtful(self) -> float:
-        """Width from which an exit that is too narrow for a gateway may still be one."""
+        """Least width, in metres, of an uncertain gateway, narrower than `gateway`."""
         return 0.6 * self.gateway
 
     @property

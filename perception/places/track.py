@@ -247,9 +247,9 @@ def _bridged(
 
 
 def _carried(log: RobotLog, track: Track) -> list[int]:
-    """Find scans from which on nothing was seen before although the odometer does not jump.
+    """Find scans from which on all is unseen, although the odometer does not jump.
 
-    There the robot was carried while nothing was logged.
+    There the robot was carried, unlogged.
     """
     found: list[int] = []
     for i in np.flatnonzero(track.shares < STRANGE).tolist():

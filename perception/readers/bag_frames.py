@@ -30,7 +30,7 @@ class Frame:
         first: First transform in the plane.
         track: Transforms over time in the plane; None for a static one.
         count: Number of messages.
-        off: Largest difference from the first one, in metres and radians.
+        off: Largest difference from `first`, in metres and radians.
     """
 
     parent: str
@@ -53,7 +53,7 @@ Frames = dict[str, dict[str, Frame]]
 def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
     """Read the transforms. Only the ancestors of the scans' frames keep theirs over time.
 
-    A robot has many joints, whose transforms are not needed.
+    Transforms of the many joints are not needed.
     """
     frames: Frames = {}
     topics = set(bag.topics(*TRANSFORMS))

@@ -29,13 +29,13 @@ from perception.readers.messages import (
 )
 from ssh_abduction.data.odometry import Pose, between
 
-# Meaning of the poses of the scans, in the order of the docstring of `carmen`; `lines` if the scans
-# have no poses, but ODOM lines are between them.
+# Meaning of the poses of the scans, in the order of the docstring of `carmen`. `lines`: only ODOM
+# lines between scans give poses.
 Meaning: TypeAlias = Literal["edges", "restarts", "first corrected", "raw", "lines"]
 # Share of the scans that must follow a rule, since lines may be damaged.
 MOST_SCANS = 0.9
-# The first pose is corrected if it is this far from the second, in metres or radians. A smaller
-# difference may come from reading it some milliseconds later.
+# The first pose is corrected if it is this far from the second, in metres or radians. Smaller
+# differences may come from a delay of milliseconds.
 WANDERED = (0.5, 0.25)
 # The mount of the laser is the same in all scans up to this difference, since some logs have two
 # decimals.

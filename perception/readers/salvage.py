@@ -35,7 +35,7 @@ class Message(NamedTuple):
         connection: Number of its connection.
         topic: Its topic.
         msgtype: Its kind.
-        sender: Who sent it.
+        sender: Its sender.
         time: Time of recording in nanoseconds.
         data: Its bytes.
     """

@@ -70,8 +70,7 @@ class Scan:
         laser: The scanner.
         odometry: Pose by the odometer, which starts anywhere and drifts. Only its increments
             matter.
-        corrected: Pose by whoever corrected the log, for pictures and evaluation. No inference
-            reads it.
+        corrected: Pose by later correction, for pictures and evaluation. No inference reads it.
         time: Seconds by the clock of the log, which may be cut, wrapped or missing.
         line: Line of the scan in the log, or number of its message, from 1.
     """
