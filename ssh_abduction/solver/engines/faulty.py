@@ -5,9 +5,9 @@ A view may be misread, and an action may slip. Clingo is given some steps of the
 whole trace. A map of the given steps is followed through the others. If it predicts all views
 there, it is a minimal map of the whole trace. If not, clingo is given the steps around.
 
-A Viterbi pass chooses these steps: it finds the fewest faults by which a map explains the whole
-trace (Viterbi 1967). That is a map of the whole trace, too, and the incumbent. The first maps are
-guessed (`guesses/robust.py`), and clingo is only asked for cheaper ones. The bound of a long trace
+A Viterbi pass chooses these steps: it finds the fewest faults with which a map explains the whole
+trace (Viterbi 1967). The result is a map of the whole trace, the incumbent. The first maps are
+guessed (`guesses/robust.py`). Clingo is only asked for cheaper ones. The bound of a long trace
 comes from blocks of it (`engines/blocks.py`).
 """
 
@@ -26,10 +26,10 @@ from ssh_abduction.solver.engines.faulty_control import LONG, FaultyAnswer, Faul
 from ssh_abduction.solver.guesses.robust import Explained, Explainer, Machine, robust_maps
 from ssh_abduction.theory.evidence import Equality
 
-FEW = 80  # steps below which no map is guessed, as clingo is fast
+FEW = 80  # no map of fewer steps is guessed, as clingo is fast
 AT_FIRST = 1000  # steps at the beginning that clingo is given at once
 PLACES = 12  # steps ignored by the Viterbi pass around which more are given at once
-SPARE = 3  # names of each view beside those of the best guess; with 1 the rests are used
+SPARE = 3  # names of each view beyond those of the best guess; with 1 the rests are used
 GUESSING = 5.0  # seconds after which no start of EM begins,
 GUESSING_SHARE = 0.1  # or a share of the time left
 
@@ -41,11 +41,11 @@ class FaultyEngine:
     goes_on = False
 
     def __init__(self, task: Task, most_faults: int | None = None) -> None:
-        """Nothing is given to clingo yet.
+        """Give nothing to clingo yet.
 
         Args:
             task: What to solve.
-            most_faults: The most faults of a map, which then cost nothing; None for any number.
+            most_faults: If given, a map may have this many faults, and faults cost nothing.
         """
         self.asker = Asker(task.watch)
         self.intact = True
@@ -80,13 +80,13 @@ class FaultyEngine:
         return len(self._task.trace)
 
     def grow(self, size: int) -> None:
-        """The prefix is the whole trace, of which clingo is given what it needs."""
+        """Take the whole trace as the prefix. Clingo is given the steps it needs."""
         if size != self.size:
             self.size = size
             self._control.given = set(range(min(size, AT_FIRST)))
             for t, others in self._task.log.pairs.one.items():
                 self._control.given |= {t, *others}
-                self._control.full |= {t, *others}  # a fault cannot evade what is one
+                self._control.full |= {t, *others}  # a fault evades no equality
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         best = self._best = self._known = None
@@ -99,7 +99,7 @@ class FaultyEngine:
                     return
 
     def _guessed(self) -> Iterator[Found]:
-        """Guessed maps of the whole trace. The best one says which names and steps clingo gets."""
+        """Guessed maps of the whole trace. The best one decides clingo's names and steps."""
         if self.size <= FEW or self._task.log.pairs.one or not self._price:
             return
         watch = self._task.watch
@@ -186,7 +186,7 @@ class FaultyEngine:
         return True
 
     def settle(self) -> None:
-        """Nothing goes on in clingo beyond an answer."""
+        """Do nothing: clingo stops after each answer."""
 
     def _raise_bound(self, bound: Sequence[int]) -> None:
         """A bound for the given steps holds for the whole trace."""
@@ -210,7 +210,7 @@ class FaultyEngine:
         """Follow the map of the given steps through all others.
 
         Returns:
-            The dstate of each step and -1; or None and a step that is not given and not predicted.
+            The dstate of each step and -1; or None and a step neither given nor predicted.
         """
         number, machine = self._machine(answer)
         labels: list[int] = []
@@ -238,7 +238,7 @@ class FaultyEngine:
         """Explain the whole trace by the dstates of an answer, with the fewest faults.
 
         Returns:
-            The map, if allowed, and the first steps not given that it ignores or lacks.
+            The map, if allowed, and the first steps that it ignores or lacks, of those not given.
         """
         _, machine = self._machine(answer)
         if not machine.shows:  # all given steps are lost
@@ -252,7 +252,7 @@ class FaultyEngine:
         return self._map_of(self._explainer.completed(machine)), doubted[:PLACES]
 
     def _map_of(self, explained: Explained) -> Found | None:
-        """The map of an explanation of the trace; None where its faults are not allowed."""
+        """The map of an explanation of the trace; None if its faults are not allowed."""
         labels, shows = explained.labels, explained.machine.shows
         if (explained.misread and "misread" not in self._price) or (
             explained.slips and "slipped" not in self._price
@@ -291,7 +291,7 @@ class FaultyEngine:
         )
 
     def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
-        """The view of each dstate. One never read right gets the view seen there most often."""
+        """The view of each dstate. One always misread gets the view seen there most often."""
         views = list(shown)
         for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:
             views[s] = Counter(

@@ -1,11 +1,11 @@
-"""What clingo knows of some steps of a trace with faults (faulty.lp), and the answers it gives.
+"""Asks clingo about some steps of a trace with faults (faulty.lp).
 
-Dstates have names: each view has as many as it needs, and a rest, which stands for all its other
-dstates. A rest costs one dstate, and nothing is asked of the steps at it. So a minimal answer that
-uses no rest is minimal for any number of names. If one uses a rest, its view gets more names.
+Dstates have names. Each view has some names and a *rest*, which stands for all its other dstates.
+A rest costs one dstate and imposes nothing on the steps at it. So a minimal answer without rests
+is minimal for any number of names. If an answer uses a rest, its view gets more names.
 
-At first a step that is misread is *lost*: nothing links it with other steps. If a minimal answer
-loses a step, the step becomes *full*: it may be at any dstate.
+At first a misread step is *lost*: nothing links it with other steps. If a minimal answer loses a
+step, the step becomes *full*: it may be at any dstate.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.theory.evidence import Equality
 
-LONG = 1000  # steps from which on a trace is bounded by blocks before clingo is asked
+LONG = 1000  # a trace of more steps is bounded by blocks before clingo is asked
 AROUND = 8  # steps given before and after one that a map does not predict
 NAMES = 3  # names of each view at first
 MORE_NAMES = 2  # further names of a view whose rest is used
@@ -49,13 +49,13 @@ class FaultyAnswer:
 
     @property
     def is_open(self) -> bool:
-        """Whether clingo has to be told more before this can be a map."""
+        """Whether clingo needs more names or steps before this can be a map."""
         return bool(self.rests or self.lost)
 
 
 @dataclass
 class _Told:
-    """What the present control was told.
+    """What the present control was given.
 
     Attributes:
         names: The number of names of each view.
@@ -78,7 +78,7 @@ class FaultyControl:
     Attributes:
         names: The number of names of each view, besides its rest.
         given: The steps that clingo is given.
-        full: Those that may be at any dstate, even if their view is misread.
+        full: The steps that may be at any dstate, even if their view is misread.
         forbidden: Sets of equalities of steps that do not all hold.
     """
 
@@ -90,13 +90,13 @@ class FaultyControl:
         most_faults: int | None,
         on_bound: Callable[[Sequence[int]], None],
     ) -> None:
-        """Nothing is given to clingo yet.
+        """Give nothing to clingo yet.
 
         Args:
             task: What to solve.
             asker: Asks clingo.
             price: Tenths of dstates that each kind of fault costs, at each step.
-            most_faults: The most faults of a map, which then cost nothing; None for any number.
+            most_faults: If given, a map may have this many faults, and faults cost nothing.
             on_bound: Called with each bound that clingo proves.
         """
         self.names = dict.fromkeys(range(max(task.log.seen) + 1), NAMES)
@@ -129,7 +129,7 @@ class FaultyControl:
         self.full |= answer.lost
 
     def _prepare(self) -> None:
-        """Tell clingo what it does not know yet, in a new control where names changed."""
+        """Give clingo what it lacks, in a new control if names changed."""
         with self._asker.grounding_timed():
             if (self._told.names, self._told.full) != (self.names, self.full):
                 self._begin()
@@ -143,7 +143,7 @@ class FaultyControl:
             told.forbidden = len(self.forbidden)
 
     def _begin(self) -> None:
-        """Take a control that knows the names, and no step yet."""
+        """Make a control that has the names, and no step yet."""
         self._told = _Told(dict(self.names), set(self.full))
         control = self._asker.control = Control(OPTIONS, self._asker.watch.check)
         control.load_encodings("faulty")
@@ -178,7 +178,7 @@ class FaultyControl:
         """Answers for the given steps of the least cost, each once; `enough` of them, 0 for all."""
         self._prepare()
         seen: set[tuple[frozenset[tuple[int, int]], frozenset[int]]] = set()
-        # The bound of a long trace is proven by blocks, and not of the given steps.
+        # Blocks prove the bound of a long trace, not the given steps.
         mode = f"optN,{cost}" if len(self._log.seen) < LONG else f"enum,{cost}"
         for answer in self._asker.answers(self._read, mode, 0):
             key = frozenset(answer.where.items()), answer.slips

@@ -1,32 +1,31 @@
 """The engine for the topological theory where places have frames and fewest dstates come first.
 
-It finds dstates first, then places and paths. Its maps are all minimal ones, and its bound on the
+It finds dstates first, then places and paths. It finds all minimal maps, and its bound on the
 dstates is proven.
 
-Frames tell so much that the dstates are almost found before any place or path is. A turn rotates
-by known quarters, so whole visits are the same or not (`steps/chart.py`). Which ones are is asked
-of visits.lp (`engines/visit_labels.py`), which knows the causal axioms and how turns rotate, but
-not the order of places on a path, or its sides. For the dstates that are left, paths_framed.lp
-finds the fewest paths and places (`engines/framed_paths.py`).
+Frames almost determine the dstates without places and paths. A turn rotates by known quarters, so
+whole visits are the same or not (`steps/chart.py`). visits.lp decides which are
+(`engines/visit_labels.py`). It has the causal axioms and the rotations of turns, but not the order
+of places on a path, or its sides. For the dstates found, paths_framed.lp finds the fewest paths and
+places (`engines/framed_paths.py`).
 
 *Claim.* Cut to which visits are at one place, a map of the topological theory is an answer of
-visits.lp. So the fewest dstates of the latter are a lower bound. If some answer of that cost has
+visits.lp. So the fewest dstates of visits.lp are a lower bound. If some answer of that cost has
 paths, all minimal maps are among the answers of that cost with their fewest paths.
-*If none has*, paths_framed.lp is asked which path shows it, and sides_framed.lp says for that path
-what order and sides demand of the visits that are one. If no single path shows it, or visits are
-too many for that, paths_framed.lp is asked which labels clash: minimal sets of nodes at dstates
-that no paths fit. visits.lp is told that these do not go together. As every map of the topological
-theory keeps that, bounds still hold.
+*If no answer has paths*, paths_framed.lp is asked which path shows it. sides_framed.lp then adds
+the axioms of order and sides for that path. If no single path shows it, or there are too many
+visits, paths_framed.lp is asked which labels clash: minimal sets of nodes whose labels no paths
+fit. visits.lp gets a rule that forbids them. Every map of the topological theory keeps these
+rules, so bounds still hold.
 
-*Beside.* If that takes long, a map is guessed, and another thread proves from the guess outwards
-how many dstates the causal axioms need (`engines/framed_guess.py`). The names of that proof then
-list all labels with so few dstates. Some of them fit no frame, which paths_framed.lp sees, or have
-no paths; but each map of the topological theory is among them.
+*Beside.* If that takes long, a map is guessed. Another thread proves from the guess outwards how
+many dstates the causal axioms need (`engines/framed_guess.py`). The names of that proof then list
+all labels with that number of dstates. Some of them fit no frame or have no paths, which
+paths_framed.lp detects. But each map of the topological theory is among them.
 
-*Which path.* In a world half explored the causal axioms allow fewer dstates than order and sides
-do, in thousands of ways: to forbid these one by one does not end. What sides_framed.lp says of a
-single path takes a rule for each two visits that may be one, so it is said only of paths that an
-answer contradicts.
+*Which path.* In a half explored world the causal axioms allow fewer dstates than order and sides
+do, in too many ways to forbid them one by one. The axioms of order and sides of a path take a rule
+for each two visits that may be one. So they are added only for paths that an answer contradicts.
 """
 
 from __future__ import annotations
@@ -47,14 +46,14 @@ from ssh_abduction.solver.guesses.merging import kept
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.theory.evidence import Equality
 
-# With more pairs of visits that may be one, nothing is said of single paths: that takes some forty
+# With more pairs of visits that may be one, add no axioms of single paths: they take some forty
 # rules for each pair.
 MANY_PAIRS = 20_000
-# Keep this many controls of minimal labels until their maps are listed: each is some megabytes, and
-# is made again in seconds.
+# Keep this many controls of minimal labels until their maps are listed. Each takes some megabytes,
+# and seconds to make again.
 KEPT = 10
-# After this many seconds without the fewest dstates, look for a map near a guess beside: most
-# traces are solved by then.
+# After this many seconds without the fewest dstates, also look for a map near a guess. Most traces
+# are solved by then.
 SOON = 3.0
 
 
@@ -92,7 +91,7 @@ class FramedEngine:
         self._beside, self._soon_maps = self._helpers()
 
     def _helpers(self) -> tuple[GuessBeside, SoonMaps]:
-        """A guess and the maps near it, for another prefix."""
+        """A guess and the maps near it, for a new prefix."""
         beside = GuessBeside(self._fitting, self._visits, self.asker)
         soon_maps = SoonMaps(
             self._fitting,
@@ -111,7 +110,7 @@ class FramedEngine:
 
     @property
     def bound(self) -> int | None:
-        """No map of the prefix has fewer dstates."""
+        """A lower bound on the dstates of the prefix."""
         return self._visits.bound
 
     @property
@@ -123,7 +122,7 @@ class FramedEngine:
         return FramedEngine(self._task, self._around, self._soon)
 
     def over(self, task: Task) -> FramedEngine:
-        """This engine, which goes on with a trace that its own has grown to."""
+        """This engine, which goes on with the grown trace."""
         self._task = self._fitting.task = task
         self.asker.watch = task.watch
         self._visits.work_on(task)
@@ -208,7 +207,7 @@ class FramedEngine:
     def map_mended_from(self, known: Sequence[int]) -> Found | None:
         """A map of the whole trace whose first steps keep known dstates, as far as can be.
 
-        All else is new. None if that has no paths.
+        All other steps get new dstates. None if no paths fit.
 
         Args:
             known: The dstates of the first steps.
@@ -256,7 +255,7 @@ class FramedEngine:
         """All labels with this many dstates that have paths, each once, except `besides`."""
         known: set[Hashable] = {tuple(besides)}
         if search := self._beside.proved(dstates):
-            # This search is not told why labels have no paths; it lists each anyway.
+            # This search does not learn why labels have no paths; it lists each anyway.
             for labels in search.listed(self.asker.watch):
                 if tuple(labels) not in known:
                     found = self._fitting.some(self._chart, labels)
@@ -308,7 +307,7 @@ class FramedEngine:
     def _charted(self, size: int, before: FramedChart | None) -> FramedChart | None:
         """The nodes of the first steps, and which of them are at different places.
 
-        Only what the trace alone says of order and sides counts. None if steps fit no frame.
+        This uses only what the trace alone implies by order and sides. None if steps fit no frame.
 
         Args:
             size: How many steps.
@@ -319,5 +318,5 @@ class FramedEngine:
 
 
 def _listing(cost: tuple[int, ...]) -> str:
-    """Clingo's opt-mode for listing maps of this cost, whose dstates are settled."""
+    """Clingo's opt-mode for listing maps of this cost, whose dstates are known."""
     return f"enum,{','.join(map(str, (0, *cost[1:])))}"

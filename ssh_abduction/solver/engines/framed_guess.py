@@ -21,12 +21,12 @@ from ssh_abduction.solver.engines.visit_labels import VisitLabels
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
 
 # Begin to guess after this share of the time limit, if that is less than the seconds that the
-# engine waits, so that the guess has time to be of use.
+# engine waits, so that the guess comes in time.
 SOON_SHARE = 0.05
 # With one processor, look for a map near a guess after this many seconds, as clingo waits
 # meanwhile.
 GUESS_FIRST = 5.0
-# Wait this many times as long if clingo was not given all visits: it is soon told of more.
+# Wait this many times as long if clingo lacks some visits: it is soon given more.
 LATER = 4
 # Or this share of the time limit, if that is less.
 LATER_SHARE = 0.25
@@ -61,11 +61,11 @@ class GuessBeside:
 
     @property
     def running(self) -> bool:
-        """Whether there is a thread, which was not ended."""
+        """Whether a thread was started and not ended."""
         return self._thread is not None
 
     def begin(self, chart: FramedChart) -> None:
-        """Begin to guess, and to prove from there how many dstates the causal axioms need."""
+        """Guess, and prove from the guess how many dstates the causal axioms need."""
         watch = Watch(beside=self._asker.watch)
         pinned = Pinned.framed(chart, self._visits.clique or [0])
         self.search = NearbySearch(watch, self._fitting.task.speedups, pinned, far=None)
@@ -93,7 +93,7 @@ class GuessBeside:
             self._thread = None
 
     def forget(self) -> None:
-        """End the thread, and forget its search, which does not know what was forbidden."""
+        """End the thread, and drop its search, which lacks what was forbidden."""
         self.end()
         self.search = self._tried = None
 
@@ -111,7 +111,7 @@ class GuessBeside:
         return labels
 
     def proved(self, dstates: int) -> NearbySearch | None:
-        """The search near the guess, if it alone showed that there are no fewer dstates."""
+        """The search near the guess, if it has proven that there are no fewer dstates."""
         search, least = self.search, self._visits.program.cores.least
         return search if search and search.bound == dstates > least else None
 
@@ -132,24 +132,24 @@ class SoonMaps:
         """No map was made yet.
 
         Args:
-            fitting: Answers which paths labels have.
+            fitting: Finds the paths of labels.
             visits: Finds labels near a guess.
             beside: The guess, and the search near it.
             asker: Its limits hold.
             soon: Seconds without the fewest dstates after which to guess, at most.
-            refuse: Told of labels that have no paths.
+            refuse: Called with labels that have no paths.
         """
         self._fitting, self._visits, self._beside = fitting, visits, beside
         self._asker, self._soon, self._refuse = asker, soon, refuse
         self._guessed = False  # whether maps near the guess were looked for
-        # Of the known map, until better paths were looked for.
+        # The cost of the known map, until better paths were sought.
         self._known_cost: tuple[int, ...] = ()
 
     def should_interrupt(self) -> bool:
         """Whether the search for the fewest dstates should pause for a guess.
 
-        That is so if there is a guess, or it is time for one. Later, if the search beside found
-        new labels, or shows that the known map has the fewest dstates.
+        First, if there is a guess, or it is time for one. Later, if the search beside found new
+        labels, or shows that the known map has the fewest dstates.
         """
         beside, visits, task = self._beside, self._visits, self._fitting.task
         beside.absorb()
@@ -218,10 +218,10 @@ class SoonMaps:
             yield from self.known_if_it_has_paths(labels)
 
     def known_if_it_has_paths(self, labels: Sequence[int]) -> Generator[Found, None, bool | None]:
-        """The map of these labels, if any paths fit them. From now on it is the known one.
+        """Yield the map of these labels, if paths fit them. It becomes the known map.
 
         Returns:
-            Whether paths fit them; None if there is no time to see that.
+            Whether paths fit them; None if time is short.
         """
         fitting, chart = self._fitting, self._visits.chart
         fitted = fitting.found_soon(chart, labels)

@@ -1,9 +1,9 @@
 """The places and paths of given dstates, for the engine with frames, under its limits.
 
-paths_framed.lp is asked whether any paths fit the labels of nodes, for the fewest places and paths,
-and, if there are none, which labels clash. Most of the time of a long list would go into reading
-answers. So an answer is asked for the atoms that it may hold, those of the last answer first, and
-clingo searches for the next one while a map is made of it.
+paths_framed.lp finds the fewest places and paths that fit the labels of nodes, or, if there are
+none, which labels clash. A long list would spend most time on reading answers. So the reader checks
+the atoms of the last answer first, and clingo searches for the next answer while a map is made
+from this one.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from ssh_abduction.solver.engines.refusing import smaller
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality
 
-# Give clingo this many clashes in one go: each spares a question, and one control of paths lists
-# them all.
+# Give clingo this many clashes at once: each saves a question, and one control of paths lists them
+# all.
 CLASHES = 30
-# Try labels with more dstates than this with separate paths first, as to ground all ways to merge
+# Try labels with more dstates than this with separate paths first, as grounding all ways to merge
 # paths takes long.
 MANY_DSTATES = 50
 # All ways to merge paths take this many times as long to ground as separate paths, about, for each
@@ -34,8 +34,7 @@ MANY_DSTATES = 50
 ALL_PATHS = 0.1
 # Clasp prepares to solve for this many times as long as grounding took, and cannot be stopped.
 PREPARED = 3.5
-# After this many conflicts better paths are no longer looked for one after another; the bound is
-# raised from below instead.
+# After this many conflicts, stop improving paths one by one; raise the bound from below instead.
 BETTERING = 20_000
 
 
@@ -46,7 +45,7 @@ class Naming:
     Attributes:
         chart: The nodes.
         labels: The dstate of each node.
-        control: It has the paths that fit the labels; None if one is to be taken.
+        control: It has the paths that fit the labels; None to make a new one.
     """
 
     chart: FramedChart
@@ -67,7 +66,7 @@ class FramedPaths:
 
     Attributes:
         task: What the engine works on.
-        forbidden: Sets of equalities of steps that evidence found out cannot all hold.
+        forbidden: Sets of equalities of steps that contradict evidence together.
     """
 
     def __init__(self, task: Task, asker: Asker) -> None:
@@ -93,7 +92,7 @@ class FramedPaths:
         return PREPARED * self._seconds
 
     def forget_time(self) -> None:
-        """The next labels are of another prefix."""
+        """Forget grounding times: the next labels are of another prefix."""
         self._seconds = 0.0
 
     def some(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
@@ -114,7 +113,7 @@ class FramedPaths:
     def separate(self, chart: FramedChart, labels: Sequence[int]) -> Found | None:
         """A map with these dstates and separate paths, if there is one.
 
-        No two places or segments are taken for one unless they have to be.
+        No two places or segments are merged unless they have to be.
         """
         naming = Naming(chart, list(labels), self.control(chart, labels, single=True))
         return next(self.maps(naming, "ignore"), None)
@@ -122,8 +121,8 @@ class FramedPaths:
     def better(self, naming: Naming) -> Iterator[Found]:
         """Maps with these dstates, each as good as the one before or better, the last one best.
 
-        There are none if no paths fit them. If bettering maps does not end soon, the bound is
-        raised from below instead.
+        There are none if no paths fit. If improving maps does not end soon, the bound is raised
+        from below instead.
         """
         if len(self.task.theory.priorities) == 1:
             yield from self.maps(naming, "ignore")
@@ -145,10 +144,10 @@ class FramedPaths:
             beside: Whether another search runs beside this one.
 
         Returns:
-            Whether clingo came to an end, and not to the limit of conflicts.
+            Whether clingo ended before the limit of conflicts.
         """
         control = naming.control or self.control(naming.chart, naming.labels)
-        # Two threads keep all that they list, so they are only for bettering.
+        # Two threads keep all that they list, so they only improve maps.
         many = len(set(naming.labels)) > MANY_DSTATES
         two = mode == "opt" and many and not beside and self.task.has_processors
         give_threads(control, two=two)
@@ -194,7 +193,7 @@ class FramedPaths:
             single: Ask only for separate paths, none of which is taken for another.
         """
         self._asker.watch.check(0.0 if single else self.preparing)
-        # Count the time of this thread: the one beside may make it wait.
+        # Count the time of this thread, as the other one may make it wait.
         worked = time.thread_time()
         with self._asker.grounding_timed():
             control = self.paths.settled(chart, labels, options, nodes, single=single)
@@ -219,7 +218,7 @@ class FramedPaths:
         return clashes or [self._clash(chart, labels)]
 
     def _clash(self, chart: FramedChart, labels: Sequence[int]) -> list[int]:
-        """One such set, if it takes a choice of paths to see that there are none."""
+        """One conflicting set, if only a choice of paths shows it."""
 
         def clashing(nodes: list[int]) -> list[int] | None:
             control = self.control(chart, labels, nodes=nodes)
@@ -228,12 +227,12 @@ class FramedPaths:
         return smaller(list(range(len(labels))), clashing)
 
     def charted(self, chart: FramedChart, before: FramedChart | None = None) -> FramedChart:
-        """A chart with the nodes that are at different places by what the trace alone says.
+        """The chart, with the nodes that the trace alone shows to be at different places.
 
         Args:
             chart: The nodes.
-            before: The chart of fewer steps. It says of its nodes which are at different places,
-                and nothing more is asked.
+            before: The chart of fewer steps. It already has the pairs of its nodes at different
+                places.
         """
         if before is not None:
             return chart.with_elsewhere(before.elsewhere)

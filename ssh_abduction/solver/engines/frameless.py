@@ -1,13 +1,13 @@
 """The engine for the topological theory without frames where fewest dstates come first.
 
-It serves traces of which some map is known. It finds dstates first, then places and paths. Its maps
-are all minimal ones, and its bound on the dstates is proven.
+It serves traces with some known map. It finds dstates first, then places and paths. It finds all
+minimal maps, and its bound on the dstates is proven.
 
-The axioms of places and paths for each step of a trace are too much for clingo after some dozen
-steps that keep exploring. But they speak of dstates: of which place one is at, and which path it is
-along. So the dstates have names, as in the causal theory (`engines/naming.py`), and
-sides_frameless.lp says what order and sides demand of where the actions at them lead
-(`engines/frameless_paths.py`). That depends on how many dstates there are, not on how many steps.
+The axioms of places and paths for each step are too much for clingo after some dozen steps of
+exploring. But they are about dstates: the place that a dstate is at, and the path that it is along.
+So the dstates have names, as in the causal theory (`engines/naming.py`). sides_frameless.lp limits
+by order and sides where the actions at them lead (`engines/frameless_paths.py`). Its size depends
+on the number of dstates, not of steps.
 
 *Claim.* Each map of the topological theory is an answer of names.lp and sides_frameless.lp, at the
 cost that it has in the causal theory.
@@ -17,8 +17,8 @@ axioms say of two or three dstates: a travel keeps the path, and leads on along 
 transitive; a turn keeps the place. The rest (`engines/naming.py`) is no dstate of theirs. ∎
 
 So the bounds hold. If some answer of that cost has places and paths, all minimal maps are among the
-answers of that cost with the fewest of them. All labels with the fewest dstates have to be seen for
-that, which takes most of the time if there are hundreds.
+answers of that cost with the fewest of these. To find them, all labels with the fewest dstates are
+listed. If there are hundreds, this takes most of the time.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from ssh_abduction.solver.engines.refusing import all_accepted
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.theory.evidence import Equality
 
-# List this many maps whose places differ first, or some more: they are remembered while the others
-# are listed.
+# List about this many maps whose places differ first: they are remembered while the others are
+# listed.
 SOONER = 1000
 
 
@@ -44,7 +44,7 @@ class FramelessEngine:
     """The topological theory without frames, fewest dstates first, for a trace that has a map."""
 
     lists_least = True
-    goes_on = False  # of the longer trace no map is known
+    goes_on = False  # no map of the longer trace is known
 
     def __init__(self, task: Task, known: Sequence[int] = ()) -> None:
         """An engine for no steps yet.
@@ -60,7 +60,7 @@ class FramelessEngine:
         self._given_map = known
         self._fitting = PlacesAndPaths(task, self.asker, known)
         self._named = self._fitting.named
-        # The minimal cost, and all labels that have it.
+        # The minimal cost, and all labels with this cost.
         self._best: tuple[tuple[int, ...], list[list[int]]] | None = None
 
     @property
@@ -117,8 +117,8 @@ class FramelessEngine:
     def _listed(self, every: Iterable[list[int]], mode: str) -> Iterator[Found]:
         """The maps with these labels.
 
-        If displacements are used, maps whose places differ come first: how well maps close depends
-        on dstates and places alone.
+        If displacements are used, maps whose places differ come first, as the fit depends only on
+        dstates and places.
         """
         left, sooner, first = iter(every), list[list[int]](), set[SSHMap]()
         while (

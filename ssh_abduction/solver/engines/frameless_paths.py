@@ -1,9 +1,9 @@
 """The places and paths of named dstates, for the engine without frames.
 
-paths_frameless.lp tells whether any places and paths fit labels, and finds the fewest. If labels
-have none, the path of some dstate mostly shows it: sides_frameless.lp is told some of these paths
-at a time; a dozen are mostly enough. What no single path shows is forbidden: a minimal set of the
-answer's links that has no places and paths.
+paths_frameless.lp finds the fewest places and paths that fit labels. If labels have none, the path
+of some dstate mostly shows it. sides_frameless.lp then gets the axioms of some such paths at a
+time; a dozen are mostly enough. If no single path shows it, a minimal set of the answer's links
+without places and paths is forbidden.
 """
 
 from __future__ import annotations
@@ -30,32 +30,30 @@ from ssh_abduction.solver.steps.chart import Link
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 
-# Give clingo this many paths, or pairs of dstates, in one go: with fewer it would be asked more
-# often, and most of more would not be needed.
+# Give clingo this many paths, or pairs of dstates, at once. With fewer, it would be asked more
+# often; of more, most would not be needed.
 CONTRARY = 8
-# After this many conflicts better paths are no longer looked for one after another; the bound is
-# raised from below instead.
+# After this many conflicts, stop improving paths one by one; raise the bound from below instead.
 BETTERING = 20_000
 
 # Labels of all steps, options of clasp, and the parts of the program.
 _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]
-# Parts of the program. TOLD: what segments tell of places and of each other before any two of them
-# are one. PARTS: which places and paths fit labels. EACH: also list answers that differ in paths
-# alone.
+# Parts of the program. TOLD: what segments imply about places and each other before any are merged.
+# PARTS: which places and paths fit labels. EACH: also list answers that differ only in paths.
 TOLD, EACH = ("base", "segments"), ("each",)
 PARTS = (*TOLD, "least", "paths")
-# Whether the pairwise distinct places are enough is asked for at most TIGHT labels, within TIGHTLY
-# conflicts each: it mostly shows at once.
+# Ask for at most TIGHT labels whether the pairwise distinct places are enough, within TIGHTLY
+# conflicts each: the answer mostly comes at once.
 TIGHT, TIGHTLY = 5, 2000
 
 
 @dataclass(frozen=True)
 class _Far:
-    """Pairs of dstates, mostly a single pair, some pair of which is not at one place.
+    """Pairs of dstates, mostly one pair. Some pair is not at one place.
 
     Attributes:
-        pairs: Of dstates.
-        placed: The steps that evidence says so of, each with the dstate that it is at.
+        pairs: The pairs of dstates.
+        placed: The steps that evidence names, each with its dstate.
     """
 
     pairs: tuple[tuple[int, int], ...]
@@ -65,7 +63,7 @@ class _Far:
     def of(cls, labels: Sequence[int], equalities: Collection[Equality]) -> _Far | None:
         """What follows for these labels if the equalities do not all hold.
 
-        None if nothing follows, as some steps that were to be one dstate are not.
+        None if nothing follows, as some equality of dstates does not hold anyway.
         """
         steps = dict.fromkeys(
             step for equality in equalities for step in (equality.first, equality.second)
@@ -80,7 +78,7 @@ class _Far:
 
 @dataclass(frozen=True)
 class _Members:
-    """Links, and dstates that are far from each other, which perhaps no places and paths fit."""
+    """Links and distant dstates that perhaps no places and paths fit."""
 
     links: list[Link]
     far: list[_Far]
@@ -100,10 +98,10 @@ class _Members:
 
 
 class PlacesAndPaths:
-    """Whether places and paths fit labels, why none do, and which are best.
+    """Finds the best places and paths for labels, or why none fit.
 
     Attributes:
-        named: The labels, and the control that is told what is forbidden.
+        named: The labels, and the control that gets what is forbidden.
     """
 
     def __init__(self, task: Task, asker: Asker, known: Sequence[int] = ()) -> None:
@@ -117,20 +115,20 @@ class PlacesAndPaths:
         self.named = NamedLabels(task, asker, known, self)
         self._task, self._asker = task, asker
         self._actions = dict(zip(task.log.actions, task.trace.actions, strict=True))
-        # Sets of equalities that do not all hold, and some of which are of places.
+        # Sets of equalities that do not all hold, some of them of places.
         self._refused: list[Collection[Equality]] = []
         self._forbidden = 0  # how many sets of links were forbidden
         # Dstates whose paths clingo was given, as keys of `NameProgram.names`.
         self._told: set[tuple[int, int]] = set()
         # The last labels, and the control for their places and paths.
         self._asked: tuple[_Question, clingo.Control] | None = None
-        # Labels whose fewest places are known, with homes and a best map; and labels for which
-        # that was tried in vain.
+        # Labels whose fewest places are known, with homes and a best map; and labels for which the
+        # homes failed.
         self._tight: dict[tuple[int, ...], tuple[Mapping[int, list[int]], Found]] = {}
         self._failed: set[tuple[int, ...]] = set()
 
     def forget(self) -> None:
-        """Another control comes, for other labels."""
+        """Forget the control: another one comes, for other labels."""
         self._told = set()
         self._forget_tight()
 
@@ -138,7 +136,7 @@ class PlacesAndPaths:
         self._tight, self._failed, self._asked = {}, set(), None
 
     def tell_again(self) -> None:
-        """Tell a new control what the one before was told."""
+        """Give a new control the rules of the one before."""
         told, self._told = self._told, set()
         if told:
             self._tell_of([key for key in self.named.program.names() if key in told])
@@ -150,7 +148,7 @@ class PlacesAndPaths:
             self._forget_tight()
 
     def _tell_of(self, dstates: Collection[tuple[int, int]]) -> None:
-        """Tell clingo what the paths of these dstates demand, which it does not know yet."""
+        """Give clingo the axioms of the paths of these dstates, unless it has them."""
         with self._asker.grounding_timed():
             control, names = self._asker.control, self.named.program.names()
             parts: list[tuple[str, list[clingo.Symbol]]] = []
@@ -161,7 +159,7 @@ class PlacesAndPaths:
                 )
                 parts.append(("sides", []))
             parts += [("path", numbers(names[dstate])) for dstate in dstates]
-            control.ground(parts)  # in one go: that takes half as long, and searching, too
+            control.ground(parts)  # at once: this halves the time to ground and to search
             self._told.update(dstates)
 
     def fits(self, labels: Sequence[int]) -> bool:
@@ -171,7 +169,7 @@ class PlacesAndPaths:
     def _tightly(self, labels: Sequence[int]) -> Found | None:
         """A best map with these dstates, if pairwise distinct places are enough for one.
 
-        None if that is not known (`engines/homes.py`).
+        None if that is unknown (`engines/homes.py`).
         """
         key = tuple(labels)
         if key in self._tight:
@@ -199,7 +197,7 @@ class PlacesAndPaths:
         return best
 
     def _best_at_home(self, labels: Sequence[int], control: Control, fewest: int) -> Found | None:
-        """The best map at some homes, if no other map with these dstates is known to be better.
+        """The best map at some homes, if it is proven best among maps with these dstates.
 
         Args:
             labels: The dstates.
@@ -323,11 +321,11 @@ class PlacesAndPaths:
         """A control for the places and paths of dstates.
 
         Args:
-            links: How actions link them.
-            dstates: Further ones.
+            links: Links between dstates.
+            dstates: Further dstates.
             options: Of clasp.
             far: Dstates that are not at one place.
-            single: Take no two places or segments for one unless they have to be.
+            single: Merge no two places or segments unless they have to be.
             parts: Of the program.
         """
         control = Control(options, self._asker.watch.check, PREPARING)
@@ -352,7 +350,7 @@ class PlacesAndPaths:
     ) -> clingo.Control:
         """A control for the places and paths that fit these labels of all steps.
 
-        The last one is kept, as the next question is often to it.
+        The last control is kept, as the next question often needs it.
         """
         key = tuple(labels), tuple(options), tuple(parts)
         if self._asked is None or self._asked[0] != key:
@@ -388,7 +386,7 @@ class PlacesAndPaths:
     def improving_maps(self, labels: Sequence[int]) -> Iterator[Found]:
         """Maps with these dstates, each as good as the one before or better, the last one best.
 
-        There are none if no places and paths fit the labels.
+        There are none if no places and paths fit.
         """
         if (best := self._tightly(labels)) is not None:
             yield best
@@ -415,7 +413,7 @@ class PlacesAndPaths:
             parts: Of the program; without EACH there is one map for each choice of places.
 
         Returns:
-            Whether clingo came to an end, and not to the limit of conflicts.
+            Whether clingo ended before the limit of conflicts.
         """
         control = self._path_control(labels, options, parts)
         reader = path_reader.PathReader(

@@ -1,11 +1,9 @@
 """Maps of a theory with star=pattern, found as if places had frames.
 
-If places have frames, dstates are nearly settled before any place or path is (engines/framed.py),
-and
-traces of thousands of steps have good maps in seconds. With star=pattern clingo is given all axioms
-for each step, and gets through a few dozen steps only. But each map of `Theory.with_frames` is a
-map
-of this theory, too. So if the world has frames, its map or one about as small is found.
+If places have frames, dstates are nearly known before places and paths (engines/framed.py). So
+traces of thousands of steps have good maps in seconds. With star=pattern clingo gets all axioms for
+each step, and manages only a few dozen steps. But each map of `Theory.with_frames` is also a map of
+this theory. So if the world has frames, its map or one about as small is found.
 """
 
 from __future__ import annotations
