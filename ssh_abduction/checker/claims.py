@@ -34,7 +34,7 @@ REASONS = (
 def false_claims(
     answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory, proven: int
 ) -> tuple[str, ...]:
-    """Find what is wrong with the claims of an answer. No claim is taken for granted.
+    """Find the false claims of an answer. No claim is accepted without a check.
 
     Args:
         answer: The answer as `solve --json` prints it (docs/reference/formats.md).
@@ -59,7 +59,7 @@ def contradictions(
 ) -> Iterator[str]:
     """Find contradictions in an answer.
 
-    Its certificate is taken for granted, as it takes the trace to check it.
+    Its certificate is accepted: only the trace could check it.
 
     Args:
         answer: The answer, as for `false_claims`.

@@ -1,4 +1,4 @@
-"""The axioms of evidence: stars of a dstate, asserted pairs, poses, and drawings in the plane."""
+"""The axioms of evidence: stars (gateways seen), asserted pairs, poses, and planar drawings."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ class Refused:
 
     Attributes:
         returns: The steps and degrees of freedom of each.
-        closings: How far off each closes.
+        closings: The error of each.
         square: The chi-square of all.
         most: The threshold.
     """
@@ -127,7 +127,7 @@ def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts) -> I
 
 
 def _closing(trace: Trace, first: int, last: int) -> Closing:
-    """How far off a loop closes without drift; the drift is part of the uncertainty."""
+    """The error of a loop without drift; the drift is part of the uncertainty."""
     odometry = trace.odometry or Odometry()
     filtered = ErrorFilter(trace.prefix(last + 1), odometry, 0.0, odometry.bend)
     off, covariance = filtered.closing(first, last), filtered.covariance(first, last)

@@ -284,7 +284,7 @@ def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
 
 
 def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
-    """Whether these gateways are distinct, and those in the order follow each other clockwise."""
+    """Whether these gateways are distinct, and clockwise as far as the order has them."""
     there = [order.index(gateway) for gateway in told if gateway in order]
     return (
         len(set(told)) == len(told)

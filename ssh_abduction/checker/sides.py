@@ -41,7 +41,7 @@ class Branch:
 
 @dataclass(frozen=True)
 class Conflict:
-    """A place that the axioms of the sides put where another axiom says it is not."""
+    """A place whose side contradicts another axiom."""
 
     axiom: str
     branches: tuple[Branch, ...]
@@ -96,7 +96,7 @@ def _right_of(m: Reading) -> dict[Course, dict[int, Branch]]:
 
 
 def _conflicts(m: Reading) -> list[Conflict]:
-    """The places that the axioms of the sides put where they cannot be."""
+    """The places whose sides contradict another axiom."""
     right = _right_of(m)
     disjoint = _both_sides(m, right) if "sides_disjoint" in m.axioms else ()
     between = _on_and_beside(m, right) if "path_between_sides" in m.axioms else ()

@@ -1,4 +1,4 @@
-"""The axioms of local topology: the stars and headings of a place with a frame of four slots.
+"""The axioms of local topology: stars (openings) and headings of a place with four slots.
 
 Slots are numbered 0 to 3 clockwise. Turning right adds 1 to the heading.
 """

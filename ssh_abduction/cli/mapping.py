@@ -242,7 +242,7 @@ class MapQuestion:
 
     @property
     def has_limits(self) -> bool:
-        """Each log has a process of its own, which can be killed."""
+        """True: each log has its own process, which can be killed."""
         return True
 
     @property

@@ -141,7 +141,7 @@ def dump(value: dict[str, Any]) -> str:
 
 @contextlib.contextmanager
 def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
-    """Do something else on Ctrl-C and SIGTERM than to end the program at once.
+    """On Ctrl-C and SIGTERM, call `action` instead of ending the program.
 
     The guard of the whole program receives no signals meanwhile. So code that may not react to
     `action` needs a guard of its own.

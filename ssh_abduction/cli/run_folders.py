@@ -192,7 +192,7 @@ def _run_in(folder: Path) -> dict[str, Any]:
 
 
 def _content(path: str) -> str | None:
-    """The digest of a log; None if it cannot be read, or only once."""
+    """The digest of a log; None if it cannot be read twice."""
     with suppress(OSError, AbductionError):
         return digest(path)
     return None

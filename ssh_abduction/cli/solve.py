@@ -217,7 +217,7 @@ class _Json:
 
     @property
     def kept(self) -> list[SSHMap]:
-        """The maps that are held: all maps, or none."""
+        """The list of held maps: all maps, or none."""
         return [ssh_map for ssh_map, _ in self._held]
 
     def searched(self, say: Callable[[Callable[[], str]], None]) -> Explanation | None:

@@ -167,7 +167,7 @@ def describe(ssh_map: SSHMap) -> str:
 
 
 def describe_backbone(backbone: Backbone, trace: Trace) -> str:
-    """The steps that are one dstate in all minimal maps, and the pairs that are one in some."""
+    """The steps that are one dstate in all minimal maps, and the pairs that are in some."""
     steps: dict[int, list[int]] = {}
     for t, number in enumerate(backbone.dstates.always):
         steps.setdefault(number, []).append(t)

@@ -111,7 +111,7 @@ class Action:
 
     @property
     def in_quarters(self) -> bool:
-        """Whether the action says no more of a turn than right, left or around, by quarters."""
+        """Whether a turn of this action is only given as right, left or around, by quarters."""
         if self.gateway is not None:
             return False
         if self.bearing is None:
@@ -146,7 +146,7 @@ STANDARD_ACTIONS: dict[str, Action] = {
 
 
 def parse_action(value: Any, where: str) -> Action:
-    """An action of a trace file, whose errors begin with `where`."""
+    """An action of a trace file. Its errors begin with `where`."""
     if isinstance(value, str):
         value = {"name": value}
     if not isinstance(value, Mapping):

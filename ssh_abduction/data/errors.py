@@ -1,6 +1,6 @@
 """The errors that a user can cause or mend: one root, and one subclass for each layer.
 
-Errors of bad input are ValueErrors, too, so that programs without knowledge of this package can
+Errors of bad input are also ValueErrors, so that programs without knowledge of this package can
 catch them. Something that is missing on the machine is a plain AbductionError, and a defect of this
 package is an `InternalError` (`solver/judging.py`). A limit that was reached is no error:
 `Solution.stopped` says so.

@@ -29,7 +29,7 @@ from ssh_abduction.runtime.clock import look_at_clock
 
 @dataclass(frozen=True)
 class Sight:
-    """A dstate and a star that is seen there.
+    """A dstate and a star (gateways) seen there.
 
     Attributes:
         dstate: The dstate.
@@ -171,7 +171,7 @@ def by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
 def fit(
     sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_shown: bool = True
 ) -> list[_Turned] | None:
-    """Find a frame and a shift for each sight at one place such that all pairs satisfy the axioms.
+    """Find a frame and a shift for each sight at one place so that all pairs satisfy the axioms.
 
     Args:
         sights: The sights at one place.
@@ -302,7 +302,7 @@ def _between(a: float, b: float) -> float:
 
 
 def _turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
-    """Whether one of these rotations is what a turn does."""
+    """Whether a turn can make one of these rotations."""
     # a bearing or a number of the gateway says more than right, left and around
     if action.bearing is not None:
         return any(_between(r, round(action.bearing)) <= SPREAD for r in found)

@@ -219,7 +219,7 @@ class SSHMap:
 
     @classmethod
     def from_dict(cls, data: Any, where: str = "map") -> SSHMap:
-        """The map that `to_dict` made plain data of.
+        """The map from the plain data of `to_dict`.
 
         Args:
             data: The plain data.

@@ -67,7 +67,7 @@ class Gateway:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The gateways of a place as seen at one step, all of them known.
+    """The gateways of a place as seen at one step, if all are known.
 
     They are its slots, numbered clockwise from the one ahead, or from the next one.
 
@@ -135,7 +135,7 @@ class Star:
 
     @property
     def openings(self) -> Openings | None:
-        """Whether there is a gateway ahead, right, back and left.
+        """Four flags: is a gateway ahead, right, back and left?
 
         None if a gateway was not observed, is in none of these directions, or has another opposite
         than the one straight opposite, or if two gateways are in one direction.
@@ -204,7 +204,7 @@ def is_four(entries: Sequence[Entry]) -> bool:
 
 
 def near_quarter(bearing: float) -> int | None:
-    """The quarter that a bearing is near: 0 ahead, 1 right, 2 back, 3 left, or None."""
+    """The quarter near a bearing: 0 ahead, 1 right, 2 back, 3 left, or None."""
     quarter = round(bearing / 90)
     return quarter % 4 if abs(bearing - 90 * quarter) <= QUARTER else None
 

@@ -101,7 +101,7 @@ class Step:
         displacement: Sequence[float] | None = None,
         covariance: Sequence[Sequence[float]] | None = None,
     ) -> Step:
-        """A step whose errors begin with `where`. The other arguments are the fields of a step.
+        """A step. Its errors begin with `where`. The other arguments are the fields of a step.
 
         Raises:
             TraceError: If a field is wrong.

@@ -228,7 +228,7 @@ class Trace:
         return (self.odometry or _USUAL).covariance(here.displacement)
 
     def at(self, step: int) -> str:
-        """What messages call a step: file and line, or its number."""
+        """The name of a step in messages: file and line, or number."""
         a_whole_number("step", step, TraceError)
         return f"{named(self.source)}:{step + 2}" if self.source else f"step {step}"
 

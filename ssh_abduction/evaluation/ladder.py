@@ -65,7 +65,7 @@ class Rung:
 
 
 class UnderWay:
-    """Searches that come one after the other, and can be ended together.
+    """Successive searches that can be ended together.
 
     A signal handler or another thread ends the search that is under way, and all that come after.
 

@@ -42,7 +42,7 @@ from ssh_abduction.data.words import counted
 
 @dataclass(frozen=True, slots=True)
 class MapEvaluation:
-    """The accuracy of one map. Shares are from 0 to 1; what cannot be said is None.
+    """The accuracy of one map. Shares are from 0 to 1; an unknown value is None.
 
     An edge joins the places at both ends of a travel, in either direction. Edges are counted for
     travels that were driven, from one step to the next: the edges of TOPO-Bench (Wang et al., arXiv
@@ -87,7 +87,7 @@ class MapEvaluation:
     def isomorphic(self) -> bool | None:
         """Whether the map is the true one up to renaming.
 
-        Its dstates are right, and so are its places and paths as far as these can be said.
+        Its dstates are right, and its places and paths as far as they are known.
         """
         if False in (self.dstates_right, self.places_right, self.paths_right):
             return False
@@ -407,7 +407,7 @@ def _share(part: int, whole: int) -> float | None:
 
 
 def _ambiguity(views: Sequence[View | None], dstates: Sequence[Hashable]) -> float | None:
-    """Of the pairs of different dstates that were seen, the share that shares a view."""
+    """The share of pairs of visited dstates that have the same view."""
     seen: dict[Hashable, set[View]] = {}
     for view, dstate in zip(views, dstates, strict=True):
         if view is not None and dstate is not None:

@@ -317,7 +317,7 @@ class _Related:
             )
 
     def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """As `_Poses.seen_from`, from the robot's relative poses, and where it saw the dstates."""
+        """As `_Poses.seen_from`, by the robot's relative poses and its sightings of dstates."""
         robots = self._relations.between(self._times, step)
         origin = self._seen[step]
         dx, dy, turned, way = np.array(
@@ -339,7 +339,7 @@ def _degrees(radians: Array) -> Array:
 def _verdicts(
     truth: _Poses | _Related, visit: Steps, near: float, turned: float
 ) -> tuple[Verdicts, Verdicts]:
-    """What is true of each pair of visits, (v, v), and of each pair of steps, (n, n).
+    """The verdict on each pair of visits, (v, v), and on each pair of steps, (n, n).
 
     The earlier one of a pair comes first. Other entries are UNKNOWN.
 
@@ -375,7 +375,7 @@ def _verdicts(
 
 
 def _pairs(verdicts: Verdicts, visit: Steps) -> Pairs:
-    """How many pairs of different visits there are of each verdict.
+    """The number of pairs of different visits with each verdict.
 
     Args:
         verdicts: What is true of each pair.

@@ -42,13 +42,13 @@ FIELDS = ("time1", "time2", "x", "y", "z", "roll", "pitch", "yaw")
 # A moment that is not between two related times may be this many seconds from one, as robots that
 # map buildings drive at most a metre a second.
 NEAREST = 0.5
-# Each relation counts as this many metres more than its length, as short ones have errors, too.
+# Each relation counts as this many metres more than its length, as short ones also have errors.
 EACH = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Where the robot was at a second time, as seen from where it was at a first.
+    """The robot's pose at a second time, in the frame of its pose at a first.
 
     Attributes:
         first: The first time in seconds.
@@ -106,7 +106,7 @@ class Relations:
         """
         try:
             text = read_at_most(path, LARGEST).decode("utf-8")
-        except ValueError as error:  # bytes that are no text are one, too
+        except ValueError as error:  # also for bytes that are no text
             raise TraceError(
                 f"{named(path)}: expected a text of relations, got another file ({error}); "
                 "give one of numbers"
@@ -136,7 +136,7 @@ class Relations:
     def between(
         self, times: Sequence[float | None], origin: int
     ) -> list[tuple[Pose, float] | None]:
-        """The pose of the robot at each moment, as seen from where it was at one of them.
+        """The pose of the robot at each moment, in the frame of its pose at one of them.
 
         Args:
             times: The moments in seconds; None for one without a time.

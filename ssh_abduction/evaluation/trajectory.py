@@ -44,7 +44,7 @@ NANOSECONDS = 1e15
 
 
 class TrajectoryWarning(UserWarning):
-    """A trajectory was read, but it may not be what was meant. The text says why."""
+    """A trajectory was read, but may not be the intended one. The text says why."""
 
 
 class Trajectory:
@@ -88,7 +88,7 @@ class Trajectory:
         source = os.fspath(path)
         try:
             text = read_at_most(path, LARGEST).decode("utf-8-sig")
-        except ValueError as error:  # bytes that are no text are one, too
+        except ValueError as error:  # also for bytes that are no text
             raise TraceError(
                 f"{named(source)}: expected a trajectory in TUM format, got another file "
                 f"({error}); give a text"

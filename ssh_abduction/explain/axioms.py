@@ -412,7 +412,7 @@ class Axioms:
     def _shrunk(
         self, kept: list[clingo.Symbol], assumed: Sequence[Assumption]
     ) -> list[clingo.Symbol]:
-        """The pairs that are left after dropping, in their order, all that are not needed."""
+        """The pairs that are left after dropping unneeded ones in their order."""
         # the last unsat core: as long as all of it is kept, clingo need not be asked
         core: set[clingo.Symbol] | None = None
 

@@ -73,7 +73,7 @@ class Derivation:
         one: Whether the steps are one dstate.
         links: A minimal set of axioms and steps.
         inferences: The argument, line by line.
-        supposition: What is supposed in the lines that say so; None if no line does.
+        supposition: What the lines that say so suppose; None if none does.
         summary: The last inference of the argument in one sentence.
     """
 

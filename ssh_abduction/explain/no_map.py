@@ -27,7 +27,7 @@ from ssh_abduction.theory.theory import Theory
 
 @dataclass(frozen=True, slots=True)
 class Clash:
-    """An axiom that cannot hold at all of these steps, given the other clashes.
+    """An axiom that must fail at one of these steps, given the other clashes.
 
     Attributes:
         axiom: The name of the axiom.

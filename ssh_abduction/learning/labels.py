@@ -25,8 +25,8 @@ class LearnerError(AbductionError, ValueError):
 class AmbiguousMapWarning(UserWarning):
     """The labels may be wrong or incomplete.
 
-    Several maps are minimal and disagree, or the map is not proven minimal, or another trace cannot
-    be placed on it.
+    Several minimal maps disagree, or the map is not proven minimal, or another trace cannot be
+    placed on it.
     """
 
 

@@ -51,7 +51,7 @@ _log = log_of(__name__)
 class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
     """Learns to recognise places from images and actions, without knowing any place.
 
-    It is an estimator, as scikit-learn has them. Of several traces all images make the views, the
+    It is an estimator, as scikit-learn has them. Of several traces, all images make the views, the
     longest trace makes the map, and the others are followed on it.
 
     Args:

@@ -125,7 +125,7 @@ class FaultSolver:
         return found
 
     def begin_in_background(self, trace: Trace, theory: Theory) -> bool:
-        """Solve the trace in another process, unless that is under way; False if it cannot be."""
+        """Solve the trace in another process, if none does; False if that is impossible."""
         self.background = self.background or BackgroundSolve.begun(
             trace, theory, self._options.max_maps, self._options.speedups
         )

@@ -75,7 +75,7 @@ class Drafts:
         self._sketches = [draft for draft in self._sketches if draft.sketch.extend(action, step)]
 
     def add(self, ssh_map: SSHMap, trace: Trace) -> None:
-        """Let a map of the first steps of a trace go on, unless it contradicts the later ones."""
+        """Extend a map of the first steps of a trace, unless it contradicts the later ones."""
         if not self._may_sketch:
             return
         known = len(ssh_map.labels)
@@ -89,7 +89,7 @@ class Drafts:
         self._drafts = []
 
     def best(self, trace: Trace, pairs: Pairs) -> SSHMap | None:
-        """The best draft that is consistent, or else a consistent sketch, if there is one."""
+        """The best consistent draft, or else a consistent sketch, if there is one."""
         while self._drafts:
             if self._is_consistent(self._drafts[0], trace, pairs):
                 return self._drafts[0].sketch.map()

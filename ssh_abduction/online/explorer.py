@@ -6,8 +6,8 @@
 when clingo was asked, and when rivals were refuted:
 
 1. If known links distinguish minimal maps, the actions that do (`rivals/explore.py`).
-2. Else the shortest tour through all that is untried in the first map (`rivals/tour.py`). It looks
-   around where it comes back to, and not at once.
+2. Else the shortest tour through all that is untried in the first map (`rivals/tour.py`). It puts
+   off looking around at places that it will come back to.
 3. Else an untried action for which minimal maps predict different outcomes.
 4. Else actions that distinguish the map from one without one of its returns (`return_doubts.py`).
 
@@ -325,7 +325,7 @@ class Explorer:
         return seen
 
     def _planned(self) -> bool:
-        """Whether there is a next action. It is the first one of the plan then."""
+        """Whether there is a next action. If so, the plan begins with it."""
         able = self._abilities.here
         if self._plan and self._plan[0] not in able:
             self._plan = []

@@ -25,7 +25,7 @@ MENDING = 5e-7
 
 
 class Guesser:
-    """Makes maps of a trace that grows: from guesses, and by mending maps that it contradicts.
+    """Makes maps of a growing trace: from guesses, and by mending contradicted maps.
 
     A map is mended at once if a step has time for that, and else in another process, where also
     one guess after another becomes a map.

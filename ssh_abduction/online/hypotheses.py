@@ -118,7 +118,7 @@ class Rival:
         return (self.here, action) not in self.links
 
     def future(self) -> tuple[object, ...]:
-        """What the map predicts from here on, as a value that two maps can be compared by.
+        """The predictions of the map from here on, as a value to compare two maps.
 
         It is equal for maps that agree on dstates, links and where the robot is, up to renaming,
         however they explain the past. Of unreachable dstates it holds only the number.

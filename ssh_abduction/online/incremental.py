@@ -25,7 +25,7 @@ class IncrementalSolver:
     Attributes:
         searches: How many searches there were.
         search: The last search, None before the first.
-        solution: What the last search said, without its maps.
+        solution: The last answer, without its maps.
     """
 
     def __init__(self, options: StepOptions, searches: int = 0) -> None:

@@ -71,7 +71,7 @@ if TYPE_CHECKING:
 
 
 class Localiser:
-    """Follows a robot in a map: beliefs go in, and beliefs come out.
+    """Follows a robot in a map: each step maps a belief to the next.
 
     Args:
         ssh_map: The map. Its links and views say (4).
@@ -199,7 +199,7 @@ class Localiser:
         yield from (self._of_view(step.view) for step in trace)
 
     def _observation(self, view: View | None, image: ArrayLike | None) -> Observation | None:
-        """A view or an image, as what it says of dstates."""
+        """What a view or an image says about dstates."""
         if self._seen is not None:
             if image is None:
                 return None
@@ -217,8 +217,8 @@ class Localiser:
     def _spread(self, ratios: NDArray[np.float64]) -> Observation:
         """An image as an observation, by f(o|x) / q(o) of the recogniser's classes.
 
-        A dstate without an image in the recogniser is like a place that is not in the map: it is
-        not known how it looks.
+        A dstate without an image in the recogniser is like a place that is not in the map: its
+        looks are unknown.
         """
         assert self._seen is not None
         spread = np.ones(self._number)

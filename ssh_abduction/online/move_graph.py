@@ -175,7 +175,7 @@ class MoveGraph:
                     self._imply(course, other, around if self._is_around(course, other) else None)
 
     def _imply(self, source: Node, target: Node, action: str | None) -> None:
-        """Add a move that the paths of the map imply, unless a link says it."""
+        """Add a move that the paths of the map imply, unless a link gives it."""
         if not self._graph.has_edge(source, target):
             cost = self._cost(source, target, UNTRIED_MOVE if action else OPEN_TURN)
             self._graph.add_edge(source, target, action=action, implied=True, cost=cost)

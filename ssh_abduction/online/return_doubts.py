@@ -76,7 +76,7 @@ class ReturnDoubts:
         return None
 
     def dispel(self, doubt: Doubt, dstates: int) -> None:
-        """Doubt a return no more, until minimal maps have more than `dstates` dstates."""
+        """Stop doubting a return until minimal maps have more than `dstates` dstates."""
         self._least[doubt] = dstates + self._margin + 1
 
     def reopen(self) -> None:

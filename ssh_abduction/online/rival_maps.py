@@ -101,7 +101,7 @@ class RivalMaps:
         )
 
     def is_minimal(self, rival: Rival) -> bool:
-        """Whether a rival costs what a minimal map costs."""
+        """Whether a rival has the cost of a minimal map."""
         return rival.cost == self._least
 
     def follow(self, problem: Problem) -> Change:
@@ -193,7 +193,7 @@ class RivalMaps:
         return rivals, self._shares(rivals)
 
     def _gone_on(self, rivals: Iterable[Rival], t: int) -> list[Rival]:
-        """Let rivals of the steps before `t` go on with step `t`, and rank what they become."""
+        """Extend the rivals of the steps before `t` by step `t`, and rank the results."""
         done, step = self._trace.steps[t - 1].action, self._trace.steps[t]
         assert done
         seen = observation(step, self._theory)

@@ -125,7 +125,7 @@ def _synchronised(graph: nx.MultiDiGraph[Any], first: Course, robust: bool) -> d
     """The heading of each course of a connected part; that of the first is 0.
 
     With `robust` a missed turn counts by its size and not by its square. This is done by averaging
-    again and again, with weights that fall with what was missed the last time.
+    repeatedly, with weights that fall with the last error.
     """
     # Begin with headings along a tree of turns.
     angles = {first: 0.0}

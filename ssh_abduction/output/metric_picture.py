@@ -250,7 +250,7 @@ class _Picture:
         return []
 
     def size(self, size: float) -> float:
-        """The size of text that has this size where there is room."""
+        """The text size for this size, less if room is short."""
         return max(size * self.unit, 9.0)
 
     def half(self, label: str, size: float) -> tuple[float, float]:

@@ -111,7 +111,7 @@ def content_of(
 
 
 def _shared(listing: Listing) -> dict[str, Any] | None:
-    """What is proven of the dstates of all minimal maps, if not all of these are listed."""
+    """What is proven of the dstates of all minimal maps, if some maps are not listed."""
     if listing.complete or listing.backbone is None or not listing.backbone.proven:
         return None
     dstates = listing.backbone.dstates
@@ -119,7 +119,7 @@ def _shared(listing: Listing) -> dict[str, Any] | None:
 
 
 class _Pool:
-    """Different values, numbered in the order in which they came."""
+    """Distinct values, numbered in the order in which they came."""
 
     def __init__(self) -> None:
         self._numbers: dict[Hashable, int] = {}

@@ -312,7 +312,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
 def _depending(
     asked: Sequence[Asked], options: Sequence[NDArray[np.intp]], table: Table
 ) -> tuple[list[dict[Matter, tuple[int, ...]]], dict[Matter, tuple[int, ...]]]:
-    """For each choice the steps that depend only on it, and the steps that depend on several."""
+    """The steps that depend only on each choice, and the steps that depend on several."""
     of_choice: list[dict[Matter, set[int]]] = [{} for _ in options]
     together: dict[Matter, set[int]] = {}
     sizes = [np.bincount(option) for option in options]
@@ -345,7 +345,7 @@ def _choice(
 
 
 def _variants(table: Table, maps: Sequence[SSHMap]) -> dict[Matter, int]:
-    """How many different labelings, placings, … there are."""
+    """The numbers of different labelings, placings, …"""
     faults: dict[Matter, int] = (
         {"faults": len({m.faults for m in maps})} if any(m.faults for m in maps) else {}
     )

@@ -278,7 +278,7 @@ def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
 
 
 def _told(groups: Sequence[Steps], none: Steps) -> str:
-    """What one map does with the steps: groups steps 0–1 | 2 and leaves out step 5."""
+    """How one map treats the steps: groups steps 0–1 | 2 and leaves out step 5."""
     grouped = f"groups {_steps(sum(map(len, groups)))} {' | '.join(map(stretches, groups))}"
     left = f"leaves out {_steps(len(none))} {stretches(none)}"
     return " and ".join(([grouped] if groups else []) + ([left] if none else []))

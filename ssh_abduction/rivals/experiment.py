@@ -56,7 +56,7 @@ class Untried:
 
 @dataclass(frozen=True, slots=True)
 class Branch:
-    """How a plan goes on after an observation."""
+    """The rest of a plan after an observation."""
 
     seen: Seen
     plan: Plan
@@ -68,7 +68,7 @@ class Branch:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """An experiment as a tree: actions, and how to go on depending on what is seen after the last.
+    """An experiment as a tree: actions, and the next plan for each view after the last.
 
     Attributes:
         rivals: The rivals that are left, by number from 1.

@@ -215,7 +215,7 @@ class Laboratory:
         return self._plan_for(everything, (0,) * len(everything))
 
     def predictions(self, actions: Sequence[str]) -> tuple[Prediction, ...]:
-        """What the rivals predict after each of these actions, whose links they know."""
+        """What the rivals predict after each of these actions; they know all links."""
         names = [action.name for action in self._actions]
         found: dict[tuple[int, ...], list[int]] = {}
         for machine, group in enumerate(self._groups):
@@ -258,7 +258,7 @@ class Laboratory:
     ) -> tuple[list[int], dict[int, tuple[list[int], list[int]]]] | None:
         """The sequence of actions up to a difference that gains most per action.
 
-        To leave at worst m of n rivals gains log(n / m).
+        Leaving at worst m of n rivals gains log(n / m).
 
         Returns:
             The actions, and for each observation after them the machines that predict it (as

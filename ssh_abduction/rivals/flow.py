@@ -184,7 +184,7 @@ def reached_from(moves: Iterable[Move], start: int) -> set[int]:
 
 
 def followed_from(links: Iterable[tuple[T, T]], start: T) -> set[T]:
-    """All that links lead to from `start`, and `start` itself."""
+    """All stances that links reach from `start`, with `start`."""
     after: dict[T, list[T]] = {}
     for source, target in links:
         after.setdefault(source, []).append(target)

@@ -180,7 +180,7 @@ def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None)
 
 
 def _sound(ssh_map: SSHMap) -> list[tuple[int, int]]:
-    """The steps whose observation the map believes, each with its dstate."""
+    """The steps whose observation the map accepts, each with its dstate."""
     wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
     return [(t, label) for t, label in enumerate(ssh_map.labels) if t not in wrong]
 

@@ -83,8 +83,8 @@ class Table:
     def questions(self, sort: Sort) -> Iterator[tuple[int, int, Bools]]:
         """Questions that distinguish maps.
 
-        Only pairs are asked about whose earlier class is the first of its kind in some map. That is
-        enough: if two maps differ in what a class is one with, they differ in the first such class.
+        The earlier class of each pair is the first of its kind in some map. That is enough: if two
+        maps group a class differently, they also differ in the first class of its group.
 
         Yields:
             Two classes, the earlier first, and for each map whether they are one in it. If both are

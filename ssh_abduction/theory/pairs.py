@@ -54,7 +54,7 @@ class Pairs:
 
     @cached_property
     def asked_for(self) -> frozenset[int]:
-        """The steps that end a pair."""
+        """The later step of each pair."""
         return frozenset((*self.apart, *self.one))
 
     def allow(

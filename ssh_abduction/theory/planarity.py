@@ -110,7 +110,7 @@ def _on_rings(place_of: Sequence[Place]) -> set[int]:
 
 
 def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
-    """The allowed clockwise orders of some ends, the first end first."""
+    """The allowed clockwise orders of some ends, beginning with the first."""
     orders: list[Ends] = [()]
     for end in ends:
         longer = (

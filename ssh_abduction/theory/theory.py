@@ -196,7 +196,7 @@ class Theory:
         return any(getattr(self, kind) > 0 for kind in EXCUSED)
 
     def without_faults(self) -> Theory:
-        """This theory without faults: a map must believe the whole trace."""
+        """This theory without faults: a map may ignore nothing."""
         return replace(self, **dict.fromkeys(EXCUSED, 0.0))  # type: ignore[arg-type]
 
     def fault_tenths(self, kind: str, step: Step) -> int:
@@ -222,9 +222,9 @@ class Theory:
 
     @cached_property
     def axioms(self) -> tuple[str, ...]:
-        """The names of the axioms that hold, those of the user's own rules last.
+        """The names of the axioms that hold; the user's own rules come last.
 
-        With star=auto and displacement=auto, the trace is taken to have neither.
+        With star=auto and displacement=auto, neither counts as present.
         """
         own = [axiom.name for rules in self.rules for axiom in rules.axioms]
         return (
@@ -282,7 +282,7 @@ class Theory:
     def with_frames(self) -> Theory:
         """The theory in which places have frames and fewest dstates come first.
 
-        For star=pattern. Its maps, without their headings, are maps of this theory, too: paths are
+        For star=pattern. Its maps, without their headings, are also maps of this theory: paths are
         totally ordered, the axioms of sides hold without excuses, and stars that agree in a frame
         are one pattern.
         """

@@ -180,7 +180,7 @@ def _trend(run: Run) -> float:
 
 
 def summary(name: str, runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Each claim as a row: what the paper says, what came out by seed, and how often it holds."""
+    """Each claim as a row: the paper's value, the result by seed, and how often it holds."""
     return [
         {
             "claim": claim.text,

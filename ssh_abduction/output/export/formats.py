@@ -53,7 +53,7 @@ def export_map(
             "networkx-json", which networkx.node_link_graph reads.
         level: What nodes are, "places" or "dstates". None means places for nav2 and tmap2, if the
             map has any, and dstates otherwise.
-        name: What the map is called; in tmap2 its pointset, too.
+        name: What the map is called; in tmap2 also its pointset.
         frame: The coordinate frame of the positions.
         turns: How actions turn, as in `to_svg`; for the layout of a map without poses.
 

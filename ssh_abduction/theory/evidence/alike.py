@@ -73,7 +73,7 @@ def _pairs(seen: tuple[_Seen, ...]) -> Pairs:
 def are_alike(one: Star, other: Star) -> bool:
     """Whether two stars may show the same gateways to a robot that has not turned.
 
-    Each gateway that is seen in one star must be a gateway of the other, and no two the same one.
+    Each gateway seen in one star must be a gateway of the other, each a different one.
     Gateways that were not observed may be there or not. It is enough to pair the seen gateways of
     each star (Mendelsohn & Dulmage 1958).
     """
@@ -85,7 +85,7 @@ def _pairable(one: Star, other: Star) -> bool:
     partner: dict[int, int] = {}  # gateways of `one`, by their partner in `other`
 
     def pair(k: int, tried: set[int]) -> bool:
-        """Find a partner for gateway k, and another one for the gateway that it takes it from."""
+        """Find a partner for gateway k; a gateway that loses its partner gets another one."""
         here = one.gateways[k]
         for j, there in enumerate(other.gateways):
             if (

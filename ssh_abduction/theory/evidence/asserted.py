@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Asserted:
     """The fields `same`, `different` and `elsewhere` of a theory.
 
-    Pairs with a step that the trace does not have yet say nothing.
+    Pairs with a step that the trace does not have yet are ignored.
     """
 
     name: ClassVar[str] = "asserted"

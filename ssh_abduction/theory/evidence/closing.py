@@ -1,4 +1,4 @@
-"""By how much a loop of the trace fails to close, in numbers and in words."""
+"""The error at the end of a loop of the trace, in numbers and in words."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Closing:
-    """By how much a loop fails to close, in metres and radians, with standard deviations.
+    """The error at the end of a loop, in metres and radians, with standard deviations.
 
     Attributes:
         way: Metres driven from its first step to its last one.

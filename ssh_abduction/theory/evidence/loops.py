@@ -1,4 +1,4 @@
-"""By how much the loops of a trace fail to close, and the covariance of that.
+"""The error at the end of the loops of a trace, and the covariance of the error.
 
 >>> from ssh_abduction import Trace
 >>> from ssh_abduction.theory.evidence.loops import Loops
@@ -109,7 +109,7 @@ class Loops:
         return Loops(sums[..., :3], part, sums[..., 3:20], sums[..., 20:], odometry, bend, drift)
 
     def closings(self, first: ArrayLike, last: ArrayLike) -> tuple[Array, Array]:
-        """By how much loops fail to close, in the frame of the first step of the trace.
+        """The error at the end of loops, in the frame of the first step of the trace.
 
         Args:
             first: The steps at which the loops begin, m.

@@ -372,7 +372,7 @@ def _at_edges(shown: _Shown) -> set[int]:
 
 
 def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Sequence[Arm]]) -> bool:
-    """Whether the other gateways fit into a clockwise order of some, as the turns demand."""
+    """Whether the others fit into a clockwise order, as the turns demand."""
     if not all(_is_clockwise(order, told) for told in clockwise):
         return False
     if not others:
@@ -431,7 +431,7 @@ def _fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
 def _split(
     labels: Mapping[int, int], steps: Sequence[int], cross: Callable[[Mapping[int, int]], bool]
 ) -> Mapping[int, int]:
-    """Labels of these steps with as few equal dstates as possible, with which edges still cross."""
+    """Labels of these steps with the fewest equal dstates that still make edges cross."""
     new = max(labels.values()) + 1
     for step in steps:
         look_at_clock()

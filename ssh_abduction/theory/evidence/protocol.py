@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Equality:
-    """That two steps are one dstate, or at one place; or that they are not (`holds` is False)."""
+    """Two steps are one dstate, or at one place; or they are not, if `holds` is False."""
 
     first: int
     second: int

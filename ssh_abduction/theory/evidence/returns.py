@@ -406,7 +406,7 @@ class Returns:
         return f"{named} cannot both be returns: the loops of {ways} close {sizes} off{headings}"
 
     def closing(self, first: int, last: int) -> Closing:
-        """By how much a loop fails to close. A drift of heading counts as uncertainty."""
+        """The error at the end of a loop. A drift of heading counts as uncertainty."""
         import numpy as np
 
         from ssh_abduction.theory.evidence.loops import chi_squares

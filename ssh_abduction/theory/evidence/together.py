@@ -304,7 +304,7 @@ def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps
 
 
 def _cut_off_headings(closing: Array, covariance: Array, one_dstate: Steps) -> None:
-    """Make the heading of returns to places say nothing: it closes, and is independent."""
+    """Ignore the heading of returns to places: let it close, and be independent."""
     places = one_dstate == 0
     closing[places, 2] = 0.0
     covariance[places, 2, :] = covariance[places, :, 2] = 0.0
