@@ -295,7 +295,7 @@ def test_a_reproduction_writes_its_data_before_it_draws(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(report, "measure", lambda name, seed: type("Run", (), {"seed": seed}))
-    monkeypatch.setattr(report, "to_dict", lambda run: {"seed": run.seed})
+    monkeypatch.setattr(report, "asdict", lambda run: {"seed": getattr(run, "seed", 0)})
     monkeypatch.setattr(
         report,
         "summary",
