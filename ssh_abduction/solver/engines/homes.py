@@ -1,7 +1,7 @@
 """The fewest places for given dstates, if that needs no search.
 
-This serves the engine without frames. It finds a map with the fewest places, and proves that there
-are no fewer, if as few places are enough as are pairwise distinct.
+This serves the engine without frames. If the number of pairwise distinct places is enough for a
+map, it finds such a map and proves that no map has fewer places.
 
 In a corridor of forty landmarks, driven there and back, the dstates are known at once. The places
 of the way there follow each other on one path, so they are forty different ones. Fewer places will
@@ -33,10 +33,10 @@ from ssh_abduction.solver.engines.paths import pairwise_distinct
 def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
     """The fixed places that each place may be, if there are no more places than fixed ones.
 
-    None if some place can be none of them.
+    None if some place can be no fixed one.
 
     Args:
-        told: What the segments say of places.
+        told: What the segments imply about places.
     """
     if any(c == p for c, p in told.elsewhere):
         return None  # the segments contradict each other: no places fit these dstates

@@ -1,7 +1,7 @@
-"""Talks to clingo about named dstates (names.lp), for the engines without frames.
+"""Asks clingo about named dstates (names.lp), for the engines without frames.
 
-Clingo is given only some links of the trace at first, and more where an answer needs them. That is
-a relaxation, so what clingo proves of it holds of the trace. An answer is followed along the trace
+Clingo is given only some links of the trace at first, and more if an answer needs them. That is a
+relaxation, so a proven bound holds for the trace. An answer is followed along the trace
 (`NameProgram.follow`): if it explains each link, it is a map.
 """
 
@@ -37,15 +37,15 @@ class Fitting(Protocol):
     """Demands on labels beyond the causal theory (`engines/frameless.py`)."""
 
     def fits(self, labels: Sequence[int]) -> bool:
-        """Whether these labels of a map of the causal theory are those of a map."""
+        """Whether these labels of a causal map have a map with the demands."""
         ...
 
     def forbid(self, labels: Sequence[int]) -> None:
-        """Tell clingo why these labels are not those of a map."""
+        """Forbid the reason why these labels have no map."""
         ...
 
     def tell_again(self) -> None:
-        """Tell a new control what the one before was told."""
+        """Give a new control the rules of the one before."""
         ...
 
 
@@ -56,11 +56,11 @@ class _Known:
     Attributes:
         spare: The spare names of each view; the last one is the rest.
         choices: For each node, the names that it may be at.
-        is_open: Whether a node was given and is not pinned.
+        is_open: Whether some given node is not pinned.
         links: The links that were given.
         nodes: The nodes that were given.
-        last: For each view, the node that was given last and has a choice.
-        batches: In how many batches that was.
+        last: For each view, the last node given that has a choice.
+        batches: The number of batches given.
     """
 
     spare: dict[int, list[int]]
@@ -73,7 +73,7 @@ class _Known:
 
 
 class NameProgram:
-    """The control that names dstates, and what it was told.
+    """The control that names dstates, and what it was given.
 
     Attributes:
         pinned: The nodes, their links, and the nodes that have names of their own.
@@ -91,14 +91,14 @@ class NameProgram:
         fitting: Fitting | None,
         check_ahead: Callable[[float], None],
     ) -> None:
-        """Take a control that knows the names, and no node yet.
+        """Make a control that has the names, and no node yet.
 
         Args:
             task: The trace and the speed-ups that are on.
             asker: It asks the control.
             pinned: The nodes and links.
-            spares: How many spare names each view has, beside the rest.
-            forbidden: As the attribute.
+            spares: The number of spare names of each view, besides the rest.
+            forbidden: See the attribute.
             fitting: Further demands on labels; None in the causal theory.
             check_ahead: Raises LimitError if there is no time for this many seconds of work that
                 cannot be interrupted.
@@ -124,7 +124,7 @@ class NameProgram:
         return len(self._known.links)
 
     def tell_all(self, links: Iterable[Link]) -> None:
-        """Tell a new control these links, and all that is forbidden."""
+        """Give a new control these links, and all that is forbidden."""
         self.add(links)
         for number in range(len(self.forbidden)):
             self.tell_forbidden(number)
@@ -132,7 +132,7 @@ class NameProgram:
             self._fitting.tell_again()
 
     def name_more(self, views: Collection[int]) -> None:
-        """Take one more spare name for each of these views. That takes a new control."""
+        """Add a spare name to each of these views. This makes a new control."""
         for view in views:
             self._spares[view] += 1
         self._asker.watch.check()
@@ -141,7 +141,7 @@ class NameProgram:
         self.tell_all(links)
 
     def _new_control(self) -> _Known:
-        """Take a control that knows the names, and no node yet."""
+        """Make a control that has the names, and no node yet."""
         with self._asker.grounding_timed():
             seen, clique = self.chart.seen, self.pinned.clique
             names = [(name, seen[node]) for name, node in enumerate(clique)]
@@ -175,7 +175,7 @@ class NameProgram:
         self._check_ahead(PREPARING * (self._asker.ground_seconds - before))
 
     def add_links_at(self, nodes: Collection[int]) -> None:
-        """Give clingo the links to and from these nodes, as far as it does not know them."""
+        """Give clingo the links to and from these nodes, unless it has them."""
         self.add(
             link
             for link in self.chart.links
@@ -183,9 +183,9 @@ class NameProgram:
         )
 
     def more_links(self) -> list[Link]:
-        """Links that clingo does not know yet: all of them, or some if the trace is long.
+        """Links that clingo lacks: all of them, or some if the trace is long.
 
-        These are the ones whose ends have the fewest names to choose from.
+        Links whose ends have the fewest possible names come first.
         """
         known = self._known
         left = [link for link in self.chart.links if link not in known.links]
@@ -224,16 +224,16 @@ class NameProgram:
         self._asker.control.ground([(part, [])])
 
     def tell_forbidden(self, number: int) -> None:
-        """Tell clingo that the pairs of a forbidden set are not all one dstate.
+        """Give clingo the rule that the pairs of a forbidden set are not all one dstate.
 
-        Also give it their nodes, as far as it does not know them.
+        Also give it their nodes, unless it has them.
         """
         pairs = self.forbidden[number]
         self.add_links_at({step for pair in pairs for step in pair})
         self.tell(f"not_together_{number}", names_lp.not_together(number, pairs))
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
-        """Whether labels of a map keep what evidence says of pairs of steps."""
+        """Whether labels of a map agree with evidence about pairs of steps."""
         if any(all(labels[i] == labels[j] for i, j in pairs) for pairs in self.forbidden):
             return False
         return not self.chart.excluded or self.chart.is_map(labels)
@@ -268,8 +268,8 @@ class NameProgram:
         """Follow the links of an answer from node to node.
 
         Returns:
-            The name of each node, and the links that the answer does not explain. Clingo has to
-            be given these.
+            The name of each node, and the links that the answer does not explain. Clingo needs
+            these links.
         """
         if self.has_all_links and not self.rests(answer):
             return [answer[node] for node in range(len(answer))], []
@@ -277,7 +277,7 @@ class NameProgram:
         goes: dict[tuple[int, int], int] = {
             (answer[t], action): answer[u] for t, action, u in known
         }
-        labels = [-1] * len(self.chart.seen)  # -1 where the name is not known
+        labels = [-1] * len(self.chart.seen)  # -1 if the name is unknown
         followed: list[_Trail] = [None] * len(labels)
         failed: dict[Link, None] = {}
         asked: set[tuple[int, int]] = set()  # ask for one link of each name and action
@@ -306,7 +306,7 @@ class NameProgram:
         return labels, list(failed)
 
     def _links_at_excluded(self, labels: Sequence[int]) -> list[Link]:
-        """Links at nodes that have one label though evidence says that they are two dstates."""
+        """Links at nodes that share a label, though evidence says they are two dstates."""
         excluded = {
             node
             for pair in self.chart.excluded

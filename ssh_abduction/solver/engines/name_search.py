@@ -1,12 +1,12 @@
 """Searches for the fewest named dstates, for the engines without frames.
 
 Clasp raises the lower bound core by core. A core is a set of spare names that cannot all be left
-unused. Cores are small at first, as the names of a view are its own.
+unused. Cores are small at first, as views share no names.
 
 Meanwhile another thread looks for small maps (`engines/small_maps.py`, `engines/nearby.py`). The
 search ends as soon as some map has as few dstates as the bound. With one processor, steps are
-merged at once, and the guess waits until raising the bound takes long. If no small maps are
-looked for, clasp uses the second processor: two threads, which exchange what they learn.
+merged at once, and the guess waits until raising the bound takes long. If no thread looks for
+small maps, clasp uses two threads, which exchange learned clauses.
 """
 
 from __future__ import annotations
@@ -26,23 +26,22 @@ from ssh_abduction.solver.engines.refusing import first_accepted_of
 from ssh_abduction.solver.engines.small_maps import SmallMaps
 from ssh_abduction.solver.steps.chart import Link
 
-# After this many conflicts clingo is given more links: it shows soon if the links that it has do
-# not decide much.
+# After this many conflicts clingo is given more links: too few links show soon.
 PATIENCE = 2000
-# After this many conflicts with all links, and with nothing beside, look for a map near a guess.
-# Then clingo goes on for as long as it takes.
+# After this many conflicts with all links and no other thread, look for a map near a guess. Then
+# clingo continues without a limit.
 CORES = 10_000
-# With nothing beside, ask this often with more conflicts: later tries rarely find a smaller map.
+# Without another thread, try this often with more conflicts: later tries rarely help.
 TRIES = 3
 
 
 class Incumbent:
-    """The best labels known, a lower bound, and the search beside that betters both.
+    """The best known labels, a lower bound, and a search beside that improves both.
 
     Attributes:
-        bound: No labels have fewer dstates; None while nothing is known.
+        bound: A lower bound on the dstates; None if unknown.
         labels: Labels of a map with few dstates; None if no map is known.
-        beside: A search near a guess in another thread, if there is one.
+        beside: A search near a guess in another thread; None without one.
     """
 
     def __init__(self, asker: Asker, is_allowed: Callable[[Sequence[int]], bool]) -> None:
@@ -50,7 +49,7 @@ class Incumbent:
 
         Args:
             asker: Its limits are checked.
-            is_allowed: Whether labels keep what evidence says of pairs of steps.
+            is_allowed: Whether labels agree with evidence about pairs of steps.
         """
         self.bound: int | None = None
         self.labels: list[int] | None = None
@@ -67,7 +66,7 @@ class Incumbent:
         return self.beside is not None and self.beside.running
 
     def is_settled(self) -> bool:
-        """Whether known labels have as few dstates as the bound."""
+        """Whether the known labels reach the bound."""
         if self.beside is not None:
             self.beside.check()
             self.take(self.beside.labels, self.beside.bound)
@@ -76,7 +75,7 @@ class Incumbent:
     def check_ahead(self, seconds: float) -> None:
         """Raise LimitError if there is no time for work that cannot be interrupted.
 
-        First let the search beside use what time is left.
+        First let the search beside use the time left.
 
         Args:
             seconds: How long the work takes.
@@ -88,16 +87,16 @@ class Incumbent:
         self._asker.watch.check(seconds)
 
     def end_beside(self) -> None:
-        """End the search beside, and take what it knows."""
+        """End the search beside, and take its labels and bound."""
         if self.beside is not None:
             self.beside.end()
             self.take(self.beside.labels, self.beside.bound)
             self.beside = None
 
     def take(self, labels: list[int] | None, bound: int) -> None:
-        """Take what a search near a guess knows, if it is better.
+        """Take labels and a bound from a search near a guess, if better.
 
-        Such a search knows nothing of what evidence says of pairs of steps.
+        Such a search ignores evidence about pairs of steps.
         """
         fewer = labels is not None and (
             self.labels is None or len(set(labels)) < len(set(self.labels))
@@ -122,12 +121,12 @@ class _Answer:
 
 @dataclass(frozen=True)
 class _Lacking:
-    """What clingo has to be told, one of these.
+    """What clingo lacks. One attribute is set.
 
     Attributes:
         views: Views that need another name.
         links: Links that the answer does not explain.
-        labels: Labels that do not fit what goes beyond the causal theory.
+        labels: Labels that violate demands beyond the causal theory.
     """
 
     views: Collection[int] = ()
@@ -152,19 +151,19 @@ class NameSearch:
             task: The trace and the speed-ups that are on.
             asker: It asks clingo.
             program: The control that names dstates.
-            incumbent: The best labels and the bound, which are bettered.
+            incumbent: The best labels and the bound. The search improves them.
             fitting: Further demands on labels; None in the causal theory.
         """
         self._task, self._asker, self._program = task, asker, program
         self._incumbent, self._fitting = incumbent, fitting
         self._small = SmallMaps(task, program.pinned)
         self._hard = False  # whether few conflicts were not enough
-        self._had_all_help = False  # whether clingo has all links, and small maps were looked for
+        self._had_all_help = False  # whether clingo has all links, and small maps were sought
 
     def improving(self) -> Iterator[list[int]]:
         """Labels of all nodes; the last ones have the fewest dstates.
 
-        If that takes its time, labels with few dstates come before.
+        If the search takes long, other labels with few dstates come first.
         """
         known = self._incumbent
         if not self._program.chart.links:
@@ -185,7 +184,7 @@ class NameSearch:
             known.end_beside()
 
     def name_more(self, views: Collection[int]) -> None:
-        """Take one more spare name for each of these views."""
+        """Add a spare name to each of these views."""
         self._program.name_more(views)
         self._configure()
 
@@ -197,9 +196,9 @@ class NameSearch:
         yield found.labels if found else self._incumbent.labels or []
 
     def _cheapest_answer(self) -> Generator[list[int], None, _Answer | None]:
-        """The cheapest answer by what clingo was told; None if a known map is as good.
+        """The cheapest answer under clingo's rules; None if a known map is as good.
 
-        If that takes its time, yield labels that are found otherwise.
+        If the search takes long, yield labels found in other ways.
         """
         while True:
             names, proven = self._cheapest(self._patience)
@@ -230,7 +229,7 @@ class NameSearch:
                 return answer, bool(end.value)
 
     def _why_not(self, answer: _Answer) -> _Lacking | None:
-        """What clingo has to be told, as an answer shows; None if the answer is a map."""
+        """What clingo lacks, by an answer; None if the answer is a map."""
         program = self._program
         if views := program.rests(answer.names):
             return _Lacking(views=views)
@@ -254,7 +253,7 @@ class NameSearch:
 
     @property
     def _patience(self) -> int:
-        """After how many conflicts something else is done; -1 for never."""
+        """The number of conflicts after which to try something else; -1 for never."""
         if not self._program.has_all_links:
             return PATIENCE
         return -1 if self._had_all_help or not self._may_help else CORES
@@ -270,7 +269,7 @@ class NameSearch:
         )
 
     def _helped(self) -> Iterator[list[int]]:
-        """Labels of small maps that are found otherwise, as clingo's search takes long."""
+        """Labels of small maps found in other ways, as clingo's search takes long."""
         if self._may_help and not self._hard:
             yield from self._begin_help()
         self._hard = True
@@ -297,7 +296,7 @@ class NameSearch:
             yield from self._small.merged(self._asker.watch.check)
 
     def _search_alone(self) -> Iterator[list[int]]:
-        """Look for small maps near a guess for a while, with nothing beside."""
+        """Look for small maps near a guess for a while, in this thread."""
         check, known = self._asker.watch.check, self._incumbent.labels
         if self._program.pinned.is_long:
             yield from _ever_fewer(self._small.from_beginning(check), known)
@@ -313,7 +312,7 @@ class NameSearch:
 
 
 def _ever_fewer(found: Iterable[list[int]], known: list[int] | None = None) -> Iterator[list[int]]:
-    """Those labels that have fewer dstates than all before them."""
+    """The labels that have fewer dstates than all before them."""
     for labels in found:
         if known is None or len(set(labels)) < len(set(known)):
             known = labels

@@ -1,14 +1,14 @@
 """Labels with the fewest dstates for theories without frames: the dstates have names.
 
 This serves the causal engine and the frameless one. It finds labels of the first steps with the
-fewest dstates, proves that there are none with fewer, and lists all that have as few.
+fewest dstates, proves that none have fewer, and lists all that have as few.
 
 Pairwise distinct steps (`steps/apart.py`) are pinned to names of their own. Their number is a
-lower bound on the dstates. It also leaves no two ways to name these dstates, and lets every
-other step choose only among the names that it is not apart from. A view has a few spare names, at
-the cost of one dstate each, and a *rest*, which stands for all dstates of the view beyond them. Of
-several largest cliques, the one whose steps are apart from most others is pinned. That leaves the
-other steps the fewest names.
+lower bound on the dstates. Pinning leaves only one way to name these dstates. Every other step
+chooses among the names of steps that it is not apart from. A view has a few spare names, at the
+cost of one dstate each, and a *rest*, which stands for all other dstates of the view. Of several
+largest cliques, the one whose steps are apart from most others is pinned. That leaves the other
+steps the fewest names.
 
 *Claim.* A map of minimal cost that uses no rest is a minimal map, and its cost is the minimum.
 *Proof.* Name the dstates of any map: those of the pinned steps as pinned, the others by spare
@@ -21,15 +21,15 @@ If a minimal answer does use a rest, its view gets one more spare name, and clin
 Not every step is needed. Clingo starts with the links of the pinned steps. An answer is followed
 along the trace, and the links at which it fails are added, until one holds everywhere
 (`engines/name_program.py`). If clingo does not answer soon, it is given all links, or of a long
-trace some at a time. Of a very long trace only as many steps are charted as make the clique as
-large as that of all steps.
+trace some at a time. A very long trace is charted only up to a step at which the clique is as large
+as that of all steps.
 
 The search for the fewest dstates is in `engines/name_search.py`. Which minimal maps come first may
 differ from run to run, as the search may use threads; the set of minimal maps is the same.
 
-Python reads an answer more slowly than clingo finds it. So an answer is asked only for the atoms
-that it may hold: where actions lead, from which the step after each step follows. While a map is
-made of one answer, clingo searches for the next.
+Python reads an answer more slowly than clingo finds it. So only the atoms that say where actions
+lead are read. The labels of all steps follow from them. While a map is made of one answer, clingo
+searches for the next.
 """
 
 from __future__ import annotations
@@ -47,14 +47,13 @@ from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.chart import Chart, Link, numbered
 
-# Hold back this many maps until clingo was given all links; then they stream. Until then any
-# answer may show that clingo lacks a link.
+# Hold back this many maps until clingo has all links; then they stream. Until then any answer may
+# show that clingo lacks a link.
 HELD_BACK = 100
-# A view begins with this many spare names: one that is used, and one that shows that no more are
-# needed.
+# A view begins with this many spare names: one to use, and one to show that no more are needed.
 SPARES = 2
-# Take at most this many steps of a long trace at once, if more of them are apart then: the clique
-# of more takes minutes.
+# Take at most this many steps of a long trace at once, if its clique still grows: the clique of
+# more takes minutes.
 WHOLE = 100_000
 
 
@@ -62,7 +61,7 @@ class NamedLabels:
     """Labels of the first steps of a trace with the fewest dstates.
 
     Attributes:
-        size: How many steps these are.
+        size: The number of these steps.
     """
 
     def __init__(
@@ -77,7 +76,7 @@ class NamedLabels:
         Args:
             task: The trace and the speed-ups that are on.
             asker: It asks clingo.
-            given_map: Labels of all steps of a map with few dstates, if one is known.
+            given_map: Labels of all steps in a map with few dstates, if known.
             fitting: Further demands on labels; None in the causal theory.
         """
         self.size = 0
@@ -91,12 +90,12 @@ class NamedLabels:
 
     @property
     def bound(self) -> int | None:
-        """No labels have fewer dstates; None while nothing is known."""
+        """A lower bound on the dstates; None if unknown."""
         return self._incumbent.bound
 
     @property
     def clique(self) -> Sequence[int]:
-        """Steps that are pairwise distinct, which have names of their own."""
+        """Pairwise distinct steps, which have names of their own."""
         return self._pinned.clique if self._pinned else []
 
     @property
@@ -133,11 +132,11 @@ class NamedLabels:
         try:
             self._take(size)
         except BaseException:
-            self.size = 0  # nothing of this prefix may be taken for granted
+            self.size = 0  # an error may have left this prefix incomplete
             raise
 
     def _take(self, size: int) -> None:
-        """Chart the first steps, pin a clique of them, and tell a new control of it."""
+        """Chart the first steps, pin a clique of them, and make a new control."""
         self.size = size
         speedups, known = self._task.speedups, self._incumbent
         with self._asker.grounding_timed():
@@ -178,17 +177,17 @@ class NamedLabels:
     def improving(self) -> Iterator[list[int]]:
         """Labels of all steps; the last ones have the fewest dstates.
 
-        If that takes its time, labels with few dstates come before.
+        If the search takes long, other labels with few dstates come first.
         """
         assert self._search is not None  # `grow` comes first
         return self._search.improving()
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
-        """Whether labels of a map keep what evidence says of pairs of steps."""
+        """Whether labels of a map agree with evidence about pairs of steps."""
         return self.program.is_allowed(labels)
 
     def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
-        """From now on these pairs of steps are not all one dstate."""
+        """Forbid that these pairs of steps are all one dstate."""
         self._forbidden.append(list(pairs))
         known = self._incumbent
         if known.labels and not self.is_allowed(known.labels):
@@ -226,7 +225,7 @@ class NamedLabels:
             yield [0]
             return
         while True:
-            # Ask again when nodes were added, as these may be at a rest.
+            # Ask again when nodes were added, as they may be at a rest.
             while not enough and self._needs_rest(spares):
                 pass
             held: list[list[int]] = []
@@ -257,10 +256,10 @@ class NamedLabels:
                 return
 
     def _needs_rest(self, spares: int) -> bool:
-        """Take more spare names if some answer of this cost uses a rest.
+        """Add spare names if some answer of this cost uses a rest.
 
         Returns:
-            Whether that was so.
+            Whether some answer did.
         """
         assert self._search is not None  # `grow` comes first
         answers = self._asker.answers(

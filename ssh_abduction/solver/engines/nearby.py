@@ -3,30 +3,30 @@
 This serves the causal theory, and the causal axioms of theories with frames. `NearbySearch` yields
 ever smaller maps; when it ends with a `bound`, the last one is minimal.
 
-If all steps were free, the search would take long. So most of them stay where a known map has them.
+If all steps were free, the search would take long. So most steps keep the dstates of a known map.
 The search tries to spare one dstate. If that is impossible, clingo returns a
 core of assumptions: the steps that are in the way. Their dstates become free, until some steps can
-move, or it is shown that the dstate is needed. If that stays open, all steps of some part of the
-map become free at once; the parts are as large as can be settled soon (large neighbourhood search:
-Shaw 1998).
+move, or the dstate is proven to be needed. If neither happens soon, all steps of some part of the
+map become free at once. The size of parts is adapted so that each is solved soon (large
+neighbourhood search: Shaw 1998).
 
-When each dstate is needed, nothing is assumed any more of where steps are. But each view may still
-use no more names than in the known map. Then views are allowed more names, one after the other, and
-in the end any number of dstates (the rest, see `engines/naming.py`). Each time clingo is asked for
-a map of fewer dstates in all.
+When each dstate is needed, all steps become free. But each view may still use no more names than in
+the known map. Then views are allowed more names, one after the other, and in the end any number of
+dstates (the rest, see `engines/naming.py`). Each time clingo is asked for a map of fewer dstates in
+all.
 
 *Claim.* If there is none when everything is allowed, the known map is minimal.
 *Proof.* What is asked then is what `engines/naming.py` asks, at a cost of one less: by the claim
 there, each map with fewer dstates is an answer. ∎
 
-To allow everything at once is to ask for a proof that may take hours. What clingo learns from each
-question makes the next one short. So names are allowed one, two, four at a time, as long as that
-goes well.
+If everything were allowed at once, a proof might take hours. What clingo learns from each question
+makes the next one short. So one, two, four names are allowed at a time, as long as answers come
+soon.
 
-The nodes need not be the steps of a trace. If places have frames, they are those of
-`Chart.framed`, and rotations are links like actions. What is found then need not fit a frame, as
-names.lp does not know how rotations compose; but the bound holds. Names are poor at raising that
-bound core by core, which is why `engines/visit_labels.py` has none, but good at this.
+The nodes need not be the steps of a trace. If places have frames, the nodes are those of
+`Chart.framed`, and rotations are links like actions. The maps then need not fit a frame, as
+names.lp does not know how rotations compose; but the bound holds. Names are good for this search,
+but poor for raising the bound core by core. So `engines/visit_labels.py` has none.
 """
 
 from __future__ import annotations
@@ -51,19 +51,20 @@ from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart, numbered
 from ssh_abduction.theory.speedups import Speedups
 
-# After this many conflicts a question is left open, at first; each round of questions doubles it.
+# At first, a question is left open after this many conflicts. Each round of questions doubles it.
 CONFLICTS = 2000
-# A question that assumes nothing of where steps are may take this many times as many conflicts.
+# A question in which all steps are free may take this many times as many conflicts.
 WIDE = 10
-# Draw this many parts of the map in vain before anything else is tried.
+# Try something else after drawing this many parts of the map without success.
 REGIONS = 40
-# Such a part has this many dstates at first, and at least.
+# A part has this many dstates at first, and at least.
 FIRST_REGION = 10
-# It gets this many dstates more if it is shown to need them, and this many less if that is open.
+# A part gets this many more dstates after a proof that it needs its own, and this many fewer after
+# an open question.
 LARGER, SMALLER = 2, 4
 # After grounding, clingo prepares to solve for about as long again, and cannot be stopped.
 PREPARING = 1.0
-# Give clingo this many links in one go, as it cannot be stopped meanwhile.
+# Give clingo this many links at once, as it cannot be stopped meanwhile.
 AT_A_TIME = 100
 # Seconds a character, about and at most, that clingo takes to read and ground where names lead. It
 # cannot be stopped meanwhile.
@@ -113,10 +114,10 @@ class NearbySearch:
 
         Args:
             watch: The limits.
-            speedups: Those that are on.
+            speedups: The speed-ups that are on.
             pinned: The nodes and links, and the nodes that have names of their own.
-            far: The nodes that are different dstates from a node, as a row, if clingo has to be
-                told of these.
+            far: Returns a row of the nodes that are different dstates from a node, if clingo
+                needs these.
             configuration: Of clasp, if not its default.
         """
         self.bound: int | None = None
@@ -126,9 +127,9 @@ class NearbySearch:
         self._names = _Names({}, frozenset(), (), {}, 0)
         self._labels: Labels = []
         self._needed: set[int] = set()  # names that cannot be spared
-        # By view, the spare names that it keeps, as once they were not enough.
+        # By view, the spare names that it keeps, as fewer were not enough once.
         self._fewest: dict[int, int] = {}
-        # Names that do not help, though all are allowed; None before they were tried one by one.
+        # Names that do not help, though all are allowed; None before each was tried.
         self._allowed: list[int] | None = None
         self._waiting: list[int] = []  # names yet to be allowed
         self._region = FIRST_REGION
@@ -141,8 +142,8 @@ class NearbySearch:
 
         Args:
             guess: A label of each node, -1 where it is not known. It need not be a map.
-            tries: How often to ask with more conflicts before it is left open whether there are
-                fewer dstates. None: until that is settled.
+            tries: How often to ask with more conflicts before giving up. None: until fewer
+                dstates are found or refuted.
         """
         if known := self._pinned.chart.is_map(guess):
             yield list(guess)
@@ -157,8 +158,8 @@ class NearbySearch:
         left = {view: iter(spare) for view, spare in self._names.spare.items()}
         name_of |= {key: next(left[key[0]]) for key in extra}
         self._labels = [-1 if key is None else name_of[key] for key in guessed]
-        # Do so even if the guess is a map: clasp goes on choosing as in its last answer, and so
-        # stays near. First allow only the names of the guess, then all others.
+        # Do so even if the guess is a map: clasp keeps choosing as in its last answer, and so stays
+        # near. First allow only the names of the guess, then all others.
         for allowed in ((), [name for spare in self._names.spare.values() for name in spare[:-1]]):
             verdict = self._moved(
                 self._not_allowed(allowed), (), WIDE * CONFLICTS, step_by_step=True
@@ -267,7 +268,7 @@ class NearbySearch:
         return atom.literal
 
     def _not_allowed(self, allowed: Collection[int]) -> list[int]:
-        """The assumptions that only the names of the labels and these are used."""
+        """The assumptions that allow only the names of the labels and these names."""
         taken = {*self._labels, *allowed}
         return [-literal for name, literal in self._names.used.items() if name not in taken]
 
@@ -287,11 +288,11 @@ class NearbySearch:
             assumed: Literals.
             free: Names whose nodes may move.
             conflicts: After this many, the question is left open.
-            step_by_step: Of what is in the way, let only the nodes of the core move. Otherwise all
-                nodes at their names move, too.
+            step_by_step: Let only the nodes of a core move. Otherwise all nodes at their names
+                may move.
 
         Returns:
-            "moved"; "needed" if the assumptions cannot hold; "open" if that is not known.
+            "moved"; "needed" if the assumptions cannot hold; "open" if that is unknown.
         """
         free = {-1, *free}
         literals = self._literals()
@@ -327,7 +328,7 @@ class NearbySearch:
         ]
 
     def _keep(self, answer: Mapping[int, int]) -> None:
-        """Take an answer for the labels, renamed so that it uses the first spare names."""
+        """Make an answer the labels, renamed so that it uses the first spare names."""
         taken = set(answer.values())
         name_of = {name: name for name in range(len(self._pinned.clique))}
         for spare in self._names.spare.values():
@@ -410,8 +411,8 @@ class NearbySearch:
         """Labels with fewer dstates, if allowing more names leads to some.
 
         Returns:
-            "moved"; "needed" if all names are allowed and there are none; "open" if that is not
-            known.
+            "moved"; "needed" if all names are allowed and there are none; "open" if that is
+            unknown.
         """
         if self._allowed is None:  # first no more names, then each of them alone
             taken = set(self._labels)
@@ -451,7 +452,7 @@ class NearbySearch:
         return "open" if self._waiting else "needed"
 
     def _asked(self, allowed: Collection[int], conflicts: int) -> Generator[Labels, None, _Verdict]:
-        """Labels with fewer dstates that may use these names, too."""
+        """Labels with fewer dstates that may also use these names."""
         answer, core = self._with_fewer(
             [self._names.ordered, *self._not_allowed(allowed)], conflicts
         )

@@ -1,26 +1,26 @@
-"""Questions to paths_framed.lp: what order and sides say of dstates, and guesses that become maps.
+"""Questions to paths_framed.lp: what order and sides imply for dstates, and mending of guesses.
 
-This serves the engine with frames. What takes a choice of places and paths is asked in
-`engines/framed_paths.py`, under the limits of the engine. What is asked here takes none, or hardly
-any: some conflicts are limit enough.
+This serves the engine with frames. Questions that need a choice of places and paths are in
+`engines/framed_paths.py`, under the limits of the engine. The questions here need hardly any
+choice: some conflicts are enough as their limit.
 
 *A guess.* Visits are annealed (`guesses/annealing.py`). If the guess cannot be right, its places
-become free, and what is there is merged by evidence (`guesses/merging.py`). Meanwhile
+become free, and their visits are merged by evidence (`guesses/merging.py`). Meanwhile
 paths_framed.lp says which visits cannot be one, which have to be, and which merge leads to no
 paths. So a guess becomes a map.
 
-*Taken back.* If what is known by then has no paths, the first merge that shows it is found by
-bisection, and the two classes that it made one are apart from then on. If the guess itself has no
-paths, its places are taken in order: those visited once first, then those visited most. The first
-place with which there are no paths is left out of the guess, a few at most. If a guess leads to no
-map, another one follows, with more spare names for places: places that fall together when names are
-short do not come apart later.
+*Taken back.* If no paths fit the merged labels, bisection finds the first wrong merge. The two
+classes that it merged stay separate from then on. If the guess itself has no paths, its places are
+added in order: places visited once first, then places visited most. A place that leads to no paths
+is left out of the guess; this is done for a few places at most. If a guess leads to no map, another
+one follows, with more spare names for places: places that are merged for lack of names do not
+separate later.
 
-*Separate paths.* To see that dstates have paths at all, no two places that turns do not join, and
-no two segments of a path, are taken for one unless they have to be. That takes a small part of the
-time that it takes to ground all ways to merge them.
+*Separate paths.* To see whether dstates have any paths, places and segments are not merged unless
+they have to be. That takes a small part of the time that it takes to ground all ways to merge
+them.
 
-*Pinned.* For the fewest paths, pairwise distinct segments are paths of their own, and the other
+*Pinned.* For the fewest paths, pairwise distinct segments are paths of their own. The other
 segments choose among these first.
 """
 
@@ -53,19 +53,19 @@ from ssh_abduction.solver.steps.localising import faced, states_of, tracked
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.theory import Theory
 
-# So clasp lists the answers in which no atom that is shown can be spared.
+# So clasp lists the answers that are minimal in their shown atoms.
 SMALLEST = ("--heuristic=Domain", "--dom-mod=5,16", "--enum-mode=domRec")
 # If more than twice as many pairs of visits may be one, guess the beginning with this many pairs
 # first: annealing takes time for each pair.
 FIRST_PAIRS = 200_000
-# Continue a guess at the beginning if it leaves at most this share of the visits open. With more it
-# is worth little.
+# Continue a guess at the beginning if it leaves at most this share of the visits open. Otherwise it
+# helps little.
 LOST = 0.05
-# After this many conflicts it is left open whether there are separate paths: the question is asked
-# thousands of times, and mostly decided without a conflict.
+# After this many conflicts, stop looking for separate paths: this is asked thousands of times, and
+# mostly decided without a conflict.
 TRYING = 500
-# Leave at most this many places out of a guess so that the others have paths. A guess that is wrong
-# about more is better made anew.
+# Leave at most this many places out of a guess so that the others have paths. If more are wrong,
+# make a new guess.
 LEFT_OUT = 3
 # Clasp prepares for about these multiples of the time and the memory that grounding took. It cannot
 # be stopped meanwhile.
@@ -93,9 +93,9 @@ class Paths:
             trace: The trace.
             theory: The settled theory.
             pinned: Whether pairwise distinct segments are named as paths beforehand.
-            check: Called now and then while clingo grounds; it may raise. It is not sent along to
+            check: Called now and then while clingo grounds; it may raise. It is not sent to
                 another process, which has its own.
-            forbidden: Sets of equalities of steps that evidence found out cannot all hold.
+            forbidden: Sets of equalities of steps that contradict evidence together.
         """
         self._trace = trace
         self._theory = theory
@@ -116,7 +116,7 @@ class Paths:
         )
 
     def control(self, chart: FramedChart, options: Sequence[str] = ()) -> Control:
-        """A control with these axioms, and what happened; nothing is grounded yet."""
+        """A control with these axioms and the facts of a chart; nothing is grounded yet."""
         control = Control(options, self._check, PREPARING)
         control.load_encodings("paths_framed")
         control.add(
@@ -136,7 +136,7 @@ class Paths:
     def clashing(self, chart: FramedChart, labels: Sequence[int]) -> clingo.Control:
         """A control whose answers are minimal sets of nodes whose labels no paths fit.
 
-        It finds only those that show without a choice of paths.
+        It finds only sets that show without a choice of paths.
         """
         control = self.control(chart, SMALLEST)
         control.add("base", [], paths_lp.open_labels(labels))
@@ -187,7 +187,7 @@ class Paths:
         Args:
             chart: The nodes.
             labels: The dstate of each node.
-            loose: Dstates that may turn out to be others.
+            loose: Dstates whose labels may be wrong.
         """
         control = self.control(chart)
         control.add(
@@ -199,7 +199,7 @@ class Paths:
     def told(self, chart: FramedChart, labels: Sequence[int], loose: Sequence[int]) -> Told | None:
         """Which nodes are apart, and which are one, if all labels but the loose ones hold.
 
-        None if they cannot hold.
+        None if these labels cannot hold.
         """
         control = self.telling(chart, labels, {labels[node] for node in loose})
         with control.solve(yield_=True) as handle:
@@ -212,7 +212,7 @@ class Paths:
         return _apart(chart, labels, elsewhere), [(first[a], first[b]) for a, b in one]
 
     def may_fit(self, chart: FramedChart, labels: Sequence[int], loose: Collection[int]) -> bool:
-        """Whether labels, except the loose ones, may be those of a map with separate paths."""
+        """Whether labels, except the loose ones, may have separate paths."""
         control = self.control(chart)
         control.add("base", [], paths_lp.settled_labels(enumerate(labels)))
         control.ground([("base", [])])
@@ -223,7 +223,7 @@ class Paths:
     ) -> bool | None:
         """Whether the labels of all nodes, or of these, have separate paths.
 
-        None if that is not soon known.
+        None if this is not soon known.
         """
         options = [f"--solve-limit={TRYING}"]
         return self.settled(chart, labels, options, nodes, single=True).solve().satisfiable
@@ -254,7 +254,7 @@ class Paths:
         return asked._guessed(chart, watch.check)
 
     def _guessed(self, chart: FramedChart, check: Callable[[], None]) -> list[int]:
-        """The same, of visits that are guessed in one go."""
+        """The same, for visits that are guessed at once."""
         began = time.thread_time()  # a thread may be made to wait
         apart = chart.apart()
         found: list[list[int]] = []
@@ -273,7 +273,7 @@ class Paths:
     def _continued(
         self, chart: FramedChart, part: FramedChart, known: Sequence[int], check: Callable[[], None]
     ) -> list[int] | None:
-        """Labels of all visits near those of a beginning, if these say where most visits are."""
+        """Labels of all visits near those of a beginning, if these locate most visits."""
         states = tracked(chart, dict(enumerate(states_of(part, known))))
         if states.count(-1) > LOST * len(states):
             return None
@@ -316,10 +316,10 @@ class Paths:
     def _likely(
         self, chart: FramedChart, apart: Matrix, start: Sequence[int], check: Callable[[], None]
     ) -> list[int] | None:
-        """A guess without places with which it has no paths, -1 there; None if they are many."""
+        """The guess, with -1 at places that leave it no paths; None if they are many."""
         states = states_of(chart, kept(apart, chart.links, start))
         visits = Counter(state // 4 for state in states)
-        # What was visited once cannot be wrong by itself, and hardly what was visited often.
+        # A place visited once cannot be wrong by itself. One visited often hardly is.
         places = sorted(visits, key=lambda place: (visits[place] > 1, -visits[place]))
         left_out: set[int] = set()
 
@@ -362,7 +362,7 @@ def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) 
 def _apart(
     chart: FramedChart, labels: Sequence[int], elsewhere: Iterable[tuple[int, int]]
 ) -> Matrix:
-    """Which nodes are of visits that have labels at different places: nodes x nodes.
+    """Which nodes have visits with labels at different places: nodes x nodes.
 
     Args:
         chart: The nodes.
