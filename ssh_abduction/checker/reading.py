@@ -158,7 +158,7 @@ class Reading:
         return {*self.orders[path].listed, *self.along.get(path, ())}
 
     def onward(self, s: DState) -> tuple[int, ...]:
-        """Where the path of a dstate goes on to another place: 0 (ahead), 180 (behind)."""
+        """Bearings at which the path of a dstate continues: 0 (ahead), 180 (behind)."""
         course = course_of(s)
         if course is None or s.place is None or course[0] not in self.orders:
             return ()

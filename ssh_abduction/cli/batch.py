@@ -85,7 +85,7 @@ class Question:
         memory: MiB for the process; None for no limit.
         speedups: The speed-ups that are on.
         json: Whether the line is JSON.
-        within: How many dstates more than the minimum a listed map may have.
+        within: Number of dstates by which a listed map may exceed the minimum.
     """
 
     theory: Theory

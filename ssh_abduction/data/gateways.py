@@ -107,7 +107,7 @@ def sights_of(
 def _onward_of(
     trace: Trace, ssh_map: SSHMap, axioms: Collection[str]
 ) -> Callable[[DState], tuple[int, ...]]:
-    """A function that says in which directions the path of a dstate goes on to another place."""
+    """A function that gives the directions in which the path of a dstate continues."""
     kinds = {action.name: action.kind for action in trace.actions}
     states = {s.id: s for s in ssh_map.dstates}
     total = {"path_order_total", "on_path"} <= set(axioms)

@@ -65,8 +65,8 @@ class MapEvaluation:
         link_precision: Of the map's links, the share that is true, under the assignment of dstates.
         link_recall: Of the true links, the share that the map has.
         dstates: How many dstates the map has at the counted steps.
-        places: How many places.
-        paths: How many paths.
+        places: Number of places.
+        paths: Number of paths.
     """
 
     dstates_right: bool | None
@@ -106,8 +106,8 @@ class Evaluation:
         maps: Each map, in the order given.
         steps: How many steps have truth.
         true_dstates: How many different dstates the truth names; None if it names none.
-        true_places: How many different places.
-        true_paths: How many different paths.
+        true_places: Number of distinct places.
+        true_paths: Number of distinct paths.
         ambiguity: Of the pairs of different true dstates, the share that shares a view.
     """
 

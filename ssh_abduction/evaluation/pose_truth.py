@@ -138,7 +138,7 @@ class VisitsEvaluation:
         judge: Where the truth is from: "poses" of the trace, or "relations".
         near: Metres within which two poses are one place.
         turned: Degrees by which the headings of one dstate differ at most.
-        visits: How many visits the trace has.
+        visits: Number of visits of the trace.
         places: Pairs of visits.
         dstates: Pairs of steps of different visits.
         maps: Each map, in the order given.

@@ -3,7 +3,7 @@
 They judge independently whether the robot was at one place at two times. A file of relations
 (Kümmerle et al. 2009, "On measuring the accuracy of SLAM algorithms") has a line for each:
 time1 time2 x y z roll pitch yaw, in seconds, metres and radians. The pose is that of the robot at
-the second time, as seen from where it was at the first.
+the second time, in the frame of its first pose.
 
 >>> from ssh_abduction.evaluation.relations import Relation, Relations
 >>> quarter = 1.5707963

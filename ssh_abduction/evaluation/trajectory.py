@@ -160,7 +160,7 @@ class Trajectory:
                 TrajectoryWarning,
                 stacklevel=2,
             )
-        # The pose of a dstate is where the robot saw it from its own pose.
+        # The pose of a dstate is seen from the pose of the robot.
         steps = []
         for t, (step, robot) in enumerate(zip(trace.steps, robots, strict=True)):
             pose = None

@@ -107,7 +107,7 @@ class PairExplanation:
         return (verdict, *self._of_maps(), *self._of_costs())
 
     def _of_maps(self) -> Iterator[str]:
-        """How many maps there are of each kind, or why there is none."""
+        """The number of maps of each kind, or why there is none."""
         maps = self.same.maps + self.different.maps
         if self.verdict is Verdict.DISAGREE and maps > 1:
             of = f"{'the' if self.listed else 'the first'} {maps} minimal maps"

@@ -32,8 +32,8 @@ class SecondMap:
     """The map of the runner-up, if it is another one.
 
     Attributes:
-        views: How many views were chosen.
-        other_views: How many views the runner-up has.
+        views: Number of chosen views.
+        other_views: Number of views of the runner-up.
         dstates: How many dstates the map of the chosen views has; None if they have no map.
         solution: The solution for the views of the runner-up.
     """

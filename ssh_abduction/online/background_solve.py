@@ -77,10 +77,10 @@ class FaultSolver:
 
     Args:
         options: What a step may use.
-        searches: How many searches there were before.
+        searches: Number of earlier searches.
 
     Attributes:
-        searches: How often the trace was solved in a step.
+        searches: Number of steps that solved the trace.
         background: The search in the background, if one is under way.
     """
 

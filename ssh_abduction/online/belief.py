@@ -73,7 +73,7 @@ class Belief:
             to 1.
         nowhere: Probability that the robot is at no dstate of the map.
         normaliser: Probability of the observation by the belief before it, divided by its
-            probability at a place of which nothing is known: 1 / (α q(o)) of equation 2 of
+            probability at an unknown place: 1 / (α q(o)) of equation 2 of
             `localiser.py`. Below COLLAPSED the belief has collapsed.
         sure: Entropy in bits of the belief before the one that collapsed; None if the robot is not
             lost.
@@ -118,7 +118,7 @@ class Belief:
     def collapsed(self) -> bool:
         """Whether the observation was far less probable by the belief before it than anywhere.
 
-        Then the robot was not where it was believed to be.
+        Then the earlier belief was wrong.
         """
         return self.normaliser < COLLAPSED
 

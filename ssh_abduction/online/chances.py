@@ -22,7 +22,7 @@ class Chances:
         slipped: Probability that the action does not lead where the link says: it failed, or the
             robot was kidnapped.
         unmapped: Probability that a robot of which nothing is known is at no dstate of the map.
-            It also holds for the end of an action of which the map has no link.
+            It also holds for the end of an action without a link in the map.
         reentered: Probability that a robot at no dstate of the map is at one after its next action.
     """
 

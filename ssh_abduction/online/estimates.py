@@ -19,8 +19,8 @@ class Links:
     """Where an action leads.
 
     Attributes:
-        leads: p(x'|x,a), (N, N), x' by x: a column for each dstate where it is known.
-        missing: 1 for each dstate where it is not known, else 0, (N,).
+        leads: p(x'|x,a), (N, N), x' by x: a column for each dstate with a known end.
+        missing: 1 for each dstate with an unknown end, else 0, (N,).
     """
 
     leads: sparse.csr_array
@@ -31,7 +31,7 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
     """For each view v the dstates that show it, and their f(v|x) / q(v).
 
     Args:
-        ssh_map: The map, which says what dstates show where no step of the trace is (equation 4).
+        ssh_map: The map. It says what dstates without a step of the trace show (equation 4).
         trace: The trace of the map's labels, from which f is estimated (equation 3), if there is
             one.
     """
@@ -64,10 +64,10 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
 
 
 def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
-    """For each action where it leads.
+    """The end of each action.
 
     Args:
-        ssh_map: The map, whose links hold where the trace does not have an action at a dstate
+        ssh_map: The map. Its links hold if the trace does not have an action at a dstate
             (equation 4).
         trace: The trace of the map's labels, from which probabilities are estimated (equation 3),
             if there is one.

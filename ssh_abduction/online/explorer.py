@@ -93,7 +93,7 @@ class Exploration:
     """What an explorer found out.
 
     Attributes:
-        steps: How many actions were done.
+        steps: Number of done actions.
         ending: Why it ended. "done": one map is left, nothing in it is untried, and no return is in
             doubt. "inseparable": nothing that the robot can do distinguishes the rivals that are
             left, or the minimal map from `rival`. "steps": all steps are spent. "time": there was

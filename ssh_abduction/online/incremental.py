@@ -20,10 +20,10 @@ class IncrementalSolver:
 
     Args:
         options: What a step may use.
-        searches: How many searches there were before.
+        searches: Number of earlier searches.
 
     Attributes:
-        searches: How many searches there were.
+        searches: Number of searches.
         search: The last search, None before the first.
         solution: The last answer, without its maps.
     """

@@ -18,7 +18,7 @@ observed o:
     p(x'|a,o) = α p(o|x') Σ_x p(x'|x,a) p(x)           (2)   as there are finitely many dstates
     p(v|x) = n(x,v) / n(x),                            (3)   estimated from the steps of a
     p(x'|x,a) = n(x,a,x') / n(x,a)                           labelled trace
-    p(v|x) = 1 if x shows v, else 0;                   (4)   where the map holds without exception
+    p(v|x) = 1 if x shows v, else 0;                   (4)   if the map holds without exception
     p(x'|x,a) = 1 if a link leads there, else 0
 
 A map alone says (4), and so does the trace that it explains. As no robot is without faults,
@@ -47,7 +47,7 @@ map on average, over the n dstates that look like o and have a link for a:
 Without the second kind a robot in another maze would be taken to be in this one, as what a turn
 shows is no surprise in any maze. All p(o|·) are divided by q(o), which changes no belief. So views
 and images are weighed alike, and the normaliser says how probable an observation was, compared with
-a place of which nothing is known.
+an unknown place.
 """
 
 from __future__ import annotations

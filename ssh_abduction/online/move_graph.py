@@ -108,7 +108,7 @@ class MoveGraph:
         return None if found is None else way[found[2]]
 
     def dstates_from(self, here: AbstractSet[Node]) -> int:
-        """How many dstates moves lead to from some nodes."""
+        """The number of dstates reachable from some nodes."""
         reached = nx.multi_source_dijkstra_path_length(self._graph, here)
         return sum(isinstance(node, int) for node in reached)
 

@@ -74,7 +74,7 @@ class Recovery:
 
     @property
     def searches(self) -> int:
-        """How often the trace was solved again in a step."""
+        """The number of steps that solved the trace."""
         return self.solver.searches
 
     def restarted(self, problem: Problem) -> Recovery:

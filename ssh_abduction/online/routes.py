@@ -45,7 +45,7 @@ class Move:
             for that turn.
         known: Whether a link says the move, so that the robot did it before. Else the paths of the
             map imply it.
-        dstate: Where the move ends; None if the robot was never there facing that way.
+        dstate: The end of the move; None if the robot never faced that way there.
         view: The view to expect there; None if the map does not know it.
         place: The place there; None if the map has none.
         path: The path that the robot faces along there; None if the map has none.
@@ -84,7 +84,7 @@ class Route:
         agree: The numbers of the listed maps in which these actions lead along links to the same
             views, from where the robot was at `start`. Empty for a route with a move that was
             never tried.
-        maps: How many maps are listed.
+        maps: Number of listed maps.
     """
 
     map: int

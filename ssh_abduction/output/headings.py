@@ -55,7 +55,7 @@ def turns_between(
     Args:
         ssh_map: The map.
         degrees: For each action's name the degrees clockwise, and the weight of that.
-        spot: Where each dstate is. Dstates with one spot are at one place.
+        spot: Spot of each dstate. Dstates with one spot are at one place.
     """
     dstates = ssh_map.dstates
     in_slots = max((s.heading or 0 for s in dstates), default=0) < 4

@@ -33,11 +33,11 @@ from ssh_abduction.output.layout import travelled
 # In units of the page: the distance of the two nearest places, unless the other limits forbid it;
 # the largest usual distance of a place from its nearest; and the largest size of the whole map.
 NEAREST, APART, LARGEST = 110.0, 240.0, 1600.0
-# In units of the page, where there is room: the radius of the dot of a place, and how far from its
+# In units of the page, if there is room: the radius of the dot of a place, and how far from its
 # middle the arrow of a dstate begins and ends.
 DOT, BEGIN, END = 4.5, 8.0, 27.0
 MARGIN = 24.0
-SMALLEST = 0.6  # the size of marks where places are near each other
+SMALLEST = 0.6  # the size of marks if places are near each other
 WIDEST = LARGEST / 4  # half axes of ellipses that are drawn: larger ones would fill the page
 DEVIATIONS = 2.0  # the half axes of ellipses, in standard deviations
 # In a map without places, dstates nearer than this share of the longest link are drawn as if the
@@ -58,7 +58,7 @@ class _Picture:
         map: The map.
         poses: The poses of its dstates.
         scale: Units of the page in a metre.
-        unit: The size of marks, as a share of their size where there is room.
+        unit: The size of marks, as a share of their size with enough room.
         points: What the page has to hold.
         boxes: What labels keep clear of, as (left, top, right, bottom).
     """
@@ -393,7 +393,7 @@ def _scale(spots: Sequence[Point], nearest: float) -> tuple[float, float]:
     """Choose the scale so that spots are apart and the page is not too large.
 
     Args:
-        spots: Where the places are, in metres.
+        spots: Positions of places, in metres.
         nearest: The distance of the two nearest places, in units of the page.
 
     Returns:

@@ -43,7 +43,7 @@ class _State:
 
     Attributes:
         value: What it costs.
-        at: Where the spots are, (spots, 2).
+        at: Positions of spots, (spots, 2).
         conditions: What was added to the program.
         left_alone: Pairs of streets that stay as they are.
     """
@@ -84,7 +84,7 @@ class StreetProgram:
 
     @property
     def bent(self) -> int:
-        """How many travelled streets leave their headings, or are too short."""
+        """The number of travelled streets off their headings, or too short."""
         way = self.at[self.ends[:, 1]] - self.at[self.ends[:, 0]]
         astray = np.maximum(
             np.abs(np.sum(way * self.across, axis=1)), 1 - np.sum(way * self.along, axis=1)

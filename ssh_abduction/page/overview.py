@@ -75,7 +75,7 @@ def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
 
     Args:
         maps: The maps.
-        spots: Where each step is drawn.
+        spots: Position of each step.
 
     Returns:
         `nodes` (places, or dstates if there are no places), `dstates` and `streets`, each with its

@@ -36,10 +36,10 @@ class Experiment:
         world: The name of the world.
         tours: How many tours the robot drives.
         k_max: The largest number of views that is tried.
-        views: How many views the paper reports.
-        dstates: How many dstates the paper reports.
-        places: How many places the paper reports.
-        paths: How many paths the paper reports.
+        views: Number of views in the paper.
+        dstates: Number of dstates in the paper.
+        places: Number of places in the paper.
+        paths: Number of paths in the paper.
     """
 
     world: str
@@ -87,7 +87,7 @@ class FoundMaps:
 
     Attributes:
         cost: How many dstates, places and paths a minimal map has; None if none was found.
-        maps: How many minimal maps there are.
+        maps: Number of minimal maps.
     """
 
     cost: dict[str, int] | None
@@ -141,7 +141,7 @@ class Run:
 
     Attributes:
         seed: The seed of all noise.
-        images: How many images there are.
+        images: Number of images.
         clustering: The views.
         by_views: The minimal maps from the views alone.
         by_stars: The minimal maps from the views and the openings that the robot saw.

@@ -319,7 +319,7 @@ def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[flo
 
     Args:
         path: The file to write.
-        outcomes: One for each notch and spread. Frames mark those where all is as in the paper.
+        outcomes: One for each notch and spread. Frames mark those that are as in the paper.
         here: The notch and the scale of this world and robot. A cross marks them.
     """
     notches = sorted({o.notch for o in outcomes})

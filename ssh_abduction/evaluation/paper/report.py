@@ -146,7 +146,7 @@ def _done(
 
 
 def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:
-    """How often `on_done` will be called, for a progress bar."""
+    """The number of calls of `on_done`, for a progress bar."""
     has_outcomes = outcomes and name == "notched-rectangle"
     return len(seeds) + 1 + (len(NOTCHES) * len(SCALES) if has_outcomes else 0)
 

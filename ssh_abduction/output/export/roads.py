@@ -136,7 +136,7 @@ class Roads:
 
     @property
     def together(self) -> int:
-        """How many stops share their position with another one."""
+        """The number of stops at the position of another one."""
         counts = Counter((round(stop.x, 2), round(stop.y, 2)) for stop in self.stops)
         return sum(count for count in counts.values() if count > 1)
 
