@@ -52,14 +52,13 @@ def solve(
     Args:
         trace: The trace.
         theory: The axioms and the preference; Theory.topological() by default.
-        time_limit: Seconds of wall-clock time. When they are over, the best answer so far is
-            returned.
+        time_limit: Seconds of wall-clock time. After them, the best answer so far is returned.
         max_maps: List at most this many maps; None lists all. Use `Search` to stream them. After
-            the last one, the search goes on for a second, or a tenth of the time so far, to see
-            whether there is another one. The answer is complete only if that shows there is none.
+            the last one, the search looks for another map for a second, or a tenth of the time so
+            far. The answer is complete only if this proves that there is none.
         within: Also list maps with up to this many dstates more than the minimum: for each number
-            of dstates, the maps that are minimal among those with that number. Where the theory
-            prefers few paths or places first, these are counted instead.
+            of dstates, the minimal maps with that number. If the theory prefers few paths or
+            places first, these are counted instead.
         memory_limit: MiB of memory that the process may use at its peak before the search stops.
         speedups: The speed-ups that are on. None of them changes the answer.
         on_progress: Called now and then with how far the search is.
@@ -96,8 +95,8 @@ def find_backbone(
     """Find out what all minimal maps share, also those that the solution does not list.
 
     clingo looks for minimal maps that differ from those in the solution until it has proven that
-    there is nothing more to find. That may take as long as the search did. Where the solution
-    knows the answer already, or holds no minimal map to begin with, nothing is searched.
+    there are no more. That may take as long as the search did. If the solution has a proven
+    backbone, or no minimal map, nothing is searched.
 
     >>> from ssh_abduction import Theory, Trace, solve
     >>> solution = solve(Trace.load("examples/aces3-route.jsonl"), max_maps=1)
@@ -111,8 +110,8 @@ def find_backbone(
         memory_limit: MiB of memory that the process may use at its peak.
 
     Returns:
-        The backbone; None where no minimal map is known. It is not `proven` if a limit was over
-        or Ctrl-C was pressed before the proof, or the theory allows none.
+        The backbone; None if no minimal map is known. It is not `proven` if a limit or Ctrl-C
+        ended the search before the proof, or the theory allows no proof.
 
     Raises:
         SolverError: The solution has no trace, and none is given.
@@ -153,7 +152,7 @@ def find_backbone(
 
 
 def _is_known_by_mending_alone(task: Task) -> bool:
-    """Whether the maps come from mended traces, of which no engine knows anything."""
+    """Whether the maps come from mended traces, which no engine has."""
     mends = row("mending").holds_for(task.theory) and may_name(task)
     return mends and len(task.trace) > READABLE
 

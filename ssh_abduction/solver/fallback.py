@@ -1,4 +1,4 @@
-"""What a search that was stopped still does: make some map of the whole trace, and a bound."""
+"""After a search was stopped: make some map of the whole trace, and a bound."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ssh_abduction.solver.map_list import Priced, note
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status
 
-# To make some map of a search that was stopped without one, or to check it, may take this many
-# seconds beyond the time limit, and this share of the limit.
+# After a stop without a map, making and checking one may take this many seconds beyond the time
+# limit, and this share of the limit.
 OVERTIME, OVERTIME_SHARE = 0.5, 0.05
 # Or this many seconds after Ctrl-C, or when the memory limit is over.
 INTERRUPTED = 0.6
@@ -26,7 +26,7 @@ def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
 
     Args:
         parts: The parts of the search.
-        answer: What it gave.
+        answer: Its answer.
         may_search: Whether clingo may look for a map in the last part of the time limit.
     """
     known = parts.known

@@ -38,7 +38,7 @@ class Point:
         faults: The number of faults that a map may have.
         dstates: The fewest dstates of such a map.
         map: A map with these; None if none was found in time.
-        proven: Whether no map has fewer. Without a proof, `dstates` is a lower bound.
+        proven: Whether `dstates` is proven minimal. Otherwise it is a lower bound.
     """
 
     faults: int
@@ -65,7 +65,7 @@ class Front:
     def knee(self) -> int | None:
         """The number of faults at which the number of dstates stops falling fast.
 
-        There, it fell by most more than it falls next. None if it never does, or nothing is proven.
+        There, the last fall exceeds the next one by most. None if it never falls, or without proof.
         """
         counts = self._proven
         bends = {

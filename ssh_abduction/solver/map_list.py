@@ -13,8 +13,8 @@ from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status
 
-# After the last map that was asked for, one more is sought for this many seconds. It shows whether
-# the list is complete.
+# After the last map asked for, seek one more for this many seconds. The result shows whether the
+# list is complete.
 ONE_MORE = 1.0
 # Or for this share of the time that the maps took, if that is more.
 ONE_MORE_SHARE = 0.1
@@ -27,7 +27,7 @@ Priced: TypeAlias = tuple[SSHMap, tuple[int, ...]]
 def listed(
     parts: Parts, mended_maps: tuple[SSHMap, ...] | None, *, keeps_time: bool
 ) -> Iterator[Priced]:
-    """List the maps that were asked for, each after it has passed the checker.
+    """List the maps asked for, each after it has passed the checker.
 
     The clock stands still while the caller has a map.
 

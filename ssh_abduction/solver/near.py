@@ -37,12 +37,12 @@ class NearMinimal:
     def __init__(
         self, task: Task, judging: Judging, most: int, report: Callable[[], None], before: Asker
     ) -> None:
-        """Nothing is searched yet.
+        """Search nothing yet.
 
         Args:
             task: The task of the search for the minimal maps.
             judging: Checks maps.
-            most: The number of maps that are wanted; 0 for all.
+            most: The number of maps wanted; 0 for all.
             report: Called now and then.
             before: The engine of the minimal maps. Its times are included.
         """
@@ -64,7 +64,7 @@ class NearMinimal:
 
         Args:
             minimal: The preferred counts of minimal maps.
-            within: How many dstates more than these a map may have.
+            within: The number of dstates more than these that a map may have.
         """
         count = counted_first(self._task.theory)
         assert count is not None

@@ -1,4 +1,4 @@
-"""The parts of one search: what it knows, the engine it asks, and how it reports its progress."""
+"""The parts of one search: its knowledge, its engine, and its reports of progress."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Parts:
     """What the stages of one search share.
 
     Attributes:
-        limits: What the search is allowed.
+        limits: The limits of the search.
         speedups: The speed-ups that the caller has on. `task.speedups` are those that hold here.
         watch: The clock of the search.
         task: The trace and theory, as engines see them.
@@ -37,7 +37,7 @@ class Parts:
         rivals: The minimal maps, as far as they are known.
         candidates: Makes maps without a proof.
         prefixes: Finds and lists minimal maps.
-        near: Lists maps that cost more than the minimum; None before it is their turn.
+        near: Lists maps that cost more than the minimum; None before that stage.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Parts:
         return self.near.engine if self.near else self.prefixes.engine
 
     def end_clingo(self) -> None:
-        """End what clingo still does, and take over the bound that it leaves."""
+        """Stop clingo, and take over its bound."""
         self.watch.end_stage_after(math.inf)
         self.watch.stop()
         engine = self.prefixes.engine

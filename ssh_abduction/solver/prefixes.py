@@ -30,10 +30,10 @@ names as dstates in the minimal map: every path holds the two ends of a travel, 
 along one path (with all_on_paths a path may hold one dstate alone). Otherwise the control is made
 again with more names. At most one for each segment of the prefix is enough for any map.
 
-A map of the prefix that stops early is no answer. The longer prefix says how it continues. The
-claim needs determinism, and that a dstate has one place, course and heading, and that axioms
-survive the cut. `theory/speedups.py` says for which theories that is known. For any other, the
-prefix is the whole trace.
+A map whose replay stops early is no answer. The longer prefix says how it continues. The claim
+needs determinism, one place, course and heading for each dstate, and axioms that survive the cut.
+`theory/speedups.py` lists the theories for which this is known. For any other theory, the prefix is
+the whole trace.
 """
 
 from __future__ import annotations
@@ -249,7 +249,7 @@ class Prefixes:
         They are held back, or given if they are many or the prefix is the whole trace.
 
         Returns:
-            The farthest step at which a replay fails; 0 if all maps replay and there are no others.
+            The farthest step at which a replay fails; 0 if all maps replay and none are missing.
         """
         enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
         asked = self._most and self._most + 1

@@ -17,11 +17,11 @@ from ssh_abduction.theory.theory import Theory
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What a file says of a solution, and only its search or its trace could compute again.
+    """The parts of a file that only the search or the trace could compute again.
 
     Attributes:
         certificate: Why no map has fewer dstates.
-        written_certificate: The certificate as the file has it, with the words that show it.
+        written_certificate: The certificate as in the file, with its words.
         warnings: What makes the trace suspicious, a sentence each.
         explanation: Why there is no map.
     """
@@ -58,9 +58,9 @@ class Support:
     """What backs a solution up: its certificate, and warnings about its trace.
 
     Attributes:
-        basis: What the certificate is computed from. None where the theory lacks an axiom that
-            the certificate rests on.
-        odometry_warning: What is wrong with the odometry: the best map contradicts its noise, or
+        basis: The data for the certificate. None if the theory lacks an axiom that the
+            certificate needs.
+        odometry_warning: A fault of the odometry: the best map contradicts its noise, or
             displacements do not distinguish travel from standing still.
         recorded: What the file says, in a solution that was read from one.
     """
@@ -78,7 +78,7 @@ class Support:
 
 
 def backbone_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> Backbone | None:
-    """What the minimal maps share; None where the file does not say so. Raises MapError."""
+    """What the minimal maps share; None if the file lacks it. Raises MapError."""
     if record.get("backbone") is None:
         return None
     return Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone")
@@ -166,7 +166,7 @@ def effort_in(read: FieldReader, record: Mapping[str, Any]) -> Effort:
 
 
 def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> tuple[Level, ...]:
-    """The levels of the maps: one level of all maps, where the file names none. Raises MapError."""
+    """The levels of the maps: one level of all maps if the file names none. Raises MapError."""
     complete = record.get("minimal_listed", record.get("complete")) is True
     if "levels" not in record:
         if not maps or record.get("cost") is None:

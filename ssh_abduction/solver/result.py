@@ -65,13 +65,13 @@ class Solution:
         steps: The length of the trace.
         effort: What the search did: time, grounding, prefix, and evidence.
         stopped: Why the search ended before it was complete; None if it did not.
-        partial: Where no map of the whole trace was found, the best map of its first steps.
-        within: How many dstates more than the minimum a listed map may have.
+        partial: If no map of the whole trace was found, the best map of its first steps.
+        within: The number of dstates above the minimum that a listed map may have.
         levels: The minimal maps, and with `within` the maps for each greater number of dstates.
-        shared: What the search found out about all minimal maps, also those that are not in
-            `maps`. None if it found out no more than `maps` show.
+        shared: What all minimal maps share, also those not in `maps`, as the search found out.
+            None if it found out no more than `maps` show.
         trace: The trace; None in a solution that was read from a file without it.
-        support: What the certificate and the warnings are made from.
+        support: The basis of the certificate and of the warnings.
     """
 
     status: Status
@@ -209,14 +209,14 @@ class Solution:
 
     @property
     def weights(self) -> tuple[float, ...]:
-        """The probability of each map among these, by displacements alone; empty without these."""
+        """The probability of each map by displacements alone; empty without displacements."""
         return weights(self.maps)
 
     @property
     def certificate(self) -> Certificate | None:
-        """Why no map has fewer dstates; None if the theory lacks an axiom that it rests on.
+        """The proof that no map has fewer dstates; None if the theory lacks an axiom for it.
 
-        It is computed when it is first asked for.
+        It is computed at the first use.
         """
         return self.support.certificate
 
@@ -233,8 +233,8 @@ class Solution:
     def noise(self) -> Noise | None:
         """The step that looks like noise; None if there is no such step.
 
-        Because of this step alone, most steps before it are dstates of their own. It is searched
-        for when it is first asked for.
+        Because of this step alone, most steps before it are dstates of their own. The search for
+        it runs at the first use.
         """
         few = self.cost is not None and self.cost.dstates <= LEAST
         basis = self.support.basis
@@ -268,7 +268,7 @@ class Solution:
     def to_dict(self) -> dict[str, Any]:
         """The answer as plain data, as `solve --json` prints it (docs/reference/formats.md).
 
-        What needs a search of its own is left out: why there is no map, and the runner-up.
+        The reason why there is no map and the runner-up are left out, as each needs a search.
 
         Raises:
             MapError: The maps are not those that the search gave.
@@ -398,7 +398,7 @@ def _check_steps(
 
 
 def _table_of_maps(solution: Solution) -> str:
-    """A table with a row for each map: its cost, and its chi-square where it has poses."""
+    """A table with a row for each map: its cost, and its chi-square if it has poses."""
     costs = solution.costs
     chi2 = [ssh_map.fit.chi2 if ssh_map.fit else None for ssh_map in solution.maps]
     columns: dict[str, list[object]] = {"map": [*range(1, solution.count + 1)]}

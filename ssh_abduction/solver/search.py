@@ -59,7 +59,7 @@ class Search:
     Attributes:
         trace: The trace.
         theory: The theory, with its stars settled.
-        limits: What the search is allowed.
+        limits: The limits of the search.
     """
 
     @renamed_parameters("limit", "maps", "memory")
@@ -171,12 +171,12 @@ class Search:
 
     @property
     def cost(self) -> Cost | None:
-        """The cost of the map that was given last."""
+        """The cost of the last map given."""
         return self._answer.cost
 
     @property
     def backbone(self) -> Backbone | None:
-        """What the minimal maps known so far share; None where none is known."""
+        """What the minimal maps known so far share; None if none is known."""
         return self._parts.rivals.backbone
 
     @property
@@ -200,7 +200,7 @@ class Search:
         return self._given(None)
 
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
-        """Rank the maps of each level, and remember what is given."""
+        """Rank the maps of each level, and remember the maps given."""
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
             for ssh_map in ranking.ranked(maps, self.over) if ranking else maps:
@@ -304,7 +304,7 @@ class Search:
     def over(self) -> bool:
         """Whether a limit is over or the search was interrupted.
 
-        The clock runs on, for what is still to be done with the maps.
+        The clock runs on for work that is still to be done with the maps.
         """
         watch = self._parts.watch
         if not watch.running:
@@ -336,7 +336,7 @@ class Search:
         """
         one_of("stopped", stopped, get_args(Stop), SolverError)
         parts, known = self._parts, self._parts.known
-        # The other thread may change what a sketch reads. The answer then comes without it.
+        # The other thread may change data that a sketch reads. Then the answer has no sketch.
         with suppress(Exception):
             if known.status in (Status.UNKNOWN, Status.FEASIBLE):
                 parts.candidates.sketch(OVERTIME)

@@ -37,11 +37,11 @@ REMEMBERED = 10_000  # assignments of places, paths or courses that are not comp
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """Which steps maps take for one dstate, place, path or course (a path in one direction).
+    """Which steps are one dstate, place, path or course (a path in one direction) in maps.
 
     Steps with two different numbers that are not in a pair are one in no map. If a dstate is along
-    no path, its steps have a number of their own. A pair of a step with itself means that it is
-    along a path in some maps, and along none in others.
+    no path, its steps have a number of their own. A pair of a step with itself means that the step
+    is along a path in some maps, and along none in others.
 
     Attributes:
         always: A number for each step. Steps with one number are one in all maps. Numbers are
@@ -106,9 +106,8 @@ class Backbone:
         places: Which steps are at one place; None for theories without places.
         paths: Which steps are along one path; None likewise.
         courses: Which steps are along one course; None likewise.
-        proven: Whether this holds for all minimal maps. Else only for those that were found:
-            pairs that are one in some of these are so in some minimal maps, but further maps may
-            differ more.
+        proven: Whether this holds for all minimal maps. If not, it holds only for the known ones,
+            and further maps may differ more.
     """
 
     dstates: Shared

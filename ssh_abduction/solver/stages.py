@@ -26,7 +26,7 @@ class Stages:
     """The stages in which one search finds the minimal cost.
 
     Attributes:
-        mends: Whether maps were sought by mending the trace.
+        mends: Whether mending the trace was tried.
         mended_maps: The minimal maps, if mending the trace found them.
     """
 

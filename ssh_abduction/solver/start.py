@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a search is allowed.
+    """The limits of a search.
 
     Attributes:
         time_limit: Seconds of wall-clock time; None for no limit.
         memory_limit: MiB that the process may use at its peak; None for no limit.
         max_maps: The number of maps to list at most; None for all.
-        within: How many dstates more than the minimum a listed map may have.
+        within: The number of dstates above the minimum that a listed map may have.
 
     Raises:
         SolverError: A value is out of range.
@@ -56,8 +56,8 @@ class Start:
     Attributes:
         reasons: Whether to find out at the end what all minimal maps share, if not all are
             listed. A share of the time limit is kept for that.
-        after: The parts of a search for the first steps of the trace, which has ended. What it
-            grounded and proved is taken over.
+        after: The parts of an ended search for the first steps of the trace. Its grounding and
+            its proofs are taken over.
         minimal: A map of the trace with the cost that `after` proved to be minimal. Only the other
             maps remain to be found.
     """

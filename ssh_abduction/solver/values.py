@@ -30,7 +30,7 @@ class Cost:
         places: Number of places.
         paths: Number of paths.
         excuses: Number of excused pairs of paths.
-        faults: What the faults cost together, in dstates.
+        faults: The cost of all faults together, in dstates.
     """
 
     dstates: int
@@ -62,7 +62,7 @@ class Cost:
         return tuple(getattr(self, name) for name in checked_theory(theory).priorities)
 
     def to_dict(self) -> dict[str, float]:
-        """The counts by name; excuses and faults only where there are any."""
+        """The counts by name; excuses and faults only if there are any."""
         counts: dict[str, float] = {
             "dstates": self.dstates,
             "places": self.places,
@@ -75,7 +75,7 @@ class Cost:
 def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> Cost:
     """The cost of a map, with the preferred counts as clingo counted them.
 
-    Where axioms are left out, clingo may count more than the map can show.
+    If axioms are left out, clingo may count more than the map can show.
 
     Args:
         ssh_map: The map.
@@ -90,7 +90,7 @@ def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> C
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Proven lower bounds on the counts of every map of the trace; None where nothing is proven.
+    """Proven lower bounds on the counts of every map of the trace; None if nothing is proven.
 
     A search proves a bound on the count that the theory prefers first. The other counts are
     bounded among the minimal maps only; see `Solution.cost` once the status is optimal.
@@ -101,8 +101,8 @@ class Bound:
         places: Lower bound on the places.
         paths: Lower bound on the paths.
         excuses: Lower bound on the excused pairs of paths.
-        tenths: Where faults are allowed, lower bound on the cost of dstates and faults together,
-            in tenths of a dstate.
+        tenths: If faults are allowed, lower bound on the cost of dstates and faults together, in
+            tenths of a dstate.
     """
 
     dstates: int | None = None
@@ -148,11 +148,11 @@ class Effort:
     """What a search did to find its answer.
 
     Attributes:
-        prefix: How many of the first steps were given to clingo.
+        prefix: The number of first steps given to clingo.
         seconds: The time it took.
         grounding: The ground program that clingo solved last.
-        evidence: For each kind of evidence, how many pairs of steps it excluded and how many sets
-            of equalities it rejected.
+        evidence: For each kind of evidence, the numbers of pairs of steps that it excluded and of
+            sets of equalities that it rejected.
     """
 
     prefix: int
@@ -163,7 +163,7 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """The best maps with one number of dstates; of paths or places where these come first.
+    """The best maps with one number of dstates (of paths or places if these come first).
 
     Attributes:
         cost: The cost of the first map. All share the counts that the theory prefers.

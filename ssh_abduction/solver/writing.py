@@ -20,7 +20,7 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
 
     Args:
         solution: The solution.
-        count: The number of maps that were given. The solution need not hold them.
+        count: The number of maps given. The solution need not hold them.
         backbone: What the minimal maps share, as far as it is known.
     """
     if solution.status is Status.UNSATISFIABLE:
@@ -61,7 +61,7 @@ def written_map(ssh_map: SSHMap, cost: Cost | None = None) -> dict[str, Any]:
 
     Args:
         ssh_map: The map.
-        cost: What the map costs, where not all maps cost the same.
+        cost: The cost of the map, if maps differ in cost.
     """
     return ssh_map.to_dict() | ({"cost": cost.to_dict()} if cost else {})
 

@@ -1,7 +1,7 @@
 """The loop that asks for an answer, rejects it for a reason, forbids that, and asks again.
 
-What is forbidden takes away only answers that are no maps. So what clingo solves is a relaxation
-until nothing is rejected, its bounds hold, and the first answer that is accepted is as good as any.
+Forbidding a reason removes only answers that are no maps. So clingo solves a relaxation until it
+rejects nothing, its bounds hold, and the first accepted answer is as good as any map.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def first_accepted_of(
 ) -> Generator[Meanwhile, None, Answer | None]:
     """As `first_accepted`, for an `ask` that takes long.
 
-    What `ask` yields meanwhile is yielded; what it returns is the answer.
+    Yields what `ask` yields meanwhile. The answer is what `ask` returns.
     """
     while (answer := (yield from ask())) is not None:
         reason = refuse(answer)
@@ -60,7 +60,7 @@ def all_accepted(
     key: Callable[[Answer], Hashable],
     known: set[Hashable],
 ) -> Generator[Answer, None, None]:
-    """All answers that are not rejected, each once.
+    """All accepted answers, each once.
 
     Args:
         ask: Lists the answers by what is forbidden so far.
@@ -96,8 +96,8 @@ def smaller(
 
     Args:
         members: They have the property together.
-        shrunk: Of some members, a subset that has the property; None if they do not have it.
-        tries: Give up after this many tries in vain; None for never.
+        shrunk: Given members, returns a subset with the property; None if they lack it.
+        tries: Give up after this many failed tries; None for never.
     """
     size, failed = len(members), 0
     while size := size // 2:

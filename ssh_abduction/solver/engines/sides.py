@@ -1,9 +1,9 @@
 """Order and sides of visits that are one, for the engine with frames.
 
-The axioms are told only of the paths that an answer contradicts (sides_framed.lp). To tell them of
-a path takes a rule for each two visits that may be one. In a world half explored the causal axioms
-allow fewer dstates than order and sides do, in thousands of ways, and to forbid these one by one
-does not end. But few paths show nearly all of that.
+The axioms of order and sides are added only for paths that an answer contradicts
+(sides_framed.lp), as each path takes a rule for each two visits that may be one. In a half explored
+world the causal axioms allow fewer dstates than order and sides do, in too many ways to forbid them
+one by one. But few paths exclude nearly all of them.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ class FramedSides:
 
     def __init__(self, theory: Theory, asker: Asker) -> None:
         self._theory, self._asker = theory, asker
-        # The program parts of sides_framed.lp that were told, with their arguments.
+        # The grounded program parts of sides_framed.lp, with their arguments.
         self._said: dict[tuple[str, tuple[int, ...]], None] = {}
         self._batch = -1
 
     def begin(self) -> None:
-        """The control is a new one, which knows nothing."""
+        """Start over with a new control."""
         self._said = {}
         self._batch = -1
 
     def extend(self, batch: int) -> None:
-        """Tell what was told of paths also of the visits of a new batch."""
+        """Extend the axioms of paths to the visits of a new batch."""
         self._batch = batch
         if self._said:
             paths = [
@@ -57,7 +57,7 @@ class FramedSides:
             paths: The axioms of places and paths.
             chart: The nodes.
             labels: The dstate of each node.
-            standing: The visit and slot of some node at each dstate, as far as clingo knows any.
+            standing: The visit and slot of some node at each dstate, if clingo has one.
 
         Returns:
             Whether there was such a path that clingo was not given.
@@ -80,10 +80,10 @@ class FramedSides:
         return False
 
     def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides_framed.lp, unless that was done before.
+        """Ground a part of sides_framed.lp, unless it was grounded before.
 
         Returns:
-            Whether it was grounded now.
+            Whether it was new.
         """
         if (part, arguments) in self._said:
             return False

@@ -1,8 +1,8 @@
 """Small maps of the causal theory that are made without clingo, or near a guess.
 
-They are for long traces: a search that has to stop then has a map that is not bad, and a map with
-as few dstates as the lower bound ends the search. Nothing here proves that a map is minimal;
-`engines/nearby.py` does that.
+They are for long traces: a search that has to stop then has a good map, and a map with as few
+dstates as the lower bound ends the search. `engines/nearby.py` proves maps minimal; this module
+does not.
 
 First, steps are merged by evidence (`guesses/merging.py`). Then a map is guessed. If the trace
 could be one of a world whose places have frames, the guess is annealed as such
@@ -26,10 +26,10 @@ from ssh_abduction.solver.guesses.continuing import followed
 from ssh_abduction.solver.guesses.merging import merged, merged_near, thinned
 from ssh_abduction.solver.steps.chart import Chart
 
-# If the robot does not turn, guess at most this often until a guess is a map: each guess costs as
-# much as the first, and few are better.
+# If the robot does not turn, guess at most this often until a guess is a map: guesses are slow, and
+# later ones are rarely better.
 GUESSES = 10
-# Guess at most this many steps of a long trace in one go: more take minutes.
+# Guess at most this many steps of a long trace at once: more take minutes.
 GUESSED = 24_000
 
 

@@ -1,7 +1,7 @@
 """The engine that grounds the readable encodings, step by step.
 
-It serves every theory. Its maps are all minimal ones of the prefix; other engines are faster for
-the theories that they serve.
+It serves every theory and finds all minimal maps of the prefix. Other engines are faster for the
+theories that they serve.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class StepEngine:
         self._task = task
         self._asked: int | None = None  # the step that is the last one, as far as clingo knows
         self._forbidden: list[Collection[Equality]] = []
-        # How many dstates, places or paths maps have, if somebody asked for an exact number.
+        # The exact number of dstates, places or paths that maps must have, if one is set.
         self._number: tuple[int, Count] | None = None
         # Seconds and MiB that it took to ground the last step. The next one takes about as much,
         # and cannot be stopped.
@@ -104,7 +104,7 @@ class StepEngine:
         self.size = stop
 
     def _let_end_with(self, last: int) -> None:
-        """Let clingo take this step for the last one."""
+        """Make this step the last one for clingo."""
         if self._asked == last:
             return
         control = self.asker.control
@@ -148,7 +148,7 @@ class StepEngine:
         return True
 
     def ask_for(self, number: int, count: Count) -> None:
-        """From now on maps have exactly this many of `count`. The prefix must not grow any more."""
+        """Require exactly this many of `count` in maps. The prefix must not grow any more."""
         if self._number is not None:
             self.asker.control.release_external(questions.of_number(*self._number))
         self._number = number, count
@@ -163,7 +163,7 @@ class StepEngine:
         self.asker.control.assign_external(questions.of_number(*self._number), True)
 
     def settle(self) -> None:
-        """Nothing goes on in clingo beyond an answer."""
+        """Do nothing: clingo stops after each answer."""
 
     def _tell_forbidden(self, number: int) -> None:
         part = f"forbidden_{number}"

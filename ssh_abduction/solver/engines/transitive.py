@@ -1,8 +1,8 @@
 """Keeps "is the same place as" transitive in answers of visits.lp.
 
-Clingo is not told beforehand that the relation is transitive: there are millions of threes of
-visits. `intransitive` finds the threes that an answer violates, and `Transitive` is a propagator
-for listing many answers.
+The rules of transitivity are not grounded beforehand, as there are millions of threes of visits.
+`intransitive` finds the threes at which an answer fails. `Transitive` is a propagator for listing
+many answers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.steps.chart import FramedChart
 
-# Tell clingo at most this many threes of visits in one go: they are found faster than grounded.
+# Give clingo at most this many threes of visits at once: they are found faster than grounded.
 AT_A_TIME = 20_000
 
 # Visits I < J at one place, where slot 0 of I is slot R of J.
@@ -32,7 +32,7 @@ def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> 
 
     Args:
         pairs: The visits that are at one place in the answer.
-        fits: The pairs that may be at one place, as far as clingo knows.
+        fits: The pairs that may be at one place for clingo.
         chart: The visits, and how they end.
     """
     found: dict[Three, None] = {}
@@ -44,7 +44,7 @@ def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> 
     for pair in pairs:
         take(turned, pair)
     for i, j, r in work:
-        # Where two visits are one and end alike, the next visits are one, too.
+        # If two visits are one and end alike, the next visits are also one.
         follows = (
             [(i + 1, j + 1, 0)]
             if i in leaves and leaves.get(j) == ((leaves[i][0] + r) % 4, leaves[i][1])
@@ -76,7 +76,7 @@ class Transitive(clingo.Propagator):
         self.failed = 0
         self.literals: dict[Pair, int] = {}
         self._watched: dict[int, list[Pair]] = {}
-        self._literals: dict[Pair, int] = {}  # of the solver
+        self._literals: dict[Pair, int] = {}  # the solver literals
         self._turned: Turned = {}
 
     def init(self, init: clingo.PropagateInit) -> None:
@@ -164,8 +164,8 @@ def apart_yet_joined(
     The third one is one of this pair.
 
     Returns:
-        Triples: the first visit, the third one, and the last one; these two with the slot that
-        slot 0 of the first one would be.
+        Triples: the first visit, the third one, and the last one. The latter two come with the
+        slot that slot 0 of the first would be.
     """
     i, j, r = pair
     of_i, of_j = turned[i], turned[j]

@@ -1,7 +1,7 @@
-"""Talks to clingo about which visits are at one place (visits.lp), for the engine with frames.
+"""Asks clingo which visits are at one place (visits.lp), for the engine with frames.
 
-Clingo is given some visits at first, and of others as answers need them. Fewer visits are a
-relaxation, so what clingo proves of them holds of the trace.
+Clingo is given some visits at first, and others as answers need them. Fewer visits are a
+relaxation, so a bound proven for them holds for the trace.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ SECONDS_A_PAIR = 3e-5
 
 
 class Sides(Protocol):
-    """What tells clingo of order and sides, along with visits (`engines/sides.py`)."""
+    """Adds axioms of order and sides to those of visits (`engines/sides.py`)."""
 
     def begin(self) -> None:
-        """The control is a new one, which knows nothing."""
+        """Start over with a new control."""
         ...
 
     def extend(self, batch: int) -> None:
-        """Clingo was told of more visits, in this batch."""
+        """Take note of a batch of new visits."""
         ...
 
 
@@ -45,7 +45,7 @@ class Cores:
     raises the bound by one. From then on at most one of them may be alone, then two, and so on.
 
     Attributes:
-        least: This many nodes are alone, at least.
+        least: A lower bound on the number of lone nodes.
         avoided: The atoms that are assumed to be false, by the literal of that assumption.
 
     Reference:
@@ -62,10 +62,10 @@ class Cores:
         self.least = 0
         self.avoided: dict[int, clingo.Symbol] = {}
         self._asker, self._tell = asker, tell
-        self._sizes: list[int] = []  # of cores
+        self._sizes: list[int] = []  # sizes of cores
 
     def avoid(self, symbol: clingo.Symbol) -> None:
-        """Assume that this atom is false, if clingo knows it."""
+        """Assume that this atom is false, if it exists."""
         if atom := self._asker.control.symbolic_atoms[symbol]:
             self.avoided[-atom.literal] = atom.symbol
 
@@ -97,7 +97,7 @@ class Answer:
     Attributes:
         pairs: The visits that are at one place.
         everywhere: Where all visits are, once the pairs are known to be transitive.
-        is_open: Whether the answer is not known yet.
+        is_open: Whether the answer is still unknown.
     """
 
     pairs: Sequence[Pair] = ()
@@ -116,8 +116,8 @@ class Refusal:
     """Why an answer is rejected.
 
     Attributes:
-        threes: Visits on which it is not transitive.
-        missed: Visits whose places it does not say, if it is transitive.
+        threes: Threes of visits at which the answer is not transitive.
+        missed: Visits whose places a transitive answer leaves open.
     """
 
     threes: Sequence[Three]
@@ -126,13 +126,13 @@ class Refusal:
 
 @dataclass
 class _Known:
-    """What the control knows of a chart.
+    """What the control has of a chart.
 
     Attributes:
         visits: The visits that it was given.
         place_of: For each node, its position in the order of choice.
-        ends: The visits whose end it knows.
-        turns: The turns that it knows.
+        ends: The visits whose end it has.
+        turns: The turns that it has.
         fits: The pairs of visits that may be at one place.
     """
 
@@ -144,23 +144,23 @@ class _Known:
 
 
 class VisitProgram:
-    """The control that knows visits, and what it was told.
+    """The control of visits.lp, and what it was given.
 
     Attributes:
-        chart: Of the first steps.
-        batch: The number of the last visits that clingo was given in one go.
-        cores: The lower bound, and what is assumed for it.
+        chart: The chart of the first steps.
+        batch: The number of the last batch of visits.
+        cores: The lower bound, and its assumptions.
         transitive: The propagator, with the literals that were read.
     """
 
     def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: Sides) -> None:
-        """Take a control that knows nothing.
+        """Make a control without visits.
 
         Args:
             task: The trace and the speed-ups that are on.
             asker: It asks the control.
-            chart: The first one that visits are given.
-            sides: It is told of new controls and of batches.
+            chart: The first chart.
+            sides: Called for new controls and batches.
         """
         self.chart = chart
         self.batch = -1
@@ -172,7 +172,7 @@ class VisitProgram:
         asker.control.register_propagator(self.transitive)
         self._known = _Known()
         self._pair_of = PairOf()
-        self._unread: list[Pair] = []  # pairs whose literals were not looked up yet
+        self._unread: list[Pair] = []  # pairs whose literals are not yet looked up
         self._parts = 0
         sides.begin()
 
@@ -188,23 +188,23 @@ class VisitProgram:
 
     @property
     def fits(self) -> frozenset[Pair]:
-        """The pairs of visits that may be at one place, of those that clingo knows."""
+        """The pairs of clingo's visits that may be at one place."""
         return self._known.fits
 
     @property
     def nodes(self) -> Iterable[int]:
-        """The nodes that clingo knows, in the order of choice."""
+        """The nodes that clingo has, in the order of choice."""
         return self._known.place_of
 
     def give(
         self, chart: FramedChart, visits: set[int], order: Iterable[int], fits: frozenset[Pair]
     ) -> None:
-        """Tell clingo what it does not know yet of these visits.
+        """Give clingo what it lacks about these visits.
 
         Args:
             chart: The visits and nodes.
-            visits: All that clingo is to know.
-            order: Nodes in the order of choice. New ones come after those that clingo knows.
+            visits: All visits that clingo is to have.
+            order: Nodes in the order of choice. New ones come after those that clingo has.
             fits: The pairs of these visits that may be at one place.
         """
         control, known = self._asker.control, self._known
@@ -243,7 +243,7 @@ class VisitProgram:
         self._sides.extend(self.batch)
 
     def _avoid_lone(self, places: Iterable[int]) -> None:
-        """Assume that none of these new nodes is alone, or count it if it is for sure."""
+        """Assume that none of these new nodes is alone, or count those that have to be."""
         atoms = self._asker.control.symbolic_atoms
         for place in places:
             atom = atoms[visits_lp.first(place)]
@@ -259,7 +259,7 @@ class VisitProgram:
     def read_literals(self) -> Mapping[Pair, int]:
         """The literals that two visits are at one place, in the order in which they came.
 
-        To look them up takes seconds if there are many, so that is done only where it is needed.
+        Looking up many literals takes seconds, so call this only if needed.
         """
         atoms = self._asker.control.symbolic_atoms
         for pair in self._unread:
@@ -269,9 +269,9 @@ class VisitProgram:
         return self.transitive.literals
 
     def tell(self, told: str, part: str | None = None, number: int = 0) -> None:
-        """Tell clingo more rules, and ground a program part for a number if one is given.
+        """Give clingo more rules, and ground a program part for a number if one is given.
 
-        No limit stops this: a core whose members are no longer avoided has to get its limit.
+        No limit stops this: a relaxed core must get the limit on its members.
         """
         with self._asker.grounding_timed():
             name = f"told_{self._parts}"
@@ -282,7 +282,7 @@ class VisitProgram:
                 self._asker.control.ground([(part, numbers(number))])
 
     def close(self, threes: Iterable[Three]) -> None:
-        """Tell clingo that to be at one place is transitive, of these visits."""
+        """Give clingo the rules of transitivity for these visits."""
         self.tell(visits_lp.three_facts(self._parts, threes), "closed", self._parts)
 
     def intransitive(self, pairs: Sequence[Pair]) -> list[Three]:
@@ -318,7 +318,7 @@ class VisitProgram:
         return Refusal(threes, missed) if threes or missed else None
 
     def standing(self, labels: Sequence[int]) -> dict[int, tuple[int, int]]:
-        """The visit and slot of some node at each dstate, as far as clingo knows of any."""
+        """The visit and slot of some node at each dstate, if clingo has one."""
         return {labels[node]: self.chart.facing[node] for node in self._known.place_of}
 
     def spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
@@ -344,8 +344,8 @@ def fits_in_time(watch: Watch, chart: FramedChart, visits: set[int], known: int)
     Args:
         watch: The limits.
         chart: The visits.
-        visits: Those that clingo is to know.
-        known: How many pairs it knows already.
+        visits: The visits that clingo is to have.
+        known: The number of pairs that it has already.
     """
     told = sorted(visits)
     if len(told) == len(chart.stars):  # count the pairs before they are listed

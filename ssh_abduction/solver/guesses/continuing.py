@@ -11,9 +11,9 @@
 The trace is walked along the links of the map. An unknown action must lead to a dstate with the
 next observation. Of these dstates, the walk takes the one that predicts the following steps
 longest, if it leads the others clearly and its prediction does not end in a contradiction. If there
-is none, the robot is lost until its observations and actions tell where it is: Markov localisation
-with beliefs that are sets. Links that one walk leaves open may be settled by the next, as the map
-has grown by then. Links that stay open lead to new dstates in the end.
+is none, the robot is lost until its observations and actions locate it: Markov localisation with
+beliefs that are sets. Links that one walk leaves open may be found by the next, as the map has
+grown by then. Links that stay open lead to new dstates in the end.
 
 A link may therefore be wrong, and so may the given map. Then the trace contradicts it sooner or
 later. The walk forgets the dstate where this happens, and more of the dstates before it if that

@@ -11,9 +11,10 @@
 >>> gated_map(straight, settle(straight).theory, homing=True).labels
 (0, 1, 2, 3)
 
-Stars tell which steps can be at a place: there has to be one frame, and a shift for each star, that
-satisfy all axioms of gateways. The map grows by one step at a time. If the end of an action is
-unknown, the options are tried in order, and the first that the stars of the place allow is kept:
+A star is the gateways that a step sees. Steps can be at one place if one frame, and a shift for
+each star, satisfy all axioms of gateways. The map grows by one step at a time. If the end of an
+action is unknown, the options are tried in order. The first that the stars of the place allow is
+kept:
 
 - a turn leads to a dstate of the place with the right view, or to a new dstate;
 - a travel goes along the reverse of a course at the place, or along a new path; it leads to the

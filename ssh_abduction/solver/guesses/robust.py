@@ -113,8 +113,8 @@ class Explained:
     Attributes:
         machine: The machine.
         labels: The dstate of each step.
-        misread: The steps whose views are ignored.
-        slips: The steps whose actions are ignored.
+        misread: The steps whose views are treated as wrong.
+        slips: The steps whose actions are treated as wrong.
         unknown: The steps whose actions the machine does not know.
         tenths: The cost of dstates and faults, in tenths of a dstate.
     """

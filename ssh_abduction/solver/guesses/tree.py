@@ -126,7 +126,7 @@ class Sketch:
         sketch._orders = [list(path.order) for path in ssh_map.paths]
         sketch._states, sketch._along, sketch._facing, sketch._slots = [], {}, {}, {}
         stars: dict[int, object] = {}
-        # The first step at each dstate tells its observation.
+        # The first step at each dstate gives its observation.
         seen = dict(zip(reversed(ssh_map.labels), reversed(trace.steps), strict=True))
         for s in ssh_map.dstates:
             place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1

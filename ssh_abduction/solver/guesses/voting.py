@@ -1,10 +1,10 @@
-"""Find wrong views and stars: merge visits robustly, so that right observations outvote them.
+"""Find wrong views and stars (openings seen): merge visits, so that right observations win.
 
-Where places have frames, the steps between two travels are a visit. A place is a group of visits,
+If places have frames, the steps between two travels are a visit. A place is a group of visits,
 each turned by some quarters. The cost of a group is the cost of its dstates, plus the cost of
 ignoring each view and star that differs from what most of its steps show. Groups are merged
 while that lowers the total cost, those with the largest gain first. If two visits of a group leave
-by the same action, the next visits are merged, too, as actions are deterministic. This is
+by the same action, the next visits are also merged, as actions are deterministic. This is
 evidence-driven state merging (Lang, Pearlmutter & Price 1998) with votes instead of contradictions.
 Evidence such as displacements is obeyed.
 

@@ -1,10 +1,10 @@
 """How the stars of a trace fit each other when turned: the input of gateways.lp.
 
-A star is what a step sees. A *frame* is a star in which each unobserved gateway has been decided to
-be there or not. All frames seen at a place have the same number N of slots. Slot K of a frame is
-slot (K+C) mod N of an earlier frame, for some *shift* C. The shift and the spreads of the bearings
-limit by how much the robot has turned: a set of rotations in whole degrees. If the set is empty,
-the two frames are not seen at one place with this shift.
+A star is the gateways that a step sees. A *frame* is a star in which each unobserved gateway has
+been decided to exist or not. All frames at a place have the same number N of slots. Slot K of a
+frame is slot (K+C) mod N of an earlier frame, for some *shift* C. The shift and the spreads of the
+bearings limit how far the robot has turned: a set of rotations in whole degrees. If the set is
+empty, the two frames are not seen at one place with this shift.
 
 >>> from ssh_abduction.data.star import Star
 >>> from ssh_abduction.solver.steps.frames import members, rotations
@@ -23,7 +23,7 @@ from functools import lru_cache
 from ssh_abduction.data.star import SPREAD, Frame, Star
 from ssh_abduction.data.trace import Action, Trace
 
-# A set of rotations is an integer: bit R tells whether R degrees clockwise are in the set.
+# A set of rotations is an integer: bit R is 1 if R degrees clockwise are in the set.
 FULL = (1 << 360) - 1
 # The least degrees of a turn right or left, and by how much it has to fall short of a turn around:
 # bearings that differ by less may belong to one gateway.
@@ -99,7 +99,7 @@ def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
 
 
 def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
-    """The ways that the robot has to face in the later frame, as far as bearings tell."""
+    """The ways that the robot has to face in the later frame, by bearings."""
     found = rotations(first, then, shift)
     return [
         way
@@ -133,7 +133,7 @@ def ends(frame: Frame) -> list[str]:
 def heading(first: Frame, then: Frame, shift: int) -> int:
     """The heading in the later frame, in whole degrees clockwise from the heading in the first.
 
-    0 if bearings do not tell.
+    0 if bearings leave it open.
     """
     return middle(rotations(first, then, shift)) if first.slots == then.slots else 0
 
@@ -178,7 +178,7 @@ def _turned_by(action: Action, first: Frame) -> int:
 def _declared(first: Frame, then: Frame, shift: int) -> str | None:
     """The direction along the robot's path in the later frame, by slots declared opposite.
 
-    "alike", "opposite", or None if they do not tell.
+    "alike", "opposite", or None if these leave it open.
     """
     here, there = _way(first), _way(then)
     if here is None or there is None or not rotations(first, then, shift):
@@ -198,7 +198,7 @@ def _way(frame: Frame) -> tuple[int, int] | None:
 def _surely(found: int, towards: int) -> bool:
     """Whether a set of rotations is narrow and contains this direction.
 
-    Stars without known gateways leave nearly all rotations, which tells nothing.
+    Stars without known gateways leave nearly all rotations open.
     """
     return bool(found >> towards & 1) and not found >> 90 & 1 and not found >> 270 & 1
 

@@ -1,8 +1,8 @@
 """Localise the visits of a trace in a map of some of them.
 
-For a long trace in a small world, clingo need not be given every visit: a map of some visits tells
-where the others are. This is Markov localisation with beliefs that are sets of states. From all
-states at which a visit may be, the map tells where its action leads, and there is the next visit.
+For a long trace in a small world, clingo does not need every visit: a map of some visits locates
+the others. This is Markov localisation with beliefs that are sets of states. From all possible
+states of a visit, the map says where its action leads. These are the possible states of the next.
 A visit is *missed* if no such state fits it, if the map does not know the action, or if the visit
 faces a slot that no visit of the map faced. The map then needs to know this visit, and as many
 visits before it as it takes to localise it.
@@ -33,8 +33,8 @@ class Located:
     """The result of localising.
 
     Attributes:
-        states: The state of each visit; empty if the map does not tell all of them.
-        missed: Otherwise, visits that the map has to know first.
+        states: The state of each visit; empty if the map does not locate all of them.
+        missed: If so, the visits that the map needs first.
     """
 
     states: tuple[State, ...]
@@ -55,7 +55,7 @@ def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
 
 
 def tracked(chart: FramedChart, states: Mapping[int, State]) -> list[State]:
-    """The state of each visit; -1 where the map does not tell it."""
+    """The state of each visit; -1 if the map leaves it open."""
     return _Localiser(chart, states).tracked()
 
 

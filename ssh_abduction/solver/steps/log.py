@@ -120,11 +120,11 @@ class Log:
     def merged(self) -> tuple[int, ...]:
         """Labels of a consistent map of the whole trace, found greedily. It need not be minimal.
 
-        Where the map does not know an action, each known dstate with the next observation is tried
-        as its end. The map then predicts the trace up to the next unknown action, or is
-        contradicted before. The dstate that predicts the most steps without contradiction is taken;
-        if there is none, a new dstate is. So a link, once made, is never wrong. After STEPS_TRIED
-        predictions, all unknown actions lead to new dstates.
+        If the map does not know an action, each known dstate with the next observation is tried as
+        its end. The map then predicts the trace up to the next unknown action, or is contradicted
+        before. The action leads to the dstate that predicts the most steps without contradiction,
+        or else to a new one. So a link never has to be taken back. After STEPS_TRIED predictions,
+        all unknown actions lead to new dstates.
         """
         actions, seen = self.actions, self.seen
         shows = [seen[0]]

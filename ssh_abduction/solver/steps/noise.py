@@ -36,9 +36,9 @@ class Noise:
 
     Attributes:
         step: The number of the step.
-        told_apart: How many of the steps up to this one are dstates of their own because of it.
-        without: How many steps of the whole trace are dstates of their own if this step is
-            ignored.
+        told_apart: The number of steps up to this one that it makes dstates of their own.
+        without: The number of steps of the whole trace that are dstates of their own if this
+            step is ignored.
     """
 
     step: int
