@@ -1,4 +1,4 @@
-"""Places whose stars cannot be those of one place (star=gateways).
+"""Places whose stars (gateways seen) cannot fit one place (star=gateways).
 
 A map does not show which gateway is which. So if no frame fits the stars of a place, a smallest
 set of sights that no frame fits is reported, under each axiom whose removal would make one fit.

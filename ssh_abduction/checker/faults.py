@@ -1,4 +1,4 @@
-"""Checks the faults of a map: the views, stars, actions and displacements it ignores."""
+"""Checks the faults of a map: ignored views, stars (openings), actions and displacements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fits the stars seen at each place of a map into one frame (star=gateways).
+"""Fits the stars (gateways seen) at each place of a map into one frame (star=gateways).
 
 >>> from ssh_abduction.data.gateways import rotations
 >>> from ssh_abduction.data.star import Star

@@ -18,7 +18,7 @@ robot passed, and two poses are taken for one place if they are near each other.
 *What is counted.* A visit is the steps between two travels, which turns join. Pairs of visits are
 counted for places, and pairs of steps of different visits for dstates. A pair is a true *return* if
 both are near each other and the robot was farther away at some visit in between. If it merely went
-on to the next door, it did not return, and yet both may be near each other. Nobody can say whether
+on to the next door, it did not return, but both may be near each other. Nobody can say whether
 such a pair is one place, so it is left out and counted as `stayed`.
 """
 

@@ -33,7 +33,7 @@ def explain_trace(
 ) -> TraceExplanation:
     """Explain why a trace has no map, and which single observation would mend it.
 
-    An observation is a view, a star, an action, a displacement, or an asserted pair of steps. Each
+    An observation is a view, a star (openings), an action, a displacement, or asserted pair. Each
     one in the clashing stretch is replaced by other values from the trace, or dropped. It is a mend
     if the whole trace then has a map.
 

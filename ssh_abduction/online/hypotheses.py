@@ -33,7 +33,7 @@ from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver import Cost, observation
 from ssh_abduction.theory.theory import Theory
 
-# As `observation` returns it: the view, and the star if the theory uses stars.
+# As `observation` returns it: the view, and the star (openings) if used.
 Seen = tuple[object, object]
 # What a dstate costs, in tenths of dstates.
 DSTATE = 10

@@ -33,19 +33,19 @@ is nowhere that the map knows. Let f be (3) or (4), or what a recogniser's dista
     p(x'|nowhere) = reentered / N
     e(x')         = (1 - unmapped) / N,  e(nowhere) = unmapped
 
-e is the prior of global localisation. q is the observation at an unknown place:
-it looks like one of the N dstates, or like none of them (g), each as likely.
+e is the prior of global localisation. q is the observation at an unknown
+place. It looks like one of the N dstates, or like none of them (g), each as likely.
 
-Nowhere is of two kinds, equally likely when the robot gets there. A *strange* place: nothing
-follows from what was seen before. A place *akin* to the map: what follows is what follows in the
+Nowhere is of two kinds, equally likely when the robot gets there. A *strange* place: earlier
+observations predict nothing. A place *akin* to the map: what follows is what follows in the
 map on average, over the n dstates that look like o and have a link for a:
 
     p(o'|strange) = q(o')
     p(o'|akin)    = (n · mean over these x of Σ_x' f(x'|x,a) f(o'|x') + q(o')) / (n + 1)
                     of a novel o': q(o')
 
-Without the second kind a robot in another maze would be taken to be in this one, as what a turn
-shows is no surprise in any maze. All p(o|·) are divided by q(o), which changes no belief. So views
+Without the second kind a robot in another maze would be located in this one, because views
+after turns fit any maze. All p(o|·) are divided by q(o), which changes no belief. So views
 and images are weighed alike, and the normaliser says how probable an observation was, compared with
 an unknown place.
 """

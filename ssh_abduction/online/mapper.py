@@ -22,7 +22,7 @@ it are all minimal maps of the longer trace.
 A map that predicts the step costs c, by (2). Conversely let F be a minimal map of the longer trace.
 It costs c and, cut by the last step, is a map R of M, by (3). R does not contradict the step:
 actions are deterministic, and a dstate has one observation, by functional_view and the axioms of
-the stars. (`observation` reads the star as these axioms do, so another rotation of a pattern is no
+the stars (openings seen). (`observation` reads a star as these axioms do: a rotated pattern is no
 contradiction.) So R predicts the step, and F is the replayed R, by (3). ∎
 
 Otherwise clingo is asked, in the one control that is kept. It is asked for all maps of cost c if

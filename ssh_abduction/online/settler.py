@@ -17,7 +17,7 @@ class TheorySettler:
         first: A trace of the first step.
 
     Raises:
-        TheoryError: The theory needs stars and the first step has none.
+        TheoryError: The theory needs stars, but the first step has none.
         TraceError: The first step lacks something else that the theory needs.
     """
 

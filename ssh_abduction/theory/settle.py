@@ -72,7 +72,7 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
 
     Raises:
         TraceError: All views, the kind of an action, or a star is missing.
-        TheoryError: The theory needs stars or displacements, and the trace has none.
+        TheoryError: The theory needs stars or displacements, but the trace has none.
     """
     checked_trace(trace)
     theory = checked_theory(theory)

@@ -7,7 +7,7 @@
 
 A travel leads along an edge from a gateway of one place to a gateway of another, and passes no
 place unseen. So a gateway leads to exactly one other gateway. Turns give the order of the gateways
-around a place; in frames, stars do too. If the order is not known, any order will do. A map is
+around a place; in frames, so do stars (openings). If the order is unknown, any will do. A map is
 planar if *some* orders allow a drawing. The first steps of a planar map are planar as well: they
 have fewer edges, and no other orders.
 
