@@ -298,12 +298,12 @@ class _Problem:
         return part
 
     def _freedom(self, unknown: Array) -> int:
-        """The degrees of freedom: the number of equations minus that of the unknowns they settle.
+        """The degrees of freedom: the number of equations minus the unknowns they determine.
 
         Each part of the map may be moved and turned as a whole, and so may each group of headings
         in it that positions leave open.
 
-        A displacement that is known to the millimetre has no noise worth counting. It settles as
+        A displacement known to the millimetre has no noise worth counting. It determines as
         many unknowns as it has equations, and adds no freedom.
         """
         said = np.unique(np.concatenate([self._from, self._to]))

@@ -229,7 +229,7 @@ class Mending:
                 yield from self._improving(self._minimal(slipped)[0], slipped)
 
     def _mended(self, causal: SSHMap) -> Trace:
-        """The trace without what a causal map ignores.
+        """The trace without the faults of a causal map.
 
         A wrong view is replaced by that of another step at the same dstate, and a wrong action by
         an unknown one.

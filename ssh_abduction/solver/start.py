@@ -51,7 +51,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where a search begins, and whether it reasons at its end. For other packages of this project.
+    """Where a search begins, and whether it reasons at its end. For other packages here.
 
     Attributes:
         reasons: Whether to find out at the end what all minimal maps share, if not all are

@@ -1,4 +1,4 @@
-"""Runs a search for small maps in a thread of its own, beside the search of an engine."""
+"""Runs a search for small maps in another thread, during the search of an engine."""
 
 from __future__ import annotations
 

@@ -221,7 +221,7 @@ class FramedEngine:
         return self._fitting.separate(chart, kept(chart.apart(), chart.links, guess))
 
     def settle(self) -> None:
-        """End the search beside this one."""
+        """End the search in the other thread."""
         self._beside.end()
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:

@@ -51,7 +51,7 @@ class GuessBeside:
         Args:
             fitting: Makes the guess.
             visits: Gets the bound that the search proves.
-            asker: Its limits hold for the search, too.
+            asker: Its limits also hold for the search.
         """
         self.guess: list[int] | None = None
         self.search: NearbySearch | None = None

@@ -190,7 +190,7 @@ class FramedPaths:
             labels: The dstate of each node.
             options: Of clasp.
             nodes: The nodes whose labels have to fit; all of them by default.
-            single: Ask only for separate paths, none of which is taken for another.
+            single: Ask only for separate paths, and merge none of them.
         """
         self._asker.watch.check(0.0 if single else self.preparing)
         # Count the time of this thread, as the other one may make it wait.

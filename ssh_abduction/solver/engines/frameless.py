@@ -6,7 +6,7 @@ minimal maps, and its bound on the dstates is proven.
 The axioms of places and paths for each step are too much for clingo after some dozen steps of
 exploring. But they are about dstates: the place that a dstate is at, and the path that it is along.
 So the dstates have names, as in the causal theory (`engines/naming.py`). sides_frameless.lp limits
-by order and sides where the actions at them lead (`engines/frameless_paths.py`). Its size depends
+by order and sides where actions may lead (`engines/frameless_paths.py`). Its size depends
 on the number of dstates, not of steps.
 
 *Claim.* Each map of the topological theory is an answer of names.lp and sides_frameless.lp, at the

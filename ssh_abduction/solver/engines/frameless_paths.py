@@ -291,7 +291,7 @@ class PlacesAndPaths:
     def _far_away(self, labels: Sequence[int]) -> list[_Far]:
         """The dstates that evidence says are not at one place.
 
-        Each pair comes once; sets of pairs, not all of which are at one place, come last.
+        Each pair comes once. Sets of pairs that are not all at one place come last.
         """
         away = self._task.log.pairs.elsewhere.items()
         found = {

@@ -195,7 +195,7 @@ class NamedLabels:
         self.program.tell_forbidden(len(self._forbidden) - 1)
 
     def settle(self) -> None:
-        """End the search beside this one."""
+        """End the search in the other thread."""
         self._incumbent.end_beside()
 
     def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:

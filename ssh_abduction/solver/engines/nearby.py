@@ -493,7 +493,7 @@ class NearbySearch:
 
 
 def seen_labels(guess: Sequence[int], chart: Chart) -> list[Key | None]:
-    """The observation and the label of each node; None where the label is not known."""
+    """The observation and the label of each node; None if the label is unknown."""
     return [
         None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)
     ]

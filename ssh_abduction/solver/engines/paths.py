@@ -70,7 +70,7 @@ LEFT_OUT = 3
 # Clasp prepares for about these multiples of the time and the memory that grounding took. It cannot
 # be stopped meanwhile.
 PREPARING = (1.6, 2.1)
-# If a guess cannot be right, the places less than this many travels away become free, too: a wrong
+# If a guess cannot be right, the places less than this many travels away also become free: a wrong
 # place mostly has a wrong neighbour.
 LOOSENED = 2
 
@@ -159,7 +159,7 @@ class Paths:
             labels: The dstate of each node.
             options: Of clasp.
             nodes: The nodes whose labels have to fit; all of them by default.
-            single: Ask only for separate paths, none of which is taken for another.
+            single: Ask only for separate paths, and merge none of them.
         """
         control = self.control(chart, options)
         control.load_encodings("preference")

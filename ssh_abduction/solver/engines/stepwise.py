@@ -140,7 +140,7 @@ class StepEngine:
         return None if found is None else found.map
 
     def labellings(self, cost: tuple[int, ...]) -> None:
-        """Dstates are not settled before places and paths."""
+        """None: this engine finds dstates with places and paths."""
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._forbidden.append(equalities)

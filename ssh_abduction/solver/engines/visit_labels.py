@@ -193,7 +193,7 @@ class VisitLabels:
         self.size = size
 
     def _give_more(self, visits: Iterable[int]) -> None:
-        """Give clingo these visits, too."""
+        """Also give clingo these visits."""
         more = {*self.program.visits, *visits}
         assert more != self.program.visits  # else the search would never end
         with self._asker.grounding_timed():

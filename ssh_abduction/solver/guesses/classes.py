@@ -135,7 +135,7 @@ class Classes:
         return np.flatnonzero(~self.known[self.root])
 
     def settle(self, evidence: int, rivals: int) -> None:
-        """Merge unsettled classes with known dstates. A class that fits none becomes one.
+        """Merge other classes with known dstates. A class that fits none becomes known.
 
         Args:
             evidence: The least lead over the evidence for the next best dstate.
@@ -158,7 +158,7 @@ class Classes:
                 self.make((ranked[0][1], root))
 
     def settle_at_any_rate(self) -> None:
-        """Merge the class of the first unsettled step with the known dstate of most evidence.
+        """Merge the class of the first open step with the known dstate of most evidence.
 
         If it fits no known dstate, it becomes one.
         """
@@ -254,7 +254,7 @@ class Classes:
         self._apart[self.root[first[0]], second] = self._apart[self.root[second[0]], first] = True
 
     def separate_all(self, apart: Matrix) -> None:
-        """Mark these pairs of steps as apart, beside those that are."""
+        """Mark these further pairs of steps as apart."""
         self._apart |= apart
         for root in np.flatnonzero(np.bincount(self.root) > 1):
             self._apart[root] |= apart[self._members[root]].any(axis=0)

@@ -32,7 +32,7 @@ LOOKED = 300
 # The fewest steps that a dstate has to predict to become the end of a link.
 SETTLED = 10
 # The fewest steps that a dstate has to predict if the robot is lost. This is more than for a link,
-# as nothing is known of where the robot comes from.
+# as it is unknown where the robot comes from.
 FOUND = 20
 # In both cases it has to predict this many steps more than any other dstate.
 AHEAD = 2

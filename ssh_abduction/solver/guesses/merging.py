@@ -95,7 +95,7 @@ def merged_as_told(
     fits: Callable[[Sequence[int], Sequence[int]], bool],
     check: Callable[[], None] = lambda: None,
 ) -> list[int] | None:
-    """The dstate of each node in a small map near a guess, by what the caller knows beside it.
+    """The dstate of each node in a small map near a guess, with the caller's knowledge.
 
     Args:
         apart: Which nodes are apart, as a matrix of nodes x nodes.

@@ -7,7 +7,7 @@ is. A wrong displacement moves the robot by about FAR metres and turns it arbitr
 displacement with the most votes is taken to be wrong, and returns across it vote no more. This
 repeats as long as any displacement has votes.
 
-The result is a guess. Wrong labels vote, too, so each vote is bounded, and a map has to pay for
+The result is a guess. Wrong labels also vote, so each vote is bounded, and a map has to pay for
 what it ignores.
 """
 

@@ -82,7 +82,7 @@ class Machine:
                 contradicted += 1
                 continue
             merges += 1
-            # The ends of equal actions are merged, too.
+            # The ends of equal actions are also merged.
             work += [
                 (self.goes[p, action], self.goes[q, action])
                 for action in self.actions

@@ -109,7 +109,7 @@ class _Transitions:
     def _tallied(self, labels: States) -> tuple[States, NDArray[np.float32], NDArray[np.float32]]:
         """The transitions of a draw as entries of the table, the table, and its row sums.
 
-        The ways back of travels count, too.
+        The ways back of travels also count.
         """
         here, there = labels[:-1], labels[1:]
         rows = self.rows(here, self._visits)
