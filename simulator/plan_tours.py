@@ -124,7 +124,8 @@ class Floor:
 
     Attributes:
         plan: The plan, as returned by Plan.told_apart.
-        spread: Stated error of a star's bearings in degrees; the bearings are exact.
+        spread: The error in degrees that a star states for its bearings. The simulated bearings
+            are exact.
     """
 
     plan: Plan

@@ -17,15 +17,17 @@ Doubt: TypeAlias = tuple[int, int]
 class ReturnDoubts:
     """The returns of minimal maps that are in doubt.
 
-    A return is in doubt while some map without it has at most `margin` dstates more.
+    A return is in doubt while some map without it has at most `margin` dstates more than the
+    minimal maps.
 
     Args:
-        margin: See above; 0 doubts nothing.
+        margin: See above; with 0 no return is doubted.
         time_limit: Seconds for weighing one doubt; None waits for exact answers.
 
     Attributes:
         undecided: Doubts that could not be weighed in time.
-        twins: For some doubts, a map without the return that no experiment distinguishes.
+        twins: For some doubts, a map without the return that no experiment can tell from
+            the minimal map.
     """
 
     def __init__(self, margin: int, time_limit: float | None) -> None:

@@ -72,8 +72,10 @@ class Shared:
 
     @property
     def differing(self) -> tuple[int, ...]:
-        """The steps in which the maps differ: those that are one with an earlier step in some maps
-        only, and all steps with their numbers.
+        """The steps in which the maps differ.
+
+        These are the steps that equal an earlier step in some maps only, and all other steps that
+        share a number with one of these.
         """
         if self.untold:
             return self.untold

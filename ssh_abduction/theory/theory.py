@@ -96,7 +96,8 @@ class Theory:
             shared; 0 counts them in the trace.
         misread: Cost in dstates, in tenths, of treating a view or a star (the openings seen at a
             place) as wrong; 0 forbids it.
-        slipped: Cost in dstates of an action that did not do what its name says; 0 forbids it.
+        slipped: Cost in dstates of an action that did not do what its name says; with 0, no action
+            may slip.
         jumped: Cost in dstates of ignoring a displacement, for example because the robot was
             carried; 0 forbids it.
         planar: Whether paths meet at places only, so that the map can be drawn in the plane

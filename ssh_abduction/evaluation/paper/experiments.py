@@ -120,13 +120,15 @@ class Labelling:
 
 @dataclass(frozen=True)
 class Contrast:
-    """The result if the method is not followed.
+    """The result without two parts of the paper's method.
+
+    Images are clustered without aggregating dstates, or are taken along the way and not at dstates.
 
     Attributes:
         alone_uncertainty: U for one cluster per dstate.
-        alone_distinct: How many dstates have a cluster of their own then.
-        even_quality: M at the chosen k for images at even distances.
-        even_uncertainty: U at the chosen k for images at even distances.
+        alone_distinct: How many dstates have a cluster of their own then, of all dstates.
+        even_quality: M at the chosen k, for images taken at equal distances along the way.
+        even_uncertainty: U at the chosen k, for the same images.
     """
 
     alone_uncertainty: float

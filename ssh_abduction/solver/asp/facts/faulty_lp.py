@@ -123,8 +123,8 @@ def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int], frozenset
     """Read an answer of faulty.lp.
 
     Returns:
-        The name of each given step, the steps whose action slipped, and the lost steps, which
-        have no name.
+        The dstate of each step that the program holds; the steps whose action slipped; and the
+        steps whose dstate is not known.
     """
     where: dict[int, int] = {}
     steps: dict[str, set[int]] = {"slips": set(), "lost": set()}
