@@ -15,7 +15,7 @@ from typing import Literal, TypeAlias
 
 from ssh_abduction.data.errors import TheoryError, TraceError
 from ssh_abduction.data.trace import Trace, checked_trace
-from ssh_abduction.theory.evidence import Displacement, Evidence, evidence_of
+from ssh_abduction.theory.evidence import Displacement, Evidence, evidence_of, pairs_of
 from ssh_abduction.theory.fields import choice
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.theory import Theory, checked_theory
@@ -46,8 +46,7 @@ class Problem:
     @cached_property
     def pairs(self) -> Pairs:
         """What the evidence that cannot be excused says about pairs of steps."""
-        hard = self.theory.hard
-        return Pairs.joined([e.pairs(self.trace) for e in self.evidence if e.axiom in hard])
+        return pairs_of(self.trace, self.theory, self.evidence)
 
     def changed(self, trace: Trace | None = None, theory: Theory | None = None) -> Problem:
         """A problem with another trace or theory. It keeps what is known.

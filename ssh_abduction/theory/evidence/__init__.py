@@ -81,8 +81,13 @@ def said_by(
     }
 
 
-def pairs_of(trace: Trace, theory: Theory) -> Pairs:
-    """What the evidence that cannot be excused says about pairs of steps."""
-    return Pairs.joined(
-        [evidence.pairs(trace) for evidence in evidence_of(theory) if evidence.axiom in theory.hard]
-    )
+def pairs_of(trace: Trace, theory: Theory, evidence: Iterable[Evidence] | None = None) -> Pairs:
+    """What the evidence that cannot be excused says about pairs of steps of a trace.
+
+    Args:
+        trace: The trace.
+        theory: The theory, without `auto`.
+        evidence: The evidence that this theory uses; made for it by default.
+    """
+    kinds = evidence_of(theory) if evidence is None else evidence
+    return Pairs.joined([e.pairs(trace) for e in kinds if e.axiom in theory.hard])
