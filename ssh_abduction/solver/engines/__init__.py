@@ -1,1 +1,1 @@
-"""Engines ask clingo for maps of a growing prefix of a trace."""
+"""Engines, which ask clingo for maps of a growing prefix of a trace."""

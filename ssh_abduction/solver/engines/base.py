@@ -1,4 +1,4 @@
-"""What all engines have in common: their task, what they find, and their protocol."""
+"""The protocol of all engines, and the values that go in (`Task`) and come out (`Found`)."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-# An engine with a chart tries a prefix of this many steps before one of AT_ONCE steps: most traces
-# are solved by then.
+# An engine with a chart first tries a prefix of this many steps, then one of AT_ONCE steps. For
+# most traces the first prefix is enough.
 FIRST_PREFIXES = 32
-# Compare at most this many steps in pairs: the matrix has the square of this number of bytes.
+# Compare at most this many steps in pairs: n steps need a matrix of n x n bytes.
 AT_ONCE = 8000
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A map of a prefix.
+    """A map of a prefix, with its cost.
 
     Attributes:
         map: The map.
-        cost: The preferred counts, first to last.
+        cost: The counts that the theory minimises, such as dstates, places and paths, in its order.
     """
 
     map: SSHMap
@@ -39,16 +39,16 @@ class Found:
 
     @staticmethod
     def of(ssh_map: SSHMap, theory: Theory) -> Found:
-        """A map with the counts that it shows."""
+        """Count what the map has, and return the map with this cost."""
         return Found(ssh_map, Cost.of(ssh_map).preferred_by(theory))
 
 
 @dataclass(frozen=True)
 class Task:
-    """What an engine works on.
+    """The problem that an engine solves, with the limits and speed-ups for it.
 
     Attributes:
-        problem: The whole trace, the settled theory and its evidence.
+        problem: The whole trace, the theory with all its defaults filled in, and the evidence.
         log: The trace as integers.
         watch: The limits of the search.
         speedups: The speed-ups that are on and hold for the theory.
@@ -66,12 +66,18 @@ class Task:
 
     @property
     def theory(self) -> Theory:
-        """The settled theory."""
+        """The theory of the problem, with all its defaults filled in."""
         return self.problem.theory
 
     @staticmethod
     def of(problem: Problem, watch: Watch | None = None, speedups: Speedups | None = None) -> Task:
-        """A task for all speed-ups that hold for the theory, or for these of them."""
+        """Make a task with those of the given speed-ups that hold for the theory.
+
+        Args:
+            problem: The trace, the theory and the evidence.
+            watch: The limits of the search; None for no limit.
+            speedups: The speed-ups that are on; None for the default ones.
+        """
         speedups = (speedups or Speedups()).that_hold_for(problem.theory)
         # `sides` treats each link between visits as a travel, so no action may have slipped.
         if speedups.sides and any(action.slipped for action in problem.trace.actions):
@@ -85,20 +91,20 @@ class Task:
 
     @property
     def has_processors(self) -> bool:
-        """Whether a search may use two threads."""
+        """Whether a search may use two threads: `threads` is on, and there are two processors."""
         return has_processors(self.speedups)
 
 
 class Engine(Protocol):
-    """What the search may call on an engine.
+    """The protocol of an engine, which asks clingo for maps of a prefix.
 
-    An engine holds the axioms for the first `size` steps of a trace, the prefix.
+    The prefix is the first `size` steps of the trace. The engine grounds the axioms for them.
 
     Attributes:
         asker: Asks clingo.
         intact: False after an error during which clingo may have missed rules.
-        lists_least: Whether it can list only maps with the fewest dstates of the prefix.
-        goes_on: Whether it can go on when its trace has grown.
+        lists_least: Whether it can only list maps that have the fewest dstates of the prefix.
+        goes_on: Whether `over` may be called after the trace has grown.
     """
 
     asker: Asker
@@ -108,86 +114,91 @@ class Engine(Protocol):
 
     @property
     def size(self) -> int:
-        """How many steps it was given."""
+        """The number of steps in the prefix."""
         ...
 
     @property
     def paths(self) -> int:
-        """How many names for paths it has."""
+        """The number of names for paths in the encoding. A map cannot have more paths."""
         ...
 
     @property
     def bound(self) -> int | None:
-        """A proven lower bound on the count that is preferred first; None if none is known."""
+        """A proven lower bound on the first count of the cost; None if none is known."""
         ...
 
     def grow(self, size: int) -> None:
-        """Let the prefix have `size` steps."""
+        """Make the first `size` steps the prefix."""
         ...
 
     def next_size(self, failed: int) -> int:
-        """The size to grow to when the maps of the prefix do not explain step `failed`."""
+        """Return the size to grow to when no map of the prefix explains step `failed`."""
         ...
 
     @property
     def size_to_go_on(self) -> int:
-        """The first size to grow to after a stop, when the trace has grown since."""
+        """The first size to grow to, when the trace has grown since the search stopped."""
         ...
 
     def with_paths(self, paths: int) -> Engine:
-        """Another engine, still for the empty prefix, with this many names for paths."""
+        """Make a new engine with this many names for paths. Its prefix is empty."""
         ...
 
     def over(self, task: Task) -> Engine:
-        """An engine for the grown trace of this one, under other limits."""
+        """Return an engine for a longer trace that begins with the trace of this engine.
+
+        Args:
+            task: The longer trace, with new limits.
+        """
         ...
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
-        """Maps of the prefix, each better than the one before.
+        """Yield maps of the prefix, each cheaper than the one before.
 
-        When the iteration ends, the last one is minimal.
+        When the iteration ends, the last map is minimal. Without any map, the prefix has none.
 
         Args:
-            most: An upper bound on their cost, if one is known.
+            most: An upper bound on the cost of the maps; empty if none is known.
         """
         ...
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        """All maps of the prefix of this cost; or `enough` of them, if not 0."""
+        """Yield the maps of the prefix that have this cost: `enough` of them, or all if it is 0."""
         ...
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled] | None:
-        """All labels of maps of the prefix of this cost, each once.
+        """Yield each labelling that maps of this cost have, once.
 
-        None if the engine does not find dstates before places and paths.
+        A labelling is the dstate of each step of the prefix. Each item gives the maps with one
+        labelling. Returns None if the engine does not find dstates before places and paths.
         """
         ...
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
-        """From now on no map has all of these equalities of steps of the prefix.
+        """Exclude all maps in which all of these equalities of steps hold, from now on.
 
         Returns:
-            Whether the engine can forbid such equalities.
+            False if the engine cannot forbid such equalities; then nothing has changed.
         """
         ...
 
     def settle(self) -> None:
-        """End what clingo still does, when a search is over.
+        """Stop all threads of the engine after a search.
 
-        A running thread would abort Python at its exit.
+        A thread that still runs clingo would abort Python at its exit.
         """
         ...
 
 
 def next_charted_size(size: int, failed: int, steps: int) -> int:
-    """The size to grow to, for an engine that charts a prefix.
+    """Return the size to grow to, for an engine that compares all pairs of steps beforehand.
 
-    Charting all steps is cheap, unless they are too many to be compared in pairs.
+    After the first prefix this is the whole trace, if it has at most `AT_ONCE` steps.
 
     Args:
-        size: How many steps the engine has.
-        failed: The step that the maps of the prefix do not explain.
-        steps: How many steps the trace has.
+        size: The number of steps in the prefix.
+        failed: The step that no map of the prefix explains.
+        steps: The number of steps in the trace.
     """
     if size < FIRST_PREFIXES:
         return min(steps, max(failed + 1, FIRST_PREFIXES))

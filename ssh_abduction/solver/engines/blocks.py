@@ -1,18 +1,20 @@
-"""A lower bound for long traces with faults, by disjoint blocks of steps.
+"""A lower bound on the cost of a long trace with faults, from disjoint blocks of its steps.
 
-This serves the faulty engine (`engines/faulty.py`). The bound holds for each map of the trace.
+The faulty engine (`engines/faulty.py`) uses this bound. It holds for every map of the trace.
 
-Let a map of the whole trace have N dstates. Cut down to a block of steps it is a map of that block,
-with N dstates at most. So its faults in the block cost at least as much as any map of the block
-with N dstates needs. Blocks that share no step add up:
+Take a map of the whole trace with N dstates. Restricted to a block of steps, it is a map of that
+block with at most N dstates. So its faults in the block cost at least as much as the cheapest
+faults of any map of the block with at most N dstates. Blocks that share no step add up:
 
     cost  >=  least over N of  (10 N + sum over blocks of the least faults with N dstates)
 
-The blocks may be other ones for each N. With few dstates short blocks take a fault, and there are
-many of them. With many dstates a block has to be long to take one, but then the dstates alone cost
-much. A block takes a fault if more than N of its steps would be pairwise distinct without one
-(a clique, `steps/apart.py`). If faults of a known map are too near to each other for that, clingo
-is asked whether the block has a cheaper map of N dstates.
+The blocks may differ for each N. With few dstates, short blocks already need a fault, and there are
+many of them. With many dstates only long blocks need one, but then the dstates alone cost much.
+
+A block needs a fault if it would otherwise contain a clique of more than N steps. A clique is a set
+of steps that are pairwise different dstates (`steps/apart.py`). Faults of the known map may be too
+close to each other for a block each. Then clingo is asked whether a block around all of them has a
+cheaper map with at most N dstates.
 """
 
 from __future__ import annotations
@@ -28,28 +30,30 @@ from ssh_abduction.solver.asp.limits import Watch
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.theory.evidence import Pairs
 
-# For each possible dstate, a block for clingo begins and ends this many more steps from the faults,
-# if there is room.
+# A block for clingo begins and ends up to this many steps, times the number of dstates, from the
+# faults.
 MARGIN = 3
-# Find the length of the shortest block to within a step, and one more step for each COARSE dstates
-# more than the known map has.
+# Find the length of the shortest block to within one step. Allow one more step for each COARSE
+# dstates beyond those of the known map.
 COARSE = 5
 # Ask clingo only about blocks up to this length, with at most this many names for dstates.
 MOST_STEPS = 200
 MOST_NAMES = 80
-CONFLICTS = 20_000  # After this many conflicts a question is left open.
+CONFLICTS = 20_000  # give up a question to clingo after this many conflicts
 
 
 @dataclass
 class Blocks:
     """Lower bounds on the cost of a trace, found with the help of a known map.
 
+    The kinds of fault are "misread" (a wrong view) and "slipped" (an action that failed).
+
     Attributes:
         seen: The observation at each step, as an integer.
-        actions: The action after each step, as an integer.
-        price: Tenths of dstates for each kind of fault that is allowed, at each step.
-        faults: The steps of the faults of the known map, by kind.
-        dstates: How many dstates the known map has.
+        actions: The action after each step but the last, as an integer.
+        price: For each kind of fault that is allowed, its cost at each step in tenths of dstates.
+        faults: For each kind, the steps at which the known map has a fault, in order.
+        dstates: The number of dstates of the known map.
         watch: The limits.
     """
 
@@ -59,39 +63,47 @@ class Blocks:
     faults: Mapping[str, Sequence[int]]
     dstates: int
     watch: Watch
-    # The proven costs, by block and number of dstates.
+    # For each block (begin, end) that clingo refuted: the most dstates and the most tenths for
+    # faults with which it has no map.
     _proven: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
 
     @property
     def cost(self) -> int:
-        """Tenths of dstates that the known map costs."""
+        """The cost of the known map, in tenths of dstates."""
         return 10 * self.dstates + self._known_cost(0, len(self.seen))
 
     def bound(self) -> int:
-        """Tenths of dstates that any map costs, at least; no more than the known map does."""
+        """Compute a lower bound on the cost of every map, in tenths of dstates.
+
+        The bound is at most the cost of the known map.
+        """
         bound = self.cost
-        most = -(-bound // 10) - 1  # a map of more dstates costs as much by these alone
+        most = -(-bound // 10) - 1  # the dstates of a larger map alone cost this bound
         while most > 0:
             least = self.least_faults(most)
             bound = min(bound, 10 * most + least)
-            # The same blocks serve all numbers in between.
+            # With fewer dstates faults cost at least as much. So skip all numbers of dstates that,
+            # with the cost of these faults, already reach the bound.
             most = min(most, -(-(bound - least) // 10)) - 1
         return bound
 
     def least_faults(self, most: int) -> int:
-        """What the faults cost, at least, in maps of at most this many dstates.
+        """Compute the least cost of faults in maps with at most `most` dstates.
 
-        This is the sum over blocks from the left, each as short as possible.
+        Blocks are cut off from the left, each as short as possible, and their costs added up.
+
+        Returns:
+            A lower bound in tenths of dstates.
         """
         total = begin = 0
         steps, places = (
             len(self.seen),
             sorted(step for found in self.faults.values() for step in found),
         )
-        reach = 0  # how far behind a fault the last block ended
+        reach = 0  # how many steps after a fault the last block ended
         while begin < steps:
             following = begin
-            if most >= self.dstates:  # the known map has no block before its next fault
+            if most >= self.dstates:  # a block needs a fault of the known map, too
                 number = bisect_left(places, begin)
                 if number == len(places):
                     return total
@@ -109,7 +121,18 @@ class Blocks:
         return total
 
     def _shortest(self, begin: int, fault: int, reach: int, most: int) -> int | None:
-        """The end of the shortest block from here that takes a fault; None if there is none."""
+        """Find the shortest block from `begin` that needs a fault.
+
+        Args:
+            begin: The first step of the block.
+            fault: The block ends after this step.
+            reach: The expected number of steps from `fault` to the end. The search starts there.
+            most: The number of dstates that a map may have.
+
+        Returns:
+            The step after the last one of the block, which may be a few steps longer than needed;
+            None if even the block to the end of the trace needs no fault.
+        """
         steps = len(self.seen)
         exact = 1 + max(most - self.dstates, 0) // COARSE
         low, high, stride = max(fault, begin + most), max(fault + reach, begin + most + 1), exact
@@ -128,11 +151,11 @@ class Blocks:
         return high
 
     def _fails(self, begin: int, end: int, low: int, most: int) -> bool:
-        """Whether a block that ends here, behind `low`, takes no fault."""
+        """Whether `end` is after `low` and the steps from `begin` up to it need no fault."""
         return end > low and not self._takes_fault(begin, end, most)
 
     def _takes_fault(self, begin: int, end: int, most: int) -> bool:
-        """Whether these steps need more dstates than `most` if they have no fault."""
+        """Whether the steps from `begin` up to `end` need a fault in a map of `most` dstates."""
         self.watch.check()
         return (
             end - begin > most
@@ -143,10 +166,17 @@ class Blocks:
     def _wider(
         self, begin: int, end: int, places: Sequence[int], most: int
     ) -> tuple[int, int] | None:
-        """A wider block, if faults of the known map are too close for blocks of their own.
+        """Widen a block to include the next faults of the known map, if they are close together.
+
+        Args:
+            begin: The first step of the block.
+            end: The step after the last one.
+            places: The steps of all faults of the known map, in order.
+            most: The number of dstates that a map may have.
 
         Returns:
-            The end of the block, and what its faults cost; None if that is not proven.
+            The end of the wider block and the cost of the known map's faults in it, in tenths;
+            None if there are no such faults, or no proof that this cost is the least.
         """
         first = behind = bisect_left(places, begin)
         while behind < len(places) and places[behind] < max(
@@ -170,15 +200,16 @@ class Blocks:
         return end, known
 
     def _refuted(self, begin: int, end: int, most: int, tenths: int) -> bool:
-        """Whether no map of these steps has at most these dstates and this cost of faults.
+        """Whether clingo proves that a block has no map within these limits.
 
-        Each view has one name more than there may be dstates, so no dstate is at the rest.
+        Each view has enough names for all dstates, so no dstate is at the rest, the one name that
+        dstates without a name of their own share.
 
         Args:
-            begin: The first step.
+            begin: The first step of the block.
             end: The step after the last one.
-            most: How many dstates.
-            tenths: What the faults cost at most.
+            most: The number of dstates that a map may have.
+            tenths: The cost that its faults may have, in tenths of dstates.
         """
         proven = self._proven.get((begin, end))
         if proven is None or proven[0] < most or proven[1] < tenths:
@@ -213,7 +244,7 @@ class Blocks:
         return True
 
     def _known_cost(self, begin: int, end: int) -> int:
-        """What the known map's faults cost at these steps and at the links between them."""
+        """The cost of the known map's faults at the steps of a block and the links between them."""
         last = {"misread": end, "slipped": end - 1}
         return sum(
             sum(

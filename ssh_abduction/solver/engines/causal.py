@@ -1,7 +1,7 @@
 """The engine for the causal theory on long traces.
 
-Its maps are labels with named dstates (`engines/naming.py`). It finds the fewest dstates, proves
-that there are no fewer, and lists all maps that have as few.
+It finds a map with the fewest dstates, proves that there are no fewer, and lists all such maps. The
+search for the dstate of each step is in `engines/naming.py`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ssh_abduction.theory.evidence import Equality
 
 
 class CausalEngine:
-    """The causal theory, fewest dstates."""
+    """The engine for the causal theory: it minimises the number of dstates."""
 
     lists_least = False
     goes_on = True
@@ -59,7 +59,7 @@ class CausalEngine:
         return map(self._found, self._named.all_of(cost[0], enough))
 
     def labellings(self, cost: tuple[int, ...]) -> None:
-        """Labels are the maps."""
+        """Return None: these maps have no places and paths that could differ for a labelling."""
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._named.forbid_together([(equality.first, equality.second) for equality in equalities])

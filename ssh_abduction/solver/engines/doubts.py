@@ -1,8 +1,9 @@
-"""Asks for maps that contradict what the known maps share.
+"""Searches for a map that contradicts something in which all known maps agree.
 
-This serves every engine. Steps may share a dstate, place, path or course in all known maps, but not
-in all maps; or in no known map, but in another. A *doubt* is one such pair. Clingo gets the rule
-for a doubt once. Then it is asked for an answer in which some open doubt holds.
+Every engine uses this. Two steps may share a dstate, place, path or course in all known maps, but
+not in an unknown one. Or they may share it in no known map, but in an unknown one. Either
+possibility is a *doubt*. Clingo gets the rule for each doubt once. Then it is asked for an answer
+in which some doubt of a given set holds.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from ssh_abduction.solver.asp.facts import path_reader, questions
 from ssh_abduction.solver.sharing import Sort
 
 Answer = TypeVar("Answer")
-# What is compared, two steps or two dstates, and whether the doubt is that they are one.
+# The sort of thing that may be shared, two steps or two dstates, and whether the doubt is that they
+# share it (True) or do not (False).
 Doubt: TypeAlias = tuple[Sort, int, int, bool]
 
 
 class Doubts:
-    """The doubts that one control was given."""
+    """The doubts whose rules one control of clingo has."""
 
     def __init__(
         self,
@@ -32,13 +34,13 @@ class Doubts:
         control: clingo.Control,
         condition: Callable[[Sort, int, int], str | None],
     ) -> None:
-        """Know no doubt yet.
+        """Begin without any doubt.
 
         Args:
             asker: Asks clingo.
-            control: The control that is asked.
-            condition: The body of a rule that says when two steps, or two dstates, are one; None
-                if they never are.
+            control: The control that gets the doubts and is asked.
+            condition: For a sort and two steps (or dstates), the body of the rule that they share
+                a thing of that sort; None if they never do.
         """
         self._asker, self._control, self._condition = asker, control, condition
         self._told: dict[Doubt, int] = {}  # the number of each doubt that clingo has
@@ -48,7 +50,16 @@ class Doubts:
     def answer(
         self, doubts: Collection[Doubt], read: Callable[[clingo.Model], Answer], mode: str
     ) -> Answer | None:
-        """An answer in which any of these doubts holds; None if there is none."""
+        """Find an answer in which at least one of the doubts holds.
+
+        Args:
+            doubts: The doubts.
+            read: Reads an answer of clingo.
+            mode: Clingo's opt-mode.
+
+        Returns:
+            The answer as `read` gives it; None if there is none.
+        """
         doubts = set(doubts)
         if not doubts:
             return None
@@ -77,7 +88,10 @@ class Doubts:
 
 
 class Settled:
-    """The best maps of some labels, for engines that find dstates before places and paths."""
+    """The best maps for one labelling, which gives the dstate of each step.
+
+    Engines that find dstates before places and paths use it.
+    """
 
     def __init__(
         self,
@@ -87,11 +101,11 @@ class Settled:
         reader: path_reader.PathReader,
         map_of: Callable[[path_reader.PathAnswer], SSHMap],
     ) -> None:
-        """Nothing is asked yet.
+        """Prepare the questions, without asking clingo yet.
 
         Args:
             asker: Asks clingo.
-            control: It has the places and paths of the labels.
+            control: Its answers are the places and paths for the labelling.
             mode: Clingo's opt-mode for the best maps.
             reader: Reads the answers.
             map_of: Makes a map from an answer.
@@ -102,11 +116,11 @@ class Settled:
         self._any: SSHMap | None = None
 
     def has_map(self) -> bool:
-        """Whether a map exists."""
+        """Whether the labelling has a map."""
         return self.any_map() is not None
 
     def any_map(self) -> SSHMap | None:
-        """Some map, if there is one."""
+        """Return some map, always the same one; None if there is none."""
         if self._any is None:
             with closing(
                 self._asker.answers(self._reader.read, self._mode, 1, control=self._control)
@@ -115,6 +129,6 @@ class Settled:
         return self._any
 
     def map_with(self, doubts: Collection[Doubt]) -> SSHMap | None:
-        """A map in which any of these doubts about its dstates holds; None if there is none."""
+        """Find a map in which at least one of these doubts about dstates holds; else None."""
         answer = self._doubts.answer(doubts, self._reader.read, self._mode)
         return None if answer is None else self._map_of(answer)

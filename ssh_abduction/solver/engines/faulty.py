@@ -1,14 +1,17 @@
-"""For the causal theory with faults: finds all maps with the fewest dstates and faults.
+"""The engine for the causal theory with faults: it finds all maps of least cost.
 
-A view may be misread, and an action may slip. Clingo is given some steps of the trace
-(`faulty_control.py`). Fewer steps are fewer constraints, so their cost is a lower bound for the
-whole trace. A map of the given steps is followed through the others. If it predicts all views
-there, it is a minimal map of the whole trace. If not, clingo is given the steps around.
+A view may be misread, and an action may slip. A map costs its dstates and its faults. Clingo is
+given only some steps of the trace (`faulty_control.py`). Fewer steps are fewer constraints, so
+their cost is a lower bound for the whole trace. A map of the given steps is then followed through
+all other steps. If it predicts all views there, it is a minimal map of the whole trace. If not,
+clingo gets more steps.
 
-A Viterbi pass chooses these steps: it finds the fewest faults with which a map explains the whole
-trace (Viterbi 1967). The result is a map of the whole trace, the incumbent. The first maps are
-guessed (`guesses/robust.py`). Clingo is only asked for cheaper ones. The bound of a long trace
-comes from blocks of it (`engines/blocks.py`).
+A Viterbi pass chooses the further steps (Viterbi 1967). It explains the whole trace by the links
+that clingo found, with the cheapest faults. Clingo gets the steps at fault and those around them.
+The explanation is also a map of the whole trace, so it may be the new incumbent.
+
+The first maps are guessed (`guesses/robust.py`), and clingo is only asked for cheaper ones. The
+bound of a long trace comes from its blocks (`engines/blocks.py`).
 """
 
 from __future__ import annotations
@@ -26,26 +29,30 @@ from ssh_abduction.solver.engines.faulty_control import LONG, FaultyAnswer, Faul
 from ssh_abduction.solver.guesses.robust import Explained, Explainer, Machine, robust_maps
 from ssh_abduction.theory.evidence import Equality
 
-FEW = 80  # no map of fewer steps is guessed, as clingo is fast
-AT_FIRST = 1000  # steps at the beginning that clingo is given at once
-PLACES = 12  # steps ignored by the Viterbi pass around which more are given at once
-SPARE = 3  # names of each view beyond those of the best guess; with 1 the rests are used
-GUESSING = 5.0  # seconds after which no start of EM begins,
-GUESSING_SHARE = 0.1  # or a share of the time left
+FEW = 80  # make no guess for a trace of at most this many steps, as clingo is fast
+AT_FIRST = 1000  # clingo gets this many first steps at the beginning
+PLACES = 12  # after a Viterbi pass, clingo gets the steps around at most this many faults
+SPARE = 3  # names of each view beyond those of the best guess; 1 would be too few for most views
+# Begin no start of EM after this many seconds, or after this share of the time left.
+GUESSING = 5.0
+GUESSING_SHARE = 0.1
 
 
 class FaultyEngine:
-    """The causal theory with faults, fewest dstates and faults."""
+    """The engine for the causal theory with faults.
+
+    It minimises the cost of dstates and faults together.
+    """
 
     lists_least = False
     goes_on = False
 
     def __init__(self, task: Task, most_faults: int | None = None) -> None:
-        """Give nothing to clingo yet.
+        """Begin with an empty prefix.
 
         Args:
-            task: What to solve.
-            most_faults: If given, a map may have this many faults, and faults cost nothing.
+            task: The problem, the limits and the speed-ups.
+            most_faults: If given, a map may have up to this many faults, and they cost nothing.
         """
         self.asker = Asker(task.watch)
         self.intact = True
@@ -55,14 +62,14 @@ class FaultyEngine:
         self.bound: int | None = None
         self._task = task
         self._seen, self._actions = task.log.seen, task.log.actions
-        # Tenths of dstates for each kind of fault that may be, at each step.
+        # For each kind of fault that is allowed, its cost at each step in tenths of dstates.
         self._price = {
             kind: [task.theory.fault_tenths(kind, step) for step in task.trace.steps]
             for kind in ("misread", "slipped")
             if getattr(task.theory, kind)
         }
-        self._best: int | None = None  # cost of the best known map, in tenths of dstates
-        self._known: SSHMap | None = None  # this map
+        self._best: int | None = None  # cost of the incumbent, in tenths of dstates
+        self._known: SSHMap | None = None  # the incumbent
         self._explainer = Explainer(self._seen, self._actions, self._price, task.watch.check)
         self._control = FaultyControl(task, self.asker, self._price, most_faults, self._raise_bound)
 
@@ -80,13 +87,13 @@ class FaultyEngine:
         return len(self._task.trace)
 
     def grow(self, size: int) -> None:
-        """Take the whole trace as the prefix. Clingo is given the steps it needs."""
+        """Take the whole trace as the prefix. Clingo gets only its first steps for now."""
         if size != self.size:
             self.size = size
             self._control.given = set(range(min(size, AT_FIRST)))
             for t, others in self._task.log.pairs.one.items():
                 self._control.given |= {t, *others}
-                self._control.full |= {t, *others}  # a fault evades no equality
+                self._control.full |= {t, *others}  # also misread steps must be equal
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         best = self._best = self._known = None
@@ -99,7 +106,10 @@ class FaultyEngine:
                     return
 
     def _guessed(self) -> Iterator[Found]:
-        """Guessed maps of the whole trace. The best one decides clingo's names and steps."""
+        """Yield guessed maps of the whole trace, each cheaper than the one before.
+
+        Clingo gets as many names as the best guess has dstates, and the steps around its faults.
+        """
         if self.size <= FEW or self._task.log.pairs.one or not self._price:
             return
         watch = self._task.watch
@@ -116,7 +126,7 @@ class FaultyEngine:
                 return
 
     def _bound_by_blocks(self) -> None:
-        """Raise the bound of a long trace by disjoint blocks of it."""
+        """Raise the lower bound of a long trace by its blocks (`engines/blocks.py`)."""
         if self.size >= LONG and self._known is not None and self._most_faults is None:
             faults = {
                 kind: [fault.step for fault in self._known.faults if fault.kind == kind]
@@ -133,7 +143,10 @@ class FaultyEngine:
             self._raise_bound([blocks.bound()])
 
     def _asked(self) -> Iterator[Found]:
-        """Maps of the whole trace made of answers for the given steps; the best one is minimal."""
+        """Yield maps of the whole trace, made from clingo's answers for the given steps.
+
+        At the end, the cheapest map known is minimal.
+        """
         self._bound_by_blocks()
         while self._best is None or self._best > (self.bound or 0):
             answer = None
@@ -153,7 +166,7 @@ class FaultyEngine:
             self._control.give_around([failed, *doubted] if failed >= 0 else doubted)
 
     def _cost_of(self, found: Found) -> int:
-        """Tenths of dstates, as clingo counts them."""
+        """The cost of a map as clingo counts it, in tenths of dstates."""
         return found.cost[0] if self._most_faults is None else 10 * len(found.map.dstates)
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
@@ -176,7 +189,7 @@ class FaultyEngine:
                 self._control.give_around([failed])
 
     def labellings(self, cost: tuple[int, ...]) -> None:
-        """Labels are the maps."""
+        """Return None: these maps have no places and paths that could differ for a labelling."""
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._control.forbidden.append(equalities)
@@ -189,12 +202,16 @@ class FaultyEngine:
         """Do nothing: clingo stops after each answer."""
 
     def _raise_bound(self, bound: Sequence[int]) -> None:
-        """A bound for the given steps holds for the whole trace."""
+        """Take over a bound that clingo proved. What holds for the given steps holds for all."""
         if bound and self._most_faults is None:
             self.bound = max(self.bound or 0, bound[0])
 
     def _machine(self, answer: FaultyAnswer) -> tuple[dict[int, int], Machine]:
-        """Number the dstates of an answer by first visit, and make them a machine."""
+        """Make a machine, which is dstates and links, from an answer.
+
+        Returns:
+            The number of each name of a dstate, in the order of first visits; and the machine.
+        """
         number: dict[int, int] = {}
         for t in sorted(answer.where):
             number.setdefault(answer.where[t], len(number))
@@ -207,10 +224,11 @@ class FaultyEngine:
         return number, Machine([view_of[name] for name in number], goes)
 
     def _followed(self, answer: FaultyAnswer) -> tuple[list[int] | None, int]:
-        """Follow the map of the given steps through all others.
+        """Follow the links of an answer through the steps that clingo was not given.
 
         Returns:
-            The dstate of each step and -1; or None and a step neither given nor predicted.
+            The dstate of each step, and -1. If that fails: None, and a step to give to clingo
+            next. The links do not explain this step, or evidence contradicts its dstate.
         """
         number, machine = self._machine(answer)
         labels: list[int] = []
@@ -235,10 +253,11 @@ class FaultyEngine:
         return labels, -1
 
     def _explained(self, answer: FaultyAnswer) -> tuple[Found | None, list[int]]:
-        """Explain the whole trace by the dstates of an answer, with the fewest faults.
+        """Explain the whole trace by the dstates and links of an answer, with the cheapest faults.
 
         Returns:
-            The map, if allowed, and the first steps that it ignores or lacks, of those not given.
+            The map of the whole trace, or None if it is not allowed; and the first steps that
+            clingo was not given and that have a fault or an action without a link.
         """
         _, machine = self._machine(answer)
         if not machine.shows:  # all given steps are lost
@@ -252,7 +271,12 @@ class FaultyEngine:
         return self._map_of(self._explainer.completed(machine)), doubted[:PLACES]
 
     def _map_of(self, explained: Explained) -> Found | None:
-        """The map of an explanation of the trace; None if its faults are not allowed."""
+        """Make a map of an explanation of the trace.
+
+        Returns:
+            The map with its cost. None if its faults are not allowed, a dstate never has its view,
+            or the map breaks an equality of the evidence or a forbidden set.
+        """
         labels, shows = explained.labels, explained.machine.shows
         if (explained.misread and "misread" not in self._price) or (
             explained.slips and "slipped" not in self._price
@@ -260,7 +284,7 @@ class FaultyEngine:
             return None
         if set(labels) - {
             s for t, s in enumerate(labels) if shows[s] == self._seen[t]
-        }:  # a dstate whose view is never read right
+        }:  # the view of some dstate is misread each time
             return None
         if any(
             all(labels[one.first] == labels[one.second] for one in together)
@@ -280,7 +304,14 @@ class FaultyEngine:
         number: Mapping[int, int],
         shows: Sequence[int] | None = None,
     ) -> Found:
-        """A map of the whole trace, and what it costs."""
+        """Make a map of the whole trace, with its cost.
+
+        Args:
+            labels: The dstate of each step.
+            slips: The steps whose action slipped.
+            number: The names of dstates, in the order of their numbers. Used if `shows` is None.
+            shows: The view of each dstate.
+        """
         view_of = dict(faulty_lp.faulty_names(self._control.names))
         shown = self._shown_somewhere(labels, shows or [view_of[name] for name in number])
         misread = [t for t in range(self.size) if shown[labels[t]] != self._seen[t]]
@@ -291,7 +322,14 @@ class FaultyEngine:
         )
 
     def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
-        """The view of each dstate. One always misread gets the view seen there most often."""
+        """Return the view of each dstate, corrected if it is never seen there.
+
+        Such a dstate gets the view that is seen there most often.
+
+        Args:
+            labels: The dstate of each step.
+            shown: The view of each dstate so far.
+        """
         views = list(shown)
         for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:
             views[s] = Counter(

@@ -1,11 +1,12 @@
-"""Asks clingo about some steps of a trace with faults (faulty.lp).
+"""The control of clingo for some steps of a trace with faults (faulty.lp).
 
-Dstates have names. Each view has some names and a *rest*, which stands for all its other dstates.
-A rest costs one dstate and imposes nothing on the steps at it. So a minimal answer without rests
-is minimal for any number of names. If an answer uses a rest, its view gets more names.
+Clingo assigns a name, which is a dstate, to each step. Each view has some names and a *rest*. The
+rest is one name for all other dstates of the view. A rest costs one dstate, and no axiom constrains
+the steps at it. So a minimal answer without rests is minimal for any number of names. If an answer
+uses a rest, its view gets more names.
 
-At first a misread step is *lost*: nothing links it with other steps. If a minimal answer loses a
-step, the step becomes *full*: it may be at any dstate.
+At first a misread step is *lost*: it has no dstate, so no link leads to or from it. If a minimal
+answer loses a step, the step becomes *full*: it may be at any dstate.
 """
 
 from __future__ import annotations
@@ -22,23 +23,23 @@ from ssh_abduction.solver.asp.facts.atoms import numbers
 from ssh_abduction.solver.engines.base import Task
 from ssh_abduction.theory.evidence import Equality
 
-LONG = 1000  # a trace of more steps is bounded by blocks before clingo is asked
-AROUND = 8  # steps given before and after one that a map does not predict
+LONG = 1000  # from this many steps on, blocks give the bound before clingo is asked
+AROUND = 8  # clingo gets this many steps before and after one that a map does not predict
 NAMES = 3  # names of each view at first
-MORE_NAMES = 2  # further names of a view whose rest is used
+MORE_NAMES = 2  # names added to a view whose rest is used
 OPTIONS = ("--opt-strategy=usc,stratify",)
 
 
 @dataclass(frozen=True)
 class FaultyAnswer:
-    """An answer of clingo.
+    """An answer of clingo for the given steps.
 
     Attributes:
-        cost: Tenths of dstates.
-        where: The name of the dstate of each given step.
+        cost: The cost of dstates and faults, in tenths of dstates.
+        where: The name of the dstate of each given step that is not lost.
         slips: The given steps whose action slipped.
         lost: The given steps that are misread and at no dstate.
-        rests: The views whose rest is used.
+        rests: The views, as integers, whose rest is used.
     """
 
     cost: int
@@ -49,18 +50,18 @@ class FaultyAnswer:
 
     @property
     def is_open(self) -> bool:
-        """Whether clingo needs more names or steps before this can be a map."""
+        """Whether the answer is no map yet, as it uses a rest or loses a step."""
         return bool(self.rests or self.lost)
 
 
 @dataclass
 class _Told:
-    """What the present control was given.
+    """A record of everything that the present control was given.
 
     Attributes:
         names: The number of names of each view.
         full: The steps that may be at any dstate.
-        steps: The given steps, in the order in which they were given.
+        steps: The steps, in the order in which clingo got them.
         batches: The number of batches of steps.
         forbidden: The number of forbidden sets.
     """
@@ -73,13 +74,15 @@ class _Told:
 
 
 class FaultyControl:
-    """Asks clingo about the given steps.
+    """Asks clingo for answers for the given steps.
+
+    Changes of the attributes take effect with the next question.
 
     Attributes:
-        names: The number of names of each view, besides its rest.
-        given: The steps that clingo is given.
+        names: The number of names of each view, not counting its rest.
+        given: The steps that clingo knows.
         full: The steps that may be at any dstate, even if their view is misread.
-        forbidden: Sets of equalities of steps that do not all hold.
+        forbidden: Sets of equalities of steps. In no answer do all equalities of one set hold.
     """
 
     def __init__(
@@ -90,13 +93,13 @@ class FaultyControl:
         most_faults: int | None,
         on_bound: Callable[[Sequence[int]], None],
     ) -> None:
-        """Give nothing to clingo yet.
+        """Begin without any given step.
 
         Args:
-            task: What to solve.
+            task: The problem, the limits and the speed-ups.
             asker: Asks clingo.
-            price: Tenths of dstates that each kind of fault costs, at each step.
-            most_faults: If given, a map may have this many faults, and faults cost nothing.
+            price: For each kind of fault, its cost at each step in tenths of dstates.
+            most_faults: If given, a map may have up to this many faults, and they cost nothing.
             on_bound: Called with each bound that clingo proves.
         """
         self.names = dict.fromkeys(range(max(task.log.seen) + 1), NAMES)
@@ -108,20 +111,20 @@ class FaultyControl:
         self._told = _Told()
 
     def give_around(self, steps: Collection[int]) -> None:
-        """Give clingo these steps, and those around them."""
+        """Add these steps, and `AROUND` steps before and after each, to the given ones."""
         size = len(self._log.seen)
         for step in steps:
             self.given |= set(range(max(step - AROUND, 0), min(step + AROUND + 1, size)))
 
     def learn_from(self, answer: FaultyAnswer) -> None:
-        """Add the names and full steps that an open answer asks for."""
+        """Add names for the rests that an answer uses, and make its lost steps full."""
         if answer.rests:
             used = Counter(
                 view
                 for name, view in faulty_lp.faulty_names(self.names)
                 if name in set(answer.where.values())
             )
-            # A view with all its names in use soon needs another one.
+            # A view whose names are all used gets one more, as it may soon need it.
             for view in self.names:
                 self.names[view] += (
                     MORE_NAMES if view in answer.rests else used[view] == self.names[view]
@@ -129,7 +132,7 @@ class FaultyControl:
         self.full |= answer.lost
 
     def _prepare(self) -> None:
-        """Give clingo what it lacks, in a new control if names changed."""
+        """Bring the control up to date. Make a new one if names or full steps have changed."""
         with self._asker.grounding_timed():
             if (self._told.names, self._told.full) != (self.names, self.full):
                 self._begin()
@@ -143,7 +146,7 @@ class FaultyControl:
             told.forbidden = len(self.forbidden)
 
     def _begin(self) -> None:
-        """Make a control that has the names, and no step yet."""
+        """Make a control with the present names, but without steps."""
         self._told = _Told(dict(self.names), set(self.full))
         control = self._asker.control = Control(OPTIONS, self._asker.watch.check)
         control.load_encodings("faulty")
@@ -152,7 +155,7 @@ class FaultyControl:
         control.ground([("base", [])])
 
     def _give(self, new: list[int]) -> None:
-        """Ground one batch of steps."""
+        """Ground the rules for new steps, as one batch."""
         control, told, batch = self._asker.control, self._told, self._told.batches
         seen, actions, pairs = self._log.seen, self._log.actions, self._log.pairs
         price = self._price
@@ -170,15 +173,26 @@ class FaultyControl:
         told.batches += 1
 
     def answers(self, mode: str) -> Iterator[FaultyAnswer]:
-        """Answers for the given steps, each cheaper than the one before; the last is minimal."""
+        """Yield answers for the given steps, each cheaper than the one before.
+
+        The last answer is minimal.
+
+        Args:
+            mode: Clingo's opt-mode.
+        """
         self._prepare()
         yield from self._asker.answers(self._read, mode, 0, on_bound=self._on_bound)
 
     def answers_of_cost(self, cost: int, enough: int) -> Iterator[FaultyAnswer]:
-        """Answers for the given steps of the least cost, each once; `enough` of them, 0 for all."""
+        """Yield each answer for the given steps that has the least cost, once.
+
+        Args:
+            cost: The least cost, in tenths of dstates.
+            enough: The number of answers after which to stop; 0 for all.
+        """
         self._prepare()
         seen: set[tuple[frozenset[tuple[int, int]], frozenset[int]]] = set()
-        # Blocks prove the bound of a long trace, not the given steps.
+        # The bound of a long trace comes from blocks. Clingo cannot prove it from the given steps.
         mode = f"optN,{cost}" if len(self._log.seen) < LONG else f"enum,{cost}"
         for answer in self._asker.answers(self._read, mode, 0):
             key = frozenset(answer.where.items()), answer.slips
