@@ -1,8 +1,9 @@
 """Find every minimal topological map that explains what a robot saw and did.
 
-Each name is loaded when it is first used. The command line therefore starts at once and hears
-Ctrl-C from then on. This module imports nothing, not even `__future__`, before `__main__` has put
-the current folder behind Python's own modules.
+Each exported name is loaded when it is first used. So the command line starts at once, and Ctrl-C
+works from its start. This module itself imports nothing when it is loaded, not even `__future__`:
+Python may still search the current folder first then, where a file could take the place of a
+module of Python. `__main__` moves that folder to the end of the search path.
 """
 
 TYPE_CHECKING = False  # as in typing, which takes longer to load than this whole module
@@ -42,8 +43,7 @@ _HOMES = {  # package: the names that are exported from it
     "theory": ("Theory",),
 }
 
-# Names of version 0.1.0: each still works in this version, with a warning that says where it is
-# now.
+# Names of version 0.1.0. Each still works in this version, with a warning that gives its new home.
 _MOVED = {
     "Action": "data.Action",
     "Backbone": "solver.Backbone",
@@ -120,6 +120,10 @@ def lazy_names(
         package: The package's `__name__`.
         homes: For each module of the package, the names to take from it.
         exported: All names that the package exports.
+
+    Returns:
+        The function `__getattr__`, which loads and returns the value of a name, and the function
+        `__dir__`, which lists all names.
     """
     import sys
 

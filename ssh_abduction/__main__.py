@@ -1,11 +1,11 @@
-"""The command line as a program. It handles Ctrl-C before it loads anything else."""
+"""The entry point of the command line. It handles Ctrl-C before it loads the other modules."""
 
 import os
 import sys
 
 from ssh_abduction.runtime import program
 
-# `python -m` puts the current folder first. A file there must not hide a module of Python's.
+# `python -m` puts the current folder first. A file there must not hide a module of Python.
 sys.path[:] = program.search_path()
 
 try:
@@ -13,7 +13,7 @@ try:
 except KeyboardInterrupt:
     os._exit(program.interrupted_code())
 
-TYPE_CHECKING = False  # as in typing, which takes longer to load than all that is here
+TYPE_CHECKING = False  # as in typing, which takes longer to load than this whole module
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 def run() -> "NoReturn":
     """Run the command line and exit with its code.
 
-    After Ctrl-C at any time the code is 130, after SIGTERM 143, and there is no traceback.
+    The exit code is 130 after Ctrl-C and 143 after SIGTERM, whenever these come. No traceback is
+    printed.
     """
     numbers = [
         number
@@ -45,10 +46,14 @@ def run() -> "NoReturn":
 
 
 def _interrupt(number: int, frame: "FrameType | None") -> None:
-    """Ctrl-C is a KeyboardInterrupt, but while a module is loaded it ends the program at once.
+    """Handle a signal: raise KeyboardInterrupt, or end the program if a module is being loaded.
 
-    Nothing is lost by that; and what is written in C, such as numpy, prints a traceback or makes
-    another error of a KeyboardInterrupt.
+    While modules are loaded, there is no result that could be lost. A KeyboardInterrupt would be
+    unsafe then: C code, such as that of numpy, prints a traceback or turns it into another error.
+
+    Args:
+        number: The number of the signal, SIGINT (Ctrl-C) or SIGTERM.
+        frame: The Python frame that the signal interrupted.
     """
     program.heard.append(number)
     while frame is not None:

@@ -1,6 +1,7 @@
 """The values that all other packages share: traces, maps, stars, odometry, files and errors.
 
-Each name is loaded when it is first used, so that a program loads only what it needs.
+A star is what a robot sees of the ways out of a place. Each name is loaded when it is first used,
+so that a program loads only what it needs.
 """
 
 from ssh_abduction import lazy_names

@@ -1,4 +1,4 @@
-"""Actions: sequences of control laws between distinctive states."""
+"""Actions, which take the robot from one distinctive state (a place and a direction) to another."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ class Action:
     The causal axioms read the name only. The topological axioms read `kind` and `turn`.
 
     Attributes:
-        name: The name. Two actions of a trace that share it must be equal.
+        name: The name. Actions of a trace with the same name must be equal.
         kind: "travel", "turn", or None for other actions.
-        turn: Which way a turn goes: "right", "left" or "around".
+        turn: The direction of a turn: "right", "left" or "around".
         extra: Fields of the trace file that this package does not know.
-        gateway: Which gateway a turn right or left ends at, counted from 1 to that side. A gateway
-            that the robot faces before the turn does not count.
-        bearing: Degrees of a turn, clockwise.
+        gateway: For a turn right or left, the number of the gateway (way out of a place) that it
+            ends at. They are counted from 1 in the direction of the turn, without one straight
+            ahead.
+        bearing: The angle of a turn in degrees, clockwise. If it is given, it sets `turn`.
     """
 
     name: str
@@ -79,7 +80,7 @@ class Action:
             )
 
     def _turn_of_bearing(self) -> TurnDirection:
-        """Which way a turn by the bearing goes."""
+        """Return the direction of a turn by `bearing` degrees, or raise TraceError."""
         if self.kind != "turn" or not is_finite(self.bearing):
             raise TraceError(
                 f"action.bearing: expected degrees clockwise, for a turn, "
@@ -100,18 +101,25 @@ class Action:
 
     @staticmethod
     def that_slipped(step: int) -> Action:
-        """The action of a step that did not do what its name says. It equals no other action."""
+        """Make the action that replaces one which did not do what its name says.
+
+        Args:
+            step: The step where the action was done. The new action equals none of another step.
+        """
         number = a_whole_number("step", step, TraceError)
         return Action(f"slipped at step {number}", extra={"slipped": True})
 
     @property
     def slipped(self) -> bool:
-        """Whether `that_slipped` made this action."""
+        """Whether this action was made by `that_slipped`."""
         return self.kind is None and self.extra.get("slipped") is True
 
     @property
     def in_quarters(self) -> bool:
-        """Whether a turn of this action is only given as right, left or around, by quarters."""
+        """Whether right angles describe this action.
+
+        True unless it names a gateway, or its bearing is not near the right angle of its turn.
+        """
         if self.gateway is not None:
             return False
         if self.bearing is None:
@@ -121,7 +129,9 @@ class Action:
 
     @staticmethod
     def of(value: Action | str | Mapping[str, Any]) -> Action:
-        """An action from its name, or from an object with some of its fields.
+        """Make an action of its name, or of a mapping with some of its fields.
+
+        The names travel, right, left and around also set `kind` and `turn`.
 
         Raises:
             TraceError: If a field is wrong.
@@ -129,14 +139,14 @@ class Action:
         return value if isinstance(value, Action) else parse_action(value, "action")
 
     def to_json(self) -> Any:
-        """The name, or an object if the name does not say everything."""
+        """Return the name, or a dict with the fields if the name does not say everything."""
         if self == STANDARD_ACTIONS.get(self.name, Action(self.name)) and not self.extra:
             return self.name
         known = {name: getattr(self, name) for name in _FIELDS}
         return {**{k: v for k, v in known.items() if v is not None}, **self.extra}
 
 
-# Actions whose names say what they are.
+# Actions whose names determine their kinds and turns.
 STANDARD_ACTIONS: dict[str, Action] = {
     "travel": Action("travel", "travel"),
     "right": Action("right", "turn", "right"),
@@ -146,7 +156,15 @@ STANDARD_ACTIONS: dict[str, Action] = {
 
 
 def parse_action(value: Any, where: str) -> Action:
-    """An action of a trace file. Its errors begin with `where`."""
+    """Make an action of a value in a trace file.
+
+    Args:
+        value: The name, or an object with some of the fields.
+        where: File, line and field, for error messages.
+
+    Raises:
+        TraceError: If a field is wrong.
+    """
     if isinstance(value, str):
         value = {"name": value}
     if not isinstance(value, Mapping):
@@ -155,7 +173,7 @@ def parse_action(value: Any, where: str) -> Action:
             f"name the action"
         )
     name, kind, turn, gateway, bearing = (value.get(key) for key in _FIELDS)
-    # Names of standard actions say the kind and the turn, if nothing else does.
+    # The name of a standard action sets kind and turn, if no other field is given.
     standard = STANDARD_ACTIONS.get(name) if isinstance(name, str) else None
     if standard is not None and kind is turn is gateway is bearing is None:
         kind, turn = standard.kind, standard.turn

@@ -1,4 +1,4 @@
-"""Checks of the arguments of public functions. Each returns the value or raises an error.
+"""Check the arguments of public functions. Each check returns the value or raises an error.
 
 >>> from ssh_abduction.data.checks import a_number, one_of
 >>> from ssh_abduction.data.errors import MapError, SolverError
@@ -11,9 +11,9 @@ ssh_abduction.data.errors.SolverError: near: expected metres above 0, got -1; ch
 Traceback (most recent call last):
 ssh_abduction.data.errors.MapError: level: expected places or dstates, got 'all'; take one of these
 
-All checks take what messages call the argument, its value, and the error to raise. Numbers of
-numpy are numbers; truth values are not. A path is a text, or an os.PathLike that stands for a text.
-Bytes are not a path: decode them with os.fsdecode.
+Most checks take the name of the argument for error messages, its value, and the class of the error
+to raise. Numbers of numpy are accepted as numbers; booleans are not. A path is a text, or an
+os.PathLike that gives a text. Bytes are not accepted as a path: decode them with os.fsdecode.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ def a_number(
     what: str = "a number",
     mend: str = "change it",
 ) -> float:
-    """A finite number from `low` to `high` that is greater than `above`.
+    """Return a value as a float if it is a finite number from `low` to `high` and above `above`.
 
     Args:
-        name: What messages call the argument.
+        name: The name of the argument in messages.
         value: What the caller gave.
-        error: The error to raise.
+        error: The class of the error to raise.
         low: The least number allowed.
         high: The greatest number allowed.
-        above: A bound that is not allowed itself.
-        what: What messages call such numbers, with their unit.
-        mend: What the caller should do.
+        above: A bound below all allowed numbers, not allowed itself.
+        what: The kind of number in messages, with its unit, such as "metres".
+        mend: What messages tell the caller to do.
     """
     if is_finite(value) and low <= value <= high and value > above:
         return float(value)
@@ -67,14 +67,17 @@ def a_whole_number(
     what: str = "a whole number",
     mend: str = "change it",
 ) -> int:
-    """A whole number from `low` to `high`. The arguments are those of `a_number`."""
+    """Return a value as an int if it is a whole number from `low` to `high`.
+
+    The arguments are those of `a_number`.
+    """
     if is_whole(value) and low <= value <= high:
         return int(value)
     raise error(f"{name}: expected {what}{_between(low, high)}, got {brief(value)}; {mend}")
 
 
 def a_count_of_maps(value: object, error: Kind) -> int | None:
-    """The most maps to list, 1 or more; None for all."""
+    """Return the largest number of maps to list: 1 or more, or None for all maps."""
     mend = "None lists all (--maps 0)"
     return (
         None if value is None else a_whole_number("max_maps (--maps)", value, error, 1, mend=mend)
@@ -84,7 +87,7 @@ def a_count_of_maps(value: object, error: Kind) -> int | None:
 def numbers(
     name: str, value: object, error: Kind, length: int, what: str, mend: str = "change it"
 ) -> tuple[float, ...]:
-    """A given number of finite numbers, from a list, a tuple or an array."""
+    """Return a list, tuple or array as a tuple of floats if it has `length` finite numbers."""
     listed = value.tolist() if hasattr(value, "tolist") else value
     if (
         isinstance(listed, Sequence)
@@ -97,14 +100,14 @@ def numbers(
 
 
 def a_flag(name: str, value: object, error: Kind) -> bool:
-    """True or false, perhaps of numpy."""
+    """Return a value as a bool if it is one, also one of numpy."""
     if isinstance(value, bool) or type(value).__name__ == "bool":  # numpy's, without loading numpy
         return bool(value)
     raise error(f"{name}: expected true or false, got {brief(value)}; take one of these")
 
 
 def a_text(name: str, value: object, error: Kind, *, mend: str = "give a text") -> str:
-    """A text, which may be empty."""
+    """Return a value if it is a text, which may be empty."""
     if isinstance(value, str):
         return value
     raise error(f"{name}: expected a text, got {brief(value)}; {mend}")
@@ -118,7 +121,7 @@ def one_of(
     *,
     mend: str = "take one of these",
 ) -> str:
-    """One of several texts."""
+    """Return a value if it is one of several texts."""
     known = list(choices)
     if isinstance(value, str) and value in known:
         return value
@@ -127,7 +130,7 @@ def one_of(
 
 
 def an_instance(name: str, value: object, kind: type[T], error: Kind, *, mend: str) -> T:
-    """A value of a class."""
+    """Return a value if it is an instance of a class."""
     if isinstance(value, kind):
         return value
     article = "an" if kind.__name__.startswith(("A", "E", "I", "O", "SSH")) else "a"
@@ -137,7 +140,10 @@ def an_instance(name: str, value: object, kind: type[T], error: Kind, *, mend: s
 def all_instances(
     name: str, values: object, kind: type[T], error: Kind, *, mend: str
 ) -> tuple[T, ...]:
-    """Values of a class, from any iterable. Messages name the first one that is wrong."""
+    """Return an iterable as a tuple if all its values are instances of a class.
+
+    Messages name the first value that is wrong.
+    """
     return tuple(
         an_instance(f"{name}[{i}]", value, kind, error, mend=mend)
         for i, value in enumerate(a_list(name, values, error))
@@ -147,28 +153,28 @@ def all_instances(
 def a_list(
     name: str, value: object, error: Kind, *, what: str = "a list", mend: str = "give a list"
 ) -> list[Any]:
-    """The members of an iterable that is not a text, bytes or a mapping."""
+    """Return the members of an iterable as a list, unless it is a text, bytes or a mapping."""
     if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
         return list(value)
     raise error(f"{name}: expected {what}, got {brief(value)}; {mend}")
 
 
 def an_object(name: str, value: object, error: Kind) -> Mapping[str, Any]:
-    """A mapping from names to values."""
+    """Return a value if it is a mapping whose keys are texts."""
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return value
     raise error(f'{name}: expected an object, got {brief(value)}; write {{"name": value}}')
 
 
 def a_function(name: str, value: object, error: Kind, *, what: str) -> Callable[..., Any]:
-    """A function, or anything else that can be called."""
+    """Return a value if it can be called."""
     if callable(value):
         return value
     raise error(f"{name}: expected {what}, got {brief(value)}; give a function")
 
 
 def a_path(name: str, value: object, error: Kind) -> str:
-    """The path of a file, as a text. Whether it is possible shows when the file is opened."""
+    """Return the path of a file as a text. The file need not exist."""
     path = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if isinstance(path, str):
         return path
@@ -179,7 +185,7 @@ def a_path(name: str, value: object, error: Kind) -> str:
 
 
 def _between(low: float, high: float, above: float = -math.inf) -> str:
-    """The range of a number, in words."""
+    """Say in words which numbers are allowed."""
 
     def told(number: float) -> str:
         return f"{number:,.0f}" if number == round(number) else f"{number:g}"

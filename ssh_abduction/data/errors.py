@@ -1,9 +1,9 @@
-"""The errors that a user can cause or mend: one root, and one subclass for each layer.
+"""The errors that a user can cause or correct: one root, and one subclass for each layer.
 
 Errors of bad input are also ValueErrors, so that programs without knowledge of this package can
-catch them. Something that is missing on the machine is a plain AbductionError, and a defect of this
-package is an `InternalError` (`solver/judging.py`). A limit that was reached is no error:
-`Solution.stopped` says so.
+catch them. If something is missing on the machine, the error is a plain AbductionError. A defect of
+this package is an `InternalError` (`solver/judging.py`). Reaching a limit of time or memory is no
+error: `Solution.stopped` names the limit.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ class LocaliserError(AbductionError, ValueError):
 
 
 class SolverError(AbductionError, ValueError):
-    """The solver cannot do this."""
+    """An argument of the solver is wrong, or the solver cannot do what was asked."""
 
 
 class RangeError(AbductionError, ValueError, IndexError):
-    """There is no such step or map. The text names the range."""
+    """There is no step or map with the given number. The text names the range."""
 
 
 def named(source: object) -> str:
-    """The name of a file for a message, on one line."""
+    """Return the name of a file for a message, on one line."""
     text = str(source)
     return text if text.isprintable() else repr(text)
 
 
 def brief(value: object, width: int = 60) -> str:
-    """A value for a message, on one line of at most `width` characters."""
+    """Return the repr of a value for a message, on one line of at most `width` characters."""
     try:
         text = repr(value)
     except (RecursionError, ValueError):  # nested without end, or a number of thousands of digits
@@ -61,7 +61,7 @@ def brief(value: object, width: int = 60) -> str:
 
 
 def printable(text: str) -> str:
-    """A text on one line, with invisible characters and those that steer a terminal escaped."""
+    """Return a text on one line, with all unprintable characters escaped."""
     return (
         text
         if text.isprintable()
@@ -70,20 +70,20 @@ def printable(text: str) -> str:
 
 
 def xml_text(text: str) -> str:
-    """A text for XML: characters that XML cannot hold or that steer a terminal become U+FFFD."""
+    """Return a text for XML. Characters that XML forbids or that steer a terminal become U+FFFD."""
     return re.sub("[^\t\n -~\u00a0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
 
 
 def checked_index(index: object, count: int, what: str) -> int:
-    """An index that counts from 0.
+    """Return an index that counts from 0, or raise an error.
 
     Args:
-        index: What the caller gave; a negative one counts from the end.
-        count: How many things there are.
-        what: What messages call them: steps, maps.
+        index: What the caller gave. A negative index counts from the end.
+        count: The number of things.
+        what: The name of the things in messages, such as "steps".
 
     Raises:
-        RangeError: If there is no such thing.
+        RangeError: If there is no thing with this index.
         TypeError: If the index is not a whole number.
     """
     if not is_whole(index):
@@ -100,7 +100,7 @@ def checked_index(index: object, count: int, what: str) -> int:
 
 
 def is_finite(value: object) -> TypeGuard[float]:
-    """Whether a value is a number that a finite float can hold. Truth values are not numbers."""
+    """Whether a value is a real number that a finite float can hold. Booleans are not numbers."""
     try:
         return (
             isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
@@ -110,12 +110,12 @@ def is_finite(value: object) -> TypeGuard[float]:
 
 
 def is_whole(value: object) -> TypeGuard[int]:
-    """Whether a value is a whole number. Truth values are not numbers."""
+    """Whether a value is a whole number. Booleans are not numbers."""
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 
 def is_writable(text: str) -> bool:
-    """Whether UTF-8 can hold a text: it cannot hold one half of a surrogate pair."""
+    """Whether UTF-8 can encode a text. It cannot encode half of a surrogate pair."""
     try:
         text.encode("utf-8")
     except UnicodeEncodeError:

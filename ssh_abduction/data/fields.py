@@ -1,4 +1,4 @@
-"""Reading the fields of JSON objects, with errors that name the field."""
+"""Read the fields of JSON objects in files of maps. Errors name the field."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ T = TypeVar("T")
 
 
 class FieldReader:
-    """Checks fields of an object that was read from a file of maps.
+    """Reads and checks fields of a JSON object from a file of maps.
 
-    Each method returns the value or raises MapError. `name` is what messages call the field.
+    Most methods return the checked value or raise MapError. Their argument `name` is the name of
+    the field in error messages.
 
     Args:
-        where: The file, as messages call it.
+        where: The name of the file in error messages.
     """
 
     def __init__(self, where: str) -> None:
         self.where = a_text("where", where, MapError)
 
     def wrong(self, name: str, expected: str, value: Any) -> MapError:
-        """The error for a field that is wrong."""
+        """Return the MapError for a field with a wrong value."""
         return MapError(
             f"{self.where}: {name or 'map'}: expected {expected}, got {brief(value)}; "
             f"write it with solve --json"
@@ -37,7 +38,7 @@ class FieldReader:
         return value
 
     def list(self, record: Mapping[str, Any], name: str, optional: bool = False) -> list[Any]:
-        """The list in a field of a record. An optional one may be missing."""
+        """Return the list in a field of a record; an empty list if an optional field is missing."""
         value = record.get(name, [] if optional else None)
         if not isinstance(value, list):
             raise self.wrong(name, "a list", value)
@@ -50,7 +51,14 @@ class FieldReader:
         read: Callable[[Any, str], T],
         optional: bool = False,
     ) -> tuple[T, ...]:
-        """The members of the list in a field, each read by a function of value and name."""
+        """Return the members of the list in a field, each converted by `read`.
+
+        Args:
+            record: The object that has the field.
+            name: The field.
+            read: Converts a member, given its value and its name in messages.
+            optional: Whether the field may be missing.
+        """
         members = self.list(record, name, optional)
         return tuple(read(value, f"{name}[{i}]") for i, value in enumerate(members))
 
@@ -74,7 +82,13 @@ class FieldReader:
         return x, y, z
 
     def view(self, value: Any, name: str, expected: str) -> View | None:
-        """A view, or None for an unknown one."""
+        """Return a view (a text or an integer), or None for an unknown one.
+
+        Args:
+            value: The value of the field.
+            name: The field.
+            expected: What messages say was expected.
+        """
         is_view = isinstance(value, str | int | None) and not isinstance(value, bool)
         if not is_view or (isinstance(value, str) and not is_writable(value)):
             raise self.wrong(name, expected, value)

@@ -1,4 +1,4 @@
-"""Reading JSON that may be malformed, writing files whole or not at all, finding shipped files."""
+"""Parse JSON that may be malformed, write files atomically, and find files of the package."""
 
 from __future__ import annotations
 
@@ -31,7 +31,12 @@ _UNSEEN = re.compile("[\x7f-\x9f\u2028\u2029]")
 
 
 class NotFinite(ValueError):  # noqa: N818 - part of an error message, which the caller completes
-    """JSON with NaN or Infinity, in the field `field`."""
+    """JSON contains NaN or Infinity.
+
+    Attributes:
+        field: The path of the field with this number, such as "a.b[2]".
+        text: The number as the JSON has it.
+    """
 
     def __init__(self, field: str, text: str) -> None:
         super().__init__(f"{text} in {field}" if field else text)
@@ -39,20 +44,21 @@ class NotFinite(ValueError):  # noqa: N818 - part of an error message, which the
 
 
 class HalfCharacter(ValueError):  # noqa: N818 - part of an error message, which the caller completes
-    """JSON with one half of a surrogate pair, which no encoding can write again."""
+    """JSON contains one half of a surrogate pair, which no encoding can write again."""
 
 
 def parse_json(text: str) -> Any:
-    """The value of a JSON text.
+    """Parse a JSON text, more strictly than Python's `json` does.
 
-    No field is given twice, numbers are finite and have at most LONGEST_NUMBER digits, texts can be
-    written again, and nothing is nested more than DEEPEST times.
+    An object may not have two fields with the same name. Numbers must be finite and have at most
+    LONGEST_NUMBER digits. It must be possible to write all texts again. Objects and lists may be
+    nested at most DEEPEST times.
 
     Raises:
         json.JSONDecodeError: If the JSON is broken.
         NotFinite: If a number is not finite.
         HalfCharacter: If a text cannot be written again.
-        ValueError: If something else is wrong; the text says what was found.
+        ValueError: If something else is wrong. The text says what was found.
     """
     not_finite: list[str] = []
 
@@ -80,11 +86,11 @@ def parse_json(text: str) -> Any:
 
 
 def json_line(value: Any) -> str:
-    """A value as JSON on one line, with characters that steer a terminal escaped.
+    """Return a value as JSON on one line, with the control characters escaped.
 
     Raises:
-        TypeError: If JSON cannot hold the value.
-        ValueError: If JSON cannot hold the value.
+        TypeError: If JSON has no type for the value.
+        ValueError: If a number is not finite, or the value contains itself.
     """
     return _UNSEEN.sub(
         lambda found: f"\\u{ord(found[0]):04x}",
@@ -94,18 +100,25 @@ def json_line(value: Any) -> str:
 
 @cache
 def shipped(name: str) -> Path:
-    """A folder that ships with the package: inside of it or, in a checkout, beside it."""
+    """Return the path of a folder that ships with the package.
+
+    It is inside of the package or, in a checkout, beside it.
+    """
     package = Path(__file__).resolve().parent.parent
     packaged = package / name
     return packaged if packaged.is_dir() else package.parent / name
 
 
 def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
-    """The bytes of a file.
+    """Return the bytes of a file.
+
+    Args:
+        path: The file. It may be a device that never ends.
+        most: The largest number of bytes allowed.
 
     Raises:
-        OSError: If it cannot be read.
-        ValueError: If there are more than `most`. A device may never end.
+        OSError: If the file cannot be read.
+        ValueError: If the file has more than `most` bytes.
     """
     with Path(path).open("rb") as file:
         data = file.read(most + 1)
@@ -115,14 +128,14 @@ def read_at_most(path: str | os.PathLike[str], most: int) -> bytes:
 
 
 def write_file(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file, which appears whole or not at all, and keeps the permissions of an older one.
+    """Write a file so that it appears whole or not at all.
 
-    Only a regular file is replaced. Through a symbolic link its target is written. A device or a
-    pipe takes the bytes.
+    A regular file is replaced and keeps its permissions. If the path is a symbolic link, its target
+    is written. If it is a device or a pipe, the bytes are written to it.
 
     Raises:
-        OSError: If it cannot be written; the error names this file.
-        ValueError: If the text is no path.
+        OSError: If the file cannot be written. The error names this file.
+        ValueError: If the text is not a path.
     """
     if not os.fspath(path):
         raise ValueError("expected the name of a file, got an empty text")
@@ -152,7 +165,7 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> None:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object without a field that is given twice."""
+    """Make a JSON object of pairs. Raise ValueError if a field is given twice."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
         names = [name for name, _ in pairs]
@@ -162,7 +175,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _integer(text: str) -> int:
-    """A whole number of JSON that is not too long."""
+    """Make an int of the digits in JSON. Raise ValueError if it is too long."""
     if len(text) > LONGEST_NUMBER:
         raise ValueError(f"a number of more than {LONGEST_NUMBER} digits; shorten it")
     return int(text)
@@ -184,7 +197,7 @@ def _is_deep(value: Any) -> bool:
 
 
 def _where_nan(value: Any, path: str = "") -> str:
-    """The path of the first NaN in a value; an empty text if there is none."""
+    """Return the path of the first NaN in a value, such as "a.b[2]"; "" if there is none."""
     is_list = isinstance(value, list)
     inside: Iterable[tuple[Any, Any]] = (
         enumerate(value) if is_list else value.items() if isinstance(value, dict) else ()

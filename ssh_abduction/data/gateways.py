@@ -1,4 +1,4 @@
-"""Fits the stars (gateways seen) at each place of a map into one frame (star=gateways).
+"""Fit the stars seen at each place of a map into one frame, for theories with star=gateways.
 
 >>> from ssh_abduction.data.gateways import rotations
 >>> from ssh_abduction.data.star import Star
@@ -8,10 +8,11 @@
 >>> rotations(corner, corner, 1)
 frozenset()
 
-The heading of a dstate is in degrees. Headings match gateways across steps only up to the spreads
-of their bearings, and not if a gateway was not observed. So `fit` searches, at each place, for a
-frame and a shift of slots for each sight such that all axioms hold. A sight is a dstate together
-with a star that is seen there.
+A star is all gateways (ways out of a place) seen at a step, each with a bearing. A sight is a
+dstate (distinctive state: a place and a direction) with a star that is seen there. A sight numbers
+its gateways; the numbers are its slots. The sights at a place see the same gateways, but a
+bearing may be off, and some gateways are not observed. So `fit` searches, at each place, for a
+frame (which gateways exist) and a shift of the slots for each sight, such that all axioms hold.
 """
 
 from __future__ import annotations
@@ -29,15 +30,16 @@ from ssh_abduction.runtime.clock import look_at_clock
 
 @dataclass(frozen=True)
 class Sight:
-    """A dstate and a star (gateways) seen there.
+    """A dstate (a place and a direction) and a star (all gateways) seen there.
 
     Attributes:
         dstate: The dstate.
         star: The star.
         step: The first step with this dstate and star.
-        shows: Whether this is the first sight of its dstate, which fixes the dstate's heading.
-        first: Whether this is the first sight at its place, whose heading is 0.
-        onward: Bearings in degrees, 0 (ahead) or 180 (behind), at which the path goes on.
+        shows: Whether this is the first sight of its dstate. It fixes the dstate's heading.
+        first: Whether this is the first sight at its place. Its heading is 0.
+        onward: The directions in which the dstate's path goes on, in degrees: 0 (ahead), 180
+            (behind), both or neither.
     """
 
     dstate: DState
@@ -53,7 +55,7 @@ _Turned = tuple[Frame, int]  # what a sight sees, and the shift of its slots
 
 
 def turned(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> SSHMap | None:
-    """Replace the headings of a map by headings that all stars of the trace allow.
+    """Replace the headings of a map by headings that all stars (gateways seen) of the trace allow.
 
     Args:
         trace: The trace, with stars.
@@ -74,15 +76,16 @@ def turned(trace: Trace, ssh_map: SSHMap, axioms: Collection[str]) -> SSHMap | N
 def sights_of(
     trace: Trace, ssh_map: SSHMap, onward: Callable[[DState], tuple[int, ...]]
 ) -> tuple[list[Sight], dict[tuple[Sight, Sight], set[Action]]]:
-    """List the sights of a map, and the turns between sights at one place.
+    """List the sights of a map (dstates with stars), and the turns between sights at one place.
 
     Args:
         trace: The trace, with stars.
         ssh_map: A map of the trace.
-        onward: Gives `Sight.onward` of a dstate.
+        onward: Returns `Sight.onward` for a dstate.
 
     Returns:
-        The sights by first step, and for each pair of sights the turns from one to the other.
+        The sights, sorted by first step; and a dict from pairs of sights to the turns that lead
+        from the first sight of the pair to the second.
     """
     states = {s.id: s for s in reversed(ssh_map.dstates)}
     sights: dict[tuple[int, Star], Sight] = {}
@@ -107,7 +110,10 @@ def sights_of(
 def _onward_of(
     trace: Trace, ssh_map: SSHMap, axioms: Collection[str]
 ) -> Callable[[DState], tuple[int, ...]]:
-    """A function that gives the directions in which the path of a dstate continues."""
+    """Make a function that returns the directions in which the path of a dstate goes on.
+
+    These are 0 (ahead) and 180 (behind) degrees, as in `Sight.onward`.
+    """
     kinds = {action.name: action.kind for action in trace.actions}
     states = {s.id: s for s in ssh_map.dstates}
     total = {"path_order_total", "on_path"} <= set(axioms)
@@ -127,7 +133,7 @@ def _onward_of(
             return True
         order = listed.get(path, ())[::direction]
         later = order[order.index(place) + 1 :] if place in order else ()
-        # a travel outweighs the order that the map lists
+        # if a travel contradicts the order that the map lists, believe the travel
         return any(place not in reached[path, direction, q] for q in later)
 
     def onward(s: DState) -> tuple[int, ...]:
@@ -140,15 +146,16 @@ def _onward_of(
 
 
 def headings(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> dict[int, int]:
-    """Find headings that the stars allow.
+    """Find headings of dstates that the stars (gateways seen) allow.
 
     Args:
-        sights: The sights, by first step. The headings that their dstates show are ignored.
+        sights: The sights, sorted by first step. Headings that their dstates have are ignored.
         turns: The turns between sights at one place.
         axioms: Names of the axioms that hold.
 
     Returns:
-        The heading of each dstate in degrees, without the dstates of places that no frame fits.
+        A dict from the id of a dstate to its heading in degrees. It lacks the dstates of places
+        that no frame fits.
     """
     found: dict[int, int] = {}
     for seen in by_place(sights).values():
@@ -160,7 +167,7 @@ def headings(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> 
 
 
 def by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
-    """Group sights by place."""
+    """Group sights by place: return a dict from places to lists of sights."""
     there: dict[int, list[Sight]] = {}
     for sight in sights:
         if sight.dstate.place is not None:
@@ -171,16 +178,17 @@ def by_place(sights: Sequence[Sight]) -> dict[int, list[Sight]]:
 def fit(
     sights: Sequence[Sight], turns: Turns, axioms: Collection[str], as_shown: bool = True
 ) -> list[_Turned] | None:
-    """Find a frame and a shift for each sight at one place so that all pairs satisfy the axioms.
+    """Find a frame and a shift for each sight at a place so that all pairs satisfy the axioms.
 
     Args:
         sights: The sights at one place.
         turns: The turns between sights.
         axioms: Names of the axioms that hold.
-        as_shown: Whether the headings have to be those that the dstates show.
+        as_shown: Whether the headings that the dstates have must fit, too.
 
     Returns:
-        A frame and a shift for each sight, or None if there are none.
+        For each sight, its frame (which gateways exist) and its shift (how many slots to add, so
+        that gateways have the same slots as in the first sight); None if nothing fits.
     """
 
     def extended(chosen: list[_Turned]) -> list[_Turned] | None:
@@ -210,7 +218,10 @@ def fit(
 
 
 def _middle(found: Collection[int]) -> int:
-    """A rotation in the middle of the longest arc of rotations; 0 if there are all or none."""
+    """Return the middle of the longest arc in a set of rotations, in whole degrees.
+
+    It is 0 if the set contains all rotations or none.
+    """
     starts = [r for r in sorted(found) if (r - 1) % 360 not in found]
     ends = [next(d for d in range(1, 361) if (r + d) % 360 not in found) for r in starts]
     length, start = max(zip(ends, [-r for r in starts], strict=True), default=(1, 0))
@@ -226,7 +237,17 @@ def _allowed(
     axioms: Collection[str],
     as_shown: bool,
 ) -> bool:
-    """Whether the axioms allow two sights at one place, the earlier one first, in these frames."""
+    """Whether the axioms allow these frames and shifts for two sights at one place.
+
+    Args:
+        a: The earlier sight, or `b` itself.
+        seen_a: Its frame and shift.
+        b: The later sight.
+        seen_b: Its frame and shift.
+        turns: The turns between sights.
+        axioms: Names of the axioms that hold.
+        as_shown: Whether the headings that the dstates have must fit, too.
+    """
     (first, back), (then, on) = seen_a, seen_b
     shift = (on - back) % max(first.slots, 1)
     found = rotations(first, then, shift)
@@ -241,7 +262,7 @@ def _allowed(
     ):
         return False
     alike, opposite = _ways(first, then, shift, found)
-    sure = not found & {90, 270}  # a robot that may have turned a quarter is not sure of its way
+    sure = not found & {90, 270}  # if it may have turned by a right angle, its way is uncertain
     s, x = a.dstate, b.dstate
     if "gateway_heading" in axioms:
         if s.id == x.id and not alike:
@@ -262,21 +283,21 @@ def _allowed(
 
 
 def _is_shown(heading: int | None, found: Collection[int]) -> bool:
-    """Whether a dstate shows a heading that the bearings allow."""
+    """Whether a dstate has a heading, and it is one of the rotations found (if there are any)."""
     return heading is not None and 0 <= heading < 360 and (heading in found or not found)
 
 
 @lru_cache(maxsize=2**14)
 def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
-    """The rotations between two sights of a place.
+    """Find by which angles the robot may have turned between two sights of a place.
 
     Args:
-        first: What the robot saw first.
-        then: What it saw later.
+        first: The gateways in the earlier sight.
+        then: The gateways in the later sight.
         shift: Gateway k of `then` is taken to be gateway k + shift of `first`.
 
     Returns:
-        The degrees by which the robot may have turned; empty if the gateways do not match.
+        The angles in whole degrees, clockwise, 0 to 359; empty if the gateways do not match.
     """
     n = first.slots
     if then.slots != n:
@@ -297,13 +318,19 @@ def rotations(first: Frame, then: Frame, shift: int) -> frozenset[int]:
 
 
 def _between(a: float, b: float) -> float:
-    """The angle between two bearings, 0 to 180 degrees."""
+    """Return the angle between two bearings, 0 to 180 degrees."""
     return min((a - b) % 360, (b - a) % 360)
 
 
 def _turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
-    """Whether a turn can make one of these rotations."""
-    # a bearing or a number of the gateway says more than right, left and around
+    """Whether an action can turn the robot by one of some angles.
+
+    Args:
+        action: The turn.
+        before: The gateways that the robot saw before the turn.
+        found: The angles in degrees, clockwise.
+    """
+    # the bearing or the gateway of a turn is more precise than right, left and around
     if action.bearing is not None:
         return any(_between(r, round(action.bearing)) <= SPREAD for r in found)
     if action.gateway is not None:
@@ -334,9 +361,10 @@ def _turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
 
 
 def _ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[bool, bool]:
-    """Whether the robot may face the same way in both sights, and the opposite way.
+    """Return two flags: may the robot face the same way in both sights, and opposite ways?
 
-    Gateways that are declared opposite also count: they are on one path, which may bend.
+    It may if a rotation by 0 or 180 degrees was found. Gateways that are declared opposite also
+    allow it: they are on one path, which may bend.
     """
     alike, opposite = 0 in found, 180 in found
     here, there = _passes(first), _passes(then)
@@ -350,7 +378,7 @@ def _ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple
 
 
 def _leads(frame: Frame, towards: int) -> bool:
-    """Whether the robot's path may leave by some gateway, ahead (0) or behind (180)."""
+    """Whether the robot's path may go on by some gateway ahead (`towards` 0) or behind (180)."""
     return _passes(frame) is not None or any(
         _between(bearing, towards) <= 2 * spread
         for bearing, spread in zip(frame.bearings, frame.spreads, strict=True)
@@ -358,9 +386,10 @@ def _leads(frame: Frame, towards: int) -> bool:
 
 
 def _passes(frame: Frame) -> tuple[int, int] | None:
-    """The gateways ahead and behind on a path that bends.
+    """Return the slots of two gateways that are declared opposite, one ahead and one behind.
 
-    None unless the robot faces the first one or came through the second one.
+    The robot must face the first one, or have the second one straight behind it. None if there is
+    no such pair.
     """
     for k, (bearing, spread, other) in enumerate(
         zip(frame.bearings, frame.spreads, frame.opposite, strict=True)

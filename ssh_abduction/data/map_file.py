@@ -1,4 +1,4 @@
-"""Reading and writing the JSON of maps. See docs/reference/formats.md."""
+"""Read and write the JSON of maps. See docs/reference/formats.md."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ssh_abduction.data.map_parts import FAULTS, DState, Fault, Fit, MapPath, Po
 
 # What files of solutions and of single maps begin with.
 SOLUTION_FORMAT, MAP_FORMAT, VERSION = "ssh-solution", "ssh-map", 1
-# Bytes of a file: some hundred thousand maps. Reading it takes ten times as much memory.
+# The most bytes of a file: some hundred thousand maps. Reading needs ten times more memory.
 LARGEST = 2**30
 
 
@@ -28,9 +28,9 @@ def write_map(
 
     Args:
         path: The file.
-        text: Its text, without the last line end.
-        what: What messages call the text.
-        option: The parameter or option that named the file.
+        text: The text to write, without the last line end.
+        what: The name of the text in messages.
+        option: The name in messages of the parameter or option that gave the path.
 
     Raises:
         MapError: If the file cannot be written.
@@ -47,10 +47,11 @@ def write_map(
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
-    """The JSON value in a file of maps, or on standard input for "-".
+    """Read the JSON value in a file of maps; "-" means standard input.
 
     Raises:
-        MapError: With file and line, if there is none.
+        MapError: If the file cannot be read or does not hold exactly one JSON value. The error
+            names the file and, if JSON is broken, the line.
     """
     path = a_path("path", path, MapError)
     source = "standard input" if path == "-" else named(path)
@@ -102,7 +103,7 @@ def _start_of(path: str, most: int) -> bytes:
 
 
 def _broken(error: json.JSONDecodeError, text: bytes, source: str) -> MapError:
-    """The error for JSON that is broken, or for a file that holds something else."""
+    """Return the MapError for broken JSON, or for a file that holds a trace or several values."""
     if text.startswith(b'{"format": "ssh-trace"'):
         return MapError(
             f"{source}: expected maps, got a trace; "
@@ -120,10 +121,10 @@ def _broken(error: json.JSONDecodeError, text: bytes, source: str) -> MapError:
 
 
 def check_format(data: Mapping[str, Any], expected: str, where: str) -> None:
-    """Check the format and the version. Files of early versions have neither.
+    """Check the fields `format` and `version` of a file. Files of early versions have neither.
 
     Raises:
-        MapError: If the file is of another format or version.
+        MapError: If the file has another format or version.
     """
     if "format" in data and data["format"] != expected:
         raise MapError(
@@ -139,17 +140,17 @@ def check_format(data: Mapping[str, Any], expected: str, where: str) -> None:
 
 
 def map_fields(data: Any, where: str) -> dict[str, Any]:
-    """The fields of a map, from the JSON that `SSHMap.to_dict` makes.
+    """Convert the JSON of a map, as `SSHMap.to_dict` makes it, to the arguments of SSHMap.
 
     Args:
-        data: The JSON.
-        where: Its name in messages.
+        data: The parsed JSON.
+        where: The name of the map in messages.
 
     Returns:
-        The arguments of SSHMap.
+        A dict from the names of the arguments to their values.
 
     Raises:
-        MapError: If a field is wrong; it names the field.
+        MapError: If a field is wrong. The error names the field.
     """
     read = FieldReader(where)
     record = read.mapping(data, "")
@@ -197,7 +198,7 @@ def map_fields(data: Any, where: str) -> dict[str, Any]:
 
 
 def _check_used(where: str, name: str, known: tuple[int, ...], used: set[int | None]) -> None:
-    """Check that every place or path that is used is listed."""
+    """Check that the map lists every place or path that its dstates and paths refer to."""
     if missing := used - {None, *known}:
         raise MapError(
             f"{where}: {name}: expected every id that is used, "
@@ -206,7 +207,7 @@ def _check_used(where: str, name: str, known: tuple[int, ...], used: set[int | N
 
 
 def _dstate(read: FieldReader, value: Any, name: str) -> DState:
-    """A dstate, checked by itself."""
+    """Convert and check a dstate. The caller checks that its place and path exist."""
     record = read.mapping(value, name)
     expected = "a text or an integer, or null where it is unknown"
     if "view" not in record:
@@ -237,7 +238,7 @@ def _path(read: FieldReader, value: Any, name: str) -> MapPath:
 
 
 def _link(read: FieldReader, value: Any, ids: set[int], name: str) -> tuple[int, str, int]:
-    """A link between dstates with these ids."""
+    """Convert and check a link. Its two dstates must be in `ids`."""
     good = (
         isinstance(value, list)
         and len(value) == 3
@@ -256,7 +257,7 @@ def _pair(read: FieldReader, value: Any, name: str) -> tuple[int, int]:
 
 
 def _fault(read: FieldReader, value: Any, steps: int, name: str) -> Fault:
-    """A fault at one of the steps."""
+    """Convert and check a fault. Its step must be less than `steps`."""
     record = read.mapping(value, name)
     if record.get("kind") not in FAULTS:
         raise read.wrong(f"{name}.kind", " or ".join(FAULTS), record.get("kind"))
@@ -272,7 +273,7 @@ def _fault(read: FieldReader, value: Any, steps: int, name: str) -> Fault:
 
 
 def _fit(read: FieldReader, record: Mapping[str, Any], dstates: int) -> Fit | None:
-    """The fit of a map, with the poses of its dstates."""
+    """Convert and check the fit of a map, with the poses of its dstates; None if there is none."""
     if record.get("fit") is None:
         return None
     found = read.mapping(record["fit"], "fit")

@@ -1,4 +1,4 @@
-"""The parts of a map: distinctive states, paths, faults, poses and fits. All are frozen values."""
+"""The parts of a map: distinctive states, paths, faults, poses and fits. All are immutable."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class DState:
     Attributes:
         id: Its number.
         view: The view; None if the view of each step at the dstate is unknown.
-        place: Its place; None if the theory has no places.
-        path: The path that it is along; None if there is none.
-        direction: +1 or -1, which way it faces along its path.
-        heading: With star=frame the slot (0 to 3, clockwise) of the frame of its place that it
-            faces. With star=gateways degrees (0 to 359), clockwise from the heading of the first
-            dstate at its place.
+        place: The number of its place; None if the theory has no places.
+        path: The number of the path that it is along; None if there is none.
+        direction: +1 or -1, which way it faces along its path; None without a path.
+        heading: With star=frame, the slot that it faces: the directions at its place are numbered
+            0 to 3, clockwise. With star=gateways, degrees from 0 to 359, clockwise from the
+            heading of the first dstate at its place. Otherwise None.
     """
 
     id: int
@@ -34,7 +34,7 @@ class DState:
 
     @property
     def shown(self) -> View:
-        """The view for people: "?" if it is unknown."""
+        """The view to show to people; "?" if it is unknown."""
         return "?" if self.view is None else self.view
 
 
@@ -44,8 +44,8 @@ class MapPath:
 
     Attributes:
         id: Its number.
-        order: The places, as direction +1 meets them. With path_order=partial this is one of the
-            orders that the map allows.
+        order: The places, in the order of direction +1. With path_order=partial, several orders
+            are consistent with the map, and this is one of them.
     """
 
     id: int
@@ -54,16 +54,17 @@ class MapPath:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What a map ignores at a step.
+    """A part of the trace that a map treats as wrong.
 
     Attributes:
         step: The step.
-        kind: "misread": the view of the step is not that of its dstate. "misseen": its star is not.
-            "slipped": the action did not do what its name says, so that nothing links this step
-            and the next one. "jumped": the displacement from the step before is wrong.
+        kind: "misread": the view of the step is not that of its dstate. "misseen": the star (the
+            gateways seen) is not that of its dstate. "slipped": the action did not do what its
+            name says, so no link joins this step and the next one. "jumped": the displacement
+            from the step before is wrong.
         seen: The view, the name of the action, or the displacement in words; None for a star.
-        expected: The view of the dstate, if the view is misread.
-        cost: The cost in dstates.
+        expected: The view of the dstate if the view is misread, else None.
+        cost: The cost of the fault, in dstates.
     """
 
     step: int
@@ -105,11 +106,11 @@ class Fit:
 
     Attributes:
         chi2: The sum of the squared normalised residuals.
-        dof: The degrees of freedom, which chi2 is near if the map and the noise model are right.
-        p: The probability of this chi2 or a larger one.
+        dof: The degrees of freedom. If the map and the noise model are right, chi2 is near them.
+        p: The probability that chi2 has this value or a larger one.
         scale: The share by which displacements are too long.
         bend: The drift of the heading, in radians a metre.
-        poses: The poses of the dstates, by id.
+        poses: The poses of the dstates. The index is the id of the dstate.
     """
 
     chi2: float
@@ -120,6 +121,6 @@ class Fit:
     poses: tuple[Pose, ...] = field(default=(), repr=False)
 
     def to_dict(self) -> dict[str, float]:
-        """The numbers as plain data, without the poses."""
+        """Return chi2, dof, p, scale and bend as a dict, rounded to six digits behind the point."""
         names = ("chi2", "dof", "p", "scale", "bend")
         return {name: round(getattr(self, name), 6) for name in names}

@@ -1,12 +1,12 @@
 """Maps: distinctive states, the links between them, places, and paths with an order of places.
 
-Maps are values. Dstates, places and paths are numbered by first visit, and the direction +1 of a
-path is the one in which it was first faced. Two maps of a trace are therefore equal exactly if they
-are the same up to renaming.
+A map is an immutable value. Dstates (distinctive states), places and paths are numbered by first
+visit. Direction +1 of a path is the one in which the robot first faced along it. So two maps of a
+trace are equal exactly if they are the same up to renaming.
 
-Equality compares the dstates with their places and paths, the links and the faults. It does not
-compare the orders of paths, the headings and the excused pairs, which only show that the map is
-consistent: others may show it as well.
+Equality compares the dstates with their places and paths, the links, and the faults. It does not
+compare the orders of paths, the headings, and the excused pairs. These only show that the map is
+consistent, and for one map several may do so. Nor does equality compare the fit.
 """
 
 from __future__ import annotations
@@ -64,15 +64,16 @@ class SSHMap:
     """A map: one explanation of a trace.
 
     Attributes:
-        labels: The dstate of each step.
-        dstates: The dstates, by id.
-        links: (dstate, action name, dstate) for each action tried in each dstate.
+        labels: The id of the dstate of each step.
+        dstates: The dstates (distinctive states: places and directions). The index is the id.
+        links: For each action tried at a dstate: the id of the dstate, the name of the action, and
+            the id of the dstate that the action leads to.
         places: The ids of the places.
         paths: The paths, each with an order of its places.
-        excused: With boundary=defeasible, the pairs of paths that are exempt from the default
+        excused: With boundary=defeasible, the pairs of path ids that are exempt from the default
             side_of_branch.
         fit: How well the map agrees with the displacements; None if none were used.
-        faults: What the map ignores, by step.
+        faults: The parts of the trace that the map treats as wrong, sorted by step.
     """
 
     labels: tuple[int, ...]
@@ -94,9 +95,9 @@ class SSHMap:
 
     @property
     def id(self) -> str:
-        """Twelve hexadecimal digits: a digest of what equality compares.
+        """The id: twelve hexadecimal digits, a digest of all that equality compares.
 
-        Equal maps have equal ids, in each run and however they are numbered.
+        Maps that are the same up to renaming have the same id, in every run.
         """
         whole = self.renumbered()
         dstates = [(s.view, s.place, s.path, s.direction) for s in whole.dstates]
@@ -106,14 +107,14 @@ class SSHMap:
         return hashlib.sha256(text.encode()).hexdigest()[:ID_LENGTH]
 
     def _repr_html_(self) -> str:
-        """The map for notebooks: picture, fit, faults and dstates."""
+        """Return the map as HTML for notebooks: picture, fit, faults and dstates."""
         card: str = in_output("map_card")(self)
         return card
 
     if not TYPE_CHECKING:  # so that type checkers still reject unknown attributes
 
         def __getattr__(self, name):
-            """Find a method of version 0.1.0 that is a function of `ssh_abduction.output` now."""
+            """Return a method of version 0.1.0, now a function of `ssh_abduction.output`."""
             if name not in MOVED:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
             warnings.warn(
@@ -124,7 +125,7 @@ class SSHMap:
             return partial(in_output(name), self)
 
     def place_of(self, step: int) -> int | None:
-        """The place of a step; None if the map has no places.
+        """Return the id of the place of a step; None if the map has no places.
 
         Raises:
             MapError: If the trace has no such step.
@@ -137,11 +138,14 @@ class SSHMap:
         return self.dstates[self.labels[step]].place
 
     def without_headings(self) -> SSHMap:
-        """The same map for a theory in which places have no frames."""
+        """Return the same map without headings, for a theory in which places have no frames."""
         return replace(self, dstates=tuple(replace(s, heading=None) for s in self.dstates))
 
     def renumbered(self) -> SSHMap:
-        """The same map with dstates, places and paths numbered by first visit."""
+        """Return the same map with dstates, places and paths numbered by first visit.
+
+        Direction +1 of each path becomes the one in which the robot first faced along it.
+        """
         visited = [
             self.dstates[s] for s in dict.fromkeys([*self.labels, *range(len(self.dstates))])
         ]
@@ -151,7 +155,7 @@ class SSHMap:
         faced: dict[int | None, int | None] = {}  # the direction in which each path was first faced
         for s in visited:
             faced.setdefault(s.path, s.direction)
-        # Each path gets the direction +1 in which it was first faced, and its order follows suit.
+        # Direction +1 becomes the one first faced. The order of the path is reversed accordingly.
         dstates = tuple(
             DState(
                 number[s.id],
@@ -182,7 +186,7 @@ class SSHMap:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The map as plain data, as `solve --json` prints it (docs/reference/formats.md)."""
+        """Return the map as plain data, as `solve --json` prints it (docs/reference/formats.md)."""
         dstates = [
             {
                 "id": s.id,
@@ -219,14 +223,14 @@ class SSHMap:
 
     @classmethod
     def from_dict(cls, data: Any, where: str = "map") -> SSHMap:
-        """The map from the plain data of `to_dict`.
+        """Make a map of the plain data of `to_dict`.
 
         Args:
             data: The plain data.
-            where: Its name in messages.
+            where: The name of the data in messages.
 
         Raises:
-            MapError: If a field is wrong; it names the field.
+            MapError: If a field is wrong. The error names the field.
         """
         return cls(**map_fields(data, where))
 
@@ -240,7 +244,7 @@ class SSHMap:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SSHMap:
-        """The map in a file that `save` wrote.
+        """Read a map from a file that `save` wrote.
 
         Raises:
             MapError: If the file cannot be read or holds something else.
@@ -253,29 +257,33 @@ class SSHMap:
 
 
 def _numbered(ids: Iterable[int | None]) -> dict[int | None, int]:
-    """The numbers 0, 1, 2, … of the ids in the order in which they first come."""
+    """Return a dict from ids to the numbers 0, 1, 2, … in order of occurrence. None is left out."""
     return {number: i for i, number in enumerate(dict.fromkeys(x for x in ids if x is not None))}
 
 
 def checked_map(value: object, name: str = "map") -> SSHMap:
-    """The map that a caller gives."""
+    """Return a value if it is a map, or raise MapError."""
     return an_instance(
         name, value, SSHMap, MapError, mend="take one of solution.maps, or SSHMap.load"
     )
 
 
 def checked_maps(values: object) -> tuple[SSHMap, ...]:
-    """The maps that a caller gives."""
+    """Return the values of an iterable if all are maps, or raise MapError."""
     return all_instances(
         "maps", values, SSHMap, MapError, mend="take the maps of a solution, or SSHMap.load"
     )
 
 
 def maps_of(data: Any, where: str) -> list[SSHMap]:
-    """The maps in the JSON of `solve --json`, or the one map in that of `SSHMap.save`.
+    """Make maps of JSON from `solve --json` (several maps) or from `SSHMap.save` (one map).
+
+    Args:
+        data: The parsed JSON.
+        where: The name of the file in messages.
 
     Raises:
-        MapError: If a field is wrong; it names the field.
+        MapError: If a field is wrong. The error names the field.
     """
     if isinstance(data, Mapping) and "maps" in data:
         check_format(data, SOLUTION_FORMAT, where)
@@ -291,16 +299,18 @@ def maps_of(data: Any, where: str) -> list[SSHMap]:
 
 
 def check_of_trace(maps: Iterable[SSHMap], trace: Trace, where: str, *, views: bool = True) -> None:
-    """Check that maps are of a trace: that they label each step with a dstate of its view.
+    """Check that maps belong to a trace: the dstate of each step must have the view of the step.
+
+    Steps with an unknown view or a fault are not checked.
 
     Args:
         maps: The maps.
         trace: The trace.
-        where: What messages call the source of the maps.
-        views: Whether to compare views. A theory may let a dstate have several.
+        where: The source of the maps, for messages.
+        views: Whether to compare views. Some theories let a dstate have several views.
 
     Raises:
-        MapError: If a map is of another trace.
+        MapError: If a map belongs to another trace.
     """
     for i, ssh_map in enumerate(maps):
         if len(ssh_map.labels) != len(trace):

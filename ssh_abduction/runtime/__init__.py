@@ -1,4 +1,4 @@
-"""What programs of this package run on: start and end, the clock, the log, and old names.
+"""Support for running programs: start and exit, time limits, the log, and deprecated names.
 
-This module imports nothing, as `program` is loaded before any other module (see `__main__`).
+This module imports nothing, because `__main__` loads `program` before any other module.
 """

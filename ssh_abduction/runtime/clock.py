@@ -1,7 +1,8 @@
-"""Limits of time and Ctrl-C for code that does not know the search that it works for.
+"""Check time limits and Ctrl-C in code that has no access to the search that called it.
 
-A search names the function that checks its limits (`heeding`). The checker, evidence and guesses
-call `look_at_clock` in loops that may take long. Without a search that does nothing.
+A search passes a function that checks its limits to `heeding`. The checker, the evidence and the
+guesses call `look_at_clock` in long loops, which calls this function. Outside of a search,
+`look_at_clock` does nothing.
 
 >>> def over():
 ...     raise TimeoutError("the time is over")
@@ -25,14 +26,14 @@ _check: ContextVar[Callable[[], None] | None] = ContextVar("check", default=None
 
 
 def look_at_clock() -> None:
-    """Check the limits of the search in this thread. It raises if the work has to end."""
+    """Call the checks of the surrounding `heeding` blocks. They raise if the work has to end."""
     check = _check.get()
     if check is not None:
         check()
 
 
 def each_looking(items: Iterable[Item]) -> Iterator[Item]:
-    """The same items, with a look at the clock before each."""
+    """Yield the items, and call `look_at_clock` before each."""
     for item in items:
         look_at_clock()
         yield item
@@ -40,7 +41,9 @@ def each_looking(items: Iterable[Item]) -> Iterator[Item]:
 
 @contextmanager
 def heeding(check: Callable[[], None]) -> Iterator[None]:
-    """Let `look_at_clock` call a function in this context, after those of the contexts around it.
+    """Make `look_at_clock` call `check` inside a `with` block.
+
+    If such blocks are nested, the checks of the outer blocks are called first.
 
     Args:
         check: Raises if the work has to end. It is called often, so it should take microseconds.
@@ -60,7 +63,12 @@ def heeding(check: Callable[[], None]) -> Iterator[None]:
 
 
 def each_heeding(check: Callable[[], None], items: Iterator[Item]) -> Iterator[Item]:
-    """The same items, each made within `heeding(check)` and used outside of it."""
+    """Yield the items of an iterator. Only the work of the iterator runs within `heeding(check)`.
+
+    Args:
+        check: Raises if the work has to end, as in `heeding`.
+        items: The iterator.
+    """
     while True:
         with heeding(check):
             try:

@@ -1,4 +1,4 @@
-"""Old names of parameters, which work for one more version, with a warning."""
+"""Old names of parameters. They work for one more version, with a warning."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ RENAMED = {"limit": "time_limit", "memory": "memory_limit", "maps": "max_maps"}
 
 
 def renamed_parameters(*old: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Let a function take parameters by their names of version 0.1.0, with a DeprecationWarning.
+    """Make a decorator for functions whose parameters had other names in version 0.1.0.
+
+    A decorated function also accepts the old names, and gives a DeprecationWarning for each.
+    `maps=0` becomes `max_maps=None`.
 
     Args:
-        old: The old names, out of RENAMED. `maps=0` becomes `max_maps=None`.
+        old: The old names that the function accepts, out of the keys of RENAMED.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:

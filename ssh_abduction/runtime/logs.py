@@ -1,8 +1,8 @@
 """The package's log: `logging.getLogger("ssh_abduction")` and the loggers below it.
 
-It is silent unless a program asks for it (`logging.basicConfig`, or `-v` in the shell). Messages
-are sentences for people and may change. INFO says what a search begins, finds and proves. DEBUG
-says what clingo gets.
+It is silent unless a program calls `logging.basicConfig`, or a user gives `-v` in the shell.
+Messages are sentences for people and may change. INFO messages say what a search begins, finds and
+proves. DEBUG messages say what is passed to clingo.
 
 >>> log_of("ssh_abduction.solver.search").name, PROGRESS.name
 ('ssh_abduction.solver.search', 'ssh_abduction.progress')
@@ -14,10 +14,14 @@ import logging
 
 PACKAGE = "ssh_abduction"
 logging.getLogger(PACKAGE).addHandler(logging.NullHandler())
-# Progress of a search: INFO if it knows more than before, DEBUG now and then.
+# Progress of a search: INFO if the best cost or the bound has changed, DEBUG otherwise.
 PROGRESS = logging.getLogger(f"{PACKAGE}.progress")
 
 
 def log_of(module: str) -> logging.Logger:
-    """The logger of a module of this package, by its `__name__`."""
+    """Return the logger of a module of this package.
+
+    Args:
+        module: The module's `__name__`.
+    """
     return logging.getLogger(module)

@@ -1,7 +1,7 @@
-"""Start and end of programs: the path of modules of their processes, and exit codes of signals.
+"""Start and end of processes: where Python looks for modules, and exit codes after signals.
 
-It imports only what Python has loaded already, so that no file in the current folder can take the
-place of a module of Python.
+This module imports only modules that Python has already loaded when it starts. So no file in the
+current folder can take the place of a module of Python.
 """
 
 import os
@@ -15,31 +15,35 @@ raised: list[int] = []  # those that raised a KeyboardInterrupt
 
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
-# What a new process runs first, as `python -P -c`. The option -P keeps the current folder off the
-# path. Then it gets the path of the process that started it.
+# What a new process runs first, as `python -P -c`. The option -P keeps the current folder off
+# `sys.path`. Then the process takes over the `sys.path` of the process that started it.
 _START = (
     "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from {} import serve; serve()"
 )
 
 
 def interrupted_code() -> int:
-    """The exit code after a signal: 130 for Ctrl-C, 143 for SIGTERM."""
+    """Return the exit code after the last signal: 130 for Ctrl-C (the default), 143 for SIGTERM."""
     return SIGNALLED + (heard[-1] if heard else CTRL_C)
 
 
 def command(module: str) -> list[str]:
-    """The command of a process that calls `serve` of a module.
+    """Return the command line of a new Python process that calls the function `serve` of a module.
 
-    Its input must begin with `search_path()`, pickled.
+    The standard input of the process must begin with `search_path()`, pickled.
+
+    Args:
+        module: The dotted name of the module.
     """
     return [sys.executable, "-P", "-c", _START.format(module)]
 
 
 def search_path() -> list[str]:
-    """The path of modules with the current folder last.
+    """Return `sys.path` with the current folder moved to the end.
 
-    Then no file in this folder is taken for a module of Python or of a library. The order stays in
-    a checkout, where this package lies in the current folder.
+    So no file in the current folder is loaded in place of a module of Python or of a library. The
+    order does not change if the current folder is the checkout that this package is loaded from, or
+    if it was deleted.
     """
     try:
         current = os.path.realpath(os.getcwd())
