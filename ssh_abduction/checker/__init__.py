@@ -1,4 +1,4 @@
-"""Judges of maps and bounds in plain Python, independent of the encodings and the solver."""
+"""Check maps and lower bounds in plain Python, without the encodings and the solver."""
 
 from ssh_abduction.checker.checker import Violation, check
 from ssh_abduction.checker.proof import check_bound

@@ -1,4 +1,4 @@
-"""The axioms of the causal level (C1, C2)."""
+"""Checks of the axioms of the causal level (dstates and links; C1, C2)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from ssh_abduction.data.trace import View
 
 
 def functional_view(m: Reading) -> Found:
-    """A dstate has one view (C1)."""
+    """Check that each dstate has one view (C1)."""
     known: dict[int, tuple[View | None, int]] = {}
     for (s, view), i in m.views.items():
         first, at = known.setdefault(s, (view, i))
@@ -19,7 +19,7 @@ def functional_view(m: Reading) -> Found:
 
 
 def deterministic(m: Reading) -> Found:
-    """An action done in a dstate always leads to the same dstate (C2)."""
+    """Check that an action done at a dstate always leads to the same dstate (C2)."""
     known: dict[tuple[int, str], tuple[int, int]] = {}
     for (source, action, target), i in m.links.items():
         first, at = known.setdefault((source, action), (target, i))

@@ -1,4 +1,4 @@
-"""Checks a map against a trace and a theory, axiom by axiom, in plain Python.
+"""Check a map against a trace and a theory, axiom by axiom, in plain Python.
 
 >>> from ssh_abduction import Trace
 >>> from ssh_abduction.checker.checker import check
@@ -18,10 +18,10 @@ Kuipers (AIJ 2004). `AXIOMS` maps the name of each axiom to its check. The check
 `topological`, `sides`, `stars`, `clashes` and `evidence`; `coherence` checks that the map fits the
 trace.
 
-A map shows the place, course (path and direction) and heading of each dstate, and the order of each
-path. A dstate of a map shows one of each, even if the theory leaves out the axiom that forbids
-several. All other axioms are checked on the ones shown. A map does not show sides, or rings of
-travels; `sides` and `order` say how the axioms about these are checked.
+A map lists one place, one course (path and direction) and one heading for each dstate, even if the
+theory leaves out the axiom that forbids several. The other axioms are checked on the listed ones.
+A map also lists the order of the places along each path. It lists no sides of paths and no rings of
+travels: the modules `sides` and `order` describe how the axioms about these are checked.
 """
 
 from __future__ import annotations
@@ -64,9 +64,10 @@ class Violation:
 
     Attributes:
         axiom: The name of the axiom.
-        steps: The steps of the trace that show it, ascending. An action that starts at step i shows
-            as i and i + 1. Empty if no step is to blame.
-        message: A sentence in the terms of the map.
+        steps: The steps of the trace that show the violation, ascending. The action between steps i
+            and i + 1 adds both. Empty if no step is to blame.
+        message: A sentence that describes the violation by the dstates, places and paths of the
+            map.
     """
 
     axiom: str
@@ -75,7 +76,7 @@ class Violation:
 
 
 def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[Violation, ...]:
-    """Find every axiom that a map breaks as an explanation of a trace.
+    """Find all violations of axioms by a map of a trace.
 
     Args:
         trace: What the robot saw and did, with views.
@@ -83,13 +84,13 @@ def check(trace: Trace, ssh_map: SSHMap, theory: Theory | None = None) -> tuple[
         theory: The theory; Theory.topological() if None. Axioms in its `without` are not checked.
 
     Returns:
-        The violations of all axioms except those that `unchecked` names; empty if the map is right.
-        Violations of `map_explains_trace` come first (the map does not fit the trace, or its
-        numbers do not fit each other), then those of the axioms in the order of the theory.
+        The violations; empty if the map is right. Violations of `map_explains_trace` come first:
+        the map does not fit the trace, or its numbers do not fit each other. Violations of the
+        axioms follow in the order of the theory. Axioms that `unchecked` names are skipped.
 
     Raises:
-        TraceError, TheoryError: The trace lacks what the theory asks for.
-        MapError: `ssh_map` is no SSHMap.
+        TraceError, TheoryError: The trace lacks something that the theory needs.
+        MapError: `ssh_map` is not an SSHMap.
 
     Reference:
         Kuipers & Beeson, AAAI 2002; Remolina & Kuipers, AIJ 2004; the axioms are in
@@ -108,8 +109,8 @@ def violations(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Violat
 
     Args:
         trace: What the robot saw and did, with views.
-        ssh_map: Any map.
-        theory: The theory, resolved for this trace.
+        ssh_map: Any map, even a malformed one.
+        theory: The theory, with all its defaults resolved for this trace.
 
     Yields:
         Each violation, in the order of `check`.
@@ -125,6 +126,6 @@ def violations(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Violat
 
 
 def unchecked(theory: Theory) -> tuple[str, ...]:
-    """What the checker cannot check: axioms of the user's rules, and files that name no axiom."""
+    """List what `check` skips: axioms of the user's rules, and files of rules without axioms."""
     named = tuple(name for name in theory.axioms if name not in AXIOMS)
     return named + tuple(f"the rules of {rules.name}" for rules in theory.rules if not rules.axioms)

@@ -1,4 +1,4 @@
-"""Check the claims of a file of maps against its maps and its proof.
+"""Check what a file of maps claims (status, counts, costs, bounds) against its maps and its proof.
 
 >>> from ssh_abduction.checker.claims import false_claims
 >>> from ssh_abduction.data.maps import DState, SSHMap
@@ -38,10 +38,11 @@ def false_claims(
 
     Args:
         answer: The answer as `solve --json` prints it (docs/reference/formats.md).
-        maps: The maps that it lists.
+        maps: The maps that the answer lists.
         steps: The number of steps of the trace.
-        theory: The theory of the answer, resolved.
-        proven: The number of dstates that its certificate proves, if clingo's part is believed.
+        theory: The theory of the answer, with all defaults resolved.
+        proven: The lower bound on dstates that the certificate of the answer proves. Counts that
+            clingo refuted are taken as refuted.
 
     Returns:
         A sentence for each false claim.
@@ -57,15 +58,16 @@ def false_claims(
 def contradictions(
     answer: Mapping[str, Any], maps: Sequence[SSHMap], steps: int, theory: Theory
 ) -> Iterator[str]:
-    """Find contradictions in an answer.
+    """Find contradictions between the claims of an answer and its maps.
 
-    Its certificate is accepted: only the trace could check it.
+    The certificate of the answer is accepted unchecked, because its check needs the trace.
 
     Args:
         answer: The answer, as for `false_claims`.
-        maps: The maps that it lists.
+        maps: The maps that the answer lists.
         steps: The number of steps of the trace.
-        theory: The theory of the answer, resolved.
+        theory: The theory of the answer, with all defaults resolved. If it allows faults, costs and
+            bounds are not compared.
 
     Yields:
         A sentence for each contradiction.
@@ -103,7 +105,7 @@ class _Claims:
         self.is_optimal = answer.get("status") == "optimal"
 
     def sizes(self) -> Iterator[str]:
-        """The claimed numbers of steps and maps are right."""
+        """Check the claimed numbers of steps and maps, and the range of `prefix`."""
         listed = len(self.maps)
         if "count" in self.answer and not _is(self.answer["count"], listed):
             yield (
@@ -123,7 +125,7 @@ class _Claims:
             )
 
     def twice(self) -> Iterator[str]:
-        """Each map is listed once."""
+        """Check that each map is listed once, up to renaming."""
         seen: dict[SSHMap, int] = {}
         for i, ssh_map in enumerate(self.maps):
             first = seen.setdefault(ssh_map.renumbered(), i)
@@ -134,7 +136,7 @@ class _Claims:
                 )
 
     def status(self) -> Iterator[str]:
-        """The status, `complete` and `stopped` fit each other and the maps."""
+        """Check that `status`, `complete` and `stopped` fit each other and the maps."""
         status, complete, stopped = (
             self.answer.get(name) for name in ("status", "complete", "stopped")
         )
@@ -166,7 +168,10 @@ class _Claims:
             yield "complete: expected true, as the status is unsatisfiable, got false"
 
     def cost(self) -> Iterator[str]:
-        """The claimed cost is that of the first map, and the other maps are as good."""
+        """Check that the first map has the claimed cost and that no other map is worse or better.
+
+        If the answer also lists maps above the minimum, the costs of all levels are checked.
+        """
         if "cost" in self.answer:
             cost = self.answer["cost"]
             expected = (
@@ -193,16 +198,18 @@ class _Claims:
                 )
 
     def _preferred(self, i: int) -> list[int]:
-        """The counts of a map in the order of preference; empty if there is no such map."""
+        """List the counts of map i, the most preferred first; empty if there is no map i."""
         return [
             counts[name] for counts in self.counts[i : i + 1] for name in self.theory.priorities
         ]
 
     def _costs_within(self, within: Any) -> Iterator[str]:
-        """The maps are sorted by level, and each map and each level costs what is claimed.
+        """Check the maps of an answer that also lists maps above the minimum.
 
-        A level is the number of dstates, or of what else the theory prefers first, without excuses.
-        No level is above the claimed limit, and maps of one level are equally good.
+        The level of a map is its number of dstates, or of the first other count that the theory
+        minimises, except excuses. The maps must be sorted by level, no level may exceed the minimum
+        by more than `within`, maps of one level must be equally good, and each map and each level
+        must have the claimed cost.
         """
         counted = next((name for name in self.theory.priorities if name != "excuses"), None)
         if not is_whole(within) or within < 0:
@@ -243,7 +250,7 @@ class _Claims:
             )
 
     def _costs_of_each(self, shown: Sequence[Mapping[str, int]]) -> Iterator[str]:
-        """Each map has the cost that is claimed for it."""
+        """Check that each map has the cost that is claimed for it."""
         listed = self.answer.get("maps")
         for i, (said, counts) in enumerate(
             zip(listed if isinstance(listed, Sequence) else (), shown, strict=False)
@@ -255,10 +262,10 @@ class _Claims:
                 )
 
     def _least(self, cost: Any) -> dict[str, int]:
-        """The counts of the first map.
+        """Return the counts of the first map, as a dict from name to number.
 
-        If axioms are left out, clingo may count more than the map shows. Then a larger claim is
-        accepted.
+        If axioms are left out, clingo may count more than the map lists. Then the result has the
+        larger numbers of the claimed `cost`.
         """
         shown = self.counts[0]
         if not self.theory.without or not isinstance(cost, Mapping):
@@ -271,10 +278,10 @@ class _Claims:
         return shown | more
 
     def bound(self) -> Iterator[str]:
-        """The claimed bounds hold.
+        """Check the claimed lower bounds.
 
-        No map is below a bound, the certificate proves the bound on dstates, and the bound is the
-        cost if the status is optimal.
+        No map may be below a bound. The certificate must prove the bound on dstates. If the status
+        is optimal, the bound must equal the cost.
         """
         bound = self.answer.get("bound", {})
         if not isinstance(bound, Mapping) or not all(
@@ -290,7 +297,7 @@ class _Claims:
                     else "the theory prefers nothing"
                 )
                 yield f"bound: expected none of {name}, as {preferred}, got {value}"
-            # without some axiom, clingo may count more than the map shows
+            # if axioms are left out, clingo may count more than the map shows
             below = [i for i, counts in enumerate(self.counts) if counts[name] < value]
             if below and not self.theory.without:
                 yield (

@@ -1,7 +1,9 @@
-"""Places whose stars (gateways seen) cannot fit one place (star=gateways).
+"""Check the axioms about places with any number of gateways (star=gateways).
 
-A map does not show which gateway is which. So if no frame fits the stars of a place, a smallest
-set of sights that no frame fits is reported, under each axiom whose removal would make one fit.
+A star is the set of gateways seen at a step. A sight is a dstate and a star seen there. A map does
+not list which gateways of two sights are the same. So if no frame (numbering of the gateways of a
+place) fits all sights of a place, the check reports a smallest set of sights that no frame fits.
+The set is reported as a violation of each axiom that would let a frame fit if it were left out.
 """
 
 from __future__ import annotations
@@ -25,12 +27,13 @@ NAMES = (
 
 @dataclass(frozen=True)
 class Clash:
-    """A smallest set of sights that no frame of their place fits.
+    """A smallest set of sights (dstate and star) of a place that no frame of the place fits.
 
     Attributes:
         place: The place.
-        steps: The steps of the sights.
-        axioms: Each axiom that forbids the set: a frame fits once it is dropped.
+        steps: The first step of each sight.
+        axioms: The axioms that forbid the set. Leaving out any one of them lets a frame fit. All
+            axioms that hold if no single one suffices.
     """
 
     place: int
@@ -39,11 +42,11 @@ class Clash:
 
 
 def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> Iterator[Clash]:
-    """Find the places that no frame fits.
+    """Find the places whose sights (dstate and star) fit no frame.
 
     Args:
-        sights: The sights of a map, by first step.
-        turns: The turns between sights at one place.
+        sights: The sights of a map, sorted by first step.
+        turns: For each pair of sights at one place, the turns from one to the other.
         axioms: Names of the axioms that hold.
 
     Yields:
@@ -71,7 +74,7 @@ def _clashes_of(m: Reading) -> list[Clash]:
 
 
 def _gateways(name: str, m: Reading) -> Found:
-    """The axioms of places with any number of gateways."""
+    """Check the axiom `name` about places with any number of gateways."""
     for clash in m.once(_clashes_of):
         if name not in clash.axioms:
             continue

@@ -1,4 +1,4 @@
-"""Checks that a map fits its trace, and that its numbers fit each other."""
+"""Check that a map fits its trace, and that its numbers fit each other."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ssh_abduction.data.trace import View
 
 
 def labels_are_dstates(m: Reading) -> Found:
-    """Each step has a label, and each label is the id of a dstate."""
+    """Check that each step has a label, and that each label is the id of a dstate."""
     steps, labels = len(m.trace), len(m.map.labels)
     if steps != labels:
         yield (
@@ -25,9 +25,9 @@ def labels_are_dstates(m: Reading) -> Found:
 
 
 def numbered_by_first_visit(m: Reading) -> Found:
-    """Dstates, places and paths are numbered 0, 1, 2, … by first visit.
+    """Check that dstates, places and paths are numbered 0, 1, 2, … by first visit.
 
-    Each of them is visited, and each path is first faced in direction +1.
+    Each of them must be visited, and each path must be first faced in direction +1.
     """
     yield from _numbered(
         "dstates", [s.id for s in m.map.dstates], [(i, s.id) for i, s in m.visited]
@@ -68,9 +68,9 @@ def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | N
 
 
 def dstates_look_as_seen(m: Reading) -> Found:
-    """The view of a dstate is the first one there that is known and not ignored.
+    """Check that each dstate has the first view seen there, without unknown and ignored views.
 
-    The axiom functional_view covers the views of its other steps.
+    The axiom functional_view covers the views of the later steps at the dstate.
     """
     shown: dict[int, tuple[View | None, int]] = {}
     for (label, view), i in m.views.items():
@@ -87,7 +87,7 @@ def dstates_look_as_seen(m: Reading) -> Found:
 
 
 def links_are_those_of_the_trace(m: Reading) -> Found:
-    """The links of the map are those that its labels and the trace show."""
+    """Check that the links of the map are those that its labels and the actions imply."""
     shown = set(m.map.links)
     if len(shown) < len(m.map.links):
         yield [], "The map lists a link twice."
@@ -99,10 +99,10 @@ def links_are_those_of_the_trace(m: Reading) -> Found:
 
 
 def has_what_the_theory_has(m: Reading) -> Found:
-    """The map has only the parts that the theory speaks of.
+    """Check that the map has no parts that the theory does not use.
 
-    It has places and paths only at the topological level, headings only with frames, and excuses
-    only with boundary=defeasible.
+    A map may have places and paths only at the topological level, headings only with frames, and
+    excuses only with boundary=defeasible.
     """
     causal = m.theory.level == "causal"
     if causal and (m.map.places or m.map.paths):
@@ -123,7 +123,7 @@ def has_what_the_theory_has(m: Reading) -> Found:
 
 
 def excused_are_pairs_of_paths(m: Reading) -> Found:
-    """The map excuses pairs of its own paths."""
+    """Check that each excuse of the map is a pair of its own paths."""
     paths = {h.id for h in m.map.paths}
     for pair in m.map.excused:
         if not is_pair(pair) or not set(pair) <= paths:
@@ -131,9 +131,9 @@ def excused_are_pairs_of_paths(m: Reading) -> Found:
 
 
 def orders_list_places_once(m: Reading) -> Found:
-    """The order of a path lists places of the map, each once.
+    """Check that the order of each path lists places of the map, each at most once.
 
-    The axiom on_path covers whether they are the right places.
+    The axiom on_path covers whether these are the right places.
     """
     places = set(m.map.places)
     for h in m.map.paths:
@@ -144,7 +144,7 @@ def orders_list_places_once(m: Reading) -> Found:
 
 
 def frames_start_at_first_visit(m: Reading) -> Found:
-    """The dstate at which a place is first visited has heading 0."""
+    """Check that the dstate at which a place is first visited has heading 0."""
     if not {"one_heading", "gateway_heading"} & m.axioms:
         return
     for p, i in m.place_seen.items():

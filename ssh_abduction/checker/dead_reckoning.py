@@ -2,14 +2,15 @@
 
 The error of the robot's pose is predicted as in a Kalman filter. Let E(t) be the error of the pose
 by dead reckoning at step t, in the frame of the first step, and V(t) its covariance. An error at
-step i persists at a later step j, rotated about where the robot was:
+step i persists at a later step j, rotated about the position of the robot at step i:
 
     F(j, i) = [[1, S (p(j) - p(i))], [0, 1]]        with S a quarter turn, and p the position.
 
-So the loop from i to j closes with the error E(j) - F(j, i) E(i). Its covariance is
-V(j) - F(j, i) V(i) F(j, i)', because the noise of each step is independent of the steps before. Two
-loops share the noise between the later of their first steps and the earlier of their last steps. A
-wrong scale and a drift of the heading are two more errors, which never change.
+A loop is the way from step i to a later step j at the same dstate or place. It closes with the
+error E(j) - F(j, i) E(i). The covariance of this error is V(j) - F(j, i) V(i) F(j, i)', because the
+noise of each step is independent of the steps before. Two loops share the noise between the later
+of their first steps and the earlier of their last steps. Two more errors, a wrong scale and a drift
+of the heading, are constant over the whole trace.
 """
 
 from __future__ import annotations
@@ -26,17 +27,28 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.runtime.clock import look_at_clock
 
 Array: TypeAlias = NDArray[np.float64]
-# The numbers of `one_pose` in docs/explanation/theory.md: errors of the heading that count, in
-# standard deviations; the uncertainty in radians at which a heading is lost; the steps of a drift
-# per standard deviation, and the greatest drift, in standard deviations; and the rounding error in
-# metres.
+# The numbers of `one_pose` in docs/explanation/theory.md. SIGMAS: the errors of the heading that
+# count, in standard deviations. LOST: the uncertainty in radians at which a heading is lost.
+# BENDS_A_SIGMA: how many drifts are tried per standard deviation. MOST_BENDS: the greatest drift,
+# in standard deviations. ROUNDED: the rounding error in metres and radians.
 SIGMAS, LOST, BENDS_A_SIGMA, MOST_BENDS, ROUNDED = 6.0, 1.0, 2, 6, 1e-3
-# The number of steps or returns between two looks at the clock; they take some milliseconds.
+# The number of steps or returns between two looks at the clock. They take some milliseconds.
 FEW = 64
 
 
 class ErrorFilter:
-    """Poses by dead reckoning, and the covariance of their errors: pose (3), scale and drift."""
+    """Poses by dead reckoning, and the covariance of their errors.
+
+    Errors are those of the pose (x and y in metres, heading in radians), of the scale, and of the
+    drift of the heading. The arguments `first` and `last` of the methods are the steps at the ends
+    of m loops, as arrays of length m. Two numbers give the result of one loop.
+
+    Args:
+        trace: The trace, with displacements.
+        odometry: The noise model of the odometer.
+        bend: The drift of the heading that is assumed, in radians per metre.
+        drift: The standard deviation of the remaining drift, in radians per metre.
+    """
 
     def __init__(self, trace: Trace, odometry: Odometry, bend: float, drift: float) -> None:
         size = len(trace)
@@ -78,17 +90,21 @@ class ErrorFilter:
             self.repeated[t] = onward @ self.repeated[t - 1] + new
 
     def onward(self, first: Any, last: Any) -> Array:
-        """F(last, first), m x 3 x 3."""
+        """Compute F(last, first), m x 3 x 3: how an error at `first` shows at `last`."""
         return _onward(self.pose[last, :2] - self.pose[first, :2])
 
     def since(self, first: Any, last: Any) -> Array:
-        """The covariance of the noise between two steps."""
+        """Compute the covariance of the noise between `first` and `last`, m x 3 x 3."""
         onward = self.onward(first, last)
         covariance: Array = self.white[last] - onward @ self.white[first] @ onward.swapaxes(-1, -2)
         return covariance
 
     def new_until(self, end: int) -> Array:
-        """The covariance at step `end` of the noise up to each step, m x 9."""
+        """For each step up to `end`, compute how the noise up to it shows at `end`.
+
+        Returns:
+            The covariances, (end + 1) x 9.
+        """
         steps = np.arange(end + 1)
         onward = self.onward(steps, np.full(end + 1, end))
         covariance: Array = (onward @ self.white[: end + 1] @ onward.swapaxes(-1, -2)).reshape(
@@ -97,14 +113,22 @@ class ErrorFilter:
         return covariance
 
     def repeated_since(self, first: Any, last: Any) -> Array:
-        """The derivative of a loop by scale and drift, in standard deviations, m x 3 x 2."""
+        """Compute how the end of each loop moves if scale or drift is one standard deviation off.
+
+        Returns:
+            The changes of the pose by scale and by drift, m x 3 x 2.
+        """
         moved: Array = (
             self.repeated[last] - self.onward(first, last) @ self.repeated[first]
         ) * self.sigma
         return moved
 
     def covariance(self, first: Any, last: Any) -> Array:
-        """The covariance of closings, enlarged if errors of the heading are not small."""
+        """Compute the covariance of the closing error of each loop, m x 3 x 3.
+
+        Errors of the heading have effects that are not linear. The covariance is enlarged by a
+        bound on these effects.
+        """
         white, repeated = self.since(first, last), self.repeated_since(first, last)
         heading = self.lost(first, last)
         moved = self._moved_by_heading(first, last) + (repeated[..., :2, 1] ** 2).sum(-1)
@@ -118,17 +142,17 @@ class ErrorFilter:
         return total
 
     def lost(self, first: Any, last: Any) -> Array:
-        """The variance of the heading at the end of loops."""
+        """Compute the variance of the heading at the end of each loop, in radians squared."""
         variance: Array = (
             self.since(first, last)[..., 2, 2] + self.repeated_since(first, last)[..., 2, 1] ** 2
         )
         return variance
 
     def _moved_by_heading(self, first: Any, last: Any) -> Array:
-        """The variance of the end of loops that the noise of headings causes.
+        """Compute the variance that the noise of headings causes in the position of loop ends.
 
-        It is the sum, over the steps of a loop, of that noise times the squared distance to the
-        end.
+        For each loop this is the sum, over its steps, of the heading variance that the step adds
+        times the squared distance from the step to the end of the loop.
         """
         angle = np.diff(self.white[:, 2, 2], prepend=0.0)
         x, y = self.pose[:, 0], self.pose[:, 1]
@@ -141,9 +165,10 @@ class ErrorFilter:
         return moved
 
     def is_known(self, first: Any, last: Any) -> NDArray[np.bool_]:
-        """For each loop, whether its closing is known.
+        """For each loop, tell whether its closing error is known.
 
-        It is known if no displacement is missing and the heading is not lost along the loop.
+        The error is known if no displacement of the loop is missing and the standard deviation of
+        the heading at its end is at most LOST.
         """
         known: NDArray[np.bool_] = (self.broken[first] == self.broken[last]) & (
             self.lost(first, last) <= LOST**2
@@ -151,14 +176,17 @@ class ErrorFilter:
         return known
 
     def closing(self, first: Any, last: Any) -> Array:
-        """The error at the end of each loop, m x 3."""
+        """Compute the closing error of each loop (x, y, heading), m x 3.
+
+        This is the pose at `last` minus the pose at `first`, by dead reckoning.
+        """
         off: Array = self.pose[last] - self.pose[first]
         off[..., 2] = (off[..., 2] + math.pi) % math.tau - math.pi
         return off
 
 
 def _onward(moved: Array) -> Array:
-    """F for a movement, m x 2: how errors of the pose change."""
+    """Compute F, m x 3 x 3: how errors of the pose change by the movements `moved`, m x 2."""
     onward = np.zeros((*moved.shape[:-1], 3, 3))
     onward[..., range(3), range(3)] = 1.0
     onward[..., 0, 2], onward[..., 1, 2] = -moved[..., 1], moved[..., 0]
@@ -166,8 +194,9 @@ def _onward(moved: Array) -> Array:
 
 
 class Drifts:
-    """The poses for each drift of the heading, with the chi-square of the drift, no drift first.
+    """An iterator over possible drifts of the heading, no drift first.
 
+    It yields an `ErrorFilter` with the poses for each drift, and the chi-square of that drift.
     Poses are computed at their first use.
     """
 
@@ -177,7 +206,7 @@ class Drifts:
 
     @property
     def none(self) -> ErrorFilter:
-        """The poses without a drift."""
+        """The filter with the poses without a drift."""
         return self._filter(0)
 
     def _filter(self, number: int) -> ErrorFilter:

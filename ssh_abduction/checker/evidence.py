@@ -1,4 +1,4 @@
-"""The axioms of evidence: stars (gateways seen), asserted pairs, poses, and planar drawings."""
+"""Checks of the axioms about stars (gateways seen), asserted pairs, poses and planar drawings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ssh_abduction.data.star import Star
 
 
 def one_star(m: Reading) -> Found:
-    """The stars seen at a dstate show the same gateways, in the same directions."""
+    """Check that all stars seen at a dstate show the same gateways, in the same directions."""
     seen: dict[int, dict[Star, int]] = {}
     for t, (label, step) in enumerate(zip(m.map.labels, m.trace.steps, strict=False)):
         stars, star = seen.setdefault(label, {}), step.gateways or Star(())
@@ -27,7 +27,7 @@ def one_star(m: Reading) -> Found:
 
 
 def asserted(m: Reading) -> Found:
-    """Each assertion about a pair of steps holds in the map."""
+    """Check that the map satisfies each assertion of the theory about a pair of steps."""
     labels, theory = m.map.labels, m.theory
     told = [
         ("one dstate", theory.same),
@@ -56,7 +56,7 @@ def asserted(m: Reading) -> Found:
 
 
 def one_pose(m: Reading) -> Found:
-    """The displacements agree with one pose a dstate and one position a place."""
+    """Check that displacements agree with one pose per dstate and one position per place."""
     from ssh_abduction.checker.geometry import refused_returns  # loads numpy
 
     trusted = m.trace.without_displacements_at(
@@ -76,7 +76,7 @@ def one_pose(m: Reading) -> Found:
 
 
 def planar(m: Reading) -> Found:
-    """The map can be drawn in the plane without a crossing, with right turns to the right."""
+    """Check that the map can be drawn in the plane without a crossing, right turns to the right."""
     place_of = {s.id: s.place for s in m.states.values() if s.place is not None}
     headings = {s: heading for s in place_of if (heading := heading_of(m.states[s])) is not None}
     turns = [
@@ -116,9 +116,11 @@ def planar(m: Reading) -> Found:
 
 
 def _may_show_the_same(one: Star, other: Star) -> bool:
-    """Whether two stars may show the same gateways to a robot that has not turned.
+    """Tell whether two stars may show the same gateways, seen by a robot that has not turned.
 
-    They may if a matching of bearings within their spreads covers all gateways seen in either.
+    They may if the gateways of one star can be matched one-to-one with those of the other, such
+    that bearings differ by no more than their spreads, and every gateway seen open in either star
+    is matched.
     """
     import numpy as np
     from scipy.optimize import linear_sum_assignment
@@ -127,7 +129,7 @@ def _may_show_the_same(one: Star, other: Star) -> bool:
         [np.array([getattr(g, name) for g in star.gateways], dtype=float) for star in (one, other)]
         for name in ("bearing", "spread", "open")
     )
-    seen = [np.nan_to_num(row) for row in seen]  # None, which is not observed, is 0
+    seen = [np.nan_to_num(row) for row in seen]  # not observed (None) becomes 0
     off = np.abs((bearings[0][:, None] - bearings[1] + 180) % 360 - 180)
     near = off <= spreads[0][:, None] + spreads[1]
     taken_in = np.where(near, seen[0][:, None] + seen[1], 0)

@@ -1,4 +1,4 @@
-"""Checks the faults of a map: ignored views, stars (openings), actions and displacements."""
+"""Check the faults of a map: steps whose view, star, action or displacement it treats as wrong."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ from ssh_abduction.data.maps import Fault
 
 
 def faults_are_allowed(m: Reading) -> Found:
-    """The theory allows each fault, and the map names it once, as the trace shows it."""
+    """Check that the theory allows each fault of the map, and that the map lists it correctly.
+
+    A fault must be listed once, with the view or action that the trace shows at its step, and with
+    the cost that the theory sets.
+    """
     steps, named = m.trace.steps, set[tuple[str, int]]()
     for fault in m.map.faults:
         i, kind = fault.step, fault.kind
@@ -27,7 +31,7 @@ def faults_are_allowed(m: Reading) -> Found:
 
 
 def _is_allowed(m: Reading, kind: str) -> bool:
-    """Whether the theory has a price for faults of this kind."""
+    """Tell whether the theory has a price for faults of this kind."""
     prices = {
         "misread": m.theory.misread,
         "misseen": m.theory.misread,
@@ -38,7 +42,11 @@ def _is_allowed(m: Reading, kind: str) -> bool:
 
 
 def _what_is_wrong(m: Reading, fault: Fault) -> str | None:
-    """A sentence if a fault is not allowed, or is not what the trace and the map show."""
+    """Describe in a sentence why a fault is not allowed or contradicts the trace or the map.
+
+    Returns:
+        The sentence; None if nothing is wrong.
+    """
     i, kind = fault.step, fault.kind
     without_stars = kind == "misseen" and m.theory.star not in ("pattern", "frame")
     if not _is_allowed(m, kind) or without_stars:

@@ -1,12 +1,16 @@
-"""Whether the returns of a map agree with the displacements of its trace (axiom `one_pose`).
+"""Check the returns of a map against the displacements of its trace (axiom `one_pose`).
 
-How the error of the pose grows is computed in `dead_reckoning`.
+A return is a pair of steps that the map has at one dstate or at one place. Its loop is the way
+between these steps. The module `dead_reckoning` computes the error with which a loop closes, and
+the covariance of this error.
 
-A bound passes most sets of two returns. Let z and y be the chi-squares of the returns alone. If the
-noise that both share is at most a share s of the covariance of the first one, in any direction,
-then the chi-square of both is at most (z + y) / (1 - sqrt(s)). The trace of the share bounds s, and
-it is the difference of two values of a table. So is the share itself, and the square root of the
-trace of its square is another bound.
+Returns are tested alone and in pairs by their chi-square. Most pairs need no test, because a bound
+shows that they are not rejected. Let z and y be the chi-squares of the two returns alone. The
+matrix M is the covariance of the noise that both share, times the inverse of the covariance of the
+later return. If s is at least the greatest eigenvalue of M, the chi-square of the pair is at most
+(z + y) / (1 - sqrt(s)). The trace of M is such an s. It is the difference of two values of a table,
+so it is fast. The square root of the trace of M squared is a smaller s. It is tried on the pairs
+that are left.
 """
 
 from __future__ import annotations
@@ -36,23 +40,23 @@ _Found: TypeAlias = tuple[tuple[Return, ...], float, float]
 
 # The number of sets that numpy works on at once.
 AT_A_TIME = 50_000
-# If the bound does not pass more sets of two returns than this, only this many are checked, evenly
+# If the bound leaves more pairs of returns than this, only about this many are tested, evenly
 # spread. That takes a second or two.
 MOST_SETS = 300_000
-# A bound has to pass a set by this margin, because numbers are rounded.
+# The bound skips a pair only with this margin, because numbers are rounded.
 MARGIN = 1e-3
 
 
 @dataclass(frozen=True)
 class Closing:
-    """How far off a loop closes by dead reckoning.
+    """The error with which a loop closes by dead reckoning.
 
     Attributes:
         way: The length of the loop in metres.
-        size: The distance in metres.
-        size_sigma: Its standard deviation.
-        turned: The angle in degrees.
-        turned_sigma: Its standard deviation.
+        size: The distance between its two ends in metres.
+        size_sigma: The standard deviation of that distance in metres.
+        turned: The angle between the headings at its two ends in degrees, 0 or more.
+        turned_sigma: The standard deviation of that angle in degrees.
     """
 
     way: float
@@ -64,13 +68,14 @@ class Closing:
 
 @dataclass(frozen=True)
 class Refused:
-    """One return or two returns of a map that displacements reject.
+    """One return or two returns of a map that the displacements reject.
 
     Attributes:
-        returns: The steps and degrees of freedom of each.
-        closings: The error of each.
-        square: The chi-square of all.
-        most: The threshold.
+        returns: For each return, its two steps and its degrees of freedom (2 for a place, 3 for a
+            dstate).
+        closings: For each return, the error with which its loop closes.
+        square: The chi-square of all returns together.
+        most: The threshold that the chi-square exceeds.
     """
 
     returns: tuple[Return, ...]
@@ -79,7 +84,7 @@ class Refused:
     most: float
 
     def __str__(self) -> str:
-        """How far apart the steps of one return are, or how far off the loops of two close."""
+        """Say how far apart the steps of a single return are, or how far off two loops close."""
         if len(self.closings) == 2:
             ways, sizes = (
                 " and ".join(f"{value:{form}} m" for value in values)
@@ -100,15 +105,16 @@ class Refused:
 
 
 def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Refused]:
-    """Find the return that is rejected most clearly, and the pair of returns.
+    """Find the single returns and the pair of returns that displacements reject most clearly.
 
     Args:
         trace: The whole trace.
-        ssh_map: A map of it.
-        theory: The theory, resolved, so that it says how many returns may be true.
+        ssh_map: A map of the trace.
+        theory: The theory, resolved for the trace, so that it has the number of tests.
 
     Yields:
-        At most one single return, then at most one pair.
+        At most one return to a place, one return to a dstate, and then one pair of returns. Nothing
+        if the trace has no displacements.
     """
     if not trace.has_displacements:
         return
@@ -118,7 +124,10 @@ def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[R
 
 
 def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts) -> Iterator[_Found]:
-    """Single returns come first: they are found fast, and a caller may need no more."""
+    """Find rejected returns for `refused_returns`.
+
+    Single returns come first: they are found fast, and a caller may need no more.
+    """
     yield from _refused_alone(list(_returns(trace, ssh_map, theory, drifts)), drifts, theory)
     if theory.joint > 1:
         yield from _refused_together(
@@ -127,7 +136,10 @@ def _refused(trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts) -> I
 
 
 def _closing(trace: Trace, first: int, last: int) -> Closing:
-    """The error of a loop without drift; the drift is part of the uncertainty."""
+    """Compute the closing error of the loop from step `first` to step `last`.
+
+    The poses assume no drift of the heading. A possible drift adds to the standard deviations.
+    """
     odometry = trace.odometry or Odometry()
     filtered = ErrorFilter(trace.prefix(last + 1), odometry, 0.0, odometry.bend)
     off, covariance = filtered.closing(first, last), filtered.covariance(first, last)
@@ -149,14 +161,18 @@ def _closing(trace: Trace, first: int, last: int) -> Closing:
 def _returns(
     trace: Trace, ssh_map: SSHMap, theory: Theory, drifts: Drifts, of_arrivals: bool = False
 ) -> Iterator[Return]:
-    """The returns of a map that displacements say something about.
+    """Find the returns of a map whose closing error is known.
 
     Args:
         trace: The trace.
-        ssh_map: A map of it.
-        theory: The theory, resolved.
-        drifts: The poses.
-        of_arrivals: Whether to give only the returns between first steps of visits.
+        ssh_map: A map of the trace.
+        theory: The theory, resolved for the trace.
+        drifts: The poses by dead reckoning.
+        of_arrivals: Whether returns to dstates are limited to first steps of visits. Returns to
+            places always are.
+
+    Yields:
+        Returns: first step, last step, and degrees of freedom.
     """
     place = {s.id: s.place for s in ssh_map.dstates}
     size = min(len(trace), len(ssh_map.labels))
@@ -182,14 +198,20 @@ def _returns(
 
 
 def _most(theory: Theory, freedom: int, together: bool) -> float:
-    """The chi-square above which returns are rejected."""
+    """Compute the chi-square above which returns are rejected.
+
+    Args:
+        theory: The theory, with the chance of a false rejection and the number of tests.
+        freedom: The degrees of freedom of all returns of one test.
+        together: Whether a test is of a pair of returns.
+    """
     share = theory.reject / 2 if theory.joint > 1 else theory.reject
     tests = theory.returns * (theory.returns - 1) / 2 if together else theory.returns
     return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
 
 def _refused_alone(returns: Sequence[Return], drifts: Drifts, theory: Theory) -> Iterator[_Found]:
-    """The single return that is rejected most clearly."""
+    """Find the return to a place and the return to a dstate that are rejected most clearly."""
     for freedom in (2, 3) if returns else ():
         rows = np.array([r for r in returns if r[2] == freedom], dtype=int).reshape(-1, 3)
         most, least = _most(theory, freedom, together=False), np.full(len(rows), np.inf)
@@ -213,9 +235,10 @@ def _refused_alone(returns: Sequence[Return], drifts: Drifts, theory: Theory) ->
 def _refused_together(
     returns: Sequence[Return], drifts: Drifts, theory: Theory
 ) -> Iterator[_Found]:
-    """The pair of returns that is rejected most clearly.
+    """Find the pair of returns that is rejected most clearly.
 
-    If the bound does not pass more than MOST_SETS pairs, MOST_SETS are checked, evenly spread.
+    If the bound leaves more than MOST_SETS pairs to test, about MOST_SETS of them, evenly spread,
+    are tested.
     """
     if len(returns) < 2:
         return
@@ -246,12 +269,15 @@ def _refused_together(
 
 
 def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Steps, Steps]]:
-    """The pairs of rows that share displacements and that the bound does not pass, in portions.
+    """Find the pairs of returns whose loops overlap and that need a test.
 
     Args:
-        filtered: The poses.
-        rows: The returns, by last step.
+        rows: The returns (first step, last step, degrees of freedom), sorted by last step, m x 3.
+        filtered: The poses without drift.
         most: The least chi-square at which a pair may be rejected.
+
+    Yields:
+        Portions of the pairs, each as two arrays of indices into `rows`.
     """
     alone = _Alone(filtered, rows)
     found = []
@@ -267,12 +293,12 @@ def _sets(rows: Steps, filtered: ErrorFilter, most: float) -> Iterator[tuple[Ste
 
 
 class _Alone:
-    """Values of each row alone.
+    """Values of m returns, each taken alone.
 
     Attributes:
-        inverse: The inverse of its covariance, m x 9.
-        square: Its chi-square, m.
-        repeated: The part of scale and drift in its covariance, m x 9.
+        inverse: The inverse of the covariance of each closing error, m x 9.
+        square: The chi-square of each return, m.
+        repeated: The part of each covariance that scale and drift cause, m x 9.
     """
 
     def __init__(self, filtered: ErrorFilter, rows: Steps) -> None:
@@ -297,7 +323,18 @@ class _Alone:
 def _unsafe(
     filtered: ErrorFilter, rows: Steps, alone: _Alone, end: int, most: float
 ) -> tuple[Steps, Steps]:
-    """The pairs of a row that ends at a step with earlier rows, unless the bound passes them."""
+    """Find the pairs that need a test, among the pairs whose later return ends at step `end`.
+
+    Args:
+        filtered: The poses without drift.
+        rows: The returns, sorted by last step, m x 3.
+        alone: The values of each return alone.
+        end: The last step of the later return.
+        most: The least chi-square at which a pair may be rejected.
+
+    Returns:
+        The indices into `rows` of the earlier returns, and those of the later returns.
+    """
     later = np.arange(*np.searchsorted(rows[:, 1], [end, end + 1]))
     earlier = np.arange(
         np.searchsorted(rows[:, 1], rows[later, 0].min(), side="right"), later[-1] + 1
@@ -323,11 +360,11 @@ def _unsafe(
 
 
 def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
-    """Whether the bound passes pairs.
+    """For each pair of returns, tell whether the bound shows that it is not rejected.
 
     Args:
-        share: A bound on the share of the covariance that both rows have in common.
-        squares: The sum of their chi-squares.
+        share: A bound s on the share of the covariance that both returns have in common.
+        squares: The sum of the chi-squares of both returns.
         most: The least chi-square at which a pair may be rejected.
     """
     left = 1 - squares / most
@@ -336,7 +373,14 @@ def _is_safe(share: Array, squares: Array, most: float) -> NDArray[np.bool_]:
 
 
 def _square_together(filtered: ErrorFilter, rows: Steps, here: Steps, others: Steps) -> Array:
-    """The chi-square of pairs of rows; 0 if one of them is not known."""
+    """Compute the chi-square of each pair of returns; 0 if a closing error of the pair is unknown.
+
+    Args:
+        filtered: The poses.
+        rows: The returns.
+        here: The index into `rows` of one return of each pair.
+        others: The index into `rows` of the other return of each pair.
+    """
     m = len(others)
     begin, end = (
         np.maximum(rows[others, 0], rows[here, 0]),
@@ -371,12 +415,12 @@ def _square_together(filtered: ErrorFilter, rows: Steps, here: Steps, others: St
 
 
 def _square(off: Array, covariance: Array) -> Array:
-    """The chi-squares of closings."""
+    """Compute the chi-squares of closing errors `off`, m x k, with covariances, m x k x k."""
     square: Array = np.einsum("mi,mi->m", off, np.linalg.solve(covariance, off[..., None])[..., 0])
     return square
 
 
 def returns_row(row: Steps) -> Return:
-    """The return of a row."""
+    """Convert a row of an array (first step, last step, degrees of freedom) to a tuple."""
     first, last, freedom = map(int, row)
     return first, last, freedom

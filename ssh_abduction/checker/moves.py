@@ -1,4 +1,4 @@
-"""Moves of a map, and the courses and headings of dstates."""
+"""Moves (links with their dstates), and the courses and headings of dstates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ Course: TypeAlias = tuple[int, int]
 
 @dataclass(frozen=True)
 class Move:
-    """An action that leads from one dstate to another, and the first step at which it was done."""
+    """A link of a map with its dstates.
+
+    Attributes:
+        step: The first step at which the action was done at the source.
+        source: The dstate at which the action starts.
+        action: The action.
+        target: The dstate that the action leads to.
+    """
 
     step: int
     source: DState
@@ -23,7 +30,7 @@ class Move:
 
     @property
     def steps(self) -> tuple[int, int]:
-        """The steps before and after the action."""
+        """The step at which the action starts, and the next one, at which it ends."""
         return self.step, self.step + 1
 
     def __str__(self) -> str:
@@ -32,26 +39,26 @@ class Move:
 
 
 def course_of(s: DState) -> Course | None:
-    """The path and direction of a dstate that has both."""
+    """Return the path of a dstate and its direction (+1 or -1); None if it has not both."""
     return (s.path, s.direction) if s.path is not None and s.direction in (1, -1) else None
 
 
 def opposite(course: Course) -> Course:
-    """The same path in the other direction."""
+    """Return the same path in the other direction."""
     return course[0], -course[1]
 
 
 def along(course: Course) -> str:
-    """A course in words."""
+    """Describe a course in words, as "path 2+"."""
     return f"path {course[0]}{'+' if course[1] == 1 else '-'}"
 
 
 def going(s: DState) -> str:
-    """The course of a dstate in words."""
+    """Describe the course of a dstate in words; "no path" if it has none."""
     course = course_of(s)
     return along(course) if course else "no path"
 
 
 def heading_of(s: DState) -> int | None:
-    """The heading of a dstate in a frame of four slots, if it is one."""
+    """Return the heading of a dstate if it is a slot, 0 to 3; otherwise None."""
     return s.heading if s.heading in (0, 1, 2, 3) else None

@@ -10,20 +10,27 @@ from ssh_abduction.checker.moves import Move
 
 
 class Order:
-    """The order of the places of one path.
+    """The order of the places along one path, in directions +1 and -1.
 
-    It is the order that the map lists if the order has to be total. Otherwise it is the least order
-    that the travels ask for. Directions are +1 and -1. A list can only show an order that is
-    asymmetric and transitive. So if one of these axioms is left out, a travel outweighs the list.
-    Without the axiom on_path no place is known to be on the path, so a total order orders none.
+    If the axioms demand a total order, the order is the one that the map lists. Otherwise it has
+    only the pairs that travels imply. A list can only show an order that is asymmetric and
+    transitive. So if one of these two axioms is left out, a travel overrules the list. Without the
+    axiom on_path no place is known to be on the path, so the list is not used.
+
+    Args:
+        listed: The places as the map lists them, in direction +1.
+        travels: For pairs (p, q) of places, a travel that shows that p comes before q in
+            direction +1.
+        axioms: Names of the axioms that hold.
 
     Attributes:
-        listed: The places as the map lists them.
-        travels: A travel for each pair of places that one leads between, in direction +1.
-        position: The position of each listed place.
-        backward: The pairs of places whose travel contradicts the list.
-        rings: Rings of places that travels lead around.
-        can_be_listed: Whether the axioms ask for an order that a list can show.
+        listed: As above.
+        travels: As above.
+        position: The position of each listed place in the list, from 0.
+        backward: The pairs of `travels` that the list has the other way round, or not at all.
+        rings: Lists of places. Travels lead from each place to the next, and from the last to the
+            first.
+        can_be_listed: Whether the axioms demand an order that a list can show.
     """
 
     def __init__(
@@ -54,7 +61,7 @@ class Order:
         self._is_listed = self._total and (self.can_be_listed or not self.backward)
 
     def _rings(self) -> list[list[int]]:
-        """The rings. Each has a travel against the list, so these travels are followed."""
+        """Find the rings. Each has a travel against the list, so only those travels are tried."""
         try:
             TopologicalSorter(self._next[1]).prepare()
         except CycleError:
@@ -63,11 +70,11 @@ class Order:
         return []
 
     def allows(self, ring: Sequence[int]) -> bool:
-        """Whether the axioms let these places follow each other in a ring."""
+        """Tell whether the axioms let these places follow each other in a ring."""
         return not self._asymmetric or (not self._transitive and len(ring) > 2)
 
     def after(self, p: int, direction: int) -> Iterable[int]:
-        """The places after p in this direction."""
+        """Find the places after p in this direction (+1 or -1)."""
         if self._is_listed:
             return self._later(p, direction)
         follows = self._follows(p, direction)
@@ -82,7 +89,7 @@ class Order:
         return reached
 
     def between(self, p: int, q: int, direction: int) -> set[int]:
-        """The places after p and before q in this direction."""
+        """Find the places after p and before q in this direction (+1 or -1)."""
         i, j = self.position.get(p), self.position.get(q)
         agrees = self._is_listed or not self.backward
         if agrees and i is not None and j is not None and abs(i - j) <= 1:
@@ -90,7 +97,7 @@ class Order:
         return set(self.after(p, direction)) & set(self.after(q, -direction)) - {p, q}
 
     def _way_back(self, p: int, q: int) -> list[int]:
-        """The places on a shortest way along travels from q to p; empty if there is none."""
+        """Find a shortest way along travels from q to p, as places; empty if there is none."""
         came: dict[int, int | None] = {q: None}
         queue = deque([q])
         while queue and p not in came:
@@ -106,21 +113,21 @@ class Order:
         return way[::-1]
 
     def ring_steps(self, ring: Sequence[int]) -> list[int]:
-        """The steps of the travels around a ring of places."""
+        """List the steps of the travels around a ring of places."""
         edges = zip(ring, [*ring[1:], ring[0]], strict=True)
         return [step for edge in edges for step in self.travels[edge].steps]
 
     def _later(self, p: int, direction: int) -> Sequence[int]:
-        """The places after p in the list."""
+        """Find the places after p in the list, or before it if the direction is -1."""
         i = self.position.get(p)
         if i is None:
             return ()
         return self.listed[i + 1 :] if direction == 1 else self.listed[:i]
 
     def _follows(self, p: int, direction: int) -> list[int]:
-        """The places that a travel puts after p or, if the order is total, the list does.
+        """Find the places that travels or the list put after p.
 
-        If they disagree, the travel counts.
+        The list is used only if the order is total. A travel overrules it.
         """
         travelled = self._next[direction].get(p, {})
         later = self._later(p, direction) if self._total else ()

@@ -1,4 +1,4 @@
-"""Whether the edges of a map can be drawn in the plane without a crossing.
+"""Check that the edges of a map can be drawn in the plane without a crossing.
 
 >>> there_back_and_there = [(0, 1), (2, 3), (4, 5)]
 >>> edges = Edges(there_back_and_there, [], {0: 0, 1: 1, 2: 1, 3: 0, 4: 0, 5: 1})
@@ -7,13 +7,18 @@ True
 >>> edges.can_be_drawn_by({0: 1, 1: 1, 2: 2, 3: 2, 4: 3, 5: 2})
 False
 
-A travel leads from the arm ahead of one dstate to the arm behind another one. Arms lie around a
-place in some order, and some of them may be one gateway. If places have frames, this module lists
-all headings that turns and stars allow, and tries them place by place. With the right ones each
-gateway is joined to one other, and V - E + F = 2 for each connected part (Heffter, Edmonds; see
-Mohar & Thomassen, Graphs on Surfaces, 2001). Without frames it lists the orders that sides allow.
-The search for a drawing with these orders is shared with the evidence (`theory/planarity.py`); the
-tests compare it with networkx and with a brute force.
+An arm is the gateway ahead of a dstate or behind it. A travel leads from the arm ahead of one
+dstate to the arm behind another one. Arms lie around a place in some order, and two arms may be one
+gateway.
+
+If places have frames (numbered directions), this module lists all headings that turns and stars
+allow, and tries them place by place. Headings make a drawing if each gateway is joined to one
+other, and V - E + F = 2 for each connected part (vertices, edges, faces; Heffter, Edmonds; see
+Mohar & Thomassen, Graphs on Surfaces, 2001).
+
+Without frames the module lists the clockwise orders of gateways that turns allow.
+`theory/planarity.py` searches for a drawing with these orders. The evidence uses the same search,
+so the tests compare it with networkx and with a brute force.
 """
 
 from __future__ import annotations
@@ -35,12 +40,12 @@ QUARTERS = {"right": 1, "around": 2, "left": 3}
 
 
 class Edges:
-    """The travels and turns of a map.
+    """The travels and turns of a map, for tests of whether they can be drawn without a crossing.
 
     Args:
-        travels: Pairs of dstates.
-        turns: A dstate, the way (right, left, around), and the dstate that is faced then. Turns
-            between places are ignored.
+        travels: Pairs of dstate ids: where a travel starts and where it ends.
+        turns: For each turn the dstate before it, its kind ("right", "left" or "around"), and the
+            dstate after it. Turns between places are ignored.
         place_of: The place of each dstate.
     """
 
@@ -59,10 +64,10 @@ class Edges:
             self._at[p].append(s)
 
     def can_be_drawn_by(self, headings: Mapping[int, int]) -> bool:
-        """Whether headings make a drawing without a crossing.
+        """Tell whether these headings make a drawing without a crossing.
 
         Args:
-            headings: The slot, 0 to 3, that each dstate faces.
+            headings: The slot, 0 to 3 clockwise, that each dstate faces.
         """
         return self._is_drawing(
             {(s, side): (headings[s] + (1 - side)) % 4 for s in self.place_of for side in (1, -1)}
@@ -71,12 +76,13 @@ class Edges:
     def can_be_drawn_in_frames(
         self, stars: Mapping[int, Iterable[Openings]], *, turned: bool, distinct: bool
     ) -> bool:
-        """Whether some headings make such a drawing.
+        """Tell whether some headings in frames of four slots make a drawing without a crossing.
 
         Args:
-            stars: The stars seen at each dstate. Those at one place agree in its frame.
-            turned: Whether turns rotate the heading.
-            distinct: Whether no two dstates face one slot.
+            stars: The stars (openings ahead, right, back and left) seen at each dstate. Headings
+                must make the stars of one place agree.
+            turned: Whether turns must rotate the heading.
+            distinct: Whether the dstates of a place must face different slots.
         """
         options: list[list[Option]] = []
         for here in self._at.values():
@@ -119,10 +125,13 @@ class Edges:
         return self._some_option_draws(options)
 
     def can_be_drawn(self, *, crossing: bool) -> bool:
-        """Whether some orders of gateways make such a drawing, if turns show sides only.
+        """Tell whether some clockwise orders of gateways make a drawing without a crossing.
+
+        This is for places without frames: a turn shows only the side, not the angle.
 
         Args:
-            crossing: Whether a turn leads to an edge that crosses this one, not only to a branch.
+            crossing: Whether the path after a right or left turn lies on both sides of the path
+                before it. Otherwise only the part ahead is known to lie on the side of the turn.
         """
         one = self._gateways()
         if one is None:
@@ -138,7 +147,7 @@ class Edges:
             - at_edge
         ):
             at_edge |= more
-        # gateways of each place that follow each other clockwise
+        # for each place, lists of gateways that follow each other clockwise
         told: dict[int, list[list[Arm]]] = defaultdict(list)
         for s, turn, t in self.turns:
             if turn != "around" and {s, t} <= at_edge:
@@ -168,9 +177,14 @@ class Edges:
         )
 
     def _gateways(self) -> dict[Arm, Arm] | None:
-        """For each arm, an arm that represents its gateway; None if a gateway leads to two places.
+        """Find the arms that are one gateway.
 
-        A turn around faces what was behind, and a gateway leads to one gateway.
+        A turn around faces what was behind. A gateway leads to one gateway, so if two arms are one,
+        the arms at their far ends are one.
+
+        Returns:
+            A dict from each arm to the arm that represents its gateway; None if a gateway leads to
+            two places.
         """
         one = {(s, side): (s, side) for s in self.place_of for side in (1, -1)}
 
@@ -200,9 +214,9 @@ class Edges:
         return one
 
     def _some_option_draws(self, options: list[list[Option]]) -> bool:
-        """Whether some choice of an option for each place makes a drawing.
+        """Tell whether one option can be chosen for each place so that they make a drawing.
 
-        A partial choice that makes none is not extended.
+        Options are chosen place by place. A partial choice that makes no drawing is not extended.
         """
         settled = {arm: k for some in options if len(some) == 1 for arm, k in some[0].items()}
         others = sorted((some for some in options if len(some) != 1), key=len)
@@ -222,7 +236,7 @@ class Edges:
         return False
 
     def _is_drawing(self, position: Option) -> bool:
-        """Whether the travels whose arms both have positions make a drawing.
+        """Tell whether a drawing exists for the travels whose arms both have a position.
 
         Each gateway has to be joined to one other, and V - E + F = 2 for each connected part.
         """
@@ -246,7 +260,7 @@ class Edges:
             for gateways in around.values()
             for i, gateway in enumerate(gateways)
         }
-        # an edge that leads back to its gateway gets a place of its own at its other end
+        # an edge that leads back to its own gateway gets an extra place at its other end
         places = len(around) + sum(len(edge) == 1 for edge in joined)
         faces = _cycles({gateway: after[other] for gateway, other in beyond.items()})
         return places - len(joined) + faces == 2 * _parts(around, beyond)
@@ -278,13 +292,21 @@ def _parts(
 
 
 def _is_turned(faced: Mapping[int, int], turn: tuple[int, int, int]) -> bool:
-    """Whether a turn rotates the heading, or one of its headings is not chosen yet."""
+    """Tell whether headings fit a turn. They do if one of its two headings is not chosen yet.
+
+    Args:
+        faced: The heading of each dstate that has one so far.
+        turn: The dstate before the turn, the quarters of the turn, and the dstate after it.
+    """
     s, quarters, t = turn
     return s not in faced or t not in faced or (faced[s] + quarters - faced[t]) % 4 == 0
 
 
 def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
-    """Whether these gateways are distinct, and clockwise as far as the order has them."""
+    """Tell whether the gateways `told` are distinct, and clockwise in a circular order.
+
+    Gateways that the order does not have yet are skipped.
+    """
     there = [order.index(gateway) for gateway in told if gateway in order]
     return (
         len(set(told)) == len(told)
@@ -293,7 +315,10 @@ def _goes_round(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
 
 
 def _orders(gateways: Sequence[Arm], told: Sequence[Sequence[Arm]]) -> list[tuple[Arm, ...]]:
-    """All clockwise orders of gateways that agree with the `told` sequences, the first first."""
+    """List all clockwise orders of gateways that agree with the `told` sequences.
+
+    Orders that differ by a rotation are one: each starts with the first gateway.
+    """
     orders: list[tuple[Arm, ...]] = [()]
     for gateway in gateways:
         longer = (

@@ -1,4 +1,4 @@
-"""Check the proof that no map of a trace has fewer dstates, in plain Python.
+"""Check a proof that all maps of a trace have at least some number of dstates.
 
 >>> from ssh_abduction import Trace
 >>> from ssh_abduction.checker.proof import check_bound
@@ -20,12 +20,13 @@ from ssh_abduction.data.trace import Step, Trace
 
 @dataclass(frozen=True, slots=True)
 class ProvenBound:
-    """What a certificate proves.
+    """The lower bound that a certificate proves, and what is wrong with the certificate.
 
     Attributes:
-        dstates: A lower bound on the dstates of every map, if there are no faults.
-        refuted: Larger numbers of dstates for which clingo found no map. They are not checked here.
-        faults: What is wrong with the certificate.
+        dstates: A lower bound on the dstates of every map. It is proven only if `faults` is empty.
+        refuted: The next numbers of dstates, from `dstates` up, for which the certificate says that
+            clingo found no map. This is not checked here.
+        faults: A sentence for each pair of steps that the certificate does not show to be distinct.
     """
 
     dstates: int
@@ -36,14 +37,19 @@ class ProvenBound:
 def check_bound(trace: Trace, certificate: Any) -> ProvenBound:
     """Check the certificate of a lower bound on dstates.
 
-    Two steps are different dstates if the same actions lead from them to different views, because a
-    dstate has one view and actions are deterministic. So each pair of the clique is followed along
-    the trace by its word (a list of actions) to see whether the views differ. If the certificate
-    has no words at all, the word of a pair is what was done after both steps.
+    A certificate has a clique: steps that are pairwise at different dstates. Two steps are at
+    different dstates if the same actions lead from them to different views, because a dstate has
+    one view and actions are deterministic. So for each pair of the clique, the check follows a word
+    (a list of actions) from both steps along the trace and compares the views at the end. The
+    certificate lists the words of pairs. If it has no words at all, the word of a pair is the
+    actions that the trace has after both steps.
 
     Args:
         trace: The trace.
         certificate: The certificate as `Certificate.to_dict` writes it.
+
+    Returns:
+        The bound, and the faults of the certificate.
 
     Raises:
         MapError: The certificate is malformed.
@@ -103,12 +109,12 @@ def _integers(values: Any) -> bool:
 
 
 def _look_different(here: Step, there: Step) -> bool:
-    """Whether both views are known and different."""
+    """Tell whether the views of two steps are known and different."""
     return None not in (here.view, there.view) and here.view != there.view
 
 
 def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
-    """The actions done after both steps, until the views or actions differ, or the trace ends.
+    """List the actions done after both steps, until the views or actions differ.
 
     This is the word of a pair if a certificate has no words.
     """
@@ -126,7 +132,11 @@ def _common_actions(trace: Trace, i: int, j: int) -> list[str]:
 
 
 def _not_apart(trace: Trace, i: int, j: int, word: Sequence[str]) -> str | None:
-    """Why these actions do not show that the steps are different dstates; None if they do."""
+    """Say why a word (list of actions) does not show that two steps are at different dstates.
+
+    Returns:
+        A sentence; None if the word shows it.
+    """
     for k, name in enumerate(word):
         for step in (i + k, j + k):
             action = trace.steps[step].action if step < len(trace) else None

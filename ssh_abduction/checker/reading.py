@@ -1,4 +1,4 @@
-"""The trace in the terms of a map: what the axioms are checked on."""
+"""A trace read with the labels of a map. The checks of axioms work on this."""
 
 from __future__ import annotations
 
@@ -21,21 +21,23 @@ _T = TypeVar("_T")
 
 
 class Reading:
-    """A trace in the terms of a map.
+    """A trace read with the labels of a map: what was seen and done at each dstate.
 
-    Each distinct observation and link is kept once, with the first step that shows it. A label that
-    is no dstate of the map is reported under `map_explains_trace`; the axioms skip it.
+    Each distinct observation and link is kept once, with the first step that shows it. A label
+    without a dstate in the map is reported under `map_explains_trace`. The axioms skip it.
 
     Attributes:
         trace: The trace.
         map: The map.
         theory: The theory.
         axioms: Names of the axioms that hold.
-        records: The dstates of each id. A map that is wrong may have several.
+        records: For each id, the dstates of the map with this id. A malformed map may have several.
         first: The first step of each label.
-        views: The first step of each pair of label and view, without ignored views.
-        stars: The first step of each pair of label and openings, without ignored stars.
-        links: The first step of each link, without ignored actions.
+        views: The first step of each pair (label, view). Views that the map ignores are left out.
+        stars: The first step of each pair (label, openings). Stars that the map ignores are left
+            out.
+        links: The first step of each link (label, name of the action, next label). Actions that the
+            map ignores are left out.
     """
 
     def __init__(self, trace: Trace, ssh_map: SSHMap, theory: Theory) -> None:
@@ -65,7 +67,7 @@ class Reading:
                 self.links.setdefault((label, step.action.name, labels[i + 1]), i)
 
     def once(self, compute: Callable[[Reading], _T]) -> _T:
-        """The value of a function of this reading, which is computed once."""
+        """Return `compute(self)`. Later calls with the same function return the stored value."""
         if compute not in self._computed:
             self._computed[compute] = compute(self)
         value: _T = self._computed[compute]
@@ -73,12 +75,12 @@ class Reading:
 
     @cached_property
     def states(self) -> dict[int, DState]:
-        """The dstates by id; the first one if several have an id."""
+        """A dict from each id to its dstate, or to the first one if several have the id."""
         return {i: records[0] for i, records in self.records.items()}
 
     @cached_property
     def moves(self) -> list[Move]:
-        """The distinct moves between dstates of the map."""
+        """The links between dstates of the map, each once."""
         actions = {action.name: action for action in self.trace.actions}
         return [
             Move(i, self.states[source], actions[name], self.states[target])
@@ -98,25 +100,25 @@ class Reading:
 
     @cached_property
     def visited(self) -> list[tuple[int, DState]]:
-        """The dstates by first visit, with the step."""
+        """Pairs of the first step at a dstate and the dstate, sorted by step."""
         return [(i, self.states[label]) for label, i in self.first.items() if label in self.states]
 
     def steps_of(self, *dstates: int) -> list[int]:
-        """The first steps at which these dstates were visited."""
+        """List the first step at each of these dstates. Dstates that no step is at are skipped."""
         return [self.first[s] for s in dstates if s in self.first]
 
     @cached_property
     def place_seen(self) -> dict[int, int]:
-        """The first step at each place."""
+        """A dict from each place to the first step there."""
         return {s.place: i for i, s in reversed(self.visited) if s.place is not None}
 
     def steps_at(self, place: int) -> list[int]:
-        """The first step at a place; empty if no step is there."""
+        """List the first step at a place, alone; empty if no step is there."""
         return [self.place_seen[place]] if place in self.place_seen else []
 
     @cached_property
     def along(self) -> dict[int, dict[int, int]]:
-        """For each path, the places at which a dstate is along it, and the id of that dstate."""
+        """For each path, a dict from places to the id of a dstate there that is along the path."""
         found: dict[int, dict[int, int]] = defaultdict(dict)
         for s in self.states.values():
             if (course := course_of(s)) and s.place is not None:
@@ -125,7 +127,7 @@ class Reading:
 
     @cached_property
     def orders(self) -> dict[int, Order]:
-        """The order of each path that the map lists or that a dstate is along."""
+        """A dict from each path that the map lists, or that a dstate is along, to its order."""
         edges: dict[int, dict[tuple[int, int], Move]] = defaultdict(dict)
         for move, (path, direction), p, q in (
             self.along_travels if "travel_orders" in self.axioms else ()
@@ -138,7 +140,10 @@ class Reading:
 
     @cached_property
     def along_travels(self) -> list[tuple[Move, Course, int, int]]:
-        """The travels along one course from one place to another, with the course and places."""
+        """The travels that keep their course and change the place.
+
+        Each is a tuple of the travel, its course, the place it leaves and the place it reaches.
+        """
         found = []
         for m in self.travels:
             course, p, q = course_of(m.source), m.source.place, m.target.place
@@ -149,16 +154,21 @@ class Reading:
         return found
 
     def on(self, path: int) -> set[int]:
-        """The places on a path: those that the map lists, and those that on_path puts there.
+        """Find the places on a path: those that the map lists, and those with a dstate along it.
 
-        Without the axiom on_path no place has to be on a path.
+        Empty if the axiom on_path is left out.
         """
         if "on_path" not in self.axioms or path not in self.orders:
             return set()
         return {*self.orders[path].listed, *self.along.get(path, ())}
 
     def onward(self, s: DState) -> tuple[int, ...]:
-        """Bearings at which the path of a dstate continues: 0 (ahead), 180 (behind)."""
+        """Find the bearings at which the path of a dstate continues, in degrees.
+
+        Returns:
+            0 (ahead) if a place comes after that of the dstate on its path, and 180 (behind) if one
+            comes before it.
+        """
         course = course_of(s)
         if course is None or s.place is None or course[0] not in self.orders:
             return ()

@@ -1,8 +1,9 @@
-"""The axioms of the sides of paths (B1 to B4).
+"""Checks of the axioms about the sides of paths (B1 to B4).
 
-A turn puts a branch on a side of a path, the places ahead on the branch are on that side, and the
-sides exclude each other. A map does not show sides. So a place that the axioms put where it cannot
-be is reported under each axiom that helps to put it there: dropping any of them resolves it.
+A turn puts a branch on one side of a path. The places ahead on the branch are on that side. No
+place is on both sides. A map does not list sides, so the check derives them. If the axioms put a
+place on a side that contradicts another axiom, the place is reported as a violation of each axiom
+that takes part: leaving out any of them resolves the contradiction.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from ssh_abduction.checker.reading import Check, Found, Reading
 
 @dataclass(frozen=True)
 class Branch:
-    """A course that leaves to the right of another course at a place.
+    """A course (path and direction) that leaves to the right of another course at a place.
 
     Attributes:
         place: The place.
-        course: The course whose right side is meant.
-        branch: The course that leaves there.
-        turn: The turn that shows it.
-        mirrored: Whether it follows from the turn by symmetric_sides only.
+        course: The course that the branch leaves to the right.
+        branch: The course that leaves.
+        turn: The turn that shows the branch.
+        mirrored: Whether the axiom symmetric_sides is needed to derive the branch from the turn.
     """
 
     place: int
@@ -41,7 +42,14 @@ class Branch:
 
 @dataclass(frozen=True)
 class Conflict:
-    """A place whose side contradicts another axiom."""
+    """A place whose side contradicts another axiom.
+
+    Attributes:
+        axiom: The name of the contradicted axiom.
+        branches: The branches that put the place on its sides.
+        steps: The steps that show the contradiction.
+        message: A sentence that describes it.
+    """
 
     axiom: str
     branches: tuple[Branch, ...]
@@ -50,18 +58,18 @@ class Conflict:
 
     @property
     def axioms(self) -> set[str]:
-        """The axioms that take part."""
+        """Names of the axioms that take part in the contradiction."""
         mirrored = {"symmetric_sides"} if any(b.mirrored for b in self.branches) else set()
         return {self.axiom, "branch_side", "side_of_branch"} | mirrored
 
 
-# The places to the right of each course, with the branch that each is ahead on. Places to the left
-# are to the right of the opposite course.
+# For each course, the places to its right, each with the branch that leads to it. Places to the
+# left of a course are to the right of the opposite course.
 _Right = Mapping[Course, Mapping[int, Branch]]
 
 
 def _branches(m: Reading) -> list[Branch]:
-    """The branches that turns show, then those that symmetry adds."""
+    """List the branches that turns show, then those that the axiom symmetric_sides adds."""
     if "branch_side" not in m.axioms:
         return []
     found: dict[tuple[int, Course, Course], Branch] = {}
@@ -82,7 +90,7 @@ def _branches(m: Reading) -> list[Branch]:
 
 
 def _right_of(m: Reading) -> dict[Course, dict[int, Branch]]:
-    """The places to the right of each course."""
+    """Find the places to the right of each course, each with the branch that leads to it."""
     excused = {frozenset(pair) for pair in m.map.excused if is_pair(pair)}
     if m.theory.boundary != "defeasible":
         excused = set()
@@ -96,7 +104,7 @@ def _right_of(m: Reading) -> dict[Course, dict[int, Branch]]:
 
 
 def _conflicts(m: Reading) -> list[Conflict]:
-    """The places whose sides contradict another axiom."""
+    """Find the places whose sides contradict another axiom."""
     right = _right_of(m)
     disjoint = _both_sides(m, right) if "sides_disjoint" in m.axioms else ()
     between = _on_and_beside(m, right) if "path_between_sides" in m.axioms else ()
@@ -104,7 +112,7 @@ def _conflicts(m: Reading) -> list[Conflict]:
 
 
 def _both_sides(m: Reading, right: _Right) -> Iterator[Conflict]:
-    """Places both to the right and to the left of a path."""
+    """Find the places both to the right and to the left of a path."""
     for (h, direction), places in right.items():
         other = right.get((h, -direction), {}) if direction == 1 else {}
         for q in places.keys() & other.keys():
@@ -115,7 +123,7 @@ def _both_sides(m: Reading, right: _Right) -> Iterator[Conflict]:
 
 
 def _on_and_beside(m: Reading, right: _Right) -> Iterator[Conflict]:
-    """Places both on a path and beside it."""
+    """Find the places both on a path and beside it."""
     for (h, _direction), places in right.items():
         for q in places.keys() & m.on(h):
             b = places[q]
@@ -126,7 +134,7 @@ def _on_and_beside(m: Reading, right: _Right) -> Iterator[Conflict]:
 
 
 def is_pair(pair: object) -> bool:
-    """Whether a value is a tuple of two."""
+    """Tell whether a value is a tuple of two."""
     return isinstance(pair, tuple) and len(pair) == 2
 
 

@@ -1,6 +1,7 @@
-"""The axioms of local topology: stars (openings) and headings of a place with four slots.
+"""Checks of the axioms about stars and headings at places with four slots.
 
-Slots are numbered 0 to 3 clockwise. Turning right adds 1 to the heading.
+A star is the openings seen at a step: ahead, right, back and left. Slots are the directions at a
+place, numbered 0 to 3 clockwise. A turn right adds 1 to the heading.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from ssh_abduction.data.star import Openings
 
 
 def star_pattern(m: Reading) -> Found:
-    """All stars seen at a place are rotations of one star."""
+    """Check that all stars seen at a place are rotations of one star."""
     yield from _one_star(
         ((s, min(_rotated(star, k) for k in range(4)), i) for s, star, i in stars_of(m)),
         "however turned",
@@ -23,7 +24,7 @@ def star_pattern(m: Reading) -> Found:
 
 
 def star_frame(m: Reading) -> Found:
-    """The stars seen at a place agree when each is turned by its heading."""
+    """Check that the stars seen at a place agree when each is turned by its heading."""
     framed = (
         (s, _rotated(star, heading), i)
         for s, star, i in stars_of(m)
@@ -33,12 +34,12 @@ def star_frame(m: Reading) -> Found:
 
 
 def stars_of(m: Reading) -> Iterator[tuple[DState, Openings, int]]:
-    """Each dstate with each star seen there, and the first step that sees it."""
+    """Yield each dstate with each star seen there, and the first step that sees this star."""
     return ((m.states[s], star, i) for (s, star), i in m.stars.items() if s in m.states)
 
 
 def _rotated(star: Openings, quarters: int) -> Openings:
-    """The star in the frame, as seen by a robot with this heading."""
+    """Rotate a star into the frame of its place, for a robot that faces slot `quarters`."""
     ahead, right, back, left = (star[(slot - quarters) % 4] for slot in range(4))
     return ahead, right, back, left
 
@@ -56,7 +57,7 @@ def _one_star(seen: Iterable[tuple[DState, Openings, int]], how: str) -> Found:
 
 
 def one_heading(m: Reading) -> Found:
-    """A dstate has one heading."""
+    """Check that each dstate has one heading, a slot from 0 to 3."""
     for s, records in m.records.items():
         if len({r.heading for r in records}) > 1:
             yield m.steps_of(s), f"Dstate {s} has several headings."
@@ -69,7 +70,7 @@ def one_heading(m: Reading) -> Found:
 
 
 def turn_rotates(m: Reading) -> Found:
-    """A turn right, around or left adds one, two or three quarters to the heading."""
+    """Check that a turn right, around or left adds 1, 2 or 3 to the heading, modulo 4."""
     for t in m.turns:
         before, after = heading_of(t.source), heading_of(t.target)
         if (
@@ -89,7 +90,7 @@ def turn_rotates(m: Reading) -> Found:
 
 
 def one_dstate_per_heading(m: Reading) -> Found:
-    """At a place, at most one dstate faces a slot."""
+    """Check that at most one dstate faces each slot of a place."""
     known: dict[tuple[int, int], int] = {}
     for s in m.states.values():
         heading = heading_of(s)
@@ -103,7 +104,7 @@ def one_dstate_per_heading(m: Reading) -> Found:
 
 
 def path_goes_straight(m: Reading) -> Found:
-    """A path leaves a place through opposite slots, and a slot belongs to one path."""
+    """Check that a path leaves a place through opposite slots, and that no paths share a slot."""
     slots: dict[tuple[int, int], tuple[Course, int]] = {}
     ways: dict[tuple[int, Course], tuple[int, int]] = {}
     for s in m.states.values():

@@ -1,4 +1,4 @@
-"""The axioms of places, paths and the order of places along a path (T1 to T11, TOT, ADJ)."""
+"""Checks of the axioms about places, paths and orders along paths (T1 to T11, TOT, ADJ)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ssh_abduction.checker.reading import Check, Found, Reading
 
 
 def one_place(m: Reading) -> Found:
-    """A dstate is at one place (T1, T10)."""
+    """Check that each dstate is at one place (T1, T10)."""
     for s, records in m.records.items():
         places = {r.place for r in records}
         if None in places:
@@ -19,7 +19,7 @@ def one_place(m: Reading) -> Found:
 
 
 def turn_stays(m: Reading) -> Found:
-    """A turn stays at its place (T2)."""
+    """Check that a turn stays at its place (T2)."""
     for t in m.turns:
         if t.source.place != t.target.place:
             yield (
@@ -29,14 +29,14 @@ def turn_stays(m: Reading) -> Found:
 
 
 def travel_leaves(m: Reading) -> Found:
-    """A travel leads to another place (T3)."""
+    """Check that a travel leads to another place (T3)."""
     for t in m.travels:
         if t.source.place == t.target.place and t.source.place is not None:
             yield t.steps, f"{t} is a travel, but stays at place {t.source.place}."
 
 
 def travel_follows_path(m: Reading) -> Found:
-    """A travel starts and ends along the same path in the same direction (T4)."""
+    """Check that a travel starts and ends along the same path in the same direction (T4)."""
     for t in m.travels:
         if course_of(t.source) is None or course_of(t.source) != course_of(t.target):
             yield (
@@ -47,7 +47,7 @@ def travel_follows_path(m: Reading) -> Found:
 
 
 def one_course(m: Reading) -> Found:
-    """A dstate is along at most one path, in one direction (T5, T10)."""
+    """Check that each dstate is along at most one path, in one direction (T5, T10)."""
     for s, records in m.records.items():
         if len({(r.path, r.direction) for r in records}) > 1:
             yield m.steps_of(s), f"Dstate {s} is along several paths or directions."
@@ -61,7 +61,7 @@ def one_course(m: Reading) -> Found:
 
 
 def turn_around_reverses(m: Reading) -> Found:
-    """A turn around keeps the path and reverses the direction (T6)."""
+    """Check that a turn around keeps the path and reverses the direction (T6)."""
     for t in m.turns:
         course, other = course_of(t.source), course_of(t.target)
         if t.action.turn == "around" and other != (course and opposite(course)):
@@ -72,7 +72,7 @@ def turn_around_reverses(m: Reading) -> Found:
 
 
 def turn_changes_path(m: Reading) -> Found:
-    """A turn right or left leads from one path to another (T7)."""
+    """Check that a turn right or left leads from one path to another (T7)."""
     for t in m.turns:
         course, other = course_of(t.source), course_of(t.target)
         if t.action.turn in ("right", "left") and course and other and course[0] == other[0]:
@@ -83,7 +83,7 @@ def turn_changes_path(m: Reading) -> Found:
 
 
 def one_dstate_per_course(m: Reading) -> Found:
-    """At a place, at most one dstate is along a path in a direction (T8)."""
+    """Check that at most one dstate of a place is along a path in a given direction (T8)."""
     known: dict[tuple[int, Course], int] = {}
     for s in m.states.values():
         if s.place is not None and (course := course_of(s)):
@@ -97,7 +97,7 @@ def one_dstate_per_course(m: Reading) -> Found:
 
 
 def on_path(m: Reading) -> Found:
-    """A place is on a path if a dstate at the place is along the path (T11)."""
+    """Check that a path lists exactly the places with a dstate along the path (T11)."""
     for h, order in m.orders.items():
         there = m.along.get(h, {})
         for p in set(order.listed) - there.keys():
@@ -111,7 +111,10 @@ def on_path(m: Reading) -> Found:
 
 
 def travel_orders(m: Reading) -> Found:
-    """A travel puts the place it leaves before the place it reaches (T9)."""
+    """Check that each path lists the place that a travel leaves before the place it reaches (T9).
+
+    "Before" is in the direction of the travel.
+    """
     for h, order in m.orders.items():
         for p, q in order.backward if order.can_be_listed else ():
             if {p, q} <= order.position.keys():
@@ -124,7 +127,7 @@ def travel_orders(m: Reading) -> Found:
 
 
 def order_asymmetric(m: Reading) -> Found:
-    """No two places of a path come before each other (T9)."""
+    """Check that no two places of a path come before each other (T9)."""
     for h, order in m.orders.items():
         for ring in order.rings:
             if not order.allows(ring):
@@ -136,7 +139,7 @@ def order_asymmetric(m: Reading) -> Found:
 
 
 def order_transitive(m: Reading) -> Found:
-    """If p comes before q and q before r, p comes before r (T9)."""
+    """Check that p comes before r on a path if p comes before q and q before r (T9)."""
     for h, order in m.orders.items():
         for ring in order.rings:
             if not order.allows(ring) and len(ring) > 2:
@@ -149,7 +152,7 @@ def order_transitive(m: Reading) -> Found:
 
 
 def path_order_total(m: Reading) -> Found:
-    """Of two places on a path, one comes before the other (TOT)."""
+    """Check that of any two places on a path, one comes before the other (TOT)."""
     for h, order in m.orders.items():
         places = m.on(h)
         for p in sorted(places - order.position.keys(), key=str):
@@ -163,7 +166,7 @@ def path_order_total(m: Reading) -> Found:
 
 
 def next_place(m: Reading) -> Found:
-    """A travel leads to the next place of the path: none lies between (ADJ)."""
+    """Check that a travel leads to the next place of the path: none lies between (ADJ)."""
     for t, (h, direction), p, q in m.along_travels:
         if h in m.orders and (between := m.orders[h].between(p, q, direction)):
             r = min(between, key=str)
@@ -175,14 +178,17 @@ def next_place(m: Reading) -> Found:
 
 
 def all_on_paths(m: Reading) -> Found:
-    """Every dstate is along a path (T5tot)."""
+    """Check that every dstate is along a path (T5tot)."""
     for s in m.states.values():
         if course_of(s) is None:
             yield m.steps_of(s.id), f"Dstate {s.id} is along no path."
 
 
 def course_needs_travel(m: Reading) -> Found:
-    """A dstate along a path ends a travel, or turns around link it to one that does (T5)."""
+    """Check that each dstate along a path is at an end of a travel (T5).
+
+    It is enough if turns around link it to such a dstate.
+    """
     linked: dict[int, list[int]] = defaultdict(list)
     for t in m.turns:
         if t.action.turn == "around":
