@@ -34,9 +34,9 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
 
     The pixels of each patch are averaged. The logarithm of each patch is compared with those of the
     patch on its right and the patch below, for each colour. A factor that multiplies a colour in
-    both patches cancels out: time of day, tint of the light, exposure. Light from one side remains
-    visible only at corners between walls of different directions. Distances between panoramas are
-    Euclidean distances of these features.
+    both patches cancels out. So time of day, tint of the light and exposure change nothing. Light
+    from one side changes the features only at corners, where walls face different ways. The
+    distance between two panoramas is the Euclidean distance of their features.
 
     Args:
         shape: Rows, columns and colours; None means one row of grey pixels. The last column is
@@ -86,7 +86,15 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
         return self
 
     def transform(self, X: ArrayLike) -> NDArray[np.float64]:
-        """The differences, (n, f): to the right of all patches, then below all but the lowest."""
+        """Compute the features of panoramas: differences of log brightness between patches.
+
+        Args:
+            X: (n, rows * columns * colours) values of 0 or more, row by row.
+
+        Returns:
+            (n, f) differences. For each patch: its right neighbour minus the patch. Then for each
+            patch above another: the lower patch minus the upper one.
+        """
         check_is_fitted(self)
         images = _bright(validate_data(self, equal_length(X), dtype=np.float64, reset=False))
         patches = images.reshape(-1, *self.shape_)
@@ -111,8 +119,11 @@ def features_of(trace: Trace) -> ReciprocalTransformer | PanoramaTransformer:
     """Make the transformer for the images of a trace; it is not fitted yet.
 
     Args:
-        trace: If its header gives the shape of panoramas, as `"panorama": [24, 180, 3]`, they are
-            panoramas, otherwise ranges.
+        trace: Its images are panoramas if its header gives their shape, as
+            `"panorama": [24, 180, 3]`. Otherwise, they are ranges.
+
+    Returns:
+        A PanoramaTransformer for panoramas, a ReciprocalTransformer for ranges.
 
     Raises:
         PerceptionError: The shape in the header is not three whole numbers of at least 1.

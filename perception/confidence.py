@@ -28,20 +28,20 @@ NAMED = 8
 
 
 def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
-    """Confidence of the view of each image, in [0, 1].
+    """Compute how surely each image belongs to its view.
 
     Let `own` be the distance from an image to the centre of the other images of its view, and
     `next` its distance to the nearest centre of another view. The confidence is next² / (own² +
     next²): 1 at its own centre, 0.5 half way. This is the membership of fuzzy c-means with two
-    centres (Bezdek 1981). An image alone in its view has 0.5. Noise has 0. If there is only one
-    view, all its images have 1.
+    centres (Bezdek 1981). An image alone in its view has 0.5. Noise (an image in no view) has 0. If
+    there is only one view, all its images have 1.
 
     Args:
         X: (n, d) images, finite.
-        labels: (n,) views; -1 for noise.
+        labels: (n,) view of each image; -1 for noise.
 
     Returns:
-        (n,) confidences.
+        (n,) confidence of each image, in [0, 1].
 
     Raises:
         PerceptionError: The labels have another length.
@@ -66,14 +66,14 @@ def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
 
 
 def nearest_views(X: ArrayLike, labels: ArrayLike) -> NDArray[np.intp]:
-    """Replace noise (-1) by the view of the nearest centre.
+    """Give each image without a view the view with the nearest centre.
 
     Args:
         X: (n, d) images, finite.
-        labels: (n,) views; -1 for noise.
+        labels: (n,) view of each image; -1 for noise, which is an image without a view.
 
     Returns:
-        (n,) views without noise.
+        (n,) view of each image, without -1.
 
     Raises:
         PerceptionError: All images are noise, or the labels have another length.
@@ -99,9 +99,10 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
     """Warn of images that are noise, uncertain or nearly alone, and of overlapping views.
 
     Args:
-        labels: (n,) views; -1 for noise.
-        sure: (n,) confidence of each view.
-        quality: M of the views; they overlap if it is below 1.
+        labels: (n,) view of each image; -1 for noise, which is an image in no view.
+        sure: (n,) confidence of the view of each image, in [0, 1].
+        quality: M of the views (`perception.quality.cluster_quality`). Views overlap if M is below
+            1.
     """
     of, certain = np.asarray(labels), np.asarray(sure)
     number, counts = np.unique(of, return_inverse=True, return_counts=True)[1:]
@@ -141,7 +142,7 @@ def warn_of_doubts(labels: ArrayLike, sure: ArrayLike, quality: float) -> None:
 def _centres(
     images: NDArray[np.float64], number: NDArray[np.intp], views: int
 ) -> NDArray[np.float64]:
-    """The mean image of each view, (k, d)."""
+    """The mean image of each view, (views, d)."""
     return np.array([images[number == view].mean(axis=0) for view in range(views)])
 
 

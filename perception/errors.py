@@ -8,7 +8,10 @@ from ssh_abduction.data.errors import AbductionError
 
 
 class PerceptionError(AbductionError, ValueError):
-    """Invalid images, labels, settings or stored recogniser. A ValueError for scikit-learn."""
+    """Images, labels, settings or a stored recogniser are invalid.
+
+    It is also a ValueError, which scikit-learn expects.
+    """
 
 
 class LogError(AbductionError, ValueError):
@@ -23,11 +26,12 @@ class ImageWarning(UserWarning):
 
 
 def equal_length(images: Any) -> Any:
-    """Return the images unchanged.
+    """Check that images have equal lengths, and return them unchanged.
+
+    numpy would also reject unequal lengths, but with a message that is hard to understand.
 
     Raises:
-        PerceptionError: They are a list of unequal lengths. The message of numpy is hard to
-            understand.
+        PerceptionError: Two images of a list or tuple differ in length.
     """
     if isinstance(images, list | tuple):
         lengths = [len(image) if hasattr(image, "__len__") else 0 for image in images]

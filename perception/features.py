@@ -1,4 +1,4 @@
-"""Finds the beams that distinguish two similar dstates.
+"""Finds the beams that distinguish two similar dstates (a dstate is a position and a heading).
 
 >>> images = [[1.0, 2.0, 3.0], [1.1, 2.0, 3.0], [1.0, 2.1, 3.0]]
 >>> images += [[1.0, 2.0, 5.0], [1.1, 2.0, 5.1], [1.0, 2.1, 5.0]]
@@ -6,9 +6,9 @@
 >>> {method: int(shares.argmax()) for method, shares in found.methods.items()}, found.recognised
 ({'margin': 2, 'permutation': 2, 'linear': 2}, 1.0)
 
-The paper hopes that back-propagation could learn which features of an image matter. Our recogniser
-is the nearest neighbour, which has no weights. So three measures are compared, each with its own
-weakness:
+A feature of an image is the value of one beam. Kuipers and Beeson (2002) hope that back-propagation
+could learn which features matter. Our recogniser is the nearest neighbour, which has no weights to
+learn. So three measures are compared. Each has its own weakness:
 
 - margin: by how much a feature makes the nearest image of the other dstate farther than the nearest
   image of its own dstate (Relief: Kira and Rendell 1992);
@@ -41,14 +41,15 @@ SHUFFLED = 10
 class TellingFeatures:
     """How much each feature helps to distinguish two dstates, by three methods.
 
-    The shares of a method are not negative. They sum to 1, or are all 0 if no feature helps.
+    A method gives each feature a share of at least 0. The shares of a method sum to 1, or are all 0
+    if no feature helps. The module describes the methods.
 
     Attributes:
         margin: (d,) shares by margin.
         permutation: (d,) shares by permutation.
         linear: (d,) shares by logistic regression.
-        recognised: Share of images whose nearest other image is of their own dstate. At about 0.5
-            the dstates look the same. Then the shares mean nothing.
+        recognised: Share of images whose nearest other image is of their own dstate, from 0 to 1.
+            At about 0.5 the dstates look the same, and the shares above mean nothing.
     """
 
     margin: Floats
@@ -69,9 +70,12 @@ def telling_features(
     Args:
         X: (n, d) images as the recogniser compares them, which are reciprocals of ranges.
         labels: (n,) dstate of each image. Images of other dstates are ignored.
-        a: One dstate.
-        b: The other dstate.
+        a: Label of one dstate.
+        b: Label of the other dstate.
         random_state: Seed for shuffling.
+
+    Returns:
+        The share of each feature by three methods, and the share of images that are recognised.
 
     Raises:
         PerceptionError: a is b, or one of the two has fewer than two images.
@@ -109,7 +113,15 @@ def telling_features(
 
 
 def strongest(shares: ArrayLike, most: float = 0.5) -> str:
-    """The features with the largest shares that sum to `most`, as ranges: "3–14, 80"."""
+    """Name the fewest features whose shares sum to `most` of the total.
+
+    Args:
+        shares: (d,) share of each feature.
+        most: Part of the sum of all shares, from 0 to 1.
+
+    Returns:
+        Indices of features, as ranges: "3–14, 80"; "–" if all shares are 0.
+    """
     weights = np.asarray(shares)
     order = np.argsort(-weights, kind="stable")
     chosen = np.sort(
@@ -124,7 +136,11 @@ def strongest(shares: ArrayLike, most: float = 0.5) -> str:
 def _neighbours(
     images: Floats, second: NDArray[np.bool_]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each image, the nearest other one of its dstate and the nearest of the other dstate."""
+    """For each image, find the nearest other image of its dstate and of the other dstate.
+
+    Returns:
+        Two arrays, (n,), of indices of images.
+    """
     distances = cdist(images, images)
     np.fill_diagonal(distances, np.inf)
     same = second[:, None] == second
@@ -136,7 +152,10 @@ def _neighbours(
 
 
 def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
-    """The margin lost by shuffling each feature. Half of the images are known, half test."""
+    """The margin that is lost if a feature is shuffled, (d,).
+
+    The recogniser learns half of the images. The margin is measured on the other half.
+    """
     order = np.argsort(second, kind="stable")
     known, asked = order[::2], order[1::2]
     model = KNeighborsClassifier(1, algorithm="brute").fit(images[known], second[known])
@@ -153,9 +172,10 @@ def _permuted(images: Floats, second: NDArray[np.bool_], seed: int) -> Floats:
 
 
 def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
-    """Mean squared distance to the nearest image of the other dstate, minus that of the own.
+    """How much farther the nearest image of the other dstate is than that of the own dstate.
 
-    With squares, shuffling a useless feature adds the same to both distances.
+    The number is a mean difference of squared distances. Shuffling a useless feature adds the same
+    to both squares, so the difference stays.
     """
     distances = cdist(images, model._fit_X, "sqeuclidean")
     same = second[:, None] == model.classes_[model._y]
@@ -168,7 +188,10 @@ def _margin(model: Any, images: Floats, second: NDArray[np.bool_]) -> float:
 
 
 def _linear(images: Floats, second: NDArray[np.bool_]) -> Floats:
-    """What each feature adds to the score of one dstate against the other."""
+    """What each feature adds to the difference of the dstates' mean scores, (d,).
+
+    The score is that of a logistic regression which separates the dstates.
+    """
     model = LogisticRegression(max_iter=1000).fit(images - images.mean(axis=0), second)
     return np.asarray(model.coef_[0] * (images[second].mean(axis=0) - images[~second].mean(axis=0)))
 

@@ -18,13 +18,13 @@ LARGEST = 4 * 2**30
 
 
 def images_of(trace: Trace) -> NDArray[np.float64]:
-    """The images of all steps.
+    """Collect the images of all steps.
 
-    They come from the trace, or from its sidecar file: .npy, or .npz with one array or with
-    `images`.
+    An image is in the trace itself or in its sidecar file. This is a .npy file, or a .npz file with
+    one array or with an array named `images`.
 
     Returns:
-        (n, d) ranges in metres.
+        (n, d) ranges in metres, one row a step.
 
     Raises:
         PerceptionError: A step has no image, lengths differ, or the sidecar file cannot be read.
@@ -52,7 +52,10 @@ def images_of(trace: Trace) -> NDArray[np.float64]:
 
 
 def images_held(trace: Trace) -> list[NDArray[np.float64] | None]:
-    """The image of each step, (d,) ranges in metres; None for a step without an image.
+    """Collect the image of each step, if the step has one.
+
+    Returns:
+        For each step its image, (d,) ranges in metres; None for a step without an image.
 
     Raises:
         PerceptionError: The sidecar file cannot be read.
@@ -80,7 +83,7 @@ def images_held(trace: Trace) -> list[NDArray[np.float64] | None]:
 
 
 def _sidecar(trace: Trace) -> NDArray[np.float64]:
-    """The table in the sidecar file of a trace."""
+    """Read the images in the sidecar file of a trace, (m, d). Raises PerceptionError."""
     if trace.images is None:
         raise PerceptionError(
             f"{trace.at(0)}: image: expected the header to name a file of images for the "
@@ -108,8 +111,7 @@ def _sidecar(trace: Trace) -> NDArray[np.float64]:
         ) from None
     except PerceptionError:
         raise
-    # Each part of a damaged archive fails in its own way: zlib.error, MemoryError, AttributeError,
-    # …
+    # A damaged archive can raise anything: zlib.error, MemoryError, AttributeError, …
     except Exception as error:
         why = f"{type(error).__name__}: {error}"
         raise PerceptionError(

@@ -7,18 +7,20 @@
 >>> likelihood.labels([[1.1, 4.0], [3.0, 3.2], [9.0, 0.0]])
 ['corner', 'hall', None]
 
-The nearest neighbour always answers, even for an unknown place. Here its distances give densities:
+A nearest neighbour recogniser always answers, even for an unknown place. This module turns its
+distances into densities:
 
-- p(o|x): the squared distance from image o to the nearest image of place x is a sum of `dimensions`
-  squared Gaussian deviations of equal variance. Its mean and variance are those of the distances
-  from each remembered image to the nearest other image of its place. So `dimensions` counts the
-  beams that vary independently, fewer than there are beams (moment matching, Satterthwaite 1946).
-- p(o|novel): the density of an unknown appearance, which is a Gaussian around the mean of all
-  remembered images, as wide as all of them.
-- p(o|nowhere) = (sum over places x of p(o|x) + p(o|novel)) / (places + 1). An unknown place looks
-  like one of the known places or like none of them, all with equal probability. An appearance
-  common to all places is no evidence. FAB-MAP (Cummins and Newman 2008) also uses the average
-  place, by sampling.
+- p(o|x), the density of image o at place x. The squared distance from o to the nearest image of x
+  is modelled as a sum of `dimensions` squared Gaussian deviations of equal variance. Its mean and
+  variance are fitted to the distances from each remembered image to the nearest other image of its
+  place (moment matching, Satterthwaite 1946). So `dimensions` is the number of beams that vary
+  independently. It is smaller than the number of beams.
+- p(o|novel), the density of an unknown appearance. It is a Gaussian around the mean of all
+  remembered images, with their spread.
+- p(o|nowhere) = (sum over places x of p(o|x) + p(o|novel)) / (places + 1), the density at an
+  unknown place. An unknown place looks like one of the known places or like none of them, all with
+  equal probability. So an image that is common at all places is no evidence for any of them.
+  FAB-MAP (Cummins and Newman 2008) also compares with the average place, by sampling.
 """
 
 from __future__ import annotations
@@ -39,8 +41,8 @@ from perception.errors import PerceptionError, equal_length
 from perception.recognition import PlaceRecogniser
 from ssh_abduction.data.errors import brief
 
-# The spread within a place is at least this share of the spread of all images, so that images
-# without noise, as in a test, do not give infinite certainty.
+# The spread within a place is at least this share of the spread of all images. Otherwise, images
+# without noise, as in a test, would give infinite certainty.
 LEAST_SPREAD = 1e-6
 # Number of images to compare with all remembered ones at once.
 AT_ONCE = 256
@@ -51,15 +53,18 @@ UNMAPPED = 0.1
 
 @dataclass(frozen=True)
 class ImageLikelihood:
-    """Densities of images, from the distances of a recogniser.
+    """Densities of images at each known place and elsewhere, from the distances of a recogniser.
+
+    The images below are those that the recogniser remembers, as its last estimator compares them
+    (by default, as reciprocals of ranges).
 
     Attributes:
         recogniser: The fitted PlaceRecogniser, or a pipeline that ends with one.
-        classes: (c,) place names.
-        within: Mean squared distance from an image to the nearest other one of its place.
+        classes: (c,) labels of the places.
+        within: Mean squared distance from an image to the nearest other image of its place.
         spread: Mean squared distance from an image to the mean of all images.
         centre: (d,) mean of all images.
-        dimensions: Number of independent squared deviations in a squared distance, from 1 to d.
+        dimensions: Number of beams that vary independently, from 1 to d; see the module.
     """
 
     recogniser: Any
@@ -74,7 +79,8 @@ class ImageLikelihood:
         """Measure the distances between the images that a recogniser remembers.
 
         Raises:
-            PerceptionError: It is another kind of recogniser, or saw no place twice.
+            PerceptionError: The recogniser is of another kind, is not fitted, or has no two images
+                of one place.
         """
         nearest = _nearest(recogniser)
         if not isinstance(nearest, PlaceRecogniser):
@@ -114,24 +120,25 @@ class ImageLikelihood:
         return cls(recogniser, nearest.classes_, within, max(spread, within), centre, dimensions)
 
     def log_likelihoods(self, images: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Log densities of images.
+        """Compute the log densities of images at each known place and for a new appearance.
 
         Args:
             images: (n, d) images as the recogniser takes them.
 
         Returns:
-            log p(o|x) for each of `classes`, (n, c), and log p(o|novel), (n,).
+            log p(o|x) for each image and each of `classes`, (n, c), and log p(o|novel), (n,).
         """
         return self._of_features(self._features(images))
 
     def ratios(self, images: ArrayLike) -> Iterator[NDArray[np.float64]]:
-        """Likelihood ratios of images.
+        """Compute how much likelier each image is at a known place than at an unknown one.
 
         Args:
             images: (n, d) images as the recogniser takes them.
 
         Yields:
-            For each image, p(o|x) / p(o|nowhere) for each of `classes`, (c,), from 0 to c + 1.
+            For each image an array, (c,): p(o|x) / p(o|nowhere), from 0 to c + 1, for each of
+            `classes`.
         """
         features = self._features(images)
         for some in np.array_split(features, max(1, math.ceil(len(features) / AT_ONCE))):
@@ -142,14 +149,14 @@ class ImageLikelihood:
             yield from np.exp(known - nowhere[:, None])
 
     def labels(self, images: ArrayLike, unmapped: float = UNMAPPED) -> list[Any]:
-        """The most probable place of each image, with equal priors for all places.
+        """Find the most probable place of each image, with equal priors for all known places.
 
         Args:
             images: (n, d) images as the recogniser takes them.
             unmapped: Prior probability that an image is of no known place.
 
         Returns:
-            For each image a class, or None if an unknown place is likelier.
+            For each image one of `classes`, or None if an unknown place is likelier.
         """
         found = []
         for ratios in self.ratios(images):
@@ -158,7 +165,12 @@ class ImageLikelihood:
         return found
 
     def _features(self, images: ArrayLike) -> NDArray[np.float64]:
-        """Features of images, as the last estimator of the pipeline takes them."""
+        """Compute the features, (n, d), that the last estimator of the pipeline compares.
+
+        Raises:
+            PerceptionError: The images are no table of finite numbers, or have another length than
+                the learnt ones.
+        """
         try:
             table = np.asarray(equal_length(images), np.float64)
         except PerceptionError:
@@ -203,7 +215,12 @@ class ImageLikelihood:
         return known, self._log_density(np.sum((features - self.centre) ** 2, axis=1), self.spread)
 
     def _log_density(self, squares: NDArray[np.float64], mean: float) -> NDArray[np.float64]:
-        """Log density of an isotropic Gaussian with this mean squared distance."""
+        """Log density of an isotropic Gaussian in `dimensions` dimensions.
+
+        Args:
+            squares: Squared distances from the centre.
+            mean: Mean squared distance from the centre.
+        """
         return np.asarray(
             -0.5 * self.dimensions * (np.log(2 * np.pi * mean / self.dimensions) + squares / mean)
         )

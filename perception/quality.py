@@ -1,23 +1,25 @@
-"""Measures how well clusters separate images: M and trimmed M without the truth, U with it.
+"""Measures how well clusters separate images.
+
+M and trimmed M compare distances between images. U compares the clusters with the true states.
 
 >>> import numpy as np
 >>> images = np.array([[0.0], [1.0], [5.0], [6.0]])
 >>> float(cluster_quality(images, [0, 0, 1, 1]))
 4.0
 
-For many labelings of the same images, the costly half of M is computed once. For any labeling, the
-smallest distance between two images of different clusters is the length of the shortest edge of a
-minimum spanning tree whose ends have different labels. `spanning_tree` finds the tree once.
-`SpanningTree.separation` then reads the distance off its n - 1 edges.
+M needs the smallest distance between two images of different clusters. For any labeling, this is
+the length of the shortest edge of a minimum spanning tree whose ends have different labels. So for
+many labelings of the same n images, `spanning_tree` finds the tree once, and
+`SpanningTree.separation` looks for that edge among its n - 1 edges.
 
     Proof. Let (a, b) be a closest pair with different labels, and S the images with the label of a.
     The path of the tree from a to b leaves S by an edge e, whose ends have different labels.
     Hence |e| >= |ab|. If |e| > |ab|, replacing e by (a, b) would give a shorter spanning tree:
     a contradiction. So |e| = |ab|, and no edge between different labels is shorter.
 
-Distances are exact to rounding. Matrix products only exclude pairs that cannot matter, with a
-rigorous bound of their rounding error. The distances of the remaining pairs are computed from
-differences in float64. Only one block of pairs is in memory at a time.
+Distances are exact up to rounding. Matrix products are fast but less exact. They only exclude pairs
+that cannot matter, with a rigorous bound of their rounding error. The distances of the remaining
+pairs are computed from differences in float64. Only one block of pairs is in memory at a time.
 
 References: Kuipers and Beeson, "Bootstrap Learning for Place Recognition", AAAI 2002, eq. 5 (M),
 and "Clustering" (U).
@@ -76,20 +78,27 @@ class SpanningTree:
 
     @property
     def distinct(self) -> int:
-        """Number of different images."""
+        """The number of different images."""
         return 1 + int(np.count_nonzero(self.lengths))
 
     def separation(self, labels: ArrayLike) -> float:
-        """Smallest distance between images of different labels; infinite for one label."""
+        """Find the smallest distance between two images with different labels.
+
+        Args:
+            labels: (n,) label of each image.
+
+        Returns:
+            The distance; infinite if all labels are equal.
+        """
         of = np.asarray(labels)
         crossing = of[self.edges[:, 0]] != of[self.edges[:, 1]]
         return float(self.lengths[crossing].min(initial=math.inf))
 
 
 def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None = None) -> float:
-    """M of eq. 5: the smallest distance between clusters divided by the largest within one.
+    """Compute M: the smallest distance between clusters divided by the largest within one.
 
-    Larger is better.
+    Larger is better. M is eq. 5 of the paper.
 
     Args:
         X: (n, d) images, finite.
@@ -97,8 +106,8 @@ def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None =
         tree: `spanning_tree(X)`, to save time when M is computed for many labelings.
 
     Returns:
-        M in [0, inf]: NaN for one cluster; 0 if two clusters share an image; infinite if each of
-        several clusters consists of equal images.
+        M, from 0 to infinity. It is NaN for one cluster, 0 if equal images are in two clusters, and
+        infinite if the images within each cluster are equal.
 
     Raises:
         PerceptionError: The labels have another length.
@@ -118,17 +127,17 @@ def cluster_quality(X: ArrayLike, labels: ArrayLike, tree: SpanningTree | None =
 def trimmed_quality(
     X: ArrayLike, labels: ArrayLike, trim: float = 0.5, distances: Floats | None = None
 ) -> float:
-    """M with quantiles in place of extremes, so that no single beam or image decides.
+    """Compute trimmed M: M with quantiles instead of extremes, so that no single image decides.
 
     In M, the smallest distance between clusters and the largest within one each come from a single
     pair of images. Here, the gap between two clusters is the `trim`-quantile of the distances
     between their images, and the width of a cluster is the (1 - `trim`)-quantile of the distances
     within it. The result is the smallest gap divided by the largest width; larger is better. A
-    cluster of one image has no width. A cluster of two images is ignored if most clusters are
-    large.
+    cluster of one image has no width. If most clusters are large, the width of a cluster of two
+    images is ignored.
 
     Args:
-        X: (n, d) images, finite. Of more than 2,000 images, a fixed random sample is measured.
+        X: (n, d) images, finite. If n > 2,000, only a fixed random sample of 2,000 is measured.
         labels: (n,) cluster of each image.
         trim: Share of the pairs to ignore at each end, in [0, 0.5]: 0 gives M of the measured
             images, 0.5 compares medians.
@@ -136,7 +145,8 @@ def trimmed_quality(
             few images.
 
     Returns:
-        A number in [0, inf]: NaN for one cluster, infinite if no cluster has a width.
+        Trimmed M, from 0 to infinity. It is NaN for one cluster, and infinite if no cluster has a
+        width and no gap is 0.
 
     Raises:
         PerceptionError: The labels have another length, or trim is out of range.
@@ -172,21 +182,31 @@ def trimmed_quality(
 
 
 def sample_indices(count: int) -> Integers:
-    """Ascending indices of the images for quantiles: all `count`, or a fixed random sample."""
+    """Choose the images for quantiles of distances: all, or a fixed random sample of 2,000.
+
+    Args:
+        count: Number of images.
+
+    Returns:
+        Ascending indices of images.
+    """
     if count <= SAMPLE:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, SAMPLE, replace=False))
 
 
 def uncertainty_coefficient(views: ArrayLike, truth: ArrayLike) -> float:
-    """U(v|x) = I(v; x) / H(v): the share of the entropy of views v that states x explain.
+    """Compute U(v|x) = I(v; x) / H(v), the share of the entropy of views v that states x explain.
 
-    U is 1 if all images of one state have one view. Several states may share a view: aliasing does
-    not lower U. U is also 1 for a single view.
+    U is 1 if all images of each state have one view, or if there is a single view. Several states
+    may share a view (aliasing) without lowering U.
 
     Args:
         views: (n,) view of each image.
         truth: (n,) true state of each image.
+
+    Returns:
+        U, from 0 to 1.
 
     Raises:
         PerceptionError: The lengths differ or are 0.
@@ -200,9 +220,10 @@ def uncertainty_coefficient(views: ArrayLike, truth: ArrayLike) -> float:
 def spanning_tree(X: ArrayLike) -> SpanningTree:
     """Find a minimum spanning tree of images, (n, d), with Borůvka's algorithm on blocks of pairs.
 
-    It needs O(n) memory besides the images. In each round, every component picks its shortest edge
-    to another component. The picks are added from short to long; a pick that would close a cycle is
-    skipped. Hence the forest is part of a minimum spanning tree even if lengths are equal.
+    The search needs O(n) memory besides the images. It begins with each image as a component. In
+    each round, every component picks its shortest edge to another component. The picks are added
+    from short to long. A pick that would close a cycle is skipped, so that the result is a minimum
+    spanning tree even if several edges are equally long.
     """
     images = check_array(equal_length(X), dtype=np.float64)
     cells, count = _Cells(images), len(images)
@@ -224,10 +245,17 @@ def spanning_tree(X: ArrayLike) -> SpanningTree:
 
 
 def cluster_spread(X: ArrayLike, labels: ArrayLike) -> float:
-    """The largest distance between two images of one cluster; 0 if each cluster has equal images.
+    """Find the largest distance between two images of one cluster.
 
     By the triangle inequality, the distance of two images is at most the sum of their distances
     from the centre. Pairs that cannot exceed the largest distance so far are skipped.
+
+    Args:
+        X: (n, d) images, finite.
+        labels: (n,) cluster of each image.
+
+    Returns:
+        The distance; 0 if the images within each cluster are equal.
     """
     images = check_array(equal_length(X), dtype=np.float64)
     clusters = _numbered(labels, len(images))
@@ -240,15 +268,19 @@ def cluster_spread(X: ArrayLike, labels: ArrayLike) -> float:
 
 
 def _separation(images: Floats, clusters: Integers) -> float:
-    """Smallest distance between two clusters: a round of Borůvka's with clusters as components."""
+    """The smallest distance between two clusters.
+
+    One round of Borůvka's algorithm, with clusters as components, finds it.
+    """
     return math.sqrt(float(_Cells(images).shortest_leaving(clusters)[0].min()))
 
 
 class _Cells:
-    """Images grouped into cells of near ones, with a lower bound for each pair of cells.
+    """Images grouped into cells of near images, with a lower bound for each pair of cells.
 
-    The bound is on the squared distance between images of different components. Components only
-    merge, so this distance only grows, and a bound stays valid in later rounds.
+    The bound is on the squared distance between two images, one of each cell, that belong to
+    different components. Components only merge, so that smallest distance only grows. So a bound
+    stays valid in later rounds.
     """
 
     def __init__(self, images: Floats) -> None:
@@ -291,8 +323,8 @@ class _Cells:
         # The products are small: threads would wait for each other longer than they work.
         with threadpool_limits(1, user_api="blas"):
             while len(pairs):
-                # Compare a pair of cells only if its bound is below the best edge of a component in
-                # it.
+                # Skip a pair of cells if its bound is not below the best edge of any component with
+                # images in these cells.
                 limits = np.maximum.reduceat(search.best[search.components], self.starts[:-1])
                 pairs = pairs[
                     self.bounds[pairs]
@@ -306,7 +338,7 @@ class _Cells:
         return search.best, self.order[search.ends]
 
     def _compare(self, a: int, b: int, search: _Search) -> float:
-        """Compare all pairs of images of two cells; return the new bound."""
+        """Compare all pairs of images of two cells; return the new bound for these cells."""
         rows, columns = self.slices[a], self.slices[b]
         squares = self.images[rows] @ self.images[columns].T
         squares *= -2
@@ -322,7 +354,7 @@ class _Cells:
 
 
 class _Search:
-    """The shortest edge found so far that leaves each component."""
+    """The shortest edge found so far from each component to another one."""
 
     def __init__(self, images: Floats, components: Integers) -> None:
         self.images, self.components = images, components
@@ -333,17 +365,17 @@ class _Search:
         """Search a block of pairs for shorter edges.
 
         Args:
-            lower: Lower bounds of the squared distances of the pairs.
+            lower: (rows, columns) lower bounds of the squared distances of the pairs.
             slack: Largest error of these bounds.
-            row: Image of the first row of the block.
-            column: Image of the first column of the block.
+            row: Index of the image of the first row of the block.
+            column: Index of the image of the first column of the block.
         """
         components, least = self.components[row : row + len(lower)], lower.min(axis=1)
         hot = np.flatnonzero(least < self.best[components])
         if not len(hot):
             return
-        # Offer the pair with the smallest bound first. Hardly any other pair is below the limit
-        # then.
+        # Offer the pair with the smallest bound of each row first. Then hardly any other pair is
+        # below the limit.
         self._offer(row + hot, column + lower[hot].argmin(axis=1))
         limits = self.best[components[hot]]
         hot = hot[(least[hot] < limits) & (limits > 0)]
@@ -352,7 +384,7 @@ class _Search:
             self._offer(row + hot[near[k : k + GATHERED]], column + far[k : k + GATHERED])
 
     def _offer(self, i: Integers, j: Integers) -> None:
-        """Keep the shortest of the pairs (i, j) for each component if it beats the best."""
+        """For each component of images i, keep the shortest pair (i, j) if it beats the best."""
         squares, components = _squares(self.images[i] - self.images[j]), self.components[i]
         order = np.lexsort((squares, components))
         order = order[np.flatnonzero(np.diff(components[order], prepend=-1))]
@@ -362,7 +394,11 @@ class _Search:
 
 
 def _halves(images: Floats, members: Integers) -> Iterator[Integers]:
-    """Split images into cells of at most CELL, recursively at the median along a long axis."""
+    """Split images into cells of at most CELL images, recursively at the median of a long axis.
+
+    Yields:
+        Indices of the images of each cell.
+    """
     if len(members) <= CELL:
         yield members
         return
@@ -376,16 +412,16 @@ def _halves(images: Floats, members: Integers) -> Iterator[Integers]:
 
 
 def _two_sweeps(images: Floats) -> float:
-    """A lower bound of the diameter that is often close to it.
+    """A lower bound of the largest distance between two images, often close to that distance.
 
-    It is the largest distance from the image that is farthest from the centre.
+    The bound is the largest distance from the image that is farthest from the centre.
     """
     start = images[_squares(images - images.mean(axis=0)).argmax()]
     return math.sqrt(_squares(images - start).max())
 
 
 def _wider(images: Floats, best: float) -> float:
-    """The diameter of the images if it exceeds `best`; otherwise any number of at most `best`."""
+    """The largest distance between two images if it exceeds `best`; otherwise at most `best`."""
     centred = images - images.mean(axis=0)
     radii = np.sqrt(_squares(centred))
     margin = 1 + 1e-12  # Radii are also rounded.
@@ -397,8 +433,8 @@ def _wider(images: Floats, best: float) -> float:
     scale = radii[0]
     if scale == 0:
         return 0.0
-    # Float32 products show which pairs may exceed the best. Radii fall, so that a row can stop
-    # early.
+    # Float32 products show which pairs may exceed the best. Images are sorted by falling radius, so
+    # the inner loop can stop early.
     small = (centred[kept] / scale).astype(np.float32)
     norms = np.einsum("ij,ij->i", small, small)
     for a in range(0, len(kept), BLOCK):
@@ -431,15 +467,19 @@ def _squares(differences: Floats) -> Floats:
 
 
 def _rounding(beams: int, dtype: type[np.floating[Any]], reach: float) -> float:
-    """A bound of the rounding error of |a|² + |b|² - 2ab with |a| + |b| <= reach.
+    """A bound of the rounding error of |a|² + |b|² - 2ab for vectors with |a| + |b| <= reach.
 
-    It covers the dot product and the rounding of its inputs.
+    The bound covers the dot product and the rounding of the vectors to `dtype`.
     """
     return float((beams + 16) * np.finfo(dtype).eps * reach**2)
 
 
 def _numbered(labels: ArrayLike, count: int | None = None) -> Integers:
-    """Number the labels 0, 1, … Raises PerceptionError unless they are a row (of `count`)."""
+    """Replace the labels by numbers 0, 1, …
+
+    Raises:
+        PerceptionError: The labels are no row of at least one label (exactly `count`, if given).
+    """
     of = np.asarray(labels)
     if of.ndim != 1 or not len(of) or (count is not None and len(of) != count):
         raise PerceptionError(

@@ -21,13 +21,14 @@ from ssh_abduction.data.errors import is_finite
 class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Turns ranges r in metres, (n, d), into 1 / max(r, floor).
 
-    Distances between images are Euclidean on these (Kuipers and Beeson 2002). Lasers report
-    "nothing seen" as +inf, and some report a lost beam as NaN: both become 0. Ranges of zero or
-    less are invalid and become the floor. `transform` counts these replacements in one
-    ImageWarning. Ranges between 0 and the floor become the floor without a warning.
+    The distance between two images is the Euclidean distance of their reciprocals (Kuipers and
+    Beeson 2002). Lasers report "nothing seen" as +inf, and some report a lost beam as NaN. The
+    reciprocal of both is 0. Ranges of zero or less are invalid and are replaced by the floor.
+    `transform` counts these replacements in one ImageWarning. Ranges between 0 and the floor are
+    replaced by the floor without a warning.
 
     Args:
-        floor: Smaller ranges become this; metres, greater than 0.
+        floor: Smallest range in metres, greater than 0. Smaller ranges are replaced by it.
     """
 
     def __init__(self, floor: float = 0.05) -> None:
@@ -52,7 +53,14 @@ class ReciprocalTransformer(OneToOneFeatureMixin, TransformerMixin, BaseEstimato
         return self
 
     def transform(self, X: ArrayLike) -> NDArray[np.float64]:
-        """The reciprocals, (n, d), in 1/m, within [0, 1 / floor]."""
+        """Compute the reciprocals of ranges.
+
+        Args:
+            X: (n, d) ranges in metres; +inf or NaN means "nothing seen".
+
+        Returns:
+            (n, d) reciprocals in 1/m, within [0, 1 / floor].
+        """
         check_is_fitted(self)
         ranges = validate_data(
             self, equal_length(X), dtype=np.float64, ensure_all_finite=False, reset=False

@@ -1,6 +1,7 @@
-"""Recognises places in images: the label of the nearest image that was learnt.
+"""Recognises places: an image gets the label of the most similar image that was learnt.
 
-The map labels the images to learn from.
+The labels to learn come from a map, which tells the dstate of each image (its position and
+heading).
 
 >>> recogniser().fit([[1.0, 4.0], [3.0, 3.0]], ["corner", "hall"]).predict([[1.1, 4.2]]).tolist()
 ['corner']
@@ -29,13 +30,13 @@ from ssh_abduction.data.errors import brief
 
 
 class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-    """Gives an image the commonest label among the `n_neighbors` nearest (Euclidean distance).
+    """Gives an image the commonest label among its nearest learnt images (Euclidean distance).
 
     Args:
-        n_neighbors: Number of neighbours that vote, from 1 to the number of images.
+        n_neighbors: Number of nearest images that vote, from 1 to the number of learnt images.
 
     Attributes:
-        classes_: (c,) labels.
+        classes_: (c,) learnt labels, sorted.
         neighbours_: The fitted KNeighborsClassifier.
     """
 
@@ -74,15 +75,22 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def predict(self, X: ArrayLike) -> NDArray[Any]:
-        """Labels of images, (n,)."""
+        """Predict the label of each image, (n,)."""
         return np.asarray(self._neighbours().predict(self._images(X)))
 
     def predict_proba(self, X: ArrayLike) -> NDArray[np.float64]:
-        """Share of the neighbours with each of `classes_`, (n, c)."""
+        """Compute which share of an image's nearest neighbours has each of `classes_`, (n, c)."""
         return np.asarray(self._neighbours().predict_proba(self._images(X)), np.float64)
 
     def distances(self, X: ArrayLike) -> NDArray[np.float64]:
-        """Euclidean distance from each image to the nearest learnt image of each class, (n, c)."""
+        """Measure how far the nearest learnt image of each class is from each image.
+
+        Args:
+            X: (n, d) images, finite.
+
+        Returns:
+            (n, c) Euclidean distances, a column for each of `classes_`.
+        """
         remembered, labels = self.remembered()
         found = cdist(self._images(X), remembered)
         return np.column_stack([found[:, labels == label].min(axis=1) for label in self.classes_])
@@ -93,13 +101,13 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         return np.asarray(held._fit_X), np.asarray(self.classes_)[np.asarray(held._y)]
 
     def learnt_again(self) -> PlaceRecogniser:
-        """Learn the remembered images and labels from scratch; the answers stay equal.
+        """Make a new recogniser from the remembered images and labels. It gives the same answers.
 
-        scikit-learn's compiled search trusts its tables, and a table that was damaged in a file can
-        crash the process. Learning again checks the tables.
+        This checks the remembered tables. scikit-learn's compiled search trusts its tables, so a
+        table that was damaged in a file could crash the process.
 
         Raises:
-            PerceptionError, ValueError: The tables are not sound. Numpy may raise others.
+            PerceptionError, ValueError: The tables are damaged. numpy may raise other errors.
         """
         return PlaceRecogniser(self.n_neighbors).fit(*self.remembered())
 
@@ -112,12 +120,12 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def recogniser(floor: float = 0.05, n_neighbors: int = 1, features: Any = None) -> Pipeline:
-    """Make a pipeline from images, (n, d), to labels: features, then the nearest neighbour.
+    """Make a pipeline that predicts labels of images, (n, d), by the nearest neighbour.
 
-    The pipeline is not fitted yet.
+    It first turns images into features. The pipeline is not fitted yet.
 
     Args:
-        floor: Shortest range in metres for the reciprocals, which are the default features.
+        floor: Smallest range in metres, if the features are reciprocals of ranges (the default).
         n_neighbors: Number of neighbours that vote.
         features: A scikit-learn transformer for other images, such as a PanoramaTransformer. It is
             cloned.
@@ -131,7 +139,16 @@ def recogniser(floor: float = 0.05, n_neighbors: int = 1, features: Any = None) 
 
 
 def cloned(name: str, estimator: Any, *methods: str) -> Any:
-    """Clone a scikit-learn estimator. Raises PerceptionError if it lacks `fit` or these methods."""
+    """Clone a scikit-learn estimator.
+
+    Args:
+        name: Name of the setting, for the error message.
+        estimator: The estimator.
+        *methods: Names of methods that it must have besides `fit` and `get_params`.
+
+    Raises:
+        PerceptionError: A method is missing.
+    """
     wanted = ("fit", "get_params", *methods)
     if isinstance(estimator, type) or not all(hasattr(estimator, method) for method in wanted):
         raise PerceptionError(
@@ -151,8 +168,8 @@ class LearningCurve:
         lowest: (s,) lowest share over the folds.
         highest: (s,) highest share over the folds.
         folds: Number of folds.
-        untested: Classes with a single image. They are not tested, since leaving out that image
-            leaves none to learn from.
+        untested: Labels with a single image. They are not tested, since no image to learn from is
+            left if that image is tested.
     """
 
     sizes: tuple[int, ...]
@@ -173,19 +190,22 @@ def learning_curve(
 ) -> LearningCurve:
     """Cross-validate the recognition rate for growing numbers of images.
 
-    The images are dealt into folds, each class spread evenly. For each size m and each fold, a
-    clone of the estimator learns from those of the first m images that are not in the fold. It is
-    tested on the whole fold, so all sizes are tested on the same images. An image of a place that
-    is not among the first m images counts as an error. A clone without images to learn from
-    recognises nothing.
+    The images are divided into folds, so that each label is spread evenly over them. For each size
+    m and each fold, a clone of the estimator learns from the first m images, without those of the
+    fold. It is tested on the whole fold, so all sizes are tested on the same images. An image with
+    a label that was not learnt counts as an error. A clone without images to learn from recognises
+    nothing.
 
     Args:
         X: (n, d) images in the order in which they were seen.
-        y: (n,) labels.
+        y: (n,) label of each image.
         sizes: Numbers of images to learn from, each from 1 to n.
         folds: Number of folds, at least 2.
-        random_state: Seed for dealing the images.
-        estimator: Default is `recogniser()`, for ranges in metres.
+        random_state: Seed for dividing the images.
+        estimator: A scikit-learn classifier; None means `recogniser()`, for ranges in metres.
+
+    Returns:
+        The share of recognised images for each size.
 
     Raises:
         PerceptionError: A size or the number of folds is out of range, or there are fewer images to
@@ -196,8 +216,8 @@ def learning_curve(
     """
     estimator = recogniser() if estimator is None else estimator
     images, labels = np.asarray(equal_length(X)), np.asarray(y)
-    # Fit once to all images, so that warnings and errors about the images come once, not once a
-    # fold.
+    # Fit once to all images, so that warnings and errors about the images appear once, and not for
+    # each fold.
     clone(estimator).fit(images, labels)
     wanted = tuple(int(size) for size in sizes)
     for size in wanted:
@@ -227,12 +247,13 @@ def learning_curve(
 def _deal(
     labels: NDArray[Any], folds: int, random_state: Any
 ) -> tuple[NDArray[np.intp], tuple[Any, ...]]:
-    """Deal the images into folds, one class after the other.
+    """Divide the images into folds, one class after the other, as cards are dealt.
 
-    The sizes of folds differ by at most one image, in total and within each class.
+    The sizes of two folds differ by at most one image, in total and within each class.
 
     Returns:
-        The fold of each image, -1 if it is never tested, and the classes that are never tested.
+        The fold of each image, (n,), with -1 for an image that is never tested; and the classes
+        that are never tested, because they have a single image.
     """
     if folds < 2:
         raise PerceptionError(f"folds: expected at least 2, got {folds}")

@@ -1,7 +1,7 @@
 """Stores a fitted recogniser in a file that cannot run code when it is read.
 
-The file is a skops archive, which describes types and arrays. Reading it makes objects of
-scikit-learn's own types and of those in `OURS` only. Pickles are rejected.
+The file is a skops archive, which describes types and arrays. Reading it creates only objects of
+scikit-learn's types and of the types in `OURS`. Pickles are rejected.
 """
 
 from __future__ import annotations
@@ -42,12 +42,13 @@ OURS = (
 
 @dataclass(frozen=True)
 class Stored:
-    """Content of a file of a recogniser.
+    """Content of a file that `save` wrote.
 
     Attributes:
         model: The fitted estimator or pipeline.
-        classes: Its labels, in order; empty if it has none.
-        versions: Versions of Python, numpy, scikit-learn, skops and this package that saved it.
+        classes: Labels that the model predicts, sorted; empty if the model has no classes.
+        versions: Version of each program that saved the model, by name: python, numpy,
+            scikit-learn, skops, ssh-abduction.
     """
 
     model: Any
@@ -55,7 +56,12 @@ class Stored:
     versions: Mapping[str, str]
 
     def likelihood(self) -> ImageLikelihood | None:
-        """Densities of images; None if the model saw no place twice or is of another kind."""
+        """Make the densities of images at the places that the model knows.
+
+        Returns:
+            The densities; None if the model is no recogniser of places or has no two images of one
+            place.
+        """
         try:
             return ImageLikelihood.of(self.model)
         except PerceptionError:
@@ -68,11 +74,11 @@ class Stored:
             images: (n, d) images.
 
         Returns:
-            n whole numbers.
+            The label of each image, a whole number.
 
         Raises:
-            PerceptionError: The images have another length than the learnt ones, or the model was
-                damaged in its file (which `load` may not notice).
+            PerceptionError: The images have another length than the learnt ones, or the model is
+                damaged. `load` does not notice all damage of a file.
         """
         table = np.asarray(images, np.float64)
         try:
@@ -104,7 +110,7 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     """Write a fitted estimator or pipeline to a file, completely or not at all.
 
     Args:
-        model: An estimator of this package's or scikit-learn's types.
+        model: The estimator or pipeline, of types of this package or of scikit-learn.
         path: The file to write.
 
     Raises:
@@ -202,7 +208,10 @@ def load(path: str | os.PathLike[str]) -> Stored:
 
 
 def _learnt_again(model: Any) -> Any:
-    """Let the place recognisers of a model learn again, which checks their tables."""
+    """Copy a model, with place recognisers that learnt their images again.
+
+    Learning again checks the tables of images.
+    """
     if isinstance(model, PlaceRecogniser):
         return model.learnt_again()
     if isinstance(model, Pipeline):
@@ -211,12 +220,12 @@ def _learnt_again(model: Any) -> Any:
 
 
 def _kind(value: object) -> str:
-    """A value for an error message. Objects show their type only, as their own text may raise."""
+    """Describe a value in an error message: objects by their type, as their own text may raise."""
     return (
         brief(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
     )
 
 
 def _foreign(**source: Any) -> list[str]:
-    """The types in a dump that are neither scikit-learn's nor ours."""
+    """The names of types in a dump that are neither scikit-learn's nor in `OURS`, sorted."""
     return sorted(set(skops.io.get_untrusted_types(**source)) - set(OURS))

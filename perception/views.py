@@ -39,8 +39,8 @@ ROUNDS = 30
 # There is a runner-up if trimmed M of the chosen k is below this multiple of the largest trimmed M
 # of the others. docs/measurements/reproduction.md has measurements.
 NEAR = 1.5
-# A larger k is also a runner-up if its trimmed M is at least this. A few distant views can each
-# hide several well-separated ones.
+# A larger k is also a runner-up if its trimmed M is at least this, because each of a few distant
+# views can hide several well-separated ones.
 APART = 2.3
 # Values of trimmed M within this factor of the largest count as equal, and the smallest k wins.
 EQUAL = 0.95
@@ -57,11 +57,12 @@ ISOLATED = 10.0
 class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     """Clusters images into k views.
 
-    If k is not given, it is the number in [k_min, k_max] with the largest M (eq. 5 of the paper);
-    ties go to the smallest k. M depends on two distances only, so a single lost beam can change it.
-    Each k therefore also has a trimmed M, which uses quantiles. If trimmed M clearly or nearly
-    prefers another number of views, that number is the runner-up, whose views may make a better
-    map. If all images are equal, there is one view, and an ImageWarning.
+    A view is a cluster of images that look alike. If k is not given, the k in [k_min, k_max] with
+    the largest M is chosen (`perception.quality`; eq. 5 of the paper); ties go to the smallest k. M
+    depends on two distances only, so a single lost beam can change it. Each k therefore also has a
+    trimmed M, which uses quantiles. If trimmed M prefers another k, or likes it nearly as well,
+    that k is the runner-up. Its views may make a better map. If all images are equal, there is one
+    view, and an ImageWarning.
 
     Args:
         k: Number of views; None chooses it by M.
@@ -72,29 +73,32 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             `n_clusters` or `n_components` is set to k. A clusterer that finds k itself (DBSCAN,
             HDBSCAN, or AgglomerativeClustering with n_clusters=None) is used as it is.
         n_init: Number of starts of k-means. For more than 5,000 images, the starts use a random
-            sample of 5,000 images, and the best start is refined on all images, each in at most 30
-            rounds. A view that is too rare for the sample may be missed.
+            sample of 5,000 images, and the best start is refined on all images. Both take at most
+            30 rounds. A view that is too rare for the sample may be missed.
         random_state: Seed, RandomState or None. A seed of the clusterer takes precedence.
         by: "M", or "trimmed" for the smallest k whose trimmed M is at least 0.95 times the largest.
         trim: Share of distances that trimmed M ignores at each end, in [0, 0.5].
-        isolated: A factor greater than 1: an image is noise if the distance to its third nearest
-            neighbour exceeds this factor times the median of these distances. If most views were
-            seen more often, a view that was seen three times or less is then noise. None isolates
-            no image.
+        isolated: A factor greater than 1. An image is isolated if the distance to its third nearest
+            neighbour exceeds this factor times the median of these distances. So up to three images
+            of one strange thing are isolated if most views were seen more often. None isolates no
+            image.
 
     Attributes:
         labels_: (n,) view of each fitted image; -1 for noise, which is an isolated image or one
             that the clusterer calls noise.
         k_: Number of views without noise.
-        confidence_: (n,) confidence of each view, in [0, 1]; 0 for noise (perception.confidence).
-        quality_: M for each k that was tried, without noise. One entry if the clusterer finds k
-            itself.
-        trimmed_: Trimmed M for each k that was tried (perception.quality.trimmed_quality).
-        labels_by_k_: Views, (n,), for each k that was tried.
-        runner_up_: The best other k by trimmed M, if trimmed M of k_ is below 1.5 times that of the
-            best other k; otherwise the best larger k with a trimmed M of at least 2.3, if there is
-            one; otherwise None.
-        cluster_centers_: (k, d) centres, if the clusterer has them.
+        confidence_: (n,) how surely each image belongs to its view, in [0, 1]; 0 for noise
+            (`perception.confidence`).
+        quality_: Dict from each k that was tried to its M, without noise. It has one entry if k is
+            given or if the clusterer finds k itself.
+        trimmed_: Dict from each k that was tried to its trimmed M
+            (`perception.quality.trimmed_quality`).
+        labels_by_k_: Dict from each k that was tried to the view of each image, (n,).
+        runner_up_: Another k whose views may make a better map. If trimmed M of k_ is below 1.5
+            times the largest of the other k, it is the smallest other k that is at least 0.95 times
+            as good as the best of these. Otherwise it is the larger k with the largest trimmed M,
+            if that is at least 2.3. Otherwise it is None.
+        cluster_centers_: (k, d) centres of the views, if the clusterer has them.
         clusterer_: The fitted clusterer; None if all images are equal.
     """
 
@@ -144,8 +148,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         far = _to_neighbour(images, images, 1)
         self.reach_ = float(self.isolated or math.inf) * float(np.median(far))
         inside = (far <= self.reach_) | (self.reach_ == 0)
-        # If only equal images are left, isolating would hide all differences: keep all images
-        # instead.
+        # If all images that are left are equal, nothing distinguishes them. Isolate none instead.
         if (images[inside] == images[inside][0]).all():
             inside[:] = True
         self._fit_all(images[inside])
@@ -174,8 +177,8 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     def predict(self, X: ArrayLike) -> NDArray[np.intp]:
         """Predict the views of images.
 
-        A clusterer that can predict is used (k-means: nearest centre). Otherwise an image gets the
-        view of the nearest fitted image.
+        If the clusterer can predict, it does so (k-means: the view with the nearest centre).
+        Otherwise an image gets the view of the nearest fitted image.
 
         Args:
             X: (n, d) images, finite.
@@ -195,7 +198,15 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return views
 
     def score(self, X: ArrayLike, y: Any = None) -> float:
-        """M of the predicted views of images, (n, d); larger is better. NaN for one view."""
+        """Compute M of the views that are predicted for images, without noise.
+
+        Args:
+            X: (n, d) images, finite.
+            y: Ignored.
+
+        Returns:
+            M; larger is better. NaN for one view, or if all images are noise.
+        """
         views, images = self.predict(X), np.asarray(X, float)
         return (
             cluster_quality(images[views != NOISE], views[views != NOISE])
@@ -205,7 +216,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
     @property
     def runner_up_labels_(self) -> NDArray[np.intp] | None:
-        """The views of the runner-up, (n,); None without a runner-up."""
+        """The view of each image for `runner_up_` views, (n,); None without a runner-up."""
         return None if self.runner_up_ is None else self.labels_by_k_[self.runner_up_]
 
     def _record_single(self, best: Any, images: NDArray[np.float64]) -> None:
@@ -225,7 +236,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         self.labels_by_k_ = {self.k_: labels}
 
     def _search(self, images: NDArray[np.float64], seed: int) -> Any:
-        """Try each k, record the results, and return the fitted clusterer with the best k."""
+        """Try each k, record the results in attributes, and return the clusterer of the best k."""
         tree, chosen = spanning_tree(images), sample_indices(len(images))
         distances = cdist(images[chosen], images[chosen])
         most = min(20, len(images) - 1) if self.k_max is None else self.k_max
@@ -250,7 +261,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return fitted[self.k_]
 
     def _find_runner_up(self) -> int | None:
-        """The number of views that rivals the chosen one; None without a rival."""
+        """The number of views that may be better than the chosen one; None if there is none."""
         others = {k: worth for k, worth in self.trimmed_.items() if k != self.k_}
         if others and self.trimmed_[self.k_] < NEAR * max(others.values()):
             return _smallest_good(others)
@@ -327,7 +338,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def _check(self) -> None:
-        """Check the settings."""
+        """Raise PerceptionError if a setting is invalid or contradicts another."""
         for name in ("k", "k_min", "k_max", "n_init"):
             value, least = getattr(self, name), 2 if name == "k_min" else 1
             if value is None and name in ("k", "k_max"):
@@ -394,14 +405,17 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def as_view_clusterer(clusterer: Any) -> ViewClusterer:
-    """Wrap a scikit-learn clusterer; a ViewClusterer is returned unchanged.
+    """Wrap a scikit-learn clusterer in a ViewClusterer.
 
     Args:
-        clusterer: A ViewClusterer, or a scikit-learn clusterer. The wrapper makes as many views as
-            the clusterer is set to.
+        clusterer: A scikit-learn clusterer, or a ViewClusterer.
+
+    Returns:
+        A ViewClusterer whose k is the number of clusters that the clusterer is set to. A
+        ViewClusterer is returned unchanged.
 
     Raises:
-        PerceptionError: It is not a clusterer.
+        PerceptionError: The argument is not a clusterer.
     """
     if isinstance(clusterer, ViewClusterer):
         return clusterer
@@ -414,7 +428,9 @@ def as_view_clusterer(clusterer: Any) -> ViewClusterer:
 def _to_neighbour(
     images: NDArray[np.float64], among: NDArray[np.float64], itself: int
 ) -> NDArray[np.float64]:
-    """Distance from each image to its third nearest neighbour, or its last of fewer, (n,).
+    """The distance from each image to its third nearest neighbour, (n,).
+
+    If there are fewer neighbours, it is the distance to the farthest of them.
 
     Args:
         images: (n, d) images.
@@ -429,19 +445,23 @@ def _to_neighbour(
 
 
 def _with_noise(inside: NDArray[np.bool_], labels: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Labels for all images: `labels` for those inside, noise for the others."""
+    """Labels for all images, (n,): `labels` where the mask `inside` is true, elsewhere noise."""
     every = np.full(len(inside), NOISE, np.intp)
     every[inside] = labels
     return every
 
 
 def _smallest_good(worth: dict[int, float]) -> int:
-    """The smallest k whose trimmed M is at least EQUAL times the largest."""
+    """The smallest k whose trimmed M is at least EQUAL times the largest.
+
+    Args:
+        worth: Trimmed M for each k.
+    """
     return min(k for k in worth if not worth[k] < EQUAL * max(worth.values()))
 
 
 def _count_parameter(clusterer: Any) -> str | None:
-    """The parameter that sets the number of clusters; None if the clusterer finds it."""
+    """The name of the setting for the number of clusters; None if the clusterer chooses it."""
     settings = clusterer.get_params()
     if settings.get("n_clusters") is not None:
         return "n_clusters"

@@ -1,16 +1,17 @@
 """Compares the trajectory by scan matching with the trajectory by odometry.
 
 Scan matching corrects an odometer that drifts by some percent. If the trajectories differ by more,
-something is read wrongly: the field of view, the position of the laser on the robot, a range that
-means "nothing came back", or the odometer itself. The kind of difference shows which.
+one of these was read wrongly: the field of view, the position of the laser on the robot, the range
+that means "nothing came back", or the odometer. The kind of difference shows which.
 
-Both trajectories are cut into stretches. A stretch is a motion in the plane: a complex number in
-the frame of the robot at its beginning. The least-squares factor that maps odometry motions to scan
-motions has an angle: the difference of the directions of motion.
+Both trajectories are cut into stretches of about a metre. The motion along a stretch is a complex
+number in the frame of the robot at its beginning. A least-squares fit finds the complex factor that
+maps motions by odometry to motions by scans. Its angle is the difference in direction.
 
-Matching scans starts from the odometry, so in a corridor it hardly shows that the laser points
-elsewhere. Pairs of scans show it: moved by the odometry, their points coincide only if the
-direction of the laser is right. The field of view is tested likewise.
+Scan matching starts from the odometry. So in a corridor it hardly notices if the direction of the
+laser is wrong. Pairs of scans show it better: if the second scan is moved by the odometry, its
+points coincide with those of the first only if the direction is right. The field of view is tested
+likewise.
 """
 
 from __future__ import annotations
@@ -63,12 +64,12 @@ class Agreement:
     """Comparison of the trajectories by scan matching and by odometry.
 
     Attributes:
-        odometry: Metres by odometry, over all stretches.
-        scans: Metres by scan matching.
+        odometry: Metres driven by odometry, over all stretches.
+        scans: Metres driven by scan matching, over the same stretches.
         angle: Direction of motion by scans minus that by odometry; radians to the left.
         turning: Median ratio of turns by scans to turns by odometry; None if there are few turns.
-        parted: Number of stretches that diverge.
-        of: Number of stretches.
+        parted: Number of stretches in which the two trajectories diverge.
+        of: Number of stretches that are compared for `parted`, which are those with motion.
     """
 
     odometry: float
@@ -80,12 +81,12 @@ class Agreement:
 
     @property
     def has_other_turns(self) -> bool:
-        """Whether the robot turns more or less by scans than by odometry."""
+        """Whether turns by scans are clearly larger or smaller than those by odometry."""
         return self.turning is not None and abs(self.turning - 1) > TURNING
 
     @property
     def is_askew(self) -> bool:
-        """Whether scans and odometry differ in the direction of motion."""
+        """Whether scans and odometry clearly differ in the direction of motion."""
         return abs(self.angle) > ANGLE
 
     @property
@@ -104,8 +105,8 @@ def agreement(log: RobotLog, track: Track) -> Agreement:
         track: Poses by scan matching.
 
     Returns:
-        The comparison without stretches across a cut of the track, where nothing is known. If the
-        odometer hardly moved, only lengths are compared.
+        The comparison. It ignores stretches across a cut of the track, where the motion is unknown.
+        If the odometer hardly moved, it compares only lengths.
     """
     odometry = np.array([scan.odometry for scan in log.scans])
     stretches = [
@@ -142,7 +143,8 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
         track: Poses by scan matching.
 
     Returns:
-        The differences, with likely causes and the options that mend them; None if they agree.
+        A note with the differences, likely causes, and the options that correct them; None if scans
+        and odometry agree.
     """
     found = agreement(log, track)
     covers = None if found.is_good else field_of_view(log)
@@ -196,9 +198,11 @@ def disagreement(log: RobotLog, track: Track) -> str | None:
 
 
 def direction(log: RobotLog) -> float | None:
-    """Estimate the direction of the laser, in degrees to the left of straight ahead.
+    """Estimate the direction of the laser, if the log gives a wrong one.
 
-    None if the log is right, if the scans do not show it, or if there are several lasers.
+    Returns:
+        Degrees to the left of straight ahead. None if the direction in the log is right, if the
+        scans do not show the direction, or if there are several lasers.
     """
     angles = {scan.laser.mount[2] for scan in log.scans}
     apart = _apart(log, np.radians(TURNS)) if len(angles) == 1 else None
@@ -211,9 +215,10 @@ def direction(log: RobotLog) -> float | None:
 
 
 def field_of_view(log: RobotLog) -> float | None:
-    """Estimate the field of view in degrees.
+    """Estimate the field of view of the laser, if the log gives a wrong one.
 
-    None if the log is right, or if the scans do not show it.
+    Returns:
+        Degrees. None if the field of view in the log is right, or if the scans do not show it.
     """
     fov = _fov(log.scans[0])
     tried = [_apart(log, np.zeros(1), float(degrees) / fov) for degrees in FIELDS]
@@ -230,20 +235,21 @@ def field_of_view(log: RobotLog) -> float | None:
 
 
 def _fov(scan: Scan) -> float:
-    """Field of view of a scan in degrees, as the log says."""
+    """The field of view of a scan according to the log, in degrees."""
     return math.degrees(abs(scan.laser.step)) * scan.laser.steps
 
 
 def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
-    """Mean distance of points in pairs of scans that are moved by the odometry.
+    """How far the points of two scans lie apart, if the odometry moves one scan to the other.
 
     Args:
-        log: The scans.
-        turns: (n,) radians to rotate the laser on the robot.
-        stretch: Factor for the angle between beams.
+        log: The scans. Pairs of near scans are compared.
+        turns: (n,) angles in radians by which the laser is rotated on the robot.
+        stretch: Factor by which the angle between beams is multiplied.
 
     Returns:
-        (n,) mean metres to the nearest point; None if there are too few pairs.
+        (n,) mean distance to the nearest point in metres, for each of `turns`; None if there are
+        too few pairs.
     """
     apart = []
     for first, second in _pairs(log):
@@ -253,8 +259,8 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
         here, there = _points(first, stretch), _points(second, stretch)
         if first.laser != second.laser or not len(here) or not len(there):
             continue
-        # From the laser of the second scan to its robot, to the robot of the first scan, to its
-        # laser.
+        # Transform from the laser of the second scan to the robot then, to the robot at the first
+        # scan, to the laser then.
         moved = complex(dx, dy) + (at + there[:, None] * looks) * np.exp(1j * turn)
         seen = (moved - at) / looks
         tree = cKDTree(np.stack([here.real, here.imag], axis=-1))
@@ -266,7 +272,7 @@ def _apart(log: RobotLog, turns: Array, stretch: float = 1.0) -> Array | None:
 
 
 def _pairs(log: RobotLog) -> list[tuple[Scan, Scan]]:
-    """Pairs of scans near enough for accurate odometry and a shared view."""
+    """At most PAIRS pairs of scans that see the same walls and have accurate odometry between."""
     kept = moving(log.scans)
     pairs = []
     for i, scan in enumerate(kept):
@@ -292,7 +298,7 @@ def _points(scan: Scan, stretch: float) -> NDArray[np.complex128]:
 
 
 def _stretches(odometry: Array) -> list[tuple[int, int]]:
-    """First and last scan of each stretch of a trajectory of poses (n, 3)."""
+    """Indices of the first and last scan of each stretch of a trajectory, (n, 3) poses."""
     cuts, way, turned = [0], 0.0, 0.0
     steps = np.hypot(*np.diff(odometry[:, :2], axis=0).T)
     for i, (step, turn) in enumerate(zip(steps, np.diff(odometry[:, 2]), strict=True), 1):

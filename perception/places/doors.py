@@ -1,8 +1,8 @@
 """Finds the doors that a robot drives through, for buildings whose places are doors.
 
-In a building of rooms, the robot crosses wide spaces freely, and no corridor bends or forks. It
-cannot avoid doors: constrictions of the free space on its trajectory. So a place is a door, and a
-path crosses a room from one door to the next.
+In a building of rooms, the robot crosses wide spaces freely, and no corridor bends or forks. But it
+must drive through doors, which are narrow parts of the free space on its trajectory. So a place is
+a door, and a path crosses a room from one door to the next.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Door:
     Attributes:
         scan: Index of the first scan behind the door.
         middle: (x, y) in metres, in the frame of the track.
-        width: Metres.
-        way: Metres driven up to the door.
+        width: Width of the free space in the door, in metres.
+        way: Metres driven from the beginning of the track to the door.
     """
 
     scan: int
@@ -60,9 +60,12 @@ class Door:
 
 
 def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
-    """Find the doors that the robot drove through, in order, once for each pass.
+    """Find the doors that the robot drove through.
 
     Each unbroken part of the track is searched separately.
+
+    Returns:
+        Doors in order. A door occurs once for each time that the robot drove through it.
     """
     return tuple(
         replace(
@@ -79,8 +82,7 @@ def _doors_of_span(log: RobotLog, track: Track) -> tuple[Door, ...]:
     """Find the doors of a log whose track is unbroken."""
     maps = LocalMaps(log.scans, track, 2 * ASIDE)
     ways = np.arange(0.0, track.way[-1], STRIDE)
-    # While the robot stands, its distance does not grow. Only the first of such scans is used to
-    # interpolate.
+    # Interpolation needs distances that grow. While the robot stands, only its first scan is used.
     moving = np.concatenate([[True], np.diff(track.way) > 0])
     positions = np.stack(
         [np.interp(ways, track.way[moving], track.poses[moving, k]) for k in (0, 1)], axis=1
@@ -102,7 +104,8 @@ def _doors_of_span(log: RobotLog, track: Track) -> tuple[Door, ...]:
         ]
     widths = np.array([width for width, _ in gaps])
     found: list[Door] = []
-    # Start with the narrowest position, the middle of a door. Nearby finds are the same door.
+    # Start with the narrowest position, the middle of a door. Narrow positions near a door that was
+    # found belong to that door.
     for k in np.argsort(widths, kind="stable"):
         if widths[k] > DOOR:
             break
@@ -130,7 +133,13 @@ def _doors_of_span(log: RobotLog, track: Track) -> tuple[Door, ...]:
 
 
 def _gap(patch: Patch, at: Array, across: float) -> tuple[float, Array]:
-    """The smallest width of free space across the trajectory in metres, and its middle."""
+    """The smallest width of the free space across the trajectory, in metres, and its middle.
+
+    Args:
+        patch: Local map.
+        at: (x, y) of the robot in metres.
+        across: Direction perpendicular to the trajectory, in radians.
+    """
     directions = np.stack([np.cos(across + ASKEW), np.sin(across + ASKEW)], axis=1)
     free = patch.free_along(at, np.stack([directions, -directions], axis=1), ASIDE)
     k = int(free.sum(axis=1).argmin())
@@ -148,9 +157,14 @@ def are_frequent(doors: Sequence[Door], track: Track) -> bool:
 
 
 def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
-    """The visits to doors, in order. Entering and leaving by one door counts once.
+    """Make the visits to doors, in order.
 
-    Corrected poses are not read.
+    If the robot enters and leaves a room by one door, this is a single visit. Corrected poses are
+    not read.
+
+    Args:
+        track: Trajectory of the robot.
+        doors: Doors that it drove through, in order.
     """
     spans = [
         [door for door in doors if begin <= min(door.scan, len(track.poses) - 1) < end]
@@ -160,8 +174,9 @@ def visits_of(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
 
 
 def _visits_of_span(track: Track, doors: Sequence[Door]) -> tuple[Visit, ...]:
-    """The visits to doors on an unbroken track."""
-    # Join the passes of one door, and a narrow part behind it that the robot left by the same door.
+    """Make the visits to the doors of one unbroken part of a track, in order."""
+    # Join consecutive passes of one door. If the robot drove through a door, a narrow part close
+    # behind it, and back through the door, that is also one visit.
     passes: list[list[Door]] = []
     for door in doors:
         if passes and math.dist(door.middle, passes[-1][-1].middle) < SAME:
@@ -187,7 +202,7 @@ def _visit(
     same, middle = passes[number], middles[number]
     came = _bearing(middle, middles[number - 1]) if number > 0 else None
     went = _bearing(middle, middles[number + 1]) if number < len(passes) - 1 else None
-    # Coming back to the door before means leaving by the door of arrival.
+    # If the next door is the previous one, the robot leaves by the exit of arrival.
     if (
         came is not None
         and went is not None

@@ -1,7 +1,8 @@
 """Finds the exits of the free space around a point, and the point where they meet.
 
-An exit is a part of the free space, one radius away by the shortest drivable path, that can be
-reached at full width. So an alcove is no exit. A corridor with an obstacle is one.
+An exit is a connected part of the free space at a distance of one radius from the point, measured
+along the shortest drivable path. A path is drivable if a gateway's width is free along it. So an
+alcove is no exit, but a corridor with an obstacle is one.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Exit:
 
     Attributes:
         bearing: Direction from the middle, in radians counterclockwise in the frame of the track.
-        cells: Mask of the ring's cells that form this exit.
+        cells: Mask of the cells of the patch that form this exit, just outside the radius.
     """
 
     bearing: float
@@ -45,9 +46,10 @@ class Outlook:
     """The exits seen from a cell of a patch.
 
     Attributes:
-        middle: The cell.
+        middle: The cell (row, column) from which the exits are seen.
         exits: Exits, counterclockwise.
-        reached: Metres from the middle to each cell, up to the end of the ring.
+        reached: (rows, columns) metres from the middle to each cell along drivable cells; infinite
+            beyond the exits.
     """
 
     middle: Cell
@@ -60,7 +62,16 @@ class Outlook:
 
 
 def nearest(open_cells: Bools, cell: Cell, within: float) -> Cell | None:
-    """The open cell nearest to a cell, if it is within this many metres."""
+    """Find the open cell nearest to a cell.
+
+    Args:
+        open_cells: Mask of the open cells.
+        cell: Row and column.
+        within: Largest distance in metres.
+
+    Returns:
+        Row and column; None if no open cell is near enough.
+    """
     rows, columns = np.nonzero(open_cells)
     if not len(rows):
         return None
@@ -70,7 +81,13 @@ def nearest(open_cells: Bools, cell: Cell, within: float) -> Cell | None:
 
 
 def outlook(open_cells: Bools, middle: Cell, radius: float) -> Outlook:
-    """The exits at least `radius` metres from a cell through open cells."""
+    """Find the exits around a cell, at a distance of `radius` through open cells.
+
+    Args:
+        open_cells: Mask of the drivable cells.
+        middle: The cell.
+        radius: Metres.
+    """
     seed = np.zeros(open_cells.shape, bool)
     seed[middle] = True
     reached = distances(open_cells, seed, radius + RING)
@@ -99,15 +116,22 @@ def _merged(exits: list[Exit], middle: Cell) -> list[Exit]:
 
 
 def apart(a: float, b: float) -> float:
-    """The angle between two directions, from 0 to pi."""
+    """Compute the angle between two directions in radians, from 0 to pi."""
     return abs((a - b + math.pi) % (2 * math.pi) - math.pi)
 
 
 def parting(patch: Patch, open_cells: Bools, seen: Outlook, radius: float) -> Cell:
-    """The cell where the paths to all exits meet.
+    """Find the cell where the paths to all exits meet.
 
-    The sum of the paths to the exits is shortest there. Of nearly equal cells, the one with the
-    most room is taken. With two exits, it is the sharpest bend of the path between them.
+    That is the cell with the smallest sum of distances to the exits. Of nearly equal cells, the one
+    farthest from obstacles is taken. If there are two exits, only cells at the bend of the path
+    between them are considered: those farthest from the straight line between the exits.
+
+    Args:
+        patch: Local map.
+        open_cells: Mask of the drivable cells.
+        seen: The exits.
+        radius: Distance in metres of the exits from the cell that they are seen from.
     """
     inside = open_cells & np.isfinite(seen.reached)
     total = sum(

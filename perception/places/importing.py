@@ -1,8 +1,8 @@
-"""Turns a robot's log into a trace, one line a stage.
+"""Turns a robot's log into a trace: a step for each distinctive state (position and heading).
 
-The robot did not stop at distinctive states. If it passed a junction, corner or dead end, or turned
-around, the local map shows what the robot would have seen from the middle of the place. Kuipers &
-Beeson (2002) planned this: to localise without physical motion to the actual location.
+The robot need not have stopped at distinctive states. If it passed a junction, corner or dead end,
+or turned around, the local map shows what it would have seen from the middle of the place. Kuipers
+& Beeson (2002) planned this: to localise without physical motion to the actual location.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from ssh_abduction.runtime.logs import log_of
 
 _log = log_of("ssh_abduction.perception.places")
 
-# Mean number of times that each view is seen, at least. With few images of many places, most views
-# would be seen once and would carry no information.
+# Each view is seen at least this many times on average. With few images of many places, most views
+# would otherwise be seen once and would carry no information.
 SEEN = 12
 # Largest share of scans before which a track may be broken.
 MOST_BREAKS = 0.1
-# Units of odometry and how many make a metre; number of scans over which odometry is compared with
-# scan matching; largest relative difference of the two.
+# UNITS: units of odometry, and how many make a metre. STRETCH: number of scans over which odometry
+# is compared with scan matching. UNLIKE: largest relative difference of the two.
 UNITS, STRETCH, UNLIKE = {"millimetres": 1000.0, "centimetres": 100.0}, 80, 0.25
 
 
@@ -48,12 +48,13 @@ class Imported:
     """Result of `import_log`.
 
     Attributes:
-        trace: One step for each visited dstate, with view, image, star (exits), displacement.
+        trace: One step for each distinctive state that the robot passed, with view, image, star
+            (the exits as directions) and displacement from the previous step.
         track: Trajectory of the robot.
         scale: Scale of the building.
-        visits: The distinctive places that the robot passed, in order.
-        seconds: Processor time of each stage.
-        notes: Sentences on suspicious features of the track.
+        visits: Stays at distinctive places, in order.
+        seconds: Processor time in seconds, by stage: track, scale, places, trace, views.
+        notes: Sentences on suspicious features of the odometry and the track.
     """
 
     trace: Trace
@@ -82,11 +83,11 @@ def import_log(
             it.
         name: Name of the trace.
         doors: Whether places are the doors that the robot drives through, instead of forks and
-            bends of corridors. None means False if gateway or radius is given (they describe
-            corridors). Otherwise, the log decides.
+            bends of corridors. None lets the log decide, unless `gateway` or `radius` is given:
+            these describe corridors, so places are forks and bends.
 
     Returns:
-        The trace and its source data.
+        The trace, and the trajectory, scale, visits and notes that it was made from.
 
     Raises:
         LogError: The robot passed no distinctive place or hardly moved, or the scans do not match.
@@ -144,17 +145,17 @@ def import_log(
 
 
 def tracked(log: RobotLog) -> tuple[RobotLog, Track, tuple[str, ...]]:
-    """Follow the log.
+    """Compute the trajectory of a robot from its log.
 
     Returns:
-        The log with the odometry of one source in metres, its track, and notes about the track.
+        The log with the odometry of a single source, in metres; its track; and notes on suspicious
+        odometry.
     """
     log, alternating = jumps.keep_one_source(log)
     log, counted = in_metres(log)
     track = follow(log)
     notes = alternating + counted + jumps.describe_cuts(log, track, turned_wrongly(log, track))
-    # An odometry that is wrong throughout already explains all differences between the
-    # trajectories.
+    # If the odometry is wrong throughout, that explains all differences between the trajectories.
     notes += jumps.describe_whole(log) or [doubt for doubt in [disagreement(log, track)] if doubt]
     for note in notes:
         _log.warning("%s: %s", named(log.source), note)
@@ -162,13 +163,13 @@ def tracked(log: RobotLog) -> tuple[RobotLog, Track, tuple[str, ...]]:
 
 
 def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
-    """Convert a log to metres if its odometry counts a smaller unit.
+    """Convert a log to metres if its odometry counts millimetres or centimetres.
 
-    The unit is the one in which a stretch of the odometry is most like scan matching. If no unit
-    fits, the log is unchanged.
+    The unit is recognised on a stretch of the log: in the right unit, the odometry there agrees
+    with scan matching. If no unit fits, the log is unchanged.
 
     Returns:
-        The log, and a note if it was converted.
+        The log, and a list of notes: one if the log was converted, otherwise none.
     """
     usual = jumps.usual_step(log)
     if usual <= jumps.LONG:
@@ -202,14 +203,14 @@ def in_metres(log: RobotLog) -> tuple[RobotLog, list[str]]:
 
 
 def _besides(notes: Sequence[str]) -> str:
-    """The notes as the end of an error message."""
+    """Join notes to the end of an error message; an empty text if there are none."""
     return f". {' '.join(notes)}" if notes else ""
 
 
 def with_views(trace: Trace) -> Trace:
-    """Add views of the images, by clustering.
+    """Cluster the images of a trace into views, and add its view to each step.
 
-    Few views are made, so that a place keeps its view even if objects move (Kuipers & Beeson 2002,
+    There are few views, so that a place keeps its view even if objects move (Kuipers & Beeson 2002,
     section 3).
     """
     images = ReciprocalTransformer(floor=0.3).fit_transform(

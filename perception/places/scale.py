@@ -32,13 +32,13 @@ RADIUS = (3.0, 8.0)
 
 @dataclass(frozen=True)
 class Scale:
-    """The scale of a building: the lengths in metres by which its distinctive places are found.
+    """The scale of a building: lengths in metres that the search for distinctive places uses.
 
     Attributes:
         gateway: Smallest width of a gateway.
         radius: Distance that an exit must lead from the middle of a place.
-        most: Width that most of the trajectory exceeds.
-        doors: Whether places are the doors between rooms; otherwise, where corridors fork or bend.
+        most: Width of the free space that most of the trajectory exceeds.
+        doors: Whether places are the doors between rooms, instead of forks and bends of corridors.
     """
 
     gateway: float
@@ -48,25 +48,29 @@ class Scale:
 
     @property
     def doubtful(self) -> float:
-        """Least width, in metres, of an uncertain gateway, narrower than `gateway`."""
+        """The smallest width of an uncertain gateway in metres; it is less than `gateway`."""
         return 0.6 * self.gateway
 
     @property
     def window(self) -> float:
-        """Metres of trajectory before and after a scan whose scans make its local map."""
+        """Metres of trajectory before and after a scan that its local map is made from."""
         return 2 * self.radius
 
     @property
     def half(self) -> float:
-        """Half the side of a local map around a place, in metres."""
+        """Half the side of the square local map around a place, in metres."""
         return 2 * self.radius + 2
 
 
 def suggested(scans: Sequence[Scan], track: Track) -> Scale:
-    """Estimate the scale from the robot's trajectory.
+    """Estimate the scale of a building from the free width along the robot's trajectory.
 
-    Gateways are nearly as narrow as the narrowest passages, and places are a few corridor widths
-    large.
+    The gateway is set a little below the width of the narrowest passages, and the radius to a few
+    corridor widths.
+
+    Args:
+        scans: Scans of the log.
+        track: Their poses.
     """
     maps = LocalMaps(scans, track, ASIDE)
     widths = []
@@ -91,7 +95,11 @@ def suggested(scans: Sequence[Scan], track: Track) -> Scale:
 
 
 def milestones(track: Track, every: float) -> list[int]:
-    """Scans that are at least `every` metres of the trajectory apart."""
+    """Choose scans along the trajectory, one after each `every` metres or more.
+
+    Returns:
+        Indices of scans, ascending; the first is 0.
+    """
     kept = [0]
     for i, way in enumerate(track.way):
         if way - track.way[kept[-1]] >= every:
