@@ -1,4 +1,4 @@
-"""The bootstrap loop of the paper: from images to views, a map, labels and a recogniser."""
+"""The bootstrap loop of Kuipers & Beeson (2002): images, views, map, labels, recogniser."""
 
 from ssh_abduction import lazy_names
 

@@ -1,4 +1,7 @@
-"""The dstate of each step, by a map, for a recogniser to learn from."""
+"""Label each step of a trace with its dstate in a map, so that a recogniser can learn.
+
+A dstate (distinctive state) is a place and the direction that the robot faces there.
+"""
 
 from __future__ import annotations
 
@@ -19,34 +22,41 @@ from ssh_abduction.solver import Solution, Status
 
 
 class LearnerError(AbductionError, ValueError):
-    """The loop cannot be closed: there is no map, or the maps agree on no label."""
+    """The learner has nothing to learn from or to score by, or `fit` was not called yet.
+
+    For example, there is no map, or the maps agree on no label.
+    """
 
 
 class AmbiguousMapWarning(UserWarning):
     """The labels may be wrong or incomplete.
 
-    Several minimal maps disagree, or the map is not proven minimal, or another trace cannot be
-    placed on it.
+    The reason is one of these: several minimal maps remain, the map is not proven minimal, or
+    another trace cannot be placed on the map.
     """
 
 
 def labels_of(
     maps: Sequence[SSHMap], choose: int | None = None, complete: bool = True, proven: bool = True
 ) -> NDArray[np.intp]:
-    """The label of each step, (n,): its dstate in the chosen map, or in the first.
+    """Label each step with the id of its dstate, (n,).
 
-    If no map is chosen the label is -1 if the maps disagree. They agree on a step if the first
-    step at its dstate is the same in all maps. An AmbiguousMapWarning says if they do not agree
-    everywhere, if there may be more maps, or if they are not proven minimal.
+    With `choose`, labels come from that map. Without it, they are the ids of the first map, and
+    -1 for each step on which the maps disagree. Maps agree on a step if the first step at the
+    dstate of this step is the same in all maps.
+
+    Without `choose`, issue an AmbiguousMapWarning if the maps disagree on a step, if `complete` is
+    false, or if `proven` is false.
 
     Args:
-        maps: Maps of one trace.
-        choose: Index of the map to take; None takes what all maps agree on.
-        complete: Whether these are all minimal maps.
-        proven: Whether they are proven minimal.
+        maps: Maps of one trace of n steps.
+        choose: Index of the map to take, from 0; None takes the labels on which all maps agree.
+        complete: Whether `maps` are all minimal maps.
+        proven: Whether `maps` are proven minimal.
 
     Raises:
-        LearnerError: There is no map, or the maps agree on no label.
+        LearnerError: There is no map, `choose` is no index of a map, the maps have different
+            numbers of steps, or they agree on no label.
     """
     if not maps:
         raise LearnerError(
@@ -63,7 +73,7 @@ def labels_of(
                 f"maps: expected maps of one trace, {len(labels)} labels each, "
                 f"got {len(ssh_map.labels)} in map {i + 1}; solve one trace"
             )
-    # Maps number their dstates differently, so the first step at a dstate stands for it.
+    # Maps number their dstates differently. So compare dstates by the first step at each.
     first = [_first_steps(ssh_map) for ssh_map in maps]
     agreed = np.all([f == first[0] for f in first], axis=0)
     if not proven:
@@ -88,7 +98,13 @@ def labels_of(
 
 
 def map_of(solution: Solution, choose: int | None = None) -> tuple[SSHMap, NDArray[np.intp]]:
-    """The map to learn from, and its labels, (n,), as `labels_of` gives them."""
+    """Return the map to learn from, and the labels of its n steps, (n,), by `labels_of`.
+
+    Args:
+        solution: The minimal maps.
+        choose: Index of the map, from 0; None takes the first map, and labels only the steps on
+            which all maps agree.
+    """
     labels = labels_of(solution.maps, choose, solution.complete, solution.status is Status.OPTIMAL)
     return solution.maps[choose or 0], labels
 
@@ -100,21 +116,22 @@ def labels_of_all(
     views: NDArray[np.intp],
     features: Any = None,
 ) -> NDArray[np.intp]:
-    """The label of each step of several traces, (n,); -1 if there is none.
+    """Label each step of several traces with the id of its dstate, (n,); -1 if it is unknown.
 
-    The longest trace has its own labels, as the map was made for it. The others are followed on the
-    map. An AmbiguousMapWarning names each trace that cannot be placed on it.
+    The map was made for the longest trace, so this trace keeps `labels`. Each other trace is
+    followed on the map. If a trace cannot be placed there, issue an AmbiguousMapWarning.
 
     Args:
         ssh_map: The map of the longest trace.
-        labels: The labels of the longest trace.
+        labels: The label of each step of the longest trace.
         traces: Traces with n steps in all.
-        views: The view of each step, (n,); -1 if an image has none. Such a step has no label.
-        features: Makes of images what is compared, as in `recogniser`.
+        views: The number of the view of each step, (n,); -1 if its image has none. Such a step gets
+            no label.
+        features: The transformer that makes vectors of images, as in `recogniser`.
     """
     if len(traces.each) == 1:
         return np.where(views == NOISE, -1, labels)
-    # A recogniser of the longest trace says which dstates the other images look like.
+    # A recogniser trained on the longest trace says which dstate each other image looks like.
     own = traces.parts(traces.images)[traces.longest]
     looks = (
         recogniser(features=features)
@@ -139,13 +156,15 @@ def labels_of_all(
 def labels_on(
     ssh_map: SSHMap, traces: Traces, views: NDArray[np.intp], looks: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """The dstate of each step of all traces, (n,); -1 if the map does not say it.
+    """Follow traces on a map. Return the dstate of each step, (n,), or -1 if it is unknown.
+
+    A dstate that no image looks like counts as unknown.
 
     Args:
         ssh_map: The map.
         traces: Traces with n steps in all.
-        views: The view of each step, (n,); -1 if there is none.
-        looks: The dstate that each image looks like, (n,).
+        views: The number of the view of each step, (n,); -1 if there is none.
+        looks: The dstate that the image of each step looks like, (n,).
     """
     parts = zip(traces.each, traces.parts(views), traces.parts(looks), strict=True)
     found = np.concatenate(
@@ -157,11 +176,20 @@ def labels_on(
 def _followed(
     ssh_map: SSHMap, trace: Trace, views: Sequence[int], looks: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """The dstate of each step of a trace that may begin anywhere on a map, (m,).
+    """Follow a trace that may begin at any dstate. Return the dstate of each step, (m,).
 
-    Of all beginnings that no view contradicts, take the one that fits most images. After an action
-    that was never tried in a dstate, the dstates are unknown (-1) and contradict no view. All
-    steps are -1 if two beginnings fit equally many images, or none fits half of its images.
+    Try each dstate as the first one. Drop those that a later view contradicts, and take the one
+    for which most images look like their dstates. Behind an action that the map has no link for,
+    dstates are unknown (-1) and contradict no view.
+
+    All steps get -1 if two first dstates fit equally many images, or if the best one fits fewer
+    than half of the steps with a known dstate.
+
+    Args:
+        ssh_map: The map.
+        trace: A trace of m steps.
+        views: The number of the view of each step; -1 if there is none.
+        looks: The dstate that the image of each step looks like, (m,).
     """
     leads = {(here, action): there for here, action, there in ssh_map.links}
     ways = []
@@ -188,6 +216,6 @@ def _followed(
 
 
 def _first_steps(ssh_map: SSHMap) -> NDArray[np.intp]:
-    """The first step at the dstate of each step, (n,)."""
+    """For each step, find the first step that is at the same dstate, (n,)."""
     _, first, dstates = np.unique(ssh_map.labels, return_index=True, return_inverse=True)
     return np.asarray(first[dstates], np.intp)

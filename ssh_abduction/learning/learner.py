@@ -1,4 +1,7 @@
-"""The bootstrap loop: images, views, map, labels, recogniser.
+"""The bootstrap loop: make views of images, a map of views, and a recogniser of its dstates.
+
+A view is a cluster of images that look alike. A dstate (distinctive state) is a place and the
+direction that the robot faces there. The map labels each image with its dstate.
 
 Reference: Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", Figure 1.
 
@@ -49,35 +52,37 @@ _log = log_of(__name__)
 
 
 class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
-    """Learns to recognise places from images and actions, without knowing any place.
+    """A scikit-learn estimator that learns to recognise dstates from images and actions.
 
-    It is an estimator, as scikit-learn has them. Of several traces, all images make the views, the
-    longest trace makes the map, and the others are followed on it.
+    It needs no place names. Given several traces, it clusters the images of all traces into views,
+    makes a map of the longest trace, and follows the other traces on this map.
 
     Args:
         theory: The axioms; Theory.topological() by default.
-        clusterer: Makes views of images: a ViewClusterer, or a clusterer of scikit-learn. It is
-            cloned. By default ViewClusterer(random_state=0). If the theory allows misread views
-            it has `isolated=10`: then images that are like no others have no view, and
-            ignoring them costs little.
-        choose: Index of the map to take if several are minimal; None takes the labels on which all
-            of them agree.
+        clusterer: A ViewClusterer or a clusterer of scikit-learn, which groups images into views.
+            It is cloned. The default is ViewClusterer(random_state=0). If the theory allows
+            misread views, the default also has `isolated=10`: an image that is like no other one
+            gets no view, and to treat it as misread costs little.
+        choose: Index of the map to take if several are minimal, from 0; None takes the first map,
+            and only the labels on which all maps agree.
         time_limit: Seconds for finding the map; None for no limit.
-        features: Makes of images what is clustered and compared: a transformer of scikit-learn. It
-            is cloned. By default reciprocals of ranges, or a PanoramaTransformer for panoramas.
+        features: A transformer of scikit-learn that makes vectors of images. It is cloned. The
+            default makes reciprocals of ranges, or is a PanoramaTransformer for panoramas.
 
     Attributes:
-        features_: The fitted features.
+        features_: The fitted transformer.
         clusterer_: The fitted clusterer.
-        views_: The view of each step, (n,); -1 for an image without a view. n counts the steps of
-            all traces, one after the other.
-        confidence_: How sure each view is, (n,), from 0 to 1.
+        views_: The number of the view of each step, (n,); -1 for an image without a view. n counts
+            the steps of all traces, one after the other.
+        confidence_: The confidence in each view, (n,), from 0 to 1.
         solution_: The minimal maps of the longest trace.
-        map_: The map that is learnt from.
-        second_map_: The map of the runner-up, if another number of views is about as good and gives
-            another map; else None.
-        labels_: The dstate of each step, (n,); -1 if the maps disagree or the image has no view.
-        recogniser_: The recogniser. It learns from no image that the map says is misread.
+        map_: The map that the labels come from.
+        second_map_: A SecondMap, if another number of views separates the images about as well and
+            gives another map; else None.
+        labels_: The id of the dstate of each step, (n,); -1 if it is unknown: the maps disagree,
+            the image has no view, or the trace cannot be followed.
+        recogniser_: The recogniser, trained on images with a label. Images that the map treats as
+            misread are left out.
 
     Reference:
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", Figure 1.
@@ -96,7 +101,11 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         self.choose, self.time_limit = choose, time_limit
 
     def fit(self, X: Trace | Sequence[Trace], y: Any = None) -> BootstrapLearner:
-        """Run the loop on a trace, or on several.
+        """Run the loop on one trace or several, and return this learner.
+
+        Args:
+            X: A trace with images, or traces of one world.
+            y: Ignored. scikit-learn passes it.
 
         Raises:
             LearnerError: There is no map, or no label is left to learn from.
@@ -136,13 +145,13 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         return self
 
     def predict(self, X: Trace | Sequence[Trace] | ArrayLike) -> NDArray[np.intp]:
-        """The dstates, as ids of `map_`, at which images were taken, (m,).
+        """Recognise where images were taken. Return the ids of dstates in `map_`, (m,).
 
         Args:
             X: Images, (m, d), or traces with m steps in all.
 
         Raises:
-            LearnerError: The learner has not learnt yet.
+            LearnerError: `fit` was not called yet.
         """
         if not hasattr(self, "recogniser_"):
             raise LearnerError(
@@ -152,16 +161,17 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         return np.asarray(self.recogniser_.predict(images), np.intp)
 
     def score(self, X: Trace | Sequence[Trace] | ArrayLike, y: ArrayLike | None = None) -> float:
-        """The share of images that are recognised.
+        """Compute the share of images that are recognised correctly, from 0 to 1.
 
         Args:
             X: Images, (m, d), or traces with m steps in all.
-            y: The true dstates, (m,). Without them each trace is followed on the map: of the ways
-                that no view contradicts, the one that fits most images gives the dstates. Steps
-                without a dstate do not count.
+            y: The true dstates, (m,), as ids in `map_`; a negative one does not count. None
+                follows each trace on the map instead, and takes the dstates that its views allow
+                and that fit most images.
 
         Raises:
-            LearnerError: The dstate of no step is known, or `y` has another shape.
+            LearnerError: `fit` was not called yet, images are given without `y`, no dstate is
+                known, or `y` has another shape.
         """
         found = self.predict(X)
         if y is None and not Traces.are(X):
@@ -183,23 +193,23 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         return float(np.mean(found[true >= 0] == true[true >= 0]))
 
     def _new_features(self, traces: Traces) -> Any:
-        """What makes features of images, not fitted yet."""
+        """Make the transformer of images to vectors, which is not fitted yet."""
         if self.features is None:
             return traces.features
         return cloned("features", self.features, "transform")
 
     def _new_clusterer(self, theory: Theory) -> ViewClusterer:
-        """The clusterer, not fitted yet."""
+        """Make the clusterer, which is not fitted yet."""
         if self.clusterer is not None:
             return as_view_clusterer(cloned("clusterer", self.clusterer))
         return ViewClusterer(random_state=0, isolated=ISOLATED if theory.misread else None)
 
     def _followed(self, traces: Traces, looks: NDArray[np.intp]) -> NDArray[np.intp]:
-        """The dstate of each step by the map, (m,); -1 if unknown.
+        """Follow traces on the map. Return the dstate of each step, (m,), or -1 if it is unknown.
 
         Args:
             traces: Traces with m steps in all.
-            looks: The dstates that the images look like, (m,).
+            looks: The dstate that the image of each step looks like, (m,).
         """
         views = self.clusterer_.predict(self.features_.transform(traces.images))
         return labels_on(self.map_, traces, views, looks)

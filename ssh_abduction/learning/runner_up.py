@@ -1,9 +1,9 @@
-"""The map of the runner-up: does the second best number of views give another map?
+"""Does the second best number of views (the runner-up) give another map?
 
-The number of views is chosen by how well they separate the images. No map shows whether it is
-right: too few views give a small, proven and wrong map. So if a second number of views is
-nearly as good, its views are kept beside the chosen ones, in the field `runner_up` of each step,
-and their map is compared.
+A view is a cluster of images that look alike. The number of views is the one that separates the
+images best. No map shows whether this number is right: too few views give a map that is small,
+proven minimal, and wrong. So if a second number of views is nearly as good, the field `runner_up`
+of each step holds the step's view by that second number. The maps of both are then compared.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ SECONDS = 5.0
 
 
 class RunnerUpWarning(UserWarning):
-    """Another number of views is nearly as good, and gives another map."""
+    """Another number of views separates the images nearly as well, and gives another map."""
 
 
 @dataclass(frozen=True)
 class SecondMap:
-    """The map of the runner-up, if it is another one.
+    """The result for the runner-up's views, where it differs from that for the chosen views.
 
     Attributes:
         views: Number of chosen views.
         other_views: Number of views of the runner-up.
-        dstates: How many dstates the map of the chosen views has; None if they have no map.
-        solution: The solution for the views of the runner-up.
+        dstates: Number of dstates in the map of the chosen views; None if they have no map.
+        solution: The solution for the views of the runner-up. It may have no map.
     """
 
     views: int
@@ -45,7 +45,7 @@ class SecondMap:
 
     @property
     def sentence(self) -> str:
-        """What is doubtful, and what to do about it."""
+        """A warning that names both numbers of views, and says what to do."""
         if self.solution.cost is not None:
             proven = "" if self.solution.status is Status.OPTIMAL else ", not proven minimal"
             instead = "" if self.dstates is None else f" instead of {self.dstates}"
@@ -65,7 +65,11 @@ class SecondMap:
 
 
 def with_runner_up(trace: Trace, views: Iterable[View] | None) -> Trace:
-    """The trace with the views of the runner-up at its steps; None removes them.
+    """Copy a trace with the runner-up's view in the field `runner_up` of each step.
+
+    Args:
+        trace: The trace.
+        views: A view for each step; None removes the field.
 
     Raises:
         TraceError: The views are malformed.
@@ -79,10 +83,10 @@ def with_runner_up(trace: Trace, views: Iterable[View] | None) -> Trace:
 
 
 def runner_up(trace: Trace) -> Trace | None:
-    """The trace with the views of the runner-up as its views; None if it has no runner-up.
+    """Copy a trace with the runner-up's views as its views; None if no step has one.
 
     Raises:
-        TraceError: Only some steps have a view of the runner-up.
+        TraceError: Only some steps have a view of the runner-up, or one is malformed.
     """
     if not any(FIELD in step.extra for step in trace.steps):
         return None
@@ -105,14 +109,17 @@ def second_map(
     limit: float | None = None,
     memory: int | None = None,
 ) -> SecondMap | None:
-    """The map of the runner-up, if it is another one; else None.
+    """Solve the trace with the runner-up's views. Return the result if its maps differ.
+
+    Return None if the trace has no runner-up, or if one of its maps puts the same steps at the same
+    dstates and places as one of `maps`.
 
     Args:
-        trace: A trace with the views of the runner-up.
+        trace: A trace of the chosen views, perhaps with those of the runner-up.
         maps: The minimal maps of the chosen views.
-        theory: The theory that they were found with.
-        limit: Seconds, at most SECONDS; None takes SECONDS.
-        memory: MiB, as in `solve`.
+        theory: The theory of these maps.
+        limit: Seconds for the search, at most SECONDS; None takes SECONDS.
+        memory: MiB that the process may use, as in `solve`; None for no limit.
 
     Raises:
         TraceError: The views of the runner-up are malformed.
@@ -140,7 +147,7 @@ def second_map(
 def warn_of_second_map(
     trace: Trace, maps: Sequence[SSHMap], theory: Theory | None, limit: float | None
 ) -> SecondMap | None:
-    """The map of the runner-up, if it is another one, with a RunnerUpWarning."""
+    """Issue a RunnerUpWarning if the runner-up's views give another map. Return `second_map`."""
     found = second_map(trace, maps, theory, limit)
     if found:
         warnings.warn(found.sentence, RunnerUpWarning, stacklevel=3)
@@ -148,5 +155,5 @@ def warn_of_second_map(
 
 
 def partition(ssh_map: SSHMap) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
-    """The dstate and the place of each step, both numbered by first visit."""
+    """The dstate and the place (None if it has none) of each step, numbered by first visit."""
     return tuple(ssh_map.labels), tuple(ssh_map.dstates[label].place for label in ssh_map.labels)

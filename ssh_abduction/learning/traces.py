@@ -1,4 +1,4 @@
-"""Several traces of one world, as one table of images."""
+"""Treat several traces of one world as one sequence of steps, with one table of images."""
 
 from __future__ import annotations
 
@@ -23,13 +23,17 @@ Integers = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Traces:
-    """Traces of one world. Their steps are counted one after the other, n in all."""
+    """Traces of one world. Their n steps are numbered one trace after the other.
+
+    Attributes:
+        each: The traces.
+    """
 
     each: tuple[Trace, ...]
 
     @classmethod
     def of(cls, given: Any) -> Traces:
-        """One trace, or several. Raises TraceError for anything else."""
+        """Make Traces of one trace or a sequence of them. Raise TraceError for anything else."""
         if isinstance(given, Traces):
             return given
         each: tuple[Any, ...] = ()
@@ -46,14 +50,14 @@ class Traces:
 
     @classmethod
     def are(cls, given: Any) -> bool:
-        """Whether something is a trace, or traces."""
+        """Whether a value is a trace, or a sequence that begins with one."""
         return isinstance(given, Traces | Trace) or (
             isinstance(given, Sequence) and len(given) > 0 and isinstance(given[0], Trace)
         )
 
     @cached_property
     def images(self) -> NDArray[np.float64]:
-        """The images of all steps, (n, d).
+        """The images of all steps, (n, d), each with d numbers.
 
         Raises:
             PerceptionError: A step has no image, or traces have images of different lengths.
@@ -69,7 +73,7 @@ class Traces:
 
     @property
     def features(self) -> Any:
-        """What makes features of the images, not fitted yet.
+        """The default transformer of these images to vectors, which is not fitted yet.
 
         Raises:
             PerceptionError: The traces have images of different kinds or shapes.
@@ -85,16 +89,16 @@ class Traces:
 
     @property
     def longest(self) -> int:
-        """The index of the longest trace, the first of several."""
+        """The index of the longest trace; the first one if several are equally long."""
         return max(range(len(self.each)), key=lambda i: (len(self.each[i]), -i))
 
     def at_longest(self, steps: Sequence[int]) -> Integers:
-        """The indices among all steps of some steps of the longest trace."""
+        """Convert step numbers of the longest trace to indices among all n steps."""
         before = sum(len(trace) for trace in self.each[: self.longest])
         return before + np.asarray(steps, np.intp)
 
     def parts(self, of_all: NDArray[Any]) -> list[NDArray[Any]]:
-        """An array of all steps, (n, …), split trace by trace."""
+        """Split an array with one row for each step, (n, …), into one array for each trace."""
         return np.split(of_all, np.cumsum([len(trace) for trace in self.each])[:-1])
 
     def with_views(
@@ -104,15 +108,15 @@ class Traces:
         second: Integers | None,
         sure: NDArray[np.float64] | None = None,
     ) -> Traces:
-        """These traces with views.
+        """Copy these traces with a view at each step.
 
-        Noise gets the view of the nearest centre, and the confidence 0.
+        A step without a view (noise) gets the view whose centre is nearest to its image.
 
         Args:
-            images: The features of all images, (n, d).
-            views: The view of each step, (n,); -1 for noise.
-            second: The views of the runner-up, (n,), if there is one.
-            sure: How sure each view is, (n,), from 0 to 1; None leaves that out.
+            images: The vector of each image, (n, d).
+            views: The number of the view of each step, (n,); -1 for noise.
+            second: The runner-up's view of each step, (n,); None if there is no runner-up.
+            sure: The confidence in each view, (n,), from 0 to 1; None stores no confidence.
         """
         of_steps = np.ones(len(images)) if sure is None else sure.round(4)
         parts = zip(
