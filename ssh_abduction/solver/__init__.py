@@ -1,4 +1,6 @@
-"""Search for every minimal map of a trace. Other packages import the names of this module only.
+"""Search for every minimal map of a trace.
+
+Other packages import only the names that this module lists.
 
 Each name is loaded when it is first used, so that importing `Solution` does not load clingo.
 """

@@ -1,4 +1,4 @@
-"""Make the Solution of a search from its maps and its knowledge."""
+"""Make the `Solution` of a search from the maps it gave and from what it has proven."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ssh_abduction.theory.speedups import row
 
 
 class Answer:
-    """Remembers what the Solution needs to know about the maps that a search gave."""
+    """Collects what a `Solution` says about the maps that a search gave: levels, cost, bound."""
 
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
@@ -34,11 +34,18 @@ class Answer:
 
     @property
     def cost(self) -> Cost | None:
-        """The cost of the last map given."""
+        """The cost of the last map given; None before the first one."""
         return None if self._last is None else cost_as_counted(*self._last, self._parts.task.theory)
 
     def take_down(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-        """Remember a map given to the caller, and count it in its level."""
+        """Count a map given to the caller in the level of its cost.
+
+        A level is the maps of one cost. Maps come level by level.
+
+        Args:
+            ssh_map: The map.
+            cost: Its preferred counts, the most important one first.
+        """
         theory = self._parts.task.theory
         self._first, self._last = self._first or ssh_map, (ssh_map, cost)
         if not self._levels or self._levels[-1].cost.preferred_by(theory) != cost:
@@ -46,7 +53,10 @@ class Answer:
         self._levels[-1] = replace(self._levels[-1], count=self._levels[-1].count + 1)
 
     def count_apart(self) -> None:
-        """After a stop, raise the bound to the number of pairwise distinct steps."""
+        """Raise the lower bound on dstates to the number of pairwise distinct steps.
+
+        A search that was stopped needs this, as its own bound may be smaller.
+        """
         known = self._parts.known
         self._basis = self._basis_of(len(self._parts.task.trace))
         if self._basis:
@@ -54,11 +64,11 @@ class Answer:
             known.bound = replace(known.bound, dstates=max(apart, known.bound.dstates or 0))
 
     def solution(self, maps: tuple[SSHMap, ...], grounding: Grounding | None = None) -> Solution:
-        """The solution with these maps.
+        """Make the solution that holds these maps.
 
         Args:
-            maps: The maps that the caller kept.
-            grounding: The size of the ground program; None to ask clingo.
+            maps: The maps that the caller kept, in the order that the solution lists.
+            grounding: The size of the ground program; None to ask clingo for it.
         """
         parts, known, task = self._parts, self._parts.known, self._parts.task
         levels = tuple(replace(level, complete=parts.rivals.listed) for level in self._levels)
@@ -88,10 +98,10 @@ class Answer:
         )
 
     def _support(self) -> Support:
-        """The basis of the certificate and of the warnings."""
+        """Collect the data for the certificate, and the warning about the odometry."""
         parts, trace = self._parts, self._parts.task.trace
-        # A search that ran out may have ended while the prefix was grounded. Then look for a
-        # proof of the bound in all steps.
+        # A search that reached a limit may have ended while clingo grounded the prefix. Then prove
+        # the bound from all steps.
         ran_out = parts.known.stopped not in (None, "maps limit")
         size = len(trace) if ran_out else parts.prefixes.engine.size
         warning = None
@@ -100,9 +110,10 @@ class Answer:
         return Support(self._basis or self._basis_of(size), warning)
 
     def in_order(self, maps: tuple[SSHMap, ...]) -> tuple[SSHMap, ...]:
-        """Sort maps, if they are all maps given and no minimal map is missing.
+        """Sort the maps of each level into an order that is the same in each run.
 
-        The order is the same in each run. The cost of a level is that of its first map.
+        If some maps were given but not kept, or a minimal map is missing, return them unsorted.
+        After sorting, each level gets the cost of its new first map.
         """
         parts, theory = self._parts, self._parts.task.theory
         is_all = parts.known.complete or parts.rivals.listed
@@ -117,7 +128,10 @@ class Answer:
         return ordered
 
     def _basis_of(self, size: int) -> Basis | None:
-        """The proof that no map of the first `size` steps has fewer dstates."""
+        """The data for a proof that no map of the first `size` steps has fewer dstates.
+
+        None if the theory lacks an axiom that the proof needs.
+        """
         task = self._parts.task
         if not row("clique").holds_for(task.theory):
             return None

@@ -1,22 +1,23 @@
-"""What all minimal maps of a trace share, without listing them.
+"""Find the backbone of a trace: what all its minimal maps share. Not all maps need be listed.
 
-Some minimal maps are known. What they share may not hold for all. Two steps may be one dstate in
-all known maps, but not in some other minimal map, and vice versa. Each such possibility is a doubt.
-clingo looks for a minimal map in which any doubt is true. If there is one, it is added, and fewer
-doubts are left. If there is none, what is shared is proven. This combines brave and cautious
-reasoning. Each answer is a map that can be checked.
+Some minimal maps are known. Other minimal maps may not share what the known ones share. Two steps
+may be one dstate in all known maps, but not in some unknown minimal map, or the other way round.
+Each such possibility is a *doubt*. clingo looks for a minimal map in which at least one doubt is
+true. If there is such a map, it becomes known, and fewer doubts are left. If there is none, the
+backbone is proven. This combines brave and cautious reasoning. Each answer is a map that can be
+checked.
 
 *Prefixes.* clingo looks for maps of a prefix that cost at most as much as minimal maps of the
-trace. The cuts of minimal maps are among these (`prefixes.py`). So a found map that replays to the
-end is minimal. If a found map does not, the prefix grows. If no doubt about the prefix is left, the
-classes of steps that are one in all known maps are one in all minimal maps. Actions are
-deterministic, so these classes replay like a map. If they replay to the end, each later step is in
-the class of a step of the prefix in every minimal map, and no doubt about it is left. Else the
-prefix grows.
+trace. Each minimal map, cut to the prefix, is such a map (`prefixes.py`). So a found map that
+replays to the end of the trace is minimal. If a found map does not replay to the end, the prefix
+grows. Steps that are one dstate in all known maps form a *class*. If no doubt about the prefix is
+left, the steps of each class are one dstate in all minimal maps. Actions are deterministic, so the
+classes replay like a map. If they replay to the end, each later step is in the class of a step of
+the prefix in every minimal map, and no doubt about that step is left. Otherwise the prefix grows.
 
-*Labels.* An engine that finds dstates before places and paths knows all labels of minimal maps.
-There are few labels, even for thousands of maps. So dstates are not in doubt. Doubts about places
-and paths are resolved for each labelling in turn.
+*Labels.* An engine that finds dstates before places and paths knows the labels (the dstate of each
+step) of all minimal maps. Even thousands of maps have only a few different labellings. So dstates
+are not in doubt. Doubts about places and paths are resolved for each labelling in turn.
 """
 
 from __future__ import annotations
@@ -45,21 +46,22 @@ SHOWN_ONCE = frozenset({"one_place", "one_course"})
 
 
 class Rivals:
-    """The minimal maps of a trace that are known.
+    """The minimal maps of a trace that a search has found so far.
 
     Attributes:
-        sharing: What the known maps share.
-        listed: Whether there are no other minimal maps.
-        engine: The engine that found them.
-        reasons: Whether that engine can prove what all minimal maps share.
+        sharing: What these maps share.
+        listed: Whether they are all minimal maps of the trace.
+        engine: The engine that found the maps; None if it is not needed or broken.
+        reasons: Whether engines can prove what all minimal maps share. They cannot if the maps
+            come from mended traces.
     """
 
     def __init__(self, task: Task, judging: Judging) -> None:
-        """No minimal map is known yet.
+        """Start without any known map.
 
         Args:
             task: The task of the search that lists the maps.
-            judging: Knows which maps the evidence rejects.
+            judging: Says which maps the evidence rejects.
         """
         self.sharing = Sharing()
         self.listed = False
@@ -70,14 +72,14 @@ class Rivals:
         self._proven = False
 
     def add(self, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-        """Add a minimal map with its preferred counts."""
+        """Add a minimal map with its preferred counts, the most important one first."""
         self._cost = cost
         self.sharing.absorb(ssh_map)
 
     def reason(self) -> None:
-        """Find out what all minimal maps share, unless all are listed.
+        """Prove what all minimal maps share. Do nothing if all minimal maps are listed.
 
-        This ends early if a limit is over, or with Ctrl-C.
+        At a limit, or after Ctrl-C, this returns without a proof.
         """
         if self.listed or self._proven or not self.reasons or not self.sharing.maps:
             return
@@ -91,7 +93,10 @@ class Rivals:
 
     @property
     def backbone(self) -> Backbone | None:
-        """What the known minimal maps share; None if none is known."""
+        """The backbone (what all minimal maps share) as far as known; None without a map.
+
+        It is `proven` if all minimal maps are listed, or if `reason` found a proof.
+        """
         return (
             self.sharing.backbone(proven=self.listed or self._proven) if self.sharing.maps else None
         )
@@ -104,18 +109,18 @@ def prove_backbone(
     sharing: Sharing,
     engine: Engine | None = None,
 ) -> bool:
-    """Find minimal maps until they share only what all minimal maps of the trace share.
+    """Find more minimal maps until `sharing` holds exactly what all minimal maps share.
 
     Args:
         task: The task of the search.
-        judging: Knows which maps the evidence rejects.
+        judging: Says which maps the evidence rejects.
         cost: The preferred counts of minimal maps, the most important one first.
-        sharing: What at least one known minimal map shares. New maps are added to it.
-        engine: The engine that proved them minimal, if it is still available.
+        sharing: Has taken in at least one minimal map. Takes in each new one.
+        engine: The engine that proved the minimum; None if it is no longer available.
 
     Returns:
-        Whether the sharing is proven. It never is if a dstate may be at several places, or along
-        several courses.
+        True if the proof is complete. False if the theory allows a dstate at several places or
+        along several courses: then no proof is possible.
 
     Raises:
         LimitError: A limit of the search is over.
@@ -129,7 +134,7 @@ def prove_backbone(
 
 
 class _Reasoning:
-    """Finds minimal maps in which other steps are one than in all known ones."""
+    """Finds minimal maps that differ from what all known minimal maps share."""
 
     def __init__(
         self, task: Task, judging: Judging, cost: tuple[int, ...], sharing: Sharing
@@ -137,10 +142,11 @@ class _Reasoning:
         self._task, self._judging, self._cost, self._sharing = task, judging, cost, sharing
 
     def settle_labels(self, engine: Engine) -> bool:
-        """Add maps for each labelling of minimal maps until no doubt is left.
+        """Resolve all doubts, one labelling of minimal maps after the other.
 
         Returns:
-            False if this engine cannot do it.
+            Whether no doubt is left; False if this engine cannot list labellings, or cannot forbid
+            maps that the evidence rejects.
         """
         forbidden = set[frozenset[Equality]]()
         while (labellings := engine.labellings(self._cost)) is not None:
@@ -172,7 +178,7 @@ class _Reasoning:
         return False
 
     def _differing_map(self, settled: Settled, labels: Sequence[int]) -> SSHMap | None:
-        """A map with these labels in which a doubt about places or paths is true."""
+        """A map with these labels in which a doubt about places or paths is true; else None."""
         return settled.map_with(
             [
                 (sort, labels[i], labels[j], one)
@@ -182,8 +188,8 @@ class _Reasoning:
         )
 
     def settle_steps(self) -> None:
-        """Add maps until no doubt is left, with the readable encodings."""
-        # The cut of a minimal map never has more paths than the map.
+        """Resolve all doubts with the readable encodings (`encodings/*.lp`)."""
+        # A minimal map that is cut to a prefix never has more paths than before.
         counts = dict(zip(self._task.theory.priorities, self._cost, strict=True))
         names = (
             counts["paths"]
@@ -196,7 +202,10 @@ class _Reasoning:
             size = self._settle_prefix(engine, size)
 
     def _first_size(self) -> int:
-        """The shortest prefix that may be enough: from it, the known classes replay to the end."""
+        """The size of the shortest prefix from which the known classes replay to the end.
+
+        A shorter prefix cannot be enough for a proof.
+        """
         classes, actions = self._sharing.classes, self._task.log.actions
         if not self._task.speedups.prefixes:
             return len(classes)
@@ -209,10 +218,10 @@ class _Reasoning:
         return size
 
     def _settle_prefix(self, engine: StepEngine, size: int) -> int:
-        """Resolve the doubts about a prefix.
+        """Resolve the doubts about the first `size` steps.
 
         Returns:
-            The size of the next prefix; 0 if no doubt is left.
+            The size of the prefix to try next; 0 if no doubt about the trace is left.
         """
         engine.grow(size)
         while (found := engine.map_with(list(self._doubts(size)), self._cost)) is not None:
@@ -239,7 +248,10 @@ class _Reasoning:
         )
 
     def _doubts(self, size: int) -> Iterator[Doubt]:
-        """The doubts about a prefix: steps that may be one, or may be different, after all."""
+        """Yield the doubts about the first `size` steps, each as (sort, step, step, one).
+
+        `one` says whether the doubt is that the two steps are one, or that they are not.
+        """
         firsts = self._sharing.firsts()
         yield from (
             ("dstates", firsts[self._sharing.classes[t]], t, False) for t in self._entering(size)
@@ -247,7 +259,7 @@ class _Reasoning:
         yield from self._doubts_of_classes(size)
 
     def _doubts_of_classes(self, size: int) -> Iterator[Doubt]:
-        """The doubts about classes. The first step of each class stands for it."""
+        """Yield the doubts about pairs of classes. Each class is given by its first step."""
         sharing = self._sharing
         firsts = [t for t in sharing.firsts() if t < size]
         for sort in sharing.sorts():
@@ -257,7 +269,7 @@ class _Reasoning:
                 head = heads.setdefault(known.always[c], c)
                 if head != c:
                     yield sort, firsts[head], firsts[c], False
-                # It is in doubt whether this class is along a path.
+                # If the class is along a path in all known maps, or in none, others may differ.
                 if sort == "paths" and ((c, c) in known.together) != (c in known.unnamed):
                     yield sort, firsts[c], firsts[c], c in known.unnamed
             for c, d in combinations(heads.values(), 2):
@@ -267,7 +279,7 @@ class _Reasoning:
                     yield sort, firsts[c], firsts[d], True
 
     def _may_be_one(self, i: int, j: int) -> bool:
-        """Whether two steps may be one dstate by their views."""
+        """Whether the views of two steps allow that these are one dstate."""
         steps = self._task.trace.steps
         return (
             None in (views := {steps[i].view, steps[j].view})
@@ -276,9 +288,10 @@ class _Reasoning:
         )
 
     def _entering(self, size: int) -> Iterator[int]:
-        """Steps of the prefix that come back to a known class in a new way.
+        """Yield the steps of the prefix that reach a known class by a new link.
 
-        If the same action led there from the same class before, determinism proves it.
+        If an earlier step reached the class by the same action from the same class, determinism
+        already proves that both steps are one dstate.
         """
         classes, actions = self._sharing.classes, self._task.log.actions
         seen, links = {classes[0]}, set[tuple[int, int]]()

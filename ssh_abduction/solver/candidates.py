@@ -1,6 +1,6 @@
-"""Maps of the whole trace without a proof that they are minimal.
+"""Make maps of the whole trace quickly, without a proof that they are minimal.
 
-The checker has accepted them. clingo then only has to find better ones.
+The checker accepts each of these maps. clingo then only has to find better ones.
 """
 
 from __future__ import annotations
@@ -27,18 +27,19 @@ from ssh_abduction.theory.speedups import Speedups, row
 
 _log = log_of(__name__)
 
-# Maps with frames are sought for this many seconds at most, and for this many times as long until
-# there is any map.
+# Seek maps with frames for at most FRAMING seconds. Until there is a map, take UNMAPPED times as
+# long.
 FRAMING, UNMAPPED = 30.0, 2.0
-# A sketch and its check may take this share of the time left for all sketches.
+# A sketch (a map made without a search) and its check may take this share of the time left for all
+# sketches.
 SKETCH_SHARE = 0.4
-# The most reliable sketch may take this many seconds even if less time is left. Otherwise a slow
-# machine finds no map.
+# The sketch that succeeds most often may take this many seconds even if less time is left.
+# Otherwise a slow machine finds no map.
 SUREST = 1.5
 
 
 class Candidates:
-    """Makes maps of the whole trace. Keeps each one that is better and that the checker accepts."""
+    """Makes maps of the whole trace, and keeps the best one that the checker accepts."""
 
     def __init__(
         self, task: Task, known: Known, judging: Judging, report: Callable[[], None]
@@ -54,20 +55,23 @@ class Candidates:
         self._sketching = threading.Lock()
 
     def merge(self) -> None:
-        """Make a causal map by merging steps greedily: at once, and not minimal."""
+        """Make a causal map by merging steps greedily. This is fast. The map need not be minimal.
+
+        For other theories, or without the speed-up `greedy`, do nothing.
+        """
         if self._task.speedups.greedy and self._task.theory.level == "causal":
             self.offer(answer_maps.causal_map(self._task.log.merged(), self._task.trace))
 
     def sketch(self, seconds: float = math.inf) -> None:
-        """If no map of the whole trace is known, make one without a search.
+        """Make a sketch (a map without a search), if no map of the whole trace is known.
 
-        It continues the best map of a prefix, or begins anew. The map with a new dstate for each
-        step is large, but the checker accepts it most often and fastest. So it comes first. Then
-        smaller maps are tried, the smallest first. If time is short, the first accepted map is
-        enough.
+        A sketch extends the best map of a prefix, or begins at the first step. The sketch with the
+        most new dstates is large, but the checker accepts it most often and fastest, so it is tried
+        first. Then the others are tried, the smallest first. With a time limit, stop at the first
+        of these that improves the map.
 
         Args:
-            seconds: The time for all sketches. Each may use a share of what is left.
+            seconds: The time for all sketches. Each sketch may use a share of the time left.
         """
         with self._sketching:
             if (
@@ -94,13 +98,13 @@ class Candidates:
                     return
 
     def sketch_least(self) -> bool:
-        """Offer a sketch whose number of dstates reaches the bound by pairwise distinct steps.
+        """Offer a sketch that has only as many dstates as there are pairwise distinct steps.
 
-        This works if the robot drives there and back, and most views are different. Then only
-        places and paths are still unknown.
+        No map has fewer dstates. Such a sketch exists if the robot drives there and back and most
+        views are different. clingo then only has to find the fewest places and paths.
 
         Returns:
-            Whether there is such a sketch.
+            Whether such a sketch was found and accepted.
         """
         from ssh_abduction.solver.steps.apart import Continuations  # loads numpy
 
@@ -127,7 +131,7 @@ class Candidates:
         return False
 
     def _attempts(self) -> list[Callable[[], None]]:
-        """The ways to make a map without a search, those that make small maps first."""
+        """The functions that each make one sketch, those that make small maps first."""
         trace, theory = self._task.trace, self._task.theory
         known = self._known.partial if trace is self._trace else None
         if theory.star == "gateways":
@@ -138,7 +142,11 @@ class Candidates:
         return [self.merge, *(partial(self._go_on_to_end, sketch) for sketch in sketches)]
 
     def _offer_gated(self, *, homing: bool) -> None:
-        """Offer a map with gateways at any angles, if one can be made at once."""
+        """Offer a sketch for places with gateways at any angles, if there is one.
+
+        Args:
+            homing: Whether a travel may lead back to the place it came from.
+        """
         ssh_map = gated_map(
             self._task.trace, self._task.theory, homing=homing, pairs=self._task.log.pairs
         )
@@ -146,17 +154,17 @@ class Candidates:
             self.offer(ssh_map)
 
     def _go_on_to_end(self, sketch: Sketch) -> None:
-        """Offer a sketch after extending it to the end of the trace, if the trace allows that."""
+        """Extend a sketch to the end of the trace and offer it, unless a step contradicts it."""
         trace, done = self._task.trace, len(sketch.labels)
         later = each_looking(zip(trace.actions[done - 1 :], trace.steps[done:], strict=True))
         if all(sketch.extend(action, step) for action, step in later):
             self.offer(sketch.map())
 
     def frame(self, speedups: Speedups) -> None:
-        """Offer maps in which places have frames, though the theory does not ask for any.
+        """Offer maps in which places have frames, although the theory does not demand frames.
 
         Args:
-            speedups: The speed-ups that the caller has on. Others may hold if places have frames.
+            speedups: The speed-ups that the caller has on. With frames, more of them may apply.
         """
         from ssh_abduction.solver.engines.framing import maps_with_frames  # loads numpy
 
@@ -173,7 +181,7 @@ class Candidates:
             watch.check()
 
     def offer(self, ssh_map: SSHMap) -> None:
-        """Keep a map of the whole trace if it is the best one so far and satisfies all axioms."""
+        """Keep a map of the whole trace if it is the best so far and the checker accepts it."""
         if self._task.trace is not self._trace:
             views = answer_maps.views_of(dict(enumerate(ssh_map.labels)), self._trace)
             ssh_map = replace(
@@ -192,9 +200,10 @@ class Candidates:
 
 
 def _with_all_views(task: Task) -> Task:
-    """The same task with a new view for each step of unknown view.
+    """The same task, with one new view for all steps of unknown view.
 
-    Each map of that trace is also a map of the trace itself, in which fewer steps are one dstate.
+    Each map of the changed trace is also a map of the trace itself. The new view only keeps steps
+    of unknown view from sharing a dstate with other steps.
     """
     if not task.theory.unknown_views:
         return task

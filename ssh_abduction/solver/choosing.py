@@ -8,33 +8,36 @@ from ssh_abduction.solver.engines.base import AT_ONCE, Engine, Task
 from ssh_abduction.solver.engines.stepwise import StepEngine
 from ssh_abduction.theory.speedups import row
 
-# Traces with at most this many steps are solved directly, which is faster than naming dstates or
-# merging steps first.
+# Solve traces with at most this many steps directly. This is faster than naming dstates or merging
+# steps first.
 FEW_STEPS = 24
-# Traces of at most this many steps are given to the readable encodings, which know places and
-# faults. Longer ones would take too much memory.
+# Give traces with faults and places to the readable encodings if they have at most this many steps.
+# Longer ones would take too much memory.
 READABLE = 60
 # After this many seconds with the step engine, check whether the dstates are known without a
-# search. The check loads numpy.
+# search. The check comes late because it loads numpy.
 SETTLE_AFTER = 0.15
-# After this many seconds with the step engine, or this share of the time left, go on with an
-# engine that finds dstates first. Most traces are solved by then.
+# After STEPWISE seconds with the step engine, or after STEPWISE_SHARE of the time left if that is
+# less, go on with an engine that finds dstates first. Most traces are solved by then.
 STEPWISE = 1.0
 STEPWISE_SHARE = 0.4
 
 
 def may_name(task: Task) -> bool:
-    """Whether dstates can be found before places and paths, and the trace is long enough."""
+    """Whether to use an engine that gives dstates names, and finds them before places and paths.
+
+    The speed-up `names` has to be on, and the trace has to be longer than FEW_STEPS.
+    """
     return task.speedups.names and len(task.trace) > FEW_STEPS
 
 
 def takes_all(task: Task) -> bool:
-    """Whether an engine for named dstates could take the whole trace."""
+    """Whether the length of the trace suits an engine that takes the whole trace at once."""
     return FEW_STEPS < len(task.trace) <= AT_ONCE
 
 
 def new_engine(task: Task) -> Engine:
-    """The engine for the theory and the length of the trace, still without steps."""
+    """Make the engine for the theory and the length of the trace. It has no steps yet."""
     if may_name(task):
         # Imported here, as loading numpy takes longer than solving a short trace.
         from ssh_abduction.solver.engines.causal import CausalEngine
@@ -49,7 +52,10 @@ def new_engine(task: Task) -> Engine:
 
 
 def step_engine(task: Task) -> StepEngine:
-    """The engine for any theory. It begins with few names for paths, if that is allowed."""
+    """Make a `StepEngine`, which fits any theory. It has no steps yet.
+
+    With the speed-up `path_names` it begins with few names for paths.
+    """
     most = readable.most_paths(task.trace, task.theory, len(task.trace))
     names = min(prefixes.FIRST_PATHS, most) if task.speedups.path_names else most
     return StepEngine(task, names)

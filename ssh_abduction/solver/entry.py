@@ -1,4 +1,4 @@
-"""The functions that users call: `solve`, and `find_backbone`.
+"""The functions that users call: `solve` and `find_backbone`.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> trace = Trace.from_steps(views=["end", "end", "end"], actions=["travel", "around"])
@@ -47,25 +47,30 @@ def solve(
 ) -> Solution:
     """Find the minimal maps of a trace.
 
-    Ctrl-C ends the search like a limit does.
+    Ctrl-C ends the search like a limit does. To get maps one by one, use `Search`.
 
     Args:
         trace: The trace.
         theory: The axioms and the preference; Theory.topological() by default.
-        time_limit: Seconds of wall-clock time. After them, the best answer so far is returned.
-        max_maps: List at most this many maps; None lists all. Use `Search` to stream them. After
-            the last one, the search looks for another map for a second, or a tenth of the time so
-            far. The answer is complete only if this proves that there is none.
+        time_limit: Seconds of wall-clock time. At this limit the best answer so far is returned.
+        max_maps: List at most this many maps; None lists all. After the last one, the search goes
+            on for a second, or a tenth of the time so far if that is more. The answer is
+            `complete` only if this proves that no further map exists.
         within: Also list maps with up to this many dstates more than the minimum: for each number
-            of dstates, the minimal maps with that number. If the theory prefers few paths or
-            places first, these are counted instead.
-        memory_limit: MiB of memory that the process may use at its peak before the search stops.
+            of dstates, the best maps with that number. If the theory prefers few paths or places
+            first, paths or places are counted instead.
+        memory_limit: MiB of memory. The search stops when the process reaches this peak.
         speedups: The speed-ups that are on. None of them changes the answer.
-        on_progress: Called now and then with how far the search is.
+        on_progress: A function that is called with a `Progress` several times a search.
+
+    Returns:
+        The maps, their cost, and what is proven about them.
 
     Raises:
-        TraceError: The trace lacks what the theory needs.
-        TheoryError: The theory asks for what the trace does not have.
+        TraceError: A view, a star or the kind of an action that the theory needs is missing.
+        TheoryError: The theory needs stars or displacements, but the trace has none; or the theory
+            names steps that the trace does not have.
+        SolverError: A limit, `max_maps` or `within` is out of range.
 
     Reference:
         Kuipers & Beeson 2002, "Bootstrap Learning for Place Recognition", step 2.
@@ -92,11 +97,11 @@ def find_backbone(
     time_limit: float | None = None,
     memory_limit: int | None = None,
 ) -> Backbone | None:
-    """Find out what all minimal maps share, also those that the solution does not list.
+    """Find the backbone: what all minimal maps share, also those that the solution does not list.
 
-    clingo looks for minimal maps that differ from those in the solution until it has proven that
-    there are no more. That may take as long as the search did. If the solution has a proven
-    backbone, or no minimal map, nothing is searched.
+    clingo looks for minimal maps that do not share what all known ones share, until it has proven
+    that there are none. That may take as long as the search did. If the solution already has a
+    proven backbone, or has no minimal map, its backbone is returned at once.
 
     >>> from ssh_abduction import Theory, Trace, solve
     >>> solution = solve(Trace.load("examples/aces3-route.jsonl"), max_maps=1)
@@ -105,13 +110,14 @@ def find_backbone(
 
     Args:
         solution: The solution.
-        trace: Its trace; only needed for a solution that was read from a file without it.
-        time_limit: Seconds of wall-clock time.
-        memory_limit: MiB of memory that the process may use at its peak.
+        trace: The trace that was solved. Only needed if the solution was read from a file without
+            its trace.
+        time_limit: Seconds of wall-clock time; None for no limit.
+        memory_limit: MiB of memory that the process may use at its peak; None for no limit.
 
     Returns:
         The backbone; None if no minimal map is known. It is not `proven` if a limit or Ctrl-C
-        ended the search before the proof, or the theory allows no proof.
+        came before the proof, or if the theory allows no proof.
 
     Raises:
         SolverError: The solution has no trace, and none is given.
@@ -152,13 +158,16 @@ def find_backbone(
 
 
 def _is_known_by_mending_alone(task: Task) -> bool:
-    """Whether the maps come from mended traces, which no engine has."""
+    """Whether a search would find the maps by mending the trace only. No engine has such maps."""
     mends = row("mending").holds_for(task.theory) and may_name(task)
     return mends and len(task.trace) > READABLE
 
 
 def _labelling_engine(task: Task, solution: Solution) -> Engine | None:
-    """An engine that finds dstates before places and paths; None if the search needed none."""
+    """An engine that finds dstates before places and paths, with the prefix of the solution.
+
+    None if the search needed no such engine, or the theory has none.
+    """
     engine = new_engine(task)
     if isinstance(engine, StepEngine):
         # The search needed only a prefix, or the theory has no such engine.

@@ -1,4 +1,4 @@
-"""After a search was stopped: make some map of the whole trace, and a bound."""
+"""After a search was stopped, make some map of the whole trace and prove a bound."""
 
 from __future__ import annotations
 
@@ -13,21 +13,23 @@ from ssh_abduction.solver.map_list import Priced, note
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status
 
-# After a stop without a map, making and checking one may take this many seconds beyond the time
-# limit, and this share of the limit.
+# If the time limit stops a search, making and checking a map may take OVERTIME seconds more, plus
+# OVERTIME_SHARE of the limit.
 OVERTIME, OVERTIME_SHARE = 0.5, 0.05
-# Or this many seconds after Ctrl-C, or when the memory limit is over.
+# After Ctrl-C, or at the memory limit, it may take this many seconds.
 INTERRUPTED = 0.6
 _log = log_of(__name__)
 
 
 def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
-    """If the search was stopped, make some map of the whole trace, and a bound without a search.
+    """Make some map of the whole trace if none is known, and prove a bound from distinct steps.
+
+    If the search was not stopped, or has proven its minimum, do nothing.
 
     Args:
-        parts: The parts of the search.
-        answer: Its answer.
-        may_search: Whether clingo may look for a map in the last part of the time limit.
+        parts: The parts of the search. Its `known` gets the map, the bound and the status.
+        answer: The answer of the search.
+        may_search: Whether clingo may look for a map in the reserved last part of the time limit.
     """
     known = parts.known
     if not known.stopped or known.status is Status.OPTIMAL:
@@ -48,12 +50,12 @@ def fall_back(parts: Parts, answer: Answer, *, may_search: bool) -> None:
 
 
 def salvage(parts: Parts) -> None:
-    """Look for any map of the whole trace in the last part of the time limit."""
+    """Use the reserved last part of the time limit to find any map of the whole trace by clingo."""
     _log.info("in the last part of the time limit any map is sought")
     known, watch = parts.known, parts.watch
     watch.use_reserve()
     watch.start()
-    known.lower = None  # no map as cheap as this bound was found
+    known.lower = None  # do not stop at this bound: no map of that cost was found
     try:
         with heeding(watch.check):
             parts.prefixes.engine.grow(len(parts.task.trace))
@@ -67,7 +69,10 @@ def salvage(parts: Parts) -> None:
 
 
 def best_map(parts: Parts) -> Iterator[Priced]:
-    """The best map known, if no minimal map was listed, after it has passed the checker."""
+    """Yield the best map known with its preferred counts, if no map was given so far.
+
+    The checker looks at the map first, as far as there is time.
+    """
     known = parts.known
     if known.status in (Status.FEASIBLE, Status.OPTIMAL) and not known.count and known.best:
         with suppress(LimitError), heeding(Watch().part(_overtime(parts)).check):
@@ -78,7 +83,7 @@ def best_map(parts: Parts) -> Iterator[Priced]:
 
 
 def _overtime(parts: Parts) -> float:
-    """Seconds left to make a map without a search, or to check one."""
+    """The seconds that are left to make a map without a search, or to check one."""
     limit = parts.limits.time_limit
     if parts.known.stopped != "time limit" or limit is None:
         return INTERRUPTED

@@ -1,4 +1,4 @@
-"""How well a map closes: the poses of its dstates that agree best with the displacements.
+"""Fit poses to a map: those of its dstates that agree best with the displacements of the trace.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.solver.fit import fit
@@ -9,12 +9,13 @@
 >>> len(found.poses) == len(ssh_map.dstates)
 True
 
-The unknowns are the position of each place (of each dstate, if the map has no places), the heading
-of each dstate, and two errors of all displacements with a prior: their scale, and a steady drift of
-heading. Each displacement of the trace gives equations, divided by its standard deviations. The
+A displacement is how the robot moved from one step to the next, by its odometry. The unknowns are
+the position of each place (of each dstate, if the map has no places), the heading of each dstate,
+and two errors that all displacements share: their scale, and a steady drift of heading. These two
+have a prior. Each displacement gives three equations, divided by their standard deviations. The
 best poses have the least sum of squares (Lu & Milios 1997, "Globally consistent range scan
-alignment"). That sum is chi-square distributed if the map is true and the odometry is as good as it
-claims. It ranks equally minimal maps, and may cause a warning. It rejects no map.
+alignment"). If the map is true and the odometry is as good as it claims, this sum is chi-square
+distributed. The sum ranks equally minimal maps, and may cause a warning. It rejects no map.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ Array: TypeAlias = NDArray[np.float64]
 
 # With a standard deviation below this, in metres or radians, a displacement counts as exact.
 EXACT = 2e-3
-# The number of sweeps of the power method, and the weight that pulls a rotation to its old value.
-# The weight is small: a metre weighs some hundreds.
+# SWEEPS is the number of iterations of the power method. HELD is the weight that keeps a rotation
+# at its old value. It is small: a metre weighs some hundreds.
 SWEEPS, HELD = 20, 1e-2
 
 
@@ -50,17 +51,20 @@ def fit(trace: Trace, ssh_map: SSHMap) -> Fit:
     """Find the poses of the dstates that agree best with the displacements.
 
     Args:
-        trace: A trace with displacements on some of its steps.
-        ssh_map: A map of all of its steps.
+        trace: A trace with displacements at some of its steps.
+        ssh_map: A map of all steps of the trace.
+
+    Returns:
+        The poses of the dstates, and chi-square with its degrees of freedom.
     """
     return _Problem(trace, ssh_map).solved()
 
 
 class _Problem:
-    """Least squares over the places and headings of one map.
+    """Least squares over the positions and headings of one map.
 
-    The unknowns are x and y of each position, then the heading of each dstate, then the scale and
-    the drift as multiples of their standard deviations.
+    The vector of unknowns has x and y of each position in metres, then the heading of each dstate
+    in radians, then the scale and the drift as multiples of their standard deviations.
     """
 
     def __init__(self, trace: Trace, ssh_map: SSHMap) -> None:
@@ -73,8 +77,8 @@ class _Problem:
             -1, 3
         )
         noise = np.array([trace.covariance(t) for t in steps], dtype=float).reshape(-1, 3, 3)
-        # Each dstate has one pose here. So an error of its measured pose at a visit counts as an
-        # error of the displacements to it and from it.
+        # A dstate has one pose here, but the robot is not at exactly this pose on each visit. Count
+        # that error in the displacements to the dstate and from it.
         travelled = np.array(
             [trace.actions[t - 1].kind != "turn" for t in steps], dtype=float
         ).reshape(-1, 1, 1)
@@ -115,14 +119,14 @@ class _Problem:
         return Fit(squares, freedom, p, scale, bend, self._poses(unknown))
 
     def _begun(self) -> Array:
-        """The values of the unknowns to begin with."""
+        """The initial values of the unknowns, as one vector."""
         unknown = np.zeros(self._size)
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
             unknown[2 * self._positions : -2],
         )
-        # First the headings: the problem is linear, except for whole turns. Then the positions: it
-        # is linear once the headings are known (Carlone et al. 2014).
+        # Solve for the headings first: that is linear, except for whole turns. Once the headings
+        # are known, solving for the positions is linear, too (Carlone et al. 2014).
         reckoned = self._reckoned()
         off = self._moved[:, 2] + reckoned[self._from] - reckoned[self._to]
         off -= math.tau * np.round(off / math.tau)
@@ -140,7 +144,11 @@ class _Problem:
         return unknown
 
     def _reckoned(self) -> Array:
-        """The heading of each dstate relative to one of its group, by the fewest displacements."""
+        """The heading of each dstate in radians, relative to the first dstate of its group.
+
+        Headings are added up along the fewest displacements. A group is the dstates that
+        displacements connect.
+        """
         heading = np.zeros(self._headings)
         rotated: dict[tuple[int, int], float] = {}
         for s, x, angle in zip(
@@ -155,14 +163,13 @@ class _Problem:
         return heading
 
     def _rotations(self, onward: Array) -> Array:
-        """The rotation of each group of headings that makes positions agree best, in radians.
+        """The rotation of each group of headings, in radians, for which positions agree best.
 
-        It minimises a quadratic form of complex numbers on the unit circle, by the power method for
-        its inverse (Boumal 2016, "Nonconvex phase synchronization"). A rotation that positions do
-        not determine stays as it is.
+        The rotations are complex numbers on the unit circle that minimise a quadratic form. The
+        power method for its inverse finds them (Boumal 2016, "Nonconvex phase synchronization").
 
         Args:
-            onward: The displacements under the present headings.
+            onward: The displacements n x 2 in metres, turned by the present headings.
         """
         size = int(self._group.max()) + 1
         inverse = np.linalg.inv(self._misfit(onward) + HELD * np.identity(size))
@@ -177,12 +184,13 @@ class _Problem:
         return angles
 
     def _misfit(self, onward: Array) -> NDArray[np.complex128]:
-        """The least sum of squares over positions, as a quadratic form of the groups' rotations.
+        """The matrix of the quadratic form that says how badly rotations of groups fit.
 
-        Vectors are complex numbers.
+        For given rotations, the form is the least sum of squares that any positions have. Vectors
+        in the plane are complex numbers.
 
         Args:
-            onward: The displacements under the headings without these rotations.
+            onward: The displacements n x 2 in metres, turned by the headings before the rotations.
         """
         weights = 1 / self._sigmas(0)
         vectors = weights * (onward[:, 0] + 1j * onward[:, 1])
@@ -199,21 +207,27 @@ class _Problem:
         return form
 
     def _moves(self) -> csr_array:
-        """The matrix that turns positions into displacements."""
+        """The sparse matrix that maps one coordinate of all positions to that of displacements."""
         return self._differences(self._place[self._from], self._place[self._to], self._positions)
 
     def _graph(self, first: NDArray[np.int_], second: NDArray[np.int_], size: int) -> csr_array:
         return coo_array((np.ones(len(first)), (first, second)), shape=(size, size)).tocsr()
 
     def _sigmas(self, axis: int) -> Array:
-        """The approximate standard deviation of each displacement along an axis."""
+        """The approximate standard deviation of each displacement along axis 0 (x), 1 (y) or 2."""
         sigmas: Array = 1 / np.sqrt((self._whitening[:, :, axis] ** 2).sum(1))
         return sigmas
 
     def _differences(
         self, first: NDArray[np.int_], second: NDArray[np.int_], size: int
     ) -> csr_array:
-        """The matrix that turns values into differences: second minus first."""
+        """The sparse matrix that maps a vector to differences of its entries: second minus first.
+
+        Args:
+            first: The index of the entry to subtract, for each difference.
+            second: The index of the entry to subtract it from.
+            size: The length of the vector.
+        """
         rows = np.arange(len(first))
         ones = np.ones(len(first))
         entries = (
@@ -223,7 +237,12 @@ class _Problem:
         return coo_array(entries, shape=(len(first), size)).tocsr()
 
     def _predicted(self, unknown: Array) -> tuple[Array, Array, Array]:
-        """The predicted displacements, and cosine and sine of the heading in the middle of each."""
+        """Predict the displacements from the unknowns.
+
+        Returns:
+            The displacements n x 3 in metres and radians, and the cosine and the sine of the
+            heading in the middle of each displacement.
+        """
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
             unknown[2 * self._positions : -2],
@@ -290,7 +309,7 @@ class _Problem:
         return coo_array(entries, shape=(3 * m + 2, self._size)).tocsr()
 
     def _parts(self) -> NDArray[np.int_]:
-        """The part of the map that each position is in. No displacement connects two parts."""
+        """The number of the part of the map of each position. No displacement joins two parts."""
         part: NDArray[np.int_] = connected_components(
             self._graph(self._place[self._from], self._place[self._to], self._positions),
             directed=False,
@@ -300,8 +319,8 @@ class _Problem:
     def _freedom(self, unknown: Array) -> int:
         """The degrees of freedom: the number of equations minus the unknowns they determine.
 
-        Each part of the map may be moved and turned as a whole, and so may each group of headings
-        in it that positions leave open.
+        The equations do not determine where each part of the map is and how it is turned. They also
+        leave open how some groups of headings are turned.
 
         A displacement known to the millimetre has no noise worth counting. It determines as
         many unknowns as it has equations, and adds no freedom.
@@ -328,11 +347,11 @@ class _Problem:
         )
 
     def _open_rotations(self, unknown: Array, said: NDArray[np.int_]) -> int:
-        """The number of ways to turn groups of headings that change no displacement.
+        """The number of independent rotations of groups of headings that displacements leave open.
 
         Args:
             unknown: The unknowns.
-            said: The dstates with displacements.
+            said: The numbers of the dstates that have displacements.
         """
         groups = np.unique(self._group[said])
         if len(groups) == len(np.unique(self._parts()[self._place[said]])):
@@ -344,7 +363,7 @@ class _Problem:
         return int((np.linalg.eigvalsh(form) < 1e-6 * max(float(form.diagonal().max()), 1.0)).sum())
 
     def _poses(self, unknown: Array) -> tuple[Pose, ...]:
-        """The poses and the spreads of positions, relative to the first dstate of each part."""
+        """The pose and covariance of each dstate, relative to the first dstate of its part."""
         at, heading = (
             unknown[: 2 * self._positions].reshape(-1, 2),
             unknown[2 * self._positions : -2],
@@ -371,9 +390,9 @@ class _Problem:
         return tuple(poses)
 
     def _spreads(self, unknown: Array, origins: Sequence[int]) -> Array:
-        """The covariance of each dstate's position, m x 2 x 2, in square metres.
+        """The covariance of the position of each dstate: m x 2 x 2, in square metres.
 
-        The positions of `origins` count as known.
+        The poses of the dstates `origins` count as known.
         """
         jacobian = self._jacobian(unknown)
         fixed = [
@@ -405,7 +424,13 @@ def _identity(size: int) -> csr_array:
 
 
 def _least(differences: csr_array, values: Array, weights: Array) -> Array:
-    """The values whose differences fit these best, by weighted least squares."""
+    """Solve a sparse linear system by weighted least squares.
+
+    Args:
+        differences: The matrix of the system.
+        values: The right-hand side, already multiplied by the weights.
+        weights: The weight of each equation.
+    """
     weighted = csr_array(differences.multiply(weights[:, None]))
     solved: Array = lsqr(
         weighted, values, atol=1e-10, btol=1e-10, iter_lim=4 * differences.shape[1] + 100

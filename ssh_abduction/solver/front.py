@@ -1,8 +1,8 @@
 """The front of faults: the fewest dstates that explain a trace, for each number of faults.
 
-Without faults the causal theory always has a map, even if the trace is wrong. With many faults it
-has a map of few dstates. The truth is at the *knee*, where the number of dstates stops falling
-fast. A single number that counts both hides the knee.
+Without faults the causal theory always has a map, even if the trace is wrong: a map of many
+dstates. With many faults it has a map of few dstates. The truth is at the *knee*: the number of
+faults at which the number of dstates stops falling fast. A weighted sum of both numbers hides it.
 
 >>> from ssh_abduction import Trace
 >>> from ssh_abduction.solver.front import fault_front
@@ -26,19 +26,19 @@ from ssh_abduction.solver.engines.base import Found, Task
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-# Both kinds of faults are allowed if the theory names none. Their costs do not matter for a front.
+# If the theory allows no faults, allow both kinds. Their costs do not matter for a front.
 KINDS = {"misread": 1.5, "slipped": 1.5}
 
 
 @dataclass(frozen=True)
 class Point:
-    """The fewest dstates for a number of faults.
+    """The fewest dstates of a map that may have some number of faults.
 
     Attributes:
         faults: The number of faults that a map may have.
-        dstates: The fewest dstates of such a map.
-        map: A map with these; None if none was found in time.
-        proven: Whether `dstates` is proven minimal. Otherwise it is a lower bound.
+        dstates: The fewest dstates of such a map if proven, else a lower bound.
+        map: The best map found; None if none was found in time.
+        proven: Whether `dstates` is proven to be the minimum.
     """
 
     faults: int
@@ -49,13 +49,13 @@ class Point:
 
 @dataclass(frozen=True)
 class Front:
-    """The points for 0, 1, 2, … faults that were computed in time.
+    """The points for 0, 1, 2, … faults, as far as they were computed in time.
 
-    A number of faults that contradicts the assertions of the theory has no point.
+    A number of faults has no point if the assertions of the theory allow no map with so few faults.
 
     Attributes:
-        points: The points.
-        stopped: Whether the time limit ended the search.
+        points: The points, by number of faults.
+        stopped: Whether a time limit or Ctrl-C ended the search.
     """
 
     points: tuple[Point, ...]
@@ -65,7 +65,8 @@ class Front:
     def knee(self) -> int | None:
         """The number of faults at which the number of dstates stops falling fast.
 
-        There, the last fall exceeds the next one by most. None if it never falls, or without proof.
+        The fall to this point exceeds the fall to the next point by most. Only proven points
+        count. None if no fall exceeds the next one.
         """
         counts = self._proven
         bends = {
@@ -78,9 +79,10 @@ class Front:
 
     @property
     def prices(self) -> tuple[float, float] | None:
-        """The fault costs, in dstates, for which the map at the knee is the best of the front.
+        """The costs of a fault for which the map at the knee is the best one, as (low, high).
 
-        A cost must be above the first number and below the second; None if there is no such cost.
+        Costs are in dstates. Each cost between the two numbers will do. None if there is no such
+        cost, or no knee.
         """
         if self.knee is None:
             return None
@@ -94,7 +96,7 @@ class Front:
 
     @property
     def _proven(self) -> dict[int, int]:
-        """The proven numbers of dstates, by number of faults."""
+        """The number of dstates of each proven point, by number of faults."""
         return {point.faults: point.dstates for point in self.points if point.proven}
 
 
@@ -106,14 +108,17 @@ def fault_front(
 
     Args:
         trace: The trace.
-        theory: Theory.causal() by default. Its costs say which kinds of faults are allowed; both
-            kinds if it has none.
-        most: The greatest number of faults.
-        time_limit: Seconds in all.
+        theory: Theory.causal() by default. A theory without costs of faults allows both kinds:
+            wrong views and wrong actions.
+        most: The greatest number of faults, 0 to 1000.
+        time_limit: Seconds in all; None for no limit.
+
+    Returns:
+        A point for each number of faults that was reached in time.
 
     Raises:
-        TheoryError: The theory has places, which the engine that counts faults does not know, or
-            it names steps that the trace does not have.
+        TheoryError: The theory is not the plain causal one, it allows wrong displacements, or it
+            names steps that the trace does not have; or `most` is out of range.
     """
     theory = Theory.causal() if theory is None else checked_theory(theory)
     check_limit("time_limit", "seconds", time_limit)

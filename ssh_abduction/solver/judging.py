@@ -1,8 +1,8 @@
 """A second safety net: maps must pass the checker, which shares no code with the encodings.
 
-Checking every step of a long replay, or every map of a long list, would take longer than finding
-them. So checking gets a share of the search time. The first maps are always checked, at least over
-the steps that clingo was given. Later maps are checked as far as that share allows.
+It would take longer to check every step of a long trace, or every map of a long list, than to find
+the maps. So checking gets only a share of the search time. The first maps are always checked, at
+least over the steps that clingo was given. Later maps are checked if there is time in that share.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from ssh_abduction.solver.asp.own import can_be_asked, keeps_own_rules
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.settle import Problem
 
-# Optional checks take at most this share of the search time, and this many seconds more.
+# Optional checks take at most SHARE of the search time plus BEYOND seconds.
 SHARE = 0.1
 BEYOND = 0.01
 ALWAYS = 3  # maps that are always checked, over the steps that clingo was given
-SAMPLE = 1000  # steps beyond these that are sampled if there is no time for all
+SAMPLE = 1000  # later steps to check at most, drawn at random, if there is no time for all
 A_STEP = 5e-6  # seconds that the checker takes for a step, before the first check measures it
 # Without these axioms a dstate may have several places, courses or headings, but a map shows only
 # one. So the checker cannot judge it.
@@ -31,11 +31,11 @@ UNSHOWN = frozenset({"one_place", "one_course", "one_heading", "gateway_heading"
 
 
 class InternalError(AbductionError):
-    """A map breaks an axiom: a defect of this program, not of the trace."""
+    """A map that was found breaks an axiom. This is a defect of this program, not of the trace."""
 
 
 class Judging:
-    """Checks the maps of one search."""
+    """Checks the maps of one search: against all evidence, and by the checker."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
@@ -50,19 +50,23 @@ class Judging:
 
     @property
     def may_refuse(self) -> bool:
-        """Whether some evidence may reject whole maps."""
+        """Whether the theory uses evidence that may reject whole maps, such as displacements."""
         return bool(self._evidence)
 
     def why_refused(self, ssh_map: SSHMap) -> frozenset[Equality] | None:
-        """Equalities of a map that contradict some evidence; None if no evidence rejects the map.
+        """A set of equalities of a map that contradicts some evidence; None if there is none.
 
-        The map may be one of a prefix.
+        Args:
+            ssh_map: A map of the trace or of a prefix.
         """
         refusal = self.refusal(ssh_map)
         return refusal[1] if refusal else None
 
     def refusal(self, ssh_map: SSHMap) -> tuple[str, frozenset[Equality]] | None:
-        """The same, with the name of the first kind of evidence that rejects the map."""
+        """The first kind of evidence that rejects a map: its name, and why, as `why_refused`.
+
+        None if no evidence rejects the map.
+        """
         for evidence in self._evidence:
             if found := evidence.refuse(self._trace, ssh_map):
                 return evidence.name, found
@@ -71,17 +75,22 @@ class Judging:
     def allows_grown(self, trace: Trace, ssh_map: SSHMap, since: int) -> bool:
         """Whether no evidence rejects a map of a trace that has grown.
 
+        Further checks use the grown trace.
+
         Args:
-            trace: The trace.
-            ssh_map: The map.
-            since: The number of first steps whose map no evidence rejected.
+            trace: The grown trace.
+            ssh_map: A map of all of its steps.
+            since: The number of first steps that the evidence has already accepted.
         """
         self._trace = trace
         return not any(evidence.refuse(trace, ssh_map, since) for evidence in self._evidence)
 
     @cached_property
     def can_accept(self) -> bool:
-        """Whether all that the theory demands can be checked, own rules by clingo."""
+        """Whether all axioms of the theory can be checked on a map.
+
+        The checker knows the built-in axioms. clingo checks a user's own rules.
+        """
         own = {axiom.name for rules in self._theory.rules for axiom in rules.axioms} | {
             rules.name for rules in self._theory.rules
         }
@@ -89,7 +98,7 @@ class Judging:
         return not others and own.isdisjoint(AXIOMS) and can_be_asked(self._theory)
 
     def accepts(self, ssh_map: SSHMap) -> bool:
-        """Whether an unproven map of the whole trace satisfies all axioms, as far as is known."""
+        """Whether a map of the whole trace provably satisfies all axioms and all evidence."""
         accepted = (
             self.can_accept
             and next(violations(self._trace, ssh_map, self._theory), None) is None
@@ -100,7 +109,7 @@ class Judging:
         return accepted
 
     def pass_map(self, ssh_map: SSHMap, prefix: int, elapsed: float) -> None:
-        """Check a map of the whole trace, as far as there is time.
+        """Check a map of the whole trace before it is given, as far as there is time.
 
         Args:
             ssh_map: The map.
@@ -122,14 +131,16 @@ class Judging:
         self._judged += 1
 
     def has_time_for(self, steps: int, elapsed: float) -> bool:
-        """Whether checking a map of this many steps keeps to the share of the search time.
+        """Whether checking this many steps fits into the share of the search time for checking.
 
-        There is always time for the first short maps.
+        Args:
+            steps: The number of steps to check.
+            elapsed: The seconds that the search took so far.
         """
         return self._shown and self._a_step * steps <= BEYOND + SHARE * elapsed - self._seconds
 
     def pass_grown_map(self, trace: Trace, ssh_map: SSHMap) -> None:
-        """Check a map that was replayed along a trace that has grown.
+        """Check a map of a trace that has grown. Further checks use this trace.
 
         Raises:
             InternalError: The map breaks an axiom.
@@ -147,7 +158,7 @@ class Judging:
             self._fail(violations[0])
 
     def _look_at_sample(self, ssh_map: SSHMap, prefix: int) -> None:
-        """Check some links and views beyond the prefix."""
+        """Check links and views at random steps beyond the prefix. Raises InternalError."""
         links = set(ssh_map.links)
         beyond = range(prefix, len(self._trace))
         for t in random.Random(0).sample(beyond, min(SAMPLE, len(beyond))):
@@ -175,7 +186,7 @@ class Judging:
 
 
 def _of_first_steps(ssh_map: SSHMap, steps: int) -> SSHMap:
-    """A map of the whole trace as a map of the first steps, which show all dstates and links."""
+    """Cut the labels of a map to the first steps. These steps must show all dstates and links."""
     return SSHMap(
         ssh_map.labels[:steps],
         ssh_map.dstates,

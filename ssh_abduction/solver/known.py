@@ -1,4 +1,4 @@
-"""What a search knows about a trace so far. It only gets better."""
+"""What a search knows about the maps of a trace so far."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ class Known:
     Attributes:
         status: What is proven.
         best: The best map of the whole trace; None if there is none.
-        cost: The preferred counts of that map, the most important one first.
-        bound: Proven lower bounds.
-        lower: A lower bound on the cost of every map, from a prefix; None if there is none.
-        partial: The best map of a prefix that was found last.
+        cost: The preferred counts of the best map, the most important one first; () without one.
+        bound: Proven lower bounds on the counts of any map.
+        lower: A lower bound on the preferred counts of every map, proven on a prefix; None if there
+            is none.
+        partial: The map of a prefix that was found last; None before that.
         stopped: Why the search ended before it was complete; None if it did not.
-        complete: Whether no further minimal map exists.
-        count: The number of minimal maps that were given.
-        refused: The number of sets of equalities that each kind of evidence rejected.
+        complete: Whether no further map exists: no minimal one and, with `within`, none to list.
+        count: The number of maps given to the caller.
+        refused: For each kind of evidence, by name, how many sets of equalities it rejected.
     """
 
     def __init__(self, theory: Theory) -> None:
@@ -41,26 +42,35 @@ class Known:
         self._theory = theory
 
     def is_better(self, found: Found) -> bool:
-        """Whether a map of the trace, or of a prefix, costs less than the best."""
+        """Whether a map of the trace, or of a prefix, costs less than the best map so far."""
         return self.best is None or found.cost < self.cost
 
     def keep(self, found: Found, labels: tuple[int, ...]) -> None:
-        """Make a map the best one. With these labels it is a map of the whole trace."""
+        """Make a map the best one.
+
+        Args:
+            found: The map, perhaps of a prefix.
+            labels: The dstate of each step of the whole trace.
+        """
         self.best, self.cost = replace(found.map, labels=labels), found.cost
 
     def raise_bound(self, proven: int | None) -> None:
-        """Raise the lower bound on the count that is preferred first."""
+        """Raise the lower bound on the count that is preferred first. None changes nothing."""
         first = self._theory.priorities[0] if self._theory.priorities else None
         if first and proven is not None and proven > (getattr(self.bound, first) or 0):
             self.bound = replace(self.bound, **{first: proven})
 
     def raise_lower(self, cost: tuple[int, ...]) -> None:
-        """Raise the lower bound on the cost of every map to that of a minimal map of a prefix."""
+        """Raise the lower bound on the cost of every map.
+
+        Args:
+            cost: The preferred counts of a minimal map of a prefix, the most important one first.
+        """
         self.raise_bound(cost[0] if cost else None)
         if self.lower is None or cost > self.lower:
             self.lower = cost
 
     @property
     def best_cost(self) -> Cost | None:
-        """The counts of the best map."""
+        """The counts of the best map; None if there is no map."""
         return None if self.best is None else cost_as_counted(self.best, self.cost, self._theory)

@@ -13,10 +13,10 @@ from ssh_abduction.solver.near import NearMinimal, counted_first
 from ssh_abduction.solver.parts import Parts
 from ssh_abduction.solver.values import Status
 
-# After the last map asked for, seek one more for this many seconds. The result shows whether the
-# list is complete.
+# After the last map asked for, seek one more for this many seconds. If there is none, the list is
+# complete.
 ONE_MORE = 1.0
-# Or for this share of the time that the maps took, if that is more.
+# Seek it for this share of the time that the other maps took, if that is more.
 ONE_MORE_SHARE = 0.1
 _log = log_of(__name__)
 
@@ -27,14 +27,14 @@ Priced: TypeAlias = tuple[SSHMap, tuple[int, ...]]
 def listed(
     parts: Parts, mended_maps: tuple[SSHMap, ...] | None, *, keeps_time: bool
 ) -> Iterator[Priced]:
-    """List the maps asked for, each after it has passed the checker.
+    """Yield the maps asked for, each with its preferred counts, after the checker passed it.
 
-    The clock stands still while the caller has a map.
+    The clock of the search stops while the caller works with a map.
 
     Args:
         parts: The parts of the search.
-        mended_maps: The minimal maps, if mending the trace found them.
-        keeps_time: Whether to keep a share of the time limit for reasoning.
+        mended_maps: The minimal maps, if mending the trace found them; else None.
+        keeps_time: Whether to keep a share of the time limit for finding the backbone later.
     """
     known, watch, most = parts.known, parts.watch, parts.limits.most
     if known.status is Status.OPTIMAL:
@@ -47,7 +47,7 @@ def listed(
                 known.stopped = "maps limit"
                 return
             parts.judging.pass_map(ssh_map, parts.engine.size, watch.elapsed())
-            # The first map is the best one, also in the counts that the theory does not prefer.
+            # Take the first map as the best one. The answer gives its counts as the cost.
             known.best = known.best if known.count else ssh_map
             known.count += 1
             note(parts, ssh_map, cost)
@@ -62,17 +62,17 @@ def listed(
 
 
 def note(parts: Parts, ssh_map: SSHMap, cost: tuple[int, ...]) -> None:
-    """Add a map to what the minimal maps share, if it is minimal."""
+    """Add a map to the known minimal maps (`parts.rivals`), if it is minimal."""
     if parts.known.status is Status.OPTIMAL and cost == parts.known.cost:
         parts.rivals.add(ssh_map, cost)
 
 
 def _by_cost(parts: Parts, mended_maps: tuple[SSHMap, ...] | None) -> Iterator[Priced]:
-    """The minimal maps, and then those that cost up to `within` more."""
+    """Yield the minimal maps, then those with up to `within` dstates more, with their counts."""
     known, limits = parts.known, parts.limits
     minimal = mended_maps or parts.prefixes.minimal_maps()
     yield from ((ssh_map, known.cost) for ssh_map in minimal)
-    parts.rivals.listed = True  # so no time is kept for reasoning
+    parts.rivals.listed = True  # so the backbone needs no further search
     if not limits.most or known.count < limits.most:
         parts.watch.end_stage_after(math.inf)
     if limits.within and counted_first(parts.task.theory):

@@ -1,21 +1,23 @@
-"""Maps with faults in theories with places: guess the faults, mend the trace, and solve that.
+"""Find maps with faults in theories with places: guess the faults, mend the trace, and solve it.
 
-To ignore a view is to replace it by another one. An ignored action becomes an unknown action.
-An ignored displacement may as well be missing. So a map with faults is a map without
-faults of a mended trace, which all fast engines can solve. The places of faults are guessed in two
-ways: by robust merging of visits (`guesses/voting.py`), if places have frames, and by the causal
-theory with faults (`engines/faulty.py`). Any map with places, without its places, is one of its
-maps.
+A fault is a view, an action or a displacement of the trace that a map treats as wrong. To *mend* a
+trace is to correct its faults: replace a wrong view by another view and a wrong action by an unknown
+one, and leave out a wrong displacement. So a map with faults is a map without faults of a mended
+trace, and all fast engines can solve a mended trace.
 
-*Displacements.* Labels that ignore displacements show which of these may be wrong
-(`guesses/outliers.py`), and so do the labels of the maps that follow. A map need not ignore all
-that were guessed: those that agree with it are believed again.
+Two methods guess which steps have faults. If places have frames, visits are merged robustly
+(`guesses/voting.py`). In any case, the causal theory with faults is solved (`engines/faulty.py`).
+A map with places becomes a map of that theory when its places are dropped.
+
+*Displacements.* Labels that were found without displacements show which displacements may be wrong
+(`guesses/outliers.py`). Then the labels of each better map show more. A displacement that was
+guessed to be wrong may agree with the map after all. Then the map does not count it as a fault.
 
 *Bound.* A map of the theory, without its places, is a causal map with the same dstates and with no
-more faults. So a bound for the causal theory holds here. If the mended trace has a map that costs
-no more, its dstates and faults are minimal. If all cheapest causal maps are listed, each minimal
-map of the theory has the labels and faults of one of them. So it is one of the minimal maps of the
-traces that these mend, and the best of these are the complete answer.
+more faults. So a lower bound for the causal theory holds here. If a mended trace has a map that
+costs no more than this bound, its dstates and faults are minimal. If all cheapest causal maps are
+listed, each minimal map of the theory has the labels and faults of one of them. So solve all traces
+that the cheapest causal maps mend. The best of their minimal maps are the complete answer.
 """
 
 from __future__ import annotations
@@ -38,15 +40,15 @@ from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 from ssh_abduction.theory.theory import Theory
 
-# At most this many cheapest causal maps are mended. If there are more, the list of minimal maps may
-# be incomplete.
+# Mend the trace by at most this many cheapest causal maps. If there are more, the list of minimal
+# maps may be incomplete.
 MOST_CAUSAL = 200
 ROUNDS = 5  # rounds of robust merging at most, each beginning with a better map
-# A trace that merging mends is solved for at most this many seconds and this share of the time that
-# is left.
+# A trace that merging mended is solved for at most MERGED seconds. Any mended trace is solved for
+# at most SHARE of the time that is left.
 MERGED, SHARE = 30.0, 0.5
-# A dstate with at most RARE visits is rare. One of the BEFORE actions before it may have slipped.
-# At most SUSPECTED actions are tried.
+# A dstate with at most RARE visits is rare. One of the last BEFORE actions before it may have
+# slipped. At most SUSPECTED actions are tried.
 RARE, BEFORE, SUSPECTED = 1, 3, 60
 
 # Solves a mended trace. Arguments: the trace, a theory without faults, the number of maps to list
@@ -56,7 +58,7 @@ Solver = Callable[[Trace, Theory, int, float], tuple[tuple[SSHMap, ...], bool]]
 
 
 class Mending:
-    """Finds maps with faults."""
+    """Finds maps with faults by mending the trace of a task."""
 
     def __init__(self, task: Task, solver: Solver) -> None:
         self._task, self._solver = task, solver
@@ -69,17 +71,17 @@ class Mending:
         self._cheapest: list[Trace] = []  # traces mended by all cheapest causal maps
         causal = Theory.causal().replace(misread=task.theory.misread, slipped=task.theory.slipped)
         self._causal_labels: tuple[int, ...] = ()  # the labels of the last causal map
-        # The log is that of the theory with places. So stars and pairs at different places
-        # distinguish dstates.
+        # The log (the trace as integers) is still that of the theory with places. So stars, and
+        # pairs of steps at different places, distinguish dstates here, too.
         self._causal = FaultyEngine(replace(task, problem=task.problem.changed(theory=causal)))
 
     @property
     def bound(self) -> int | None:
-        """A lower bound on the cost of a map, in tenths of dstates; None if none is known yet."""
+        """A lower bound on the cost of any map, in tenths of dstates; None if none is known yet."""
         return self._causal.bound
 
     def settle(self) -> None:
-        """Stop clingo."""
+        """Stop clingo's search for causal maps."""
         self._causal.settle()
 
     def maps(self) -> Iterator[Found]:
@@ -101,13 +103,15 @@ class Mending:
         yield from self._by_rare_dstates()
 
     def minimal_maps(self, most: int) -> tuple[SSHMap, ...] | None:
-        """The minimal maps. Call it when `maps` has ended.
+        """List all minimal maps, if it is certain that there are no others.
+
+        Call this after the iteration over `maps` has ended.
 
         Args:
             most: The number of maps to list for each mended trace; 0 for all.
 
         Returns:
-            The maps; None if a causal map is cheaper than the best map, or if some may be missing.
+            The maps; None if some may be missing, or if the best map costs more than the bound.
         """
         if self._best is None or self._best.cost[0] != self.bound or not self._cheapest:
             return None
@@ -125,16 +129,22 @@ class Mending:
         return tuple(dict.fromkeys(listed))
 
     def _improving(self, better: Found | None, mended: Trace) -> Iterator[Found]:
-        """Yield the map of a mended trace if it is the best one so far."""
+        """Yield a map, and remember it, if it is the best one so far.
+
+        Args:
+            better: The map, as a map of the trace itself; None yields nothing.
+            mended: The mended trace that it was found for.
+        """
         if better is not None and (self._best is None or better.cost < self._best.cost):
             self._best, self._best_mended = better, mended
             yield better
 
     def _by_merging(self, trace: Trace) -> Iterator[Found]:
-        """Yield maps of what robust merging mends, and merge again from each better map's places.
+        """Yield better maps that robust merging of visits leads to.
 
-        The merged groups are almost a map. It is yielded at once. A share of the time goes into a
-        better one.
+        Merging groups the visits and thereby mends the trace. The groups are almost a map: yield
+        that map first, then solve the mended trace for a better one. If there is a better map,
+        merge again, beginning with its places.
 
         Args:
             trace: The trace of the task, perhaps without some displacements.
@@ -165,8 +175,13 @@ class Mending:
     def _by_missing_displacements(
         self, labels: Sequence[int], places: Sequence[int | None]
     ) -> Iterator[Found]:
-        """Yield maps that ignore displacements that do not fit the labels, then those of each
-        better map.
+        """Yield better maps that treat displacements as wrong if they do not fit the labels.
+
+        If there is a better map, go on with its labels.
+
+        Args:
+            labels: The dstate of each step, found without displacements.
+            places: The place of each step; None if it is unknown.
         """
         trace, tried = self._task.trace, set()
         for _ in range(ROUNDS):
@@ -185,16 +200,17 @@ class Mending:
             )
 
     def _by_causal_maps(self) -> Iterator[Trace]:
-        """Yield maps of the traces that causal maps mend, each cheaper than the one before."""
+        """Yield the traces that causal maps mend, each map cheaper than the one before."""
         self._causal.grow(len(self._task.trace))
         for found in self._causal.improving_maps():
             self._causal_labels = found.map.labels
             yield self._mended(found.map)
 
     def _by_cheapest_causal_maps(self) -> Iterator[Trace]:
-        """Yield maps of the traces that the cheapest causal maps mend.
+        """Yield the distinct traces that the cheapest causal maps mend.
 
-        The faults of some of these have smaller maps with places than those of others.
+        These maps cost the same, but with places one mended trace may need more dstates than
+        another.
         """
         causal: list[SSHMap] = []
         found: dict[Trace, None] = {}
@@ -207,10 +223,10 @@ class Mending:
         self._cheapest = list(found) if len(causal) < MOST_CAUSAL else []
 
     def _by_rare_dstates(self) -> Iterator[Found]:
-        """Yield maps in which an action slipped shortly before a rarely visited dstate.
+        """Yield better maps in which an action slipped shortly before a rarely visited dstate.
 
-        The causal theory does not notice every slip: one more link in it may break a path. Then the
-        places behind it come out as new ones.
+        The causal theory does not notice every slip, as a slip may only add a link to its map. With
+        paths, that link is wrong, and the places after it become new ones.
         """
         before: Found | None = None
         while self._task.theory.slipped and self._best is not before:
@@ -229,9 +245,9 @@ class Mending:
                 yield from self._improving(self._minimal(slipped)[0], slipped)
 
     def _mended(self, causal: SSHMap) -> Trace:
-        """The trace without the faults of a causal map.
+        """Mend the trace by the faults of a causal map.
 
-        A wrong view is replaced by that of another step at the same dstate, and a wrong action by
+        Replace a wrong view by the view of another step at the same dstate, and a wrong action by
         an unknown one.
         """
         wrong = {
@@ -252,18 +268,19 @@ class Mending:
         return replace(self._task.trace, steps=tuple(steps))
 
     def _problem(self, mended: Trace) -> Problem:
-        """A mended trace, without faults."""
+        """The problem of a mended trace, in which no further faults are allowed."""
         return self._task.problem.changed(mended, self._without_faults)
 
     def _minimal(self, mended: Trace, seconds: float = math.inf) -> tuple[Found | None, bool]:
-        """The best map of a mended trace, as a map of the trace itself, and whether it is minimal.
+        """Find the best map of a mended trace.
 
         Args:
             mended: The mended trace.
-            seconds: The time it may take.
+            seconds: The time that the search may take.
 
         Returns:
-            The map, and whether it is proven minimal; None for the map if none was found.
+            The map, as a map of the trace itself with faults; None if none was found. And whether
+            the result is proven: a minimal map, or that there is none.
         """
         if mended not in self._solved or not (self._solved[mended][1] or seconds < math.inf):
             maps, proven = self._maps_of(mended, 1, seconds)
@@ -273,14 +290,23 @@ class Mending:
     def _maps_of(
         self, mended: Trace, most: int, seconds: float = math.inf
     ) -> tuple[list[SSHMap], bool]:
-        """Minimal maps of a mended trace, and whether they are proven minimal."""
+        """Solve a mended trace.
+
+        Args:
+            mended: The mended trace.
+            most: The number of maps to list; 0 for all.
+            seconds: The time that the search may take.
+
+        Returns:
+            Minimal maps of the mended trace and True; or the best map known and False.
+        """
         maps, proven = self._solver(
             mended, self._without_faults, most, min(seconds, SHARE * self._task.watch.left())
         )
         return list(maps), proven
 
     def _believed_again(self, ssh_map: SSHMap, mended: Trace) -> Trace:
-        """The mended trace, with the missing displacements that fit the map put back."""
+        """Put the missing displacements that agree with a map back into a mended trace."""
         for t, (step, other) in enumerate(zip(self._task.trace.steps, mended.steps, strict=True)):
             if step.displacement == other.displacement:
                 continue
@@ -296,7 +322,7 @@ class Mending:
         return mended
 
     def _as_found(self, ssh_map: SSHMap, mended: Trace) -> Found:
-        """A map of a mended trace as one of the trace itself."""
+        """Turn a map of a mended trace into a map of the trace itself, with its faults."""
         if self._task.theory.jumped:
             mended = self._believed_again(ssh_map, mended)
         return Found.of(
@@ -305,12 +331,12 @@ class Mending:
 
 
 def _has_frames(task: Task) -> bool:
-    """Whether the engine with frames finds all minimal maps here."""
+    """Whether `FramedEngine` finds all minimal maps for the theory of the task."""
     return row("visits").holds_for(task.theory)
 
 
 def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
-    """The place of each step, and the slot of the place that the robot faces."""
+    """The place of each step and the slot there that the robot faces; None if unknown."""
     at = [
         None if s.place is None or s.heading is None else (s.place, s.heading)
         for s in ssh_map.dstates
@@ -319,9 +345,16 @@ def _places(ssh_map: SSHMap) -> list[tuple[int, int] | None]:
 
 
 def with_faults(ssh_map: SSHMap, trace: Trace, mended: Trace, theory: Theory) -> SSHMap:
-    """A map of a mended trace as a map of the trace, with the mended observations as faults.
+    """Turn a map of a mended trace into a map of the trace itself.
 
-    Each dstate gets the view that most of its steps have.
+    Each dstate gets the view that most of its steps have, weighted by the cost of a wrong view.
+    The steps at which the map differs from the trace become its faults.
+
+    Args:
+        ssh_map: The map of the mended trace.
+        trace: The trace itself.
+        mended: The mended trace.
+        theory: The theory, with the costs of faults.
     """
     votes: dict[int, Counter[View]] = {}
     for label, step in zip(ssh_map.labels, trace.steps, strict=True):

@@ -1,11 +1,12 @@
-"""Maps that cost more than the minimum: for each greater number of dstates, the best maps with it.
+"""Find maps with more dstates than the minimum: for each number of dstates, the best such maps.
 
-A prefix may stand for the trace only for minimal maps (`prefixes.py`): a map with one dstate more
-may become minimal when it is cut to a prefix. So the readable encodings find these maps for the
-whole trace, with a rule that fixes the number of dstates.
+To solve a prefix of the trace is enough only for minimal maps (`prefixes.py`). A map with one
+dstate more may become minimal when it is cut to a prefix. So the readable encodings
+(`encodings/*.lp`) get the whole trace here, and a rule that fixes the number of dstates.
 
-If the theory prefers few paths or places first, these are counted instead. Excuses are not counted,
-because they only witness a conflict: more excuses never make a map inconsistent.
+If the theory prefers few paths or places first, the number of paths or places is fixed instead.
+Excuses (pairs of paths that an axiom is not applied to) are not counted: a map may have any number
+of them above the minimum.
 """
 
 from __future__ import annotations
@@ -31,20 +32,20 @@ class NearMinimal:
     """Lists the maps of a trace that cost more than the minimum.
 
     Attributes:
-        engine: Holds the axioms for the whole trace.
+        engine: The engine that has the axioms for the whole trace.
     """
 
     def __init__(
         self, task: Task, judging: Judging, most: int, report: Callable[[], None], before: Asker
     ) -> None:
-        """Search nothing yet.
+        """Prepare an engine. The search begins with `maps`.
 
         Args:
             task: The task of the search for the minimal maps.
-            judging: Checks maps.
+            judging: Says which maps the evidence rejects.
             most: The number of maps wanted; 0 for all.
-            report: Called now and then.
-            before: The engine of the minimal maps. Its times are included.
+            report: Called now and then to report progress.
+            before: Asked clingo for the minimal maps. Its times are added to those of this engine.
         """
         self._task = replace(task, speedups=replace(task.speedups, prefixes=False))
         self._judging, self._most, self._report = judging, most, report
@@ -60,11 +61,11 @@ class NearMinimal:
     def maps(
         self, minimal: tuple[int, ...], within: int
     ) -> Iterator[tuple[SSHMap, tuple[int, ...]]]:
-        """List the maps with their preferred counts, the most important one first.
+        """Yield the maps with their preferred counts, the most important one first.
 
         Args:
             minimal: The preferred counts of minimal maps.
-            within: The number of dstates more than these that a map may have.
+            within: By how much a map may exceed the first of these counts (excuses aside).
         """
         count = counted_first(self._task.theory)
         assert count is not None
@@ -85,7 +86,8 @@ class NearMinimal:
 
 
 def counted_first(theory: Theory) -> Count | None:
-    """The count that near-minimal maps may have more of: what the theory prefers first, except
-    excuses; None if it prefers nothing else.
+    """The count in which listed maps may exceed the minimum: "dstates", "places" or "paths".
+
+    It is the first count that the theory prefers, except excuses. None if there is no other.
     """
     return next((name for name in theory.priorities if name != "excuses"), None)

@@ -1,4 +1,4 @@
-"""The parts of one search: its knowledge, its engine, and its reports of progress."""
+"""Hold together the parts of one search: what it knows, its engine, and its progress reports."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ from ssh_abduction.theory.speedups import Speedups
 
 
 class Parts:
-    """What the stages of one search share.
+    """The objects that all stages of one search share.
 
     Attributes:
         limits: The limits of the search.
-        speedups: The speed-ups that the caller has on. `task.speedups` are those that hold here.
-        watch: The clock of the search.
+        speedups: The speed-ups that the caller has on. `task.speedups` are those of them that are
+            exact for the theory.
+        watch: The clock of the search, with its limits.
         task: The trace and theory, as engines see them.
-        known: What is known of the trace so far.
-        judging: Checks maps before they are given.
-        rivals: The minimal maps, as far as they are known.
-        candidates: Makes maps without a proof.
+        known: What is known about the maps of the trace so far.
+        judging: Checks maps before they are given to the caller.
+        rivals: The minimal maps found so far.
+        candidates: Makes maps without a proof that they are minimal.
         prefixes: Finds and lists minimal maps.
         near: Lists maps that cost more than the minimum; None before that stage.
     """
@@ -68,17 +69,17 @@ class Parts:
         self.watch.stop()
 
     def _engine_after(self, after: Parts) -> Engine:
-        """The engine of a search for the first steps, if it can go on; else a new one."""
+        """The engine of a search for the first steps, if it can take more steps; else a new one."""
         self.watch.use_reserve()
         before = after.prefixes.engine
         is_outgrown = not before.goes_on or (isinstance(before, StepEngine) and may_name(self.task))
         engine = new_engine(self.task) if is_outgrown else before.over(self.task)
-        # A search that was interrupted may have stopped while a step was grounded.
+        # A search that was interrupted may have stopped while clingo grounded a step.
         half_told = after.known.stopped == "interrupted" or not engine.intact
         return engine.with_paths(engine.paths) if half_told else engine
 
     def _take_over(self, after: Parts, start: Start) -> None:
-        """Take over what a search for the first steps proved."""
+        """Take over the bounds that a search for the first steps proved, and `start.minimal`."""
         known, before = self.known, after.known
         if self.task.speedups.prefixes:
             known.bound, known.lower = before.bound, before.lower
@@ -94,11 +95,11 @@ class Parts:
 
     @property
     def engine(self) -> Engine:
-        """The engine that was asked last."""
+        """The engine that was used last."""
         return self.near.engine if self.near else self.prefixes.engine
 
     def end_clingo(self) -> None:
-        """Stop clingo, and take over its bound."""
+        """Stop clingo and the clock, and take over the bound that clingo proved."""
         self.watch.end_stage_after(math.inf)
         self.watch.stop()
         engine = self.prefixes.engine
@@ -107,7 +108,7 @@ class Parts:
         self.rivals.engine = None if self.rivals.listed or not engine.intact else engine
 
     def report(self) -> None:
-        """Log how far the search is, and tell the caller."""
+        """Log how far the search is, and call the caller's `on_progress`."""
         if self._on_progress is None and not PROGRESS.isEnabledFor(logging.INFO):
             return
         known = self.known
