@@ -1,8 +1,9 @@
-"""The only place where `data` loads a package above it: functions of `ssh_abduction.output`.
+"""Call functions of `ssh_abduction.output` from values of this package, for notebooks.
 
-Notebooks call `_repr_html_` of a value, so the values of this package have that method. The HTML
-is made in `ssh_abduction.output`, which imports this package. It is therefore loaded when it is
-called.
+Notebooks call the method `_repr_html_` of traces and maps. The HTML is made in
+`ssh_abduction.output`, which imports this package. To avoid a cycle of imports, this module loads
+`ssh_abduction.output` only when HTML is asked for. No other module of `data` imports from packages
+above it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,6 @@ from typing import Any
 
 
 def in_output(name: str) -> Callable[..., Any]:
-    """The function of this name in `ssh_abduction.output`."""
+    """Load and return the function with this name in `ssh_abduction.output`."""
     function: Callable[..., Any] = getattr(import_module("ssh_abduction.output"), name)
     return function

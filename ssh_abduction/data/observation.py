@@ -1,4 +1,4 @@
-"""What a step observes: the checks of views, images and probabilities."""
+"""Check what a step observes: views, images and probabilities."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ View: TypeAlias = str | int
 
 
 def checked_view(value: Any, where: str) -> View:
-    """A view that a caller gives.
+    """Return a view if it is a text or an integer of 32 bits, or raise TraceError.
 
     Args:
-        value: The view; numpy's whole numbers are fine.
-        where: Its name in messages.
+        value: What the caller gave. Whole numbers of numpy are accepted.
+        where: The name of the value in messages.
     """
     if is_whole(value):
         value = int(value)
@@ -39,12 +39,12 @@ def checked_view(value: Any, where: str) -> View:
 
 
 def view_or_unknown(value: Any, where: str) -> View | None:
-    """A view, or None for an unknown one."""
+    """Return None for an unknown view. Otherwise check the view as `checked_view` does."""
     return None if value is None else checked_view(value, where)
 
 
 def checked_probability(value: Any, where: str) -> float:
-    """A probability that a caller gives."""
+    """Return a value as a float if it is a probability from 0 to 1, or raise TraceError."""
     if not is_finite(value) or not 0 <= value <= 1:
         raise TraceError(
             f"{where}: expected a probability from 0 to 1, got {brief(value)}; "
@@ -54,7 +54,15 @@ def checked_probability(value: Any, where: str) -> float:
 
 
 def checked_image(value: Any, where: str) -> tuple[float, ...] | int:
-    """An image: a list of finite numbers, or an index into the sidecar file."""
+    """Return an image, or raise TraceError.
+
+    Args:
+        value: Finite numbers (ranges in metres), or an index into the sidecar file.
+        where: The name of the value in messages.
+
+    Returns:
+        A tuple of numbers, or the index.
+    """
     if is_whole(value):
         if value < 0:
             raise TraceError(
@@ -76,9 +84,9 @@ def checked_image(value: Any, where: str) -> tuple[float, ...] | int:
 
 
 def frozen_image(value: Any) -> tuple[float, ...] | int:
-    """An image as a step holds it.
+    """Return an image as a tuple of numbers, or as an index into the sidecar file.
 
-    Only the first number of a tuple is checked, as traces are copied often and panoramas are long.
+    Of a tuple, only the first number is checked: traces are copied often, and images are long.
     """
     if isinstance(value, tuple) and (not value or is_finite(value[0])):
         return value
@@ -86,5 +94,5 @@ def frozen_image(value: Any) -> tuple[float, ...] | int:
 
 
 def plain_number(x: float) -> float:
-    """A number as Python's own int or float, as JSON cannot hold those of numpy."""
+    """Return a number as Python's own int or float. JSON cannot store numbers of numpy."""
     return x if type(x) in (int, float) else int(x) if is_whole(x) else float(x)

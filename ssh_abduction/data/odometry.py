@@ -1,4 +1,4 @@
-"""Odometry: displacements, poses, and the noise model of displacements without a covariance.
+"""Odometry: displacements, poses, and a noise model for displacements without a covariance.
 
 >>> from ssh_abduction.data.odometry import Odometry
 >>> covariance = Odometry(along=0.05, across=0.0, position=0.0).covariance((10.0, 0.0, 0.0))
@@ -23,33 +23,34 @@ Pose: TypeAlias = tuple[float, float, float]
 Displacement: TypeAlias = tuple[float, float, float]
 Covariance: TypeAlias = tuple[Displacement, Displacement, Displacement]
 
-# The longest step in metres, and the largest turn in radians. Larger numbers were meant in other
+# The longest step in metres, and the largest turn in radians. Larger numbers are probably in other
 # units.
 FARTHEST, MOST_TURNED = 1000.0, 4 * math.pi
-# The least standard deviation of a step, in metres and in radians, as numbers in a log are rounded.
+# The least standard deviation of a step, in metres and in radians, because logs round numbers.
 ROUNDED = 1e-3
-# The share by which symmetric entries of a covariance may differ, for the same reason.
+# How much symmetric entries of a covariance may differ, as a share of its largest entry. Logs round
+# these numbers, too.
 SYMMETRIC = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """The noise of displacements without a covariance, and their systematic errors.
+    """The noise of displacements without a covariance, and systematic errors of all displacements.
 
     All numbers are standard deviations.
 
     Attributes:
-        along: Along the way of a step, as a share of its length.
-        across: Across the way of a step, as a share of its length.
-        heading: Of the heading, in radians for each metre of the step.
-        turning: Of the heading, as a share of the turn.
-        position: In x and in y, in metres, for any step.
-        angle: Of the heading, in radians, for any step.
-        scale: Of the scale of all displacements, as a share: one unknown for the trace.
-        bend: Of a steady drift of the heading, in radians a metre: one unknown for the trace.
-        offset: Of the position of a dstate at each visit, in x and in y, in metres. It does not add
-            up along the way.
-        facing: Of the heading of a dstate at each visit, in radians.
+        along: Error of position along a step, as a share of the step's length.
+        across: Error of position across a step, as a share of the step's length.
+        heading: Error of heading, in radians for each metre of a step.
+        turning: Error of heading, as a share of the turn.
+        position: Error of x and of y in each step, in metres.
+        angle: Error of heading in each step, in radians.
+        scale: Systematic error of all lengths, as a share; it is the same in the whole trace.
+        bend: Systematic drift of heading, in radians a metre; it is the same in the whole trace.
+        offset: Error of x and of y of a dstate (a place and a direction) at each visit, in metres.
+            It does not accumulate along the way.
+        facing: Error of the heading of a dstate at each visit, in radians.
         extra: Fields of the trace file that this package does not know.
     """
 
@@ -78,7 +79,7 @@ class Odometry:
 
     @classmethod
     def of(cls, value: Any) -> Odometry:
-        """Odometry from an object with some of its fields; the others get their defaults.
+        """Make Odometry of a mapping with some of its fields. The other fields get their defaults.
 
         Raises:
             TraceError: If a field is wrong.
@@ -94,17 +95,18 @@ class Odometry:
         return cls(**known, extra={name: v for name, v in value.items() if name not in NUMBERS})
 
     def to_json(self) -> dict[str, Any]:
-        """The odometry as plain data, as the header of a trace file holds it."""
+        """Return the fields as a dict, as the header of a trace file has them."""
         return {**{name: v for name, v in asdict(self).items() if name in NUMBERS}, **self.extra}
 
     def covariance(self, displacement: Displacement) -> Covariance:
-        """The covariance of a displacement.
+        """Return the covariance of a displacement without its systematic errors.
 
         Args:
             displacement: (dx, dy, dtheta), in metres and radians.
 
         Returns:
-            (3, 3), in metres and radians, in the frame of the robot before it moved.
+            Three rows of three numbers, in metres and radians, in the frame of the robot before it
+            moved.
         """
         dx, dy, turned = checked_displacement(displacement, "displacement")
         # Variances along and across the way, turned into the frame of the robot.
@@ -126,7 +128,12 @@ NUMBERS = tuple(f.name for f in fields(Odometry) if f.name != "extra")
 
 
 def checked_displacement(value: Any, where: str) -> Displacement:
-    """A displacement that a caller gives."""
+    """Return (dx, dy, dtheta) as floats, or raise TraceError.
+
+    Args:
+        value: Metres ahead, metres to the left, and radians counterclockwise.
+        where: The name of the value in messages.
+    """
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
     if not _is_triple(value):
@@ -154,7 +161,12 @@ def checked_displacement(value: Any, where: str) -> Displacement:
 
 
 def checked_covariance(value: Any, where: str) -> Covariance:
-    """A covariance that a caller gives: symmetric and positive definite."""
+    """Return a covariance as three rows of three floats, or raise TraceError.
+
+    Args:
+        value: The covariance of (dx, dy, dtheta), symmetric and positive definite.
+        where: The name of the value in messages.
+    """
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
     if not _is_triple(value) or not all(map(_is_triple, value)):
@@ -191,7 +203,12 @@ def _is_triple(value: Any) -> bool:
 
 
 def moved(pose: Pose, displacement: Displacement) -> Pose:
-    """The pose (x, y, heading) after a displacement from another pose; metres and radians."""
+    """Return the pose (x, y, heading) after a displacement, in metres and radians.
+
+    Args:
+        pose: The pose before the displacement.
+        displacement: (dx, dy, dtheta), in the frame of that pose.
+    """
     x, y, heading = pose
     dx, dy, turned = displacement
     cos, sin = math.cos(heading), math.sin(heading)
@@ -203,15 +220,17 @@ def moved(pose: Pose, displacement: Displacement) -> Pose:
 
 
 def between(start: Pose, end: Pose) -> Displacement:
-    """The displacement from one pose to another, in the frame of the first, with the short turn."""
+    """Return the displacement from one pose to another, in the frame of the first pose.
+
+    Its dtheta is the shorter of the two possible turns, in radians.
+    """
     dx, dy = end[0] - start[0], end[1] - start[1]
     cos, sin = math.cos(start[2]), math.sin(start[2])
     return cos * dx + sin * dy, cos * dy - sin * dx, math.remainder(end[2] - start[2], math.tau)
 
 
 def in_words(displacement: Displacement) -> str:
-    """A displacement in words.
-
+    """Describe a displacement in words: metres to the nearest 0.1, and whole degrees.
     >>> in_words((4.1, -0.2, 0.0))
     '4.1 m ahead, 0.2 m right'
     """

@@ -1,5 +1,4 @@
-"""Stars: the gateways that a robot sees at a place, each with its bearing.
-
+"""Stars: the gateways (ways out) that a robot sees at a place, each with its bearing.
 >>> from ssh_abduction.data.star import Star
 >>> [gateway.bearing for gateway in Star.of((1, 0, 1, 0)).gateways]
 [0.0, 180.0]
@@ -8,9 +7,10 @@ True
 >>> [frame.bearings for frame in Star.of((1, None, 1, 0)).frames]
 [(0, 180), (0, 90, 180)]
 
-Bearings are degrees clockwise from straight ahead. Two sightings of one gateway agree if their
-bearings, after a turn, differ by at most the sum of their spreads. Angles need not be right angles.
-If all gateways are near quarters, a star is also four openings, which the fast engines read.
+Bearings are degrees clockwise from straight ahead, in any directions. The spread of a bearing is
+how many degrees it may be off. A gateway that is seen twice has two bearings. Corrected by the
+robot's turn, they may differ by at most the sum of their spreads. If all gateways are near straight
+ahead, right, back or left, a star is also four openings, which the fast engines read.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from ssh_abduction.data.observation import plain_number
 Openings: TypeAlias = tuple[bool, bool, bool, bool]
 Entry: TypeAlias = "float | Gateway | None"
 
-# Degrees that a bearing may be off by default. Junctions of 90 and of 120 degrees are then
-# different, as these differ by more than twice as much.
+# How many degrees a bearing may be off by default. Two spreads are less than the difference of 90
+# and 120 degrees, so junctions with these angles are different.
 SPREAD = 10.0
-# Degrees that a bearing may be off a quarter (ahead, right, back, left) and still count as it.
+# How many degrees a bearing may be off straight ahead, right, back or left, and still count as it.
 QUARTER = 20.0
-# The largest spread: a gateway that was not observed may be anywhere in a half circle.
+# The largest spread in degrees: a gateway that was not observed may be anywhere in a half circle.
 WIDEST = 90.0
-# Unobserved gateways of a star. Each may exist or not, so a star has up to 2**6 frames.
+# The most unobserved gateways of a star. Each may exist or not, so a star has up to 2**6 frames.
 MOST_UNKNOWN = 6
 _FIELDS = ("bearing", "spread", "opposite", "open")
 
@@ -44,11 +44,11 @@ class Gateway:
     """A way out of a place, as seen at one step.
 
     Attributes:
-        bearing: Degrees, clockwise from straight ahead.
-        spread: Degrees that the bearing may be off.
-        opposite: The index in the star of the other gateway of the same path; None for the one
-            straight opposite, if there is one.
-        open: True; None if it was not observed whether the gateway exists.
+        bearing: The direction in degrees, clockwise from straight ahead.
+        spread: How many degrees the bearing may be off.
+        opposite: The index, in the star, of the gateway where the same path goes on. None means
+            the gateway straight opposite, if there is one.
+        open: True if the gateway exists; None if it was not observed whether it exists.
     """
 
     bearing: float
@@ -57,7 +57,7 @@ class Gateway:
     open: bool | None = True
 
     def to_json(self) -> Any:
-        """The bearing, or an object if there is more to say."""
+        """Return the bearing, or a dict if other fields differ from their defaults."""
         if self == Gateway(self.bearing):
             return self.bearing
         said = {"bearing": self.bearing, "spread": self.spread}
@@ -67,14 +67,15 @@ class Gateway:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The gateways of a place as seen at one step, if all are known.
+    """The gateways of a place as seen at one step, without doubt about which ones exist.
 
-    They are its slots, numbered clockwise from the one ahead, or from the next one.
+    Each gateway is a slot. Slots are numbered clockwise from the gateway ahead or, if there is none
+    ahead, from the first one to the right of it.
 
     Attributes:
-        bearings: Whole degrees, clockwise from straight ahead.
-        spreads: Whole degrees.
-        opposite: For each slot the other slot of the same path, if the star declares one.
+        bearings: The bearing of each slot, in whole degrees clockwise from straight ahead.
+        spreads: How many degrees each bearing may be off.
+        opposite: For each slot, the slot where the same path goes on; None if the star gives none.
     """
 
     bearings: tuple[int, ...]
@@ -87,26 +88,28 @@ class Frame:
         return len(self.bearings)
 
     def nth(self, turn: str | None, number: int) -> int | None:
-        """The slot of a gateway counted from 1 to a side, without the one straight ahead.
+        """Return the slot of the n-th gateway to a side, or None if there are fewer gateways.
 
-        None if there are fewer gateways.
+        Args:
+            turn: "right" to count gateways clockwise; anything else to count counterclockwise.
+            number: Which gateway, from 1. A gateway straight ahead is not counted.
         """
         beside = [k for k in range(self.slots) if not self.faces(k)]
         order = beside if turn == "right" else beside[::-1]
         return order[number - 1] if number <= len(order) else None
 
     def faces(self, slot: int) -> bool:
-        """Whether the robot faces this gateway."""
+        """Whether the gateway with this slot is straight ahead of the robot."""
         return abs((self.bearings[slot] + 180) % 360 - 180) <= self.spreads[slot]
 
     def has_behind(self, slot: int) -> bool:
-        """Whether this gateway is straight behind the robot."""
+        """Whether the gateway with this slot is straight behind the robot."""
         return abs(self.bearings[slot] % 360 - 180) <= self.spreads[slot]
 
 
 @dataclass(frozen=True, slots=True)
 class Star:
-    """All gateways that are seen at a step.
+    """All gateways (ways out of a place) that are seen at a step.
 
     Attributes:
         gateways: The gateways.
@@ -116,7 +119,12 @@ class Star:
 
     @classmethod
     def of(cls, entries: Sequence[Entry]) -> Star:
-        """The star from four 0/1/None (ahead, right, back, left), or from bearings and gateways."""
+        """Make a star of the entries that a trace has for it.
+
+        Args:
+            entries: Four of 0, 1 or None (ahead, right, back, left; None if not observed), or any
+                number of bearings in degrees and Gateways.
+        """
         if is_four(entries):
             quarters = ((90.0 * k, entry) for k, entry in enumerate(entries))
             return cls(
@@ -135,10 +143,10 @@ class Star:
 
     @property
     def openings(self) -> Openings | None:
-        """Four flags: is a gateway ahead, right, back and left?
+        """Whether there is a gateway ahead, right, back and left, as four flags; or None.
 
-        None if a gateway was not observed, is in none of these directions, or has another opposite
-        than the one straight opposite, or if two gateways are in one direction.
+        It is None if a gateway was not observed or is in none of these directions, if two gateways
+        are in one direction, or if two gateways are declared opposite that are not straight opposite.
         """
         found: dict[int, int] = {}
         for k, gateway in enumerate(self.gateways):
@@ -155,7 +163,7 @@ class Star:
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        """The possible frames of the place, with and without each unobserved gateway."""
+        """All frames that the place may have: each unobserved gateway may exist or not."""
         unknown = [k for k, gateway in enumerate(self.gateways) if not gateway.open]
         left_out = (
             set(some)
@@ -179,7 +187,7 @@ class Star:
         return None
 
     def _frame(self, kept: list[int]) -> Frame:
-        """The frame of these gateways."""
+        """Make a frame of the gateways with these indices."""
         clockwise = sorted(
             kept, key=lambda k: (self.gateways[k].bearing + self.gateways[k].spread) % 360
         )
@@ -194,9 +202,9 @@ class Star:
 
 
 def is_four(entries: Sequence[Entry]) -> bool:
-    """Whether a star is written as four 0/1/None.
+    """Whether a star is written as four of 0, 1 or None.
 
-    They cannot be bearings, as two of them would be equal.
+    Such numbers cannot be bearings, because two of them would be equal.
     """
     return len(entries) == 4 and all(
         x is None or (not isinstance(x, Gateway) and x in (0, 1)) for x in entries
@@ -204,20 +212,23 @@ def is_four(entries: Sequence[Entry]) -> bool:
 
 
 def near_quarter(bearing: float) -> int | None:
-    """The quarter near a bearing: 0 ahead, 1 right, 2 back, 3 left, or None."""
+    """Return 0 for a bearing near straight ahead, 1 right, 2 back, 3 left; None for all others."""
     quarter = round(bearing / 90)
     return quarter % 4 if abs(bearing - 90 * quarter) <= QUARTER else None
 
 
 def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
-    """A star of a trace, checked.
+    """Check a star and return its entries as a tuple.
 
     Args:
         value: What the trace or the caller gives.
-        where: Its name in messages.
+        where: The name of the value in messages.
+
+    Returns:
+        Four of 0, 1 or None; or bearings in degrees and Gateways.
 
     Raises:
-        TraceError: If it is no star.
+        TraceError: If the value is not a star.
     """
     if hasattr(value, "tolist"):
         value = value.tolist()  # numpy's
@@ -248,7 +259,7 @@ def parse_star(value: Any, where: str) -> tuple[Entry, ...]:
 
 
 def star_to_json(star: Sequence[Entry]) -> list[Any]:
-    """A star as plain data, as a trace file holds it."""
+    """Return a star as a list, as a trace file has it."""
     return [entry.to_json() if isinstance(entry, Gateway) else entry for entry in star]
 
 
@@ -257,7 +268,14 @@ def _is_seen(entry: Entry) -> bool:
 
 
 def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
-    """An entry of a star of `count` entries, checked. `four` says whether it has four openings."""
+    """Check and return an entry of a star.
+
+    Args:
+        value: What the trace or the caller gives.
+        count: The number of entries of the star.
+        four: Whether the star is written as four of 0, 1 or None.
+        where: The name of the entry in messages.
+    """
     if isinstance(value, Gateway):
         value = {name: getattr(value, name) for name in _FIELDS}
     if isinstance(value, Mapping):
@@ -273,7 +291,13 @@ def _entry(value: Any, count: int, four: bool, where: str) -> Entry:
 
 
 def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
-    """A gateway that is written as an object, checked."""
+    """Check and return a gateway that is given as an object.
+
+    Args:
+        value: The object.
+        count: The number of entries of the star.
+        where: The name of the gateway in messages.
+    """
     if unknown := [name for name in value if name not in _FIELDS]:
         raise TraceError(
             f"{where}: expected fields out of {', '.join(_FIELDS)}, got {brief(unknown[0])}; "
@@ -293,7 +317,7 @@ def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
             f"{where}.open: expected true, or null where it was not observed, "
             f"got {brief(is_open)}; leave out what is closed"
         )
-    # An observed gateway is more certain than one that may not exist.
+    # The bearing of an observed gateway is known better.
     widest = WIDEST if is_open is None else WIDEST / 2
     if not is_finite(spread) or not 0 <= spread <= widest:
         raise TraceError(
@@ -311,7 +335,7 @@ def _gateway(value: Mapping[str, Any], count: int, where: str) -> Gateway:
 
 
 def _check_opposite(i: int, entry: Entry, star: Sequence[Entry], where: str) -> None:
-    """Check that the opposite of a gateway is another one, whose opposite is this one."""
+    """Check the field `opposite` of entry i. The opposite of that entry must be None or i."""
     if not isinstance(entry, Gateway) or entry.opposite is None:
         return
     other = star[entry.opposite]

@@ -1,4 +1,4 @@
-"""Steps: what a robot observed at one moment, and the action that it took next."""
+"""Steps of a trace: what a robot observed at one moment, and the action that it took next."""
 
 from __future__ import annotations
 
@@ -33,14 +33,17 @@ class Step:
     Attributes:
         view: The name or number of the view; None if it is unknown, or only an image is known.
         action: The action taken next; None on the last step of a trace.
-        star: The openings ahead, right, back and left as four 0/1, None if not observed; or
-            their bearings in degrees, clockwise from ahead; or Gateways.
-        displacement: (dx, dy, dtheta) from the step before, in metres and radians, in the frame
-            that the robot had there: x ahead, y left, counterclockwise. It has no meaning on the
-            first step.
-        covariance: Of the displacement, (3, 3). Without one the trace's odometry gives it.
-        image: Ranges in metres, or an index into the header's sidecar file.
-        truth: For evaluation only; nothing that infers reads it.
+        star: The openings seen. Either four of 0, 1 or None: ahead, right, back and left, None if
+            not observed. Or one entry for each opening: its bearing in degrees, clockwise from
+            ahead, or a Gateway. None if no openings were recorded.
+        displacement: (dx, dy, dtheta) since the step before, in metres and radians, in the frame
+            of the robot at that step: x ahead, y left, dtheta counterclockwise. It has no meaning
+            on the first step.
+        covariance: The covariance of the displacement, 3 x 3. If it is None, the odometry of the
+            trace gives one.
+        image: Ranges in metres, or an index into the sidecar file that the header names.
+        truth: What is really the case, such as the true place; for evaluation only. No inference
+            reads it.
         extra: Fields of the trace file that this package does not know.
         confidence: The probability, from 0 to 1, that the view and the star are right. If faults
             are allowed, it scales the cost of ignoring them.
@@ -57,7 +60,7 @@ class Step:
     confidence: float | None = None
 
     def __post_init__(self) -> None:
-        # Replace each field by its checked value. The dataclass is frozen.
+        # Replace each field by its checked value. Python forbids `self.view = …`: Step is frozen.
         if self.view is not None:
             object.__setattr__(self, "view", checked_view(self.view, "view"))
         if self.action is not None:
@@ -101,7 +104,15 @@ class Step:
         displacement: Sequence[float] | None = None,
         covariance: Sequence[Sequence[float]] | None = None,
     ) -> Step:
-        """A step. Its errors begin with `where`. The other arguments are the fields of a step.
+        """Make a step of some of its fields.
+
+        Args:
+            view: The view; None if it is unknown.
+            star: The openings seen, as in Step.
+            where: The name of the step in error messages.
+            action: The action taken next.
+            displacement: (dx, dy, dtheta) since the step before, in metres and radians.
+            covariance: The covariance of the displacement, 3 x 3.
 
         Raises:
             TraceError: If a field is wrong.
@@ -116,16 +127,16 @@ class Step:
 
     @property
     def gateways(self) -> Star | None:
-        """The star as gateways with bearings."""
+        """The star (the openings seen) as gateways with bearings; None if the step has no star."""
         return None if self.star is None else Star.of(self.star)
 
     @property
     def openings(self) -> Openings | None:
-        """The star as (ahead, right, back, left).
+        """Whether there is an opening ahead, right, back and left; None if the step has no star.
 
         Raises:
-            TraceError: If a gateway is in none of these directions or was not observed, or two
-                gateways share one.
+            TraceError: If a gateway was not observed or is near none of these directions, or if two
+                gateways are near the same one.
         """
         star = self.star
         if star is None:
@@ -142,7 +153,7 @@ class Step:
         return openings
 
     def to_json(self) -> dict[str, Any]:
-        """The step as plain data, as a line of a trace file holds it."""
+        """Return the step as a dict, as a line of a trace file has it."""
         known: dict[str, Any] = {
             "view": self.view,
             "image": list(self.image) if isinstance(self.image, tuple) else self.image,

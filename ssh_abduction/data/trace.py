@@ -1,12 +1,12 @@
-"""Traces: what a robot observed and did. Every package exchanges them.
+"""Traces: what a robot observed and did, step by step.
 
 >>> from ssh_abduction import Trace
 >>> trace = Trace.from_steps(views=["a", "b", "a"], actions=["travel", "around"])
 >>> len(trace), trace.views, [a.kind for a in trace.actions]
 (3, ('a', 'b', 'a'), ['travel', 'turn'])
 
-A file of a trace holds JSON lines: a header, and then for each step a line with what was observed
-and the action taken next. See docs/reference/formats.md.
+A trace file has JSON lines: a header, and then one line for each step, with what was observed and
+the action taken next. See docs/reference/formats.md.
 """
 
 from __future__ import annotations
@@ -43,19 +43,20 @@ __all__ = [
     "checked_trace",
 ]
 
-_USUAL = Odometry()  # of displacements, if the trace has no odometry
+_USUAL = Odometry()  # used if the trace has no odometry
 
 
 @dataclass(frozen=True)
 class Trace:
     """A sequence of steps: n + 1 observations with n actions between them.
 
-    A trace is immutable. `load` and `from_steps` make one.
+    A trace is immutable. Make one with `load` or `from_steps`.
 
     Attributes:
         steps: The steps.
-        name: What the trace is called.
-        images: The sidecar file that images of steps are indices into.
+        name: The name of the trace.
+        images: The path of the sidecar file. If the image of a step is a number, it is an index
+            into this file.
         odometry: The noise of displacements without a covariance; None for the defaults.
         extra: Fields of the file's header that this package does not know.
         source: The file that the trace was read from.
@@ -96,7 +97,7 @@ class Trace:
         self._check_actions()
 
     def _check_actions(self) -> None:
-        """Check that all steps but the last have an action, and that a name means one action."""
+        """Check that all steps but the last have an action, and that equal names mean equal actions."""
         last = len(self.steps) - 1
         types: dict[str, tuple[int, Action]] = {}
         for i, step in enumerate(self.steps):
@@ -135,14 +136,14 @@ class Trace:
     def __getitem__(self, index: slice) -> Trace: ...
 
     def __getitem__(self, index: int | slice) -> Step | Trace:
-        """A step, or a trace of consecutive steps: trace[3] or trace[:20].
+        """Return a step, such as trace[3], or a trace of consecutive steps, such as trace[:20].
 
-        The first step of a slice loses its displacement and the last one its action. Negative
-        indices and slices that reach beyond the trace work as for a list.
+        The first step of a slice loses its displacement, and its last step loses its action. Negative
+        indices, and slices that reach beyond the trace, work as for a list.
 
         Raises:
             RangeError: If there is no such step, or the slice is empty.
-            TraceError: If the slice leaves steps out.
+            TraceError: If the stride of the slice is not 1.
         """
         if not isinstance(index, slice):
             return self.steps[checked_index(index, len(self), "steps")]
@@ -160,7 +161,7 @@ class Trace:
         if not start:
             return self.prefix(stop)
         here = self.prefix(stop).steps[start:]
-        # Without the source, as messages would name wrong lines of the file.
+        # Drop the source: messages would otherwise name wrong lines of the file.
         return replace(
             self,
             steps=(replace(here[0], displacement=None, covariance=None), *here[1:]),
@@ -185,7 +186,7 @@ class Trace:
         return f"<Trace{name}: {', '.join(parts)}{more}>"
 
     def _repr_html_(self) -> str:
-        """The trace for notebooks: its first steps."""
+        """Return the first steps as HTML for notebooks."""
         card: str = in_output("trace_card")(self)
         return card
 
@@ -196,7 +197,7 @@ class Trace:
 
     @cached_property
     def actions(self) -> tuple[Action, ...]:
-        """The actions in order."""
+        """The actions of all steps but the last, in order."""
         return tuple(step.action for step in self.steps if step.action is not None)
 
     @property
@@ -206,7 +207,10 @@ class Trace:
 
     @cached_property
     def in_quarters(self) -> bool:
-        """Whether all stars and turns fit right angles, so that each star is four openings."""
+        """Whether right angles describe all stars (openings seen) and turns.
+
+        If so, each star is four openings: ahead, right, back and left.
+        """
         stars = {tuple(step.star) for step in self.steps if step.star is not None}
         return all(Star.of(star).openings is not None for star in stars) and all(
             action.in_quarters for action in set(self.actions)
@@ -218,9 +222,12 @@ class Trace:
         return any(step.displacement is not None for step in self.steps)
 
     def covariance(self, step: int) -> Covariance | None:
-        """The covariance of a step's displacement: its own, or else that of the odometry.
+        """Return the covariance of a step's displacement, 3 x 3; None without a displacement.
 
-        None if the step has no displacement.
+        If the step gives no covariance, it is computed from the odometry.
+
+        Raises:
+            RangeError: If there is no such step.
         """
         here = self.steps[a_whole_number("step", step, RangeError, 0, len(self) - 1)]
         if here.displacement is None or here.covariance is not None:
@@ -228,7 +235,7 @@ class Trace:
         return (self.odometry or _USUAL).covariance(here.displacement)
 
     def at(self, step: int) -> str:
-        """The name of a step in messages: file and line, or number."""
+        """Return the name of a step in messages: the file and the line, or the number of the step."""
         a_whole_number("step", step, TraceError)
         return f"{named(self.source)}:{step + 2}" if self.source else f"step {step}"
 
@@ -244,16 +251,17 @@ class Trace:
         odometry: Odometry | Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> Trace:
-        """A trace from views and the actions between them.
+        """Make a trace of n + 1 views and the n actions between them.
 
         Args:
-            views: n + 1 views; None if one is unknown.
-            actions: n actions, as `Action.of` takes them.
-            stars: n + 1 stars, as in Step; None if none was observed.
-            displacements: n of [dx, dy, dtheta], in metres and radians; None if one is unknown.
-            covariances: n of (3, 3), of the displacements; None if the odometry gives it.
+            views: The view of each step; None if it is unknown.
+            actions: The actions, as `Action.of` takes them.
+            stars: The openings seen at each step, as in `Step.star`; None if none were recorded.
+            displacements: [dx, dy, dtheta] during each action, in metres and radians; None if it is
+                unknown.
+            covariances: The covariance of each displacement, 3 x 3; None to use the odometry.
             odometry: The noise of displacements without a covariance.
-            name: What the trace is called.
+            name: The name of the trace.
 
         Raises:
             TraceError: If a value is wrong, or there are too few or too many.
@@ -270,7 +278,7 @@ class Trace:
                 f"trace: expected one view more than actions, got {len(seen)} views and "
                 f"{len(done)} actions; each action leads from one view to the next"
             )
-        # Stars belong to steps; displacements belong to actions, and each to the step after it.
+        # A step has its star. The displacement of an action belongs to the step after the action.
         openings = [None] * len(seen) if stars is None else _listed(stars, "stars")
         if len(openings) != len(seen):
             raise TraceError(
@@ -288,11 +296,11 @@ class Trace:
         return cls(steps, name=name, odometry=None if odometry is None else Odometry.of(odometry))
 
     def without_stars(self) -> Trace:
-        """The same trace without stars."""
+        """Return the same trace without stars (openings seen)."""
         return replace(self, steps=tuple(replace(step, star=None) for step in self.steps))
 
     def without_displacements(self) -> Trace:
-        """The same trace without displacements and odometry."""
+        """Return the same trace without displacements and odometry."""
         return replace(
             self,
             steps=tuple(replace(step, displacement=None, covariance=None) for step in self.steps),
@@ -300,7 +308,7 @@ class Trace:
         )
 
     def without_displacements_at(self, steps: Collection[int]) -> Trace:
-        """The same trace without the displacements of these steps."""
+        """Return the same trace without the displacements that lead to these steps."""
         unknown = {
             a_whole_number(f"steps[{i}]", step, TraceError)
             for i, step in enumerate(a_list("steps", steps, TraceError))
@@ -318,7 +326,7 @@ class Trace:
     def with_views(
         self, views: Iterable[View | None], confidences: Iterable[float | None] | None = None
     ) -> Trace:
-        """The same trace with other views.
+        """Return the same trace with other views and confidences.
 
         Args:
             views: The view of each step; None if it is unknown.
@@ -348,7 +356,7 @@ class Trace:
         )
 
     def prefix(self, steps: int) -> Trace:
-        """The trace of the first `steps` steps."""
+        """Return the trace of the first `steps` steps, or the whole trace if it has fewer."""
         head = self.steps[: a_whole_number("steps", steps, TraceError, 1)]
         if head:
             head = (*head[:-1], replace(head[-1], action=None))
@@ -356,10 +364,11 @@ class Trace:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trace:
-        """The trace in a file, or on standard input for "-".
+        """Read a trace from a file; "-" means standard input.
 
         Raises:
-            TraceError: With file, line and field, if the file cannot be read or is no trace.
+            TraceError: If the file cannot be read or is not a trace. The error names the file, the
+                line and the field.
         """
         path = a_path("path", path, TraceError)
         source = "standard input" if path == "-" else named(path)
@@ -383,10 +392,10 @@ class Trace:
             raise TraceError(f"{source}: expected the path of a trace file: {error}") from None
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the trace into a file, which appears whole or not at all.
+        """Write the trace into a file. The file appears whole or not at all.
 
         Raises:
-            TraceError: If it cannot be written.
+            TraceError: If the file cannot be written, or a value of the trace has no form in JSON.
         """
         path = a_path("path", path, TraceError)
         lines = "".join(line + "\n" for line in self.to_lines())
@@ -409,13 +418,13 @@ class Trace:
 
     @property
     def digest(self) -> str:
-        """A short digest of the trace's file, so that a report can name the trace."""
+        """A digest of the trace as a file, 16 hexadecimal digits. A report can name the trace by it."""
         return hashlib.sha256(
             "\n".join(self.to_lines()).encode("utf-8", "backslashreplace")
         ).hexdigest()[:16]
 
     def to_lines(self) -> Iterator[str]:
-        """The lines of the trace's file: the header, then one for each step."""
+        """Yield the lines of the trace as a file: the header, then one line for each step."""
         header = {"format": FORMAT, "version": VERSION, "name": self.name, "images": self.images}
         odometry = {} if self.odometry is None else {"odometry": self.odometry.to_json()}
         yield _dump(
@@ -426,14 +435,14 @@ class Trace:
 
 
 def checked_trace(value: object) -> Trace:
-    """The trace that a caller gives."""
+    """Return a value if it is a trace, or raise TraceError."""
     return an_instance(
         "trace", value, Trace, TraceError, mend="make one with Trace.load or Trace.from_steps"
     )
 
 
 def _dump(value: Mapping[str, Any]) -> str:
-    """A line of the trace's file."""
+    """Return an object as a line of a trace file."""
     try:
         return json_line(value)
     except (TypeError, ValueError, RecursionError) as error:
@@ -444,7 +453,15 @@ def _dump(value: Mapping[str, Any]) -> str:
 
 
 def _of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[Any]:
-    """One value for each step: that of the action that led to it, None for the first step."""
+    """Return a list of one value for each step, from one value for each action.
+
+    The value of an action goes to the step that it led to. The first step gets None.
+
+    Args:
+        values: The values; None to make them all None.
+        name: The name of the values in messages.
+        actions: The number of actions.
+    """
     listed = [None] * actions if values is None else _listed(values, name)
     if len(listed) != actions:
         raise TraceError(
@@ -455,7 +472,7 @@ def _of_actions(values: Iterable[Any] | None, name: str, actions: int) -> list[A
 
 
 def _listed(values: Any, name: str) -> list[Any]:
-    """One value for each step or action. A text is a list of one-letter views."""
+    """Return an iterable as a list. A text becomes a list of its letters, which are views."""
     if not isinstance(values, Iterable) or isinstance(values, bytes | Mapping):
         raise TraceError(f"{name}: expected a list, got {brief(values)}; give one value a step")
     return list(values)

@@ -1,4 +1,4 @@
-"""Reading trace files: JSON lines. The first is the header and each other line is a step.
+"""Read trace files. They have JSON lines: a header, then one line for each step.
 
 See docs/reference/formats.md.
 """
@@ -18,10 +18,10 @@ from ssh_abduction.data.star import parse_star
 from ssh_abduction.data.step import Step
 
 FORMAT, VERSION = "ssh-trace", 1
-# Bytes of a line. A step with a panorama of 100,000 numbers fits. A file without line ends is
-# rejected before it fills the memory.
+# The most bytes of a line. An image of 100,000 numbers fits into a line. A file without line ends
+# is rejected before it fills the memory.
 LONGEST_LINE = 16 * 2**20
-# How files of maps and robots' logs begin. People name them instead of a trace.
+# How files of maps and robots' logs begin. Users sometimes give these files instead of a trace.
 _MAPS = (b'{"format": "ssh-solution"', b'{"format": "ssh-map"')
 _LOGS = {
     b"\x1f\x8b": "gzipped data",
@@ -48,13 +48,13 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
 
     Args:
         file: The open file.
-        source: What messages call it.
+        source: The name of the file in messages.
 
     Returns:
-        The arguments of Trace: steps, name, images, odometry and extra.
+        A dict of arguments of Trace: steps, name, images, odometry and extra.
 
     Raises:
-        TraceError: With file, line and field.
+        TraceError: If the file is malformed. The error names the file, the line and the field.
     """
     header: dict[str, Any] | None = None
     steps: list[Step] = []
@@ -98,7 +98,12 @@ def read_trace(file: BinaryIO, source: str) -> dict[str, Any]:
 
 
 def _record(raw: bytes, where: str) -> dict[str, Any]:
-    """The object on a line."""
+    """Parse a line and return its object.
+
+    Args:
+        raw: The line. If it is the first one, it may begin with a byte order mark.
+        where: File and line, for messages.
+    """
     is_first = where.endswith(":1")
     if is_first:
         _refuse_other_files(raw, where)
@@ -137,7 +142,7 @@ def _record(raw: bytes, where: str) -> dict[str, Any]:
 
 
 def _refuse_other_files(raw: bytes, where: str) -> None:
-    """Reject a file whose first line is that of a robot's log or of maps."""
+    """Raise TraceError if the first line is that of a robot's log or of a file of maps."""
     log = next((kind for magic, kind in _LOGS.items() if raw.startswith(magic)), None)
     if log is None and LINE_OF_A_LOG.match(raw):
         log = "lines of CARMEN or g2o"
@@ -154,7 +159,7 @@ def _refuse_other_files(raw: bytes, where: str) -> None:
 
 
 def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """The header, checked, with its odometry as Odometry."""
+    """Check the header and return it as a dict. Its odometry becomes an Odometry."""
     if record.get("format") != FORMAT:
         came = (
             brief(record["format"])
@@ -186,12 +191,13 @@ def _header(record: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _step(record: Mapping[str, Any], where: str, actions: dict[str, Action]) -> Step:
-    """The step on a line.
+    """Make a step of the object on a line.
 
     Args:
-        record: The object on the line.
+        record: The object.
         where: File and line, for messages.
-        actions: The actions of earlier steps by name. Equal actions become one object.
+        actions: The actions of earlier steps, by name. Equal actions become one object. A new
+            action is added.
     """
     given = {name: record.get(name) for name in _STEP_FIELDS}
     if given["view"] is not None:

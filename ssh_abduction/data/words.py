@@ -13,12 +13,15 @@ from ssh_abduction.data.errors import brief
 
 
 def counted(number: float, things: str) -> str:
-    """A number with its noun: 8 dstates, 1 dstate."""
+    """Return a number with its noun: "8 dstates", "1 dstate"."""
     return f"{number} {things.removesuffix('s') if number == 1 else things}"
 
 
 def that_differ(value: Any) -> dict[str, str]:
-    """The short reprs of those fields of a dataclass that differ from their defaults."""
+    """Return the fields of a dataclass that differ from their defaults.
+
+    The result is a dict from names of fields to short reprs.
+    """
     told = {}
     for field in fields(value):
         usual = field.default_factory() if field.default_factory is not MISSING else field.default
@@ -28,6 +31,6 @@ def that_differ(value: Any) -> dict[str, str]:
 
 
 def shortly(value: Any) -> str:
-    """A dataclass as the call that makes it, with the fields that differ from their defaults."""
+    """Return a repr of a dataclass with only those fields that differ from their defaults."""
     fields_told = ", ".join(f"{name}={text}" for name, text in that_differ(value).items())
     return f"{type(value).__name__}({fields_told})"
