@@ -155,7 +155,8 @@ class Engine(Protocol):
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         """Yield maps of the prefix, each cheaper than the one before.
 
-        When the iteration ends, the last map is minimal. Without any map, the prefix has none.
+        When the iteration ends, the last map is minimal. If there was none, the prefix has no map
+        (within `most`).
 
         Args:
             most: An upper bound on the cost of the maps; empty if none is known.

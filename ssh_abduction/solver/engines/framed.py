@@ -1,31 +1,35 @@
-"""The engine for the topological theory where places have frames and fewest dstates come first.
+"""The engine for the topological theory with frames, if the fewest dstates are preferred first.
 
-It finds dstates first, then places and paths. It finds all minimal maps, and its bound on the
-dstates is proven.
+A place has a frame if its directions are numbered, and each turn rotates by a known number of right
+angles. The engine finds the dstates first, then the places and paths. It lists all minimal maps and
+proves its lower bound on the number of dstates.
 
-Frames almost determine the dstates without places and paths. A turn rotates by known quarters, so
-whole visits are the same or not (`steps/chart.py`). visits.lp decides which are
-(`engines/visit_labels.py`). It has the causal axioms and the rotations of turns, but not the order
-of places on a path, or its sides. For the dstates found, paths_framed.lp finds the fewest paths and
-places (`engines/framed_paths.py`).
+With frames, the dstates hardly depend on places and paths. It is enough to know which visits are at
+one place, and how their frames are turned (`steps/chart.py`). visits.lp decides on that
+(`engines/visit_labels.py`). It has the causal axioms and the rotations of turns, but not the axioms
+about the order of places on a path and about its sides. paths_framed.lp then finds the fewest paths
+and places that fit these dstates (`engines/framed_paths.py`).
 
-*Claim.* Cut to which visits are at one place, a map of the topological theory is an answer of
-visits.lp. So the fewest dstates of visits.lp are a lower bound. If some answer of that cost has
-paths, all minimal maps are among the answers of that cost with their fewest paths.
-*If no answer has paths*, paths_framed.lp is asked which path shows it. sides_framed.lp then adds
-the axioms of order and sides for that path. If no single path shows it, or there are too many
-visits, paths_framed.lp is asked which labels clash: minimal sets of nodes whose labels no paths
-fit. visits.lp gets a rule that forbids them. Every map of the topological theory keeps these
-rules, so bounds still hold.
+*Claim.* Every map of the topological theory determines an answer of visits.lp, by which of its
+visits are at one place. So the fewest dstates of visits.lp are a lower bound. If paths fit some
+answer of that cost, then all minimal maps are among the answers of that cost, with the fewest paths
+that fit them.
 
-*Beside.* If that takes long, a map is guessed. Another thread proves from the guess outwards how
-many dstates the causal axioms need (`engines/framed_guess.py`). The names of that proof then list
-all labels with that number of dstates. Some of them fit no frame or have no paths, which
-paths_framed.lp detects. But each map of the topological theory is among them.
+*If no paths fit an answer*, paths_framed.lp is asked for a path that the answer contradicts.
+sides_framed.lp then adds the axioms of order and sides for that path. Perhaps no single path is
+contradicted, or there are too many visits. Then paths_framed.lp is asked which labels clash. A
+clash is a minimal set of nodes whose labels no paths fit. visits.lp gets a rule that forbids it.
+Every map of the topological theory satisfies these rules, so the bounds still hold.
 
-*Which path.* In a half explored world the causal axioms allow fewer dstates than order and sides
-do, in too many ways to forbid them one by one. The axioms of order and sides of a path take a rule
-for each two visits that may be one. So they are added only for paths that an answer contradicts.
+*Beside.* If that takes long, a map is guessed. A second thread searches near the guess and proves
+how many dstates the causal axioms need (`engines/framed_guess.py`). It can then list all labels
+with that number of dstates. Each map of the topological theory has labels in this list. Other
+labels in it fit no frame or no paths, which paths_framed.lp detects.
+
+*Why only some paths.* In a half explored world the causal axioms allow fewer dstates than order and
+sides do, in too many ways to forbid them one by one. The axioms of order and sides of one path need
+a rule for each pair of visits that may be at one place. So they are added only for paths that an
+answer contradicts.
 """
 
 from __future__ import annotations
@@ -46,19 +50,19 @@ from ssh_abduction.solver.guesses.merging import kept
 from ssh_abduction.solver.steps.chart import Chart, FramedChart
 from ssh_abduction.theory.evidence import Equality
 
-# With more pairs of visits that may be one, add no axioms of single paths: they take some forty
-# rules for each pair.
+# If more pairs of visits than this may be at one place, add no axioms of single paths. They take
+# about forty rules for each pair.
 MANY_PAIRS = 20_000
-# Keep this many controls of minimal labels until their maps are listed. Each takes some megabytes,
-# and seconds to make again.
+# Keep at most this many controls for minimal labels until their maps are listed. A control takes
+# some megabytes, and making it again takes seconds.
 KEPT = 10
-# After this many seconds without the fewest dstates, also look for a map near a guess. Most traces
-# are solved by then.
+# If the fewest dstates are not found after this many seconds, also look for a map near a guess.
+# Most traces are solved by then.
 SOON = 3.0
 
 
 class FramedEngine:
-    """The topological theory with frames, fewest dstates first."""
+    """The engine for the topological theory with frames. It minimises the dstates first."""
 
     lists_least = True
     goes_on = True
@@ -69,12 +73,14 @@ class FramedEngine:
         around: Mapping[int, Sequence[int]] | None = None,
         soon: float | None = None,
     ) -> None:
-        """An engine for no steps yet.
+        """Begin with an empty prefix.
 
         Args:
             task: The problem, the limits and the speed-ups.
-            around: As in `Chart.framed`, if steps have no stars.
-            soon: Seconds without the fewest dstates after which to guess, at most; SOON by default.
+            around: For each observation, the ones seen ahead, right, back and left of it, as in
+                `Chart.framed`. None if the steps have stars, the gateways seen there.
+            soon: If the fewest dstates are not found after this many seconds, guess a map. None
+                for the default `SOON`.
         """
         self.asker = Asker(task.watch)
         self.intact = True
@@ -84,14 +90,14 @@ class FramedEngine:
         self._sides = FramedSides(task.theory, self.asker)
         self._fitting = FramedPaths(task, self.asker)
         self._visits = VisitLabels(task, self.asker, self._charted, self._sides)
-        self._unframed_size = 0  # how many steps there are if they fit no frames
+        self._unframed_size = 0  # the size of the prefix, used if its visits fit no frames
         self._framed = True  # whether the visits fit their frames
-        # The minimal cost, and all namings that have it.
+        # The minimal cost, and all labels with maps of that cost.
         self._best: tuple[tuple[int, ...], list[Naming]] | None = None
         self._beside, self._soon_maps = self._helpers()
 
     def _helpers(self) -> tuple[GuessBeside, SoonMaps]:
-        """A guess and the maps near it, for a new prefix."""
+        """Make the guess and the search for maps near it, for a new prefix."""
         beside = GuessBeside(self._fitting, self._visits, self.asker)
         soon_maps = SoonMaps(
             self._fitting,
@@ -105,12 +111,12 @@ class FramedEngine:
 
     @property
     def size(self) -> int:
-        """How many steps the engine was given."""
+        """The number of steps in the prefix."""
         return self._visits.size if self._framed else self._unframed_size
 
     @property
     def bound(self) -> int | None:
-        """A lower bound on the dstates of the prefix."""
+        """A proven lower bound on the number of dstates of the prefix; None if none is known."""
         return self._visits.bound
 
     @property
@@ -118,11 +124,15 @@ class FramedEngine:
         return self._visits.chart
 
     def with_paths(self, paths: int) -> FramedEngine:
-        """Another engine; names for paths are never short here."""
+        """Make a new engine. `paths` changes nothing, as there are always enough names here."""
         return FramedEngine(self._task, self._around, self._soon)
 
     def over(self, task: Task) -> FramedEngine:
-        """This engine, which goes on with the grown trace."""
+        """Go on with a longer trace, and return this engine itself.
+
+        Args:
+            task: The longer trace, with new limits.
+        """
         self._task = self._fitting.task = task
         self.asker.watch = task.watch
         self._visits.work_on(task)
@@ -130,16 +140,16 @@ class FramedEngine:
         return self
 
     def next_size(self, failed: int) -> int:
-        """The size to grow to when the maps of the prefix do not explain step `failed`."""
+        """Return the size to grow to when no map of the prefix explains step `failed`."""
         return next_charted_size(self.size, failed, len(self._task.trace))
 
     @property
     def size_to_go_on(self) -> int:
-        """The size to grow to first when the trace has grown."""
+        """The first size to grow to, when the trace has grown."""
         return self.next_size(self.size)
 
     def grow(self, size: int) -> None:
-        """Let the prefix have this many steps."""
+        """Make the first `size` steps the prefix."""
         if size != self.size:
             self._beside.end()
             self._best = None
@@ -149,7 +159,7 @@ class FramedEngine:
         self._unframed_size = size
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
-        """Maps of the prefix, each better than the one before; the last one is minimal."""
+        """Yield maps of the prefix, each cheaper than the one before; the last is minimal."""
         if not self._framed:
             return
         first = yield from self._first_with_paths()
@@ -158,7 +168,7 @@ class FramedEngine:
             return
         best = first.found
         yield best
-        # Other labels with as few dstates may have better paths.
+        # Other labels with the same number of dstates may have fewer paths or places.
         namings: list[Naming] = []
         others = self._all_with_paths(best.cost[0], besides=first.naming.labels)
         for other in chain([first.naming], others):
@@ -173,9 +183,13 @@ class FramedEngine:
         self._best = best.cost, namings
 
     def _first_with_paths(self) -> Generator[Found, None, Fitted | None]:
-        """The first labels with the fewest dstates that have paths.
+        """Find labels with the fewest dstates that paths fit.
 
-        If they take long, yield maps that are found soon.
+        Yields:
+            Maps near a guess, if the search takes long.
+
+        Returns:
+            The labels with a map; None if the prefix has no map.
         """
         fitted: list[Fitted] = []
 
@@ -194,9 +208,10 @@ class FramedEngine:
         return fitted[0] if fitted else None
 
     def map_of_guess(self) -> Found | None:
-        """A map of the whole trace made of a guess, without a search.
+        """Make a map of the whole trace from guessed labels, without a search for the fewest.
 
-        None if none is found soon.
+        Returns:
+            The map; None if the steps fit no frames, or no separate paths fit the guess.
         """
         chart = self._charted(len(self._task.trace), None)
         if chart is None:
@@ -205,12 +220,15 @@ class FramedEngine:
         return self._fitting.separate(chart, labels)
 
     def map_mended_from(self, known: Sequence[int]) -> Found | None:
-        """A map of the whole trace whose first steps keep known dstates, as far as can be.
+        """Make a map of the whole trace that keeps known dstates of the first steps if possible.
 
-        All other steps get new dstates. None if no paths fit.
+        All other steps get new dstates.
 
         Args:
             known: The dstates of the first steps.
+
+        Returns:
+            The map; None if the steps fit no frames, or no separate paths fit.
         """
         chart = Chart.framed(self._task.trace, self._task.log, around=self._around)
         if chart is None:
@@ -221,11 +239,11 @@ class FramedEngine:
         return self._fitting.separate(chart, kept(chart.apart(), chart.links, guess))
 
     def settle(self) -> None:
-        """End the search in the other thread."""
+        """Stop the search in the other thread."""
         self._beside.end()
 
     def maps_of_cost(self, cost: tuple[int, ...], enough: int) -> Iterator[Found]:
-        """All maps of the prefix that cost this; or `enough` of them, unless that is 0."""
+        """Yield the maps of the prefix that have this cost: `enough` of them, or all if it is 0."""
         if not self._framed:
             return
         mode = _listing(cost)
@@ -237,7 +255,7 @@ class FramedEngine:
         yield from islice(found, enough or None)
 
     def labellings(self, cost: tuple[int, ...]) -> Iterator[Settled]:
-        """All labels of maps that cost this, each once."""
+        """Yield each labelling that maps of this cost have, once, with these maps."""
         if not self._framed:
             return
         mode = _listing(cost)
@@ -252,10 +270,10 @@ class FramedEngine:
         return self._all_with_paths(cost[0])
 
     def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[Naming]:
-        """All labels with this many dstates that have paths, each once, except `besides`."""
+        """Yield all labels with this many dstates that paths fit, each once, except `besides`."""
         known: set[Hashable] = {tuple(besides)}
         if search := self._beside.proved(dstates):
-            # This search does not learn why labels have no paths; it lists each anyway.
+            # This search lists all labels, so it need not learn why some of them have no paths.
             for labels in search.listed(self.asker.watch):
                 if tuple(labels) not in known:
                     found = self._fitting.some(self._chart, labels)
@@ -278,7 +296,7 @@ class FramedEngine:
             yield fitted.pop(tuple(labels)).naming
 
     def _refuse(self, labels: Sequence[int]) -> None:
-        """Tell clingo why there are no paths for these labels."""
+        """Give clingo a rule that excludes these labels, as no paths fit them."""
         visits, fitting = self._visits, self._fitting
         visits.take_back(labels)
         told = (
@@ -292,7 +310,7 @@ class FramedEngine:
             visits.forbid(labels, fitting.clashing(self._chart, labels))
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
-        """From now on no map has all of these equalities of steps."""
+        """Exclude all maps in which all of these equalities of steps hold, from now on."""
         self._beside.forget()
         self._best = None
         self._fitting.forbidden.append(equalities)
@@ -305,18 +323,21 @@ class FramedEngine:
         return True
 
     def _charted(self, size: int, before: FramedChart | None) -> FramedChart | None:
-        """The nodes of the first steps, and which of them are at different places.
+        """Chart the nodes of the first steps, and the pairs of them that are at different places.
 
-        This uses only what the trace alone implies by order and sides. None if steps fit no frame.
+        The pairs are those that follow from the trace alone, by the axioms of order and sides.
 
         Args:
-            size: How many steps.
+            size: The number of steps.
             before: The chart of fewer steps, if there is one.
+
+        Returns:
+            The chart; None if the steps fit no frames.
         """
         chart = Chart.framed(self._task.trace, self._task.log, size, self._around)
         return None if chart is None else self._fitting.charted(chart, before)
 
 
 def _listing(cost: tuple[int, ...]) -> str:
-    """Clingo's opt-mode for listing maps of this cost, whose dstates are known."""
+    """Return clingo's opt-mode that lists the maps of this cost, if the dstates are fixed."""
     return f"enum,{','.join(map(str, (0, *cost[1:])))}"

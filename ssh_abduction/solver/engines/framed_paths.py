@@ -1,9 +1,10 @@
-"""The places and paths of given dstates, for the engine with frames, under its limits.
+"""Finds places and paths for given dstates. The engine with frames uses it.
 
-paths_framed.lp finds the fewest places and paths that fit the labels of nodes, or, if there are
-none, which labels clash. A long list would spend most time on reading answers. So the reader checks
-the atoms of the last answer first, and clingo searches for the next answer while a map is made
-from this one.
+The input is a label, the number of a dstate, for each node of a chart. paths_framed.lp finds the
+fewest places and paths that fit the labels. If none fit, it finds the labels that clash.
+
+Reading answers would take most of the time of a long list. So the reader starts from the atoms of
+the answer before, and clingo searches for the next answer while a map is made from the present one.
 """
 
 from __future__ import annotations
@@ -23,16 +24,17 @@ from ssh_abduction.solver.engines.refusing import smaller
 from ssh_abduction.solver.steps.chart import FramedChart
 from ssh_abduction.theory.evidence import Equality
 
-# Give clingo this many clashes at once: each saves a question, and one control of paths lists them
-# all.
+# Give clingo up to this many clashes at once. Each of them saves a question, and one control of
+# paths lists them all.
 CLASHES = 30
-# Try labels with more dstates than this with separate paths first, as grounding all ways to merge
-# paths takes long.
+# If labels have more dstates than this, first try paths that are separate if possible. Grounding
+# all ways to merge paths takes long.
 MANY_DSTATES = 50
-# All ways to merge paths take this many times as long to ground as separate paths, about, for each
-# dstate.
+# For n dstates, grounding all ways to merge paths takes about ALL_PATHS * n times as long as
+# grounding separate paths.
 ALL_PATHS = 0.1
-# Clasp prepares to solve for this many times as long as grounding took, and cannot be stopped.
+# Clasp cannot be stopped while it prepares to solve. That takes this many times as long as
+# grounding took.
 PREPARED = 3.5
 # After this many conflicts, stop improving paths one by one; raise the bound from below instead.
 BETTERING = 20_000
@@ -40,12 +42,12 @@ BETTERING = 20_000
 
 @dataclass(frozen=True)
 class Naming:
-    """Labels whose paths are asked for.
+    """Labels for which clingo is asked for places and paths.
 
     Attributes:
         chart: The nodes.
         labels: The dstate of each node.
-        control: It has the paths that fit the labels; None to make a new one.
+        control: A control whose answers are the paths that fit the labels; None to make a new one.
     """
 
     chart: FramedChart
@@ -55,29 +57,29 @@ class Naming:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Labels that have paths, and a map that has these labels."""
+    """Labels that paths fit (`naming`), and a map with these labels (`found`)."""
 
     found: Found
     naming: Naming
 
 
 class FramedPaths:
-    """Questions about the places and paths of labels.
+    """Asks clingo for the places and paths that fit labels.
 
     Attributes:
-        task: What the engine works on.
-        forbidden: Sets of equalities of steps that contradict evidence together.
+        task: The problem, the limits and the speed-ups.
+        forbidden: Sets of equalities of steps. In no map do all equalities of one set hold.
     """
 
     def __init__(self, task: Task, asker: Asker) -> None:
         self.task = task
         self.forbidden: list[Collection[Equality]] = []
         self._asker = asker
-        self._seconds = 0.0  # what the last control for paths took
+        self._seconds = 0.0  # how long grounding the last control for paths took
 
     @property
     def paths(self) -> Paths:
-        """The axioms of places and paths for this trace."""
+        """The program with the axioms of places and paths for this trace."""
         return Paths(
             self.task.trace,
             self.task.theory,
@@ -88,41 +90,49 @@ class FramedPaths:
 
     @property
     def preparing(self) -> float:
-        """Seconds, about, until clingo can be stopped when it is asked for all paths."""
+        """About how many seconds clingo cannot be stopped, when it is asked for all paths."""
         return PREPARED * self._seconds
 
     def forget_time(self) -> None:
-        """Forget grounding times: the next labels are of another prefix."""
+        """Forget how long grounding took, as the next labels are of another prefix."""
         self._seconds = 0.0
 
     def some(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
-        """A map with these dstates, if any paths fit them."""
+        """Find a map with these dstates; None if no paths fit them."""
         return self.found_soon(chart, labels) or self.any(chart, labels)
 
     def found_soon(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
-        """A map with separate paths, if there are many dstates and there is such a map."""
+        """Find a map with these dstates and separate paths, if there are many dstates; else None.
+
+        With few dstates `any` is fast enough. It may find a map if this returns None.
+        """
         found = self.separate(chart, labels) if len(set(labels)) > MANY_DSTATES else None
         return Fitted(found, Naming(chart, list(labels))) if found else None
 
     def any(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
-        """A map with these dstates, if any paths fit them, and a control for all of them."""
+        """Find a map with these dstates by a control for all ways to merge paths.
+
+        Returns:
+            The map and the labels with that control; None if no paths fit.
+        """
         naming = Naming(chart, list(labels), self.control(chart, labels))
         found = next(self.maps(naming, "ignore"), None)
         return Fitted(found, naming) if found else None
 
     def separate(self, chart: FramedChart, labels: Sequence[int]) -> Found | None:
-        """A map with these dstates and separate paths, if there is one.
+        """Find a map with these dstates that merges places and segments only if they must be one.
 
-        No two places or segments are merged unless they have to be.
+        Returns:
+            The map; None if there is no such map.
         """
         naming = Naming(chart, list(labels), self.control(chart, labels, single=True))
         return next(self.maps(naming, "ignore"), None)
 
     def better(self, naming: Naming) -> Iterator[Found]:
-        """Maps with these dstates, each as good as the one before or better, the last one best.
+        """Yield maps with these dstates, none more expensive than the one before.
 
-        There are none if no paths fit. If improving maps does not end soon, the bound is raised
-        from below instead.
+        The last map is the best one. There is none if no paths fit. If improving the maps takes
+        many conflicts, clingo raises the lower bound instead (`usc`).
         """
         if len(self.task.theory.priorities) == 1:
             yield from self.maps(naming, "ignore")
@@ -135,19 +145,19 @@ class FramedPaths:
     def maps(
         self, naming: Naming, mode: str, conflicts: int = -1, *, beside: bool = False
     ) -> Generator[Found, None, bool]:
-        """Maps with these dstates.
+        """Yield maps with these dstates.
 
         Args:
-            naming: The dstates.
-            mode: Clingo's opt-mode.
-            conflicts: The limit; -1 for none.
-            beside: Whether another search runs beside this one.
+            naming: The dstate of each node, and the control if there is one.
+            mode: Clingo's opt-mode; "ignore" for a single map.
+            conflicts: Stop after this many conflicts; -1 for no limit.
+            beside: Whether another search runs in a second thread. Then clingo gets only one.
 
         Returns:
             Whether clingo ended before the limit of conflicts.
         """
         control = naming.control or self.control(naming.chart, naming.labels)
-        # Two threads keep all that they list, so they only improve maps.
+        # Two threads would keep all maps that they list in memory, so they are only for improving.
         many = len(set(naming.labels)) > MANY_DSTATES
         two = mode == "opt" and many and not beside and self.task.has_processors
         give_threads(control, two=two)
@@ -164,7 +174,12 @@ class FramedPaths:
         return (yield from mapped(lambda answer: Found.of(reader.map_of(answer), theory), answers))
 
     def settled(self, naming: Naming, mode: str) -> Settled:
-        """The best maps with these dstates, for questions about what they share."""
+        """Prepare questions about what the best maps with these dstates share.
+
+        Args:
+            naming: The dstate of each node, and the control if there is one.
+            mode: Clingo's opt-mode for the best maps.
+        """
         control = naming.control or self.control(naming.chart, naming.labels)
         reader = self._reader(naming, control)
         return Settled(self._asker, control, mode, reader, reader.map_of)
@@ -183,31 +198,32 @@ class FramedPaths:
         *,
         single: bool = False,
     ) -> clingo.Control:
-        """A control for the paths that fit labels.
+        """Make a control whose answers are the places and paths that fit labels.
 
         Args:
             chart: The nodes.
             labels: The dstate of each node.
-            options: Of clasp.
-            nodes: The nodes whose labels have to fit; all of them by default.
-            single: Ask only for separate paths, and merge none of them.
+            options: Options of clasp.
+            nodes: The nodes whose labels the paths have to fit; None for all.
+            single: Merge places and segments only if they must be one.
         """
         self._asker.watch.check(0.0 if single else self.preparing)
-        # Count the time of this thread, as the other one may make it wait.
+        # Measure the time of this thread only, without waiting for the other one.
         worked = time.thread_time()
         with self._asker.grounding_timed():
             control = self.paths.settled(chart, labels, options, nodes, single=single)
         self._asker.watch.check()
         seconds = time.thread_time() - worked
-        if single:  # guess what all paths take, unless that is known
+        if single:  # estimate the time for all paths, unless it is known
             seconds = self._seconds or ALL_PATHS * len(set(labels)) * seconds
         self._seconds = seconds
         return control
 
     def clashing(self, chart: FramedChart, labels: Sequence[int]) -> list[list[int]]:
-        """Minimal conflicting sets of nodes: no paths fit the labels of any of these sets.
+        """Find clashes, which are minimal sets of nodes whose labels no paths fit.
 
-        At most CLASHES of them.
+        Returns:
+            At least one and at most `CLASHES` lists of nodes.
         """
         control = self.paths.clashing(chart, labels)
         clashes = list(
@@ -218,7 +234,7 @@ class FramedPaths:
         return clashes or [self._clash(chart, labels)]
 
     def _clash(self, chart: FramedChart, labels: Sequence[int]) -> list[int]:
-        """One conflicting set, if only a choice of paths shows it."""
+        """Find one small clash by trial, if it follows only after choosing which segments merge."""
 
         def clashing(nodes: list[int]) -> list[int] | None:
             control = self.control(chart, labels, nodes=nodes)
@@ -227,12 +243,13 @@ class FramedPaths:
         return smaller(list(range(len(labels))), clashing)
 
     def charted(self, chart: FramedChart, before: FramedChart | None = None) -> FramedChart:
-        """The chart, with the nodes that the trace alone shows to be at different places.
+        """Return the chart with pairs of nodes added that cannot be at one place.
+
+        The pairs follow from the trace alone, by the axioms of order and sides.
 
         Args:
             chart: The nodes.
-            before: The chart of fewer steps. It already has the pairs of its nodes at different
-                places.
+            before: The chart of fewer steps, with its pairs. If given, only these pairs are added.
         """
         if before is not None:
             return chart.with_elsewhere(before.elsewhere)

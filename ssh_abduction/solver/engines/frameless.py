@@ -1,24 +1,25 @@
-"""The engine for the topological theory without frames where fewest dstates come first.
+"""The engine for the topological theory without frames, if fewest dstates are preferred first.
 
-It serves traces with some known map. It finds dstates first, then places and paths. It finds all
-minimal maps, and its bound on the dstates is proven.
+It is for traces for which some map is known. It finds the dstates first, then the places and paths.
+It lists all minimal maps, and proves its lower bound on the number of dstates.
 
-The axioms of places and paths for each step are too much for clingo after some dozen steps of
-exploring. But they are about dstates: the place that a dstate is at, and the path that it is along.
-So the dstates have names, as in the causal theory (`engines/naming.py`). sides_frameless.lp limits
-by order and sides where actions may lead (`engines/frameless_paths.py`). Its size depends
-on the number of dstates, not of steps.
+With the axioms of places and paths for each step, clingo only manages a few dozen steps of
+exploring. But these axioms are about dstates: the place of a dstate, and the path that it is along.
+So the dstates get names, as in the causal theory (`engines/naming.py`). sides_frameless.lp has the
+axioms of order and sides, which exclude some links between dstates (`engines/frameless_paths.py`).
+Its size depends on the number of dstates, not of steps.
 
-*Claim.* Each map of the topological theory is an answer of names.lp and sides_frameless.lp, at the
-cost that it has in the causal theory.
-*Proof.* Let `goes` hold of the links of the map, and of no others; let each atom of
-sides_frameless.lp hold if what its comment says is so in the map. Then its rules are what the
-axioms say of two or three dstates: a travel keeps the path, and leads on along it, as the order is
-transitive; a turn keeps the place. The rest (`engines/naming.py`) is no dstate of theirs. ∎
+*Claim.* Each map of the topological theory is an answer of names.lp and sides_frameless.lp, with
+the number of dstates as its cost.
+*Proof.* Let `goes` hold for the links of the map only. Let each other atom of sides_frameless.lp
+hold if its comment is true of the map. The rules of sides_frameless.lp then follow from the axioms
+for two or three dstates. A travel stays on its path and leads further along it, as the order is
+transitive. A turn stays at its place. The rules say nothing about the rest, the one name of all
+dstates that have no name of their own (`engines/naming.py`). ∎
 
-So the bounds hold. If some answer of that cost has places and paths, all minimal maps are among the
-answers of that cost with the fewest of these. To find them, all labels with the fewest dstates are
-listed. If there are hundreds, this takes most of the time.
+So the bounds hold. If places and paths fit some answer of least cost, then all minimal maps are
+among the answers of that cost, with the fewest places and paths. To find them, all labels with the
+fewest dstates are listed. If there are hundreds, this takes most of the time.
 """
 
 from __future__ import annotations
@@ -35,23 +36,27 @@ from ssh_abduction.solver.engines.refusing import all_accepted
 from ssh_abduction.solver.steps.chart import numbered
 from ssh_abduction.theory.evidence import Equality
 
-# List about this many maps whose places differ first: they are remembered while the others are
-# listed.
+# First list about this many maps that differ in their places. They are kept in memory until all
+# other maps are listed.
 SOONER = 1000
 
 
 class FramelessEngine:
-    """The topological theory without frames, fewest dstates first, for a trace that has a map."""
+    """The engine for the topological theory without frames, for a trace that has a map.
+
+    It minimises the dstates first.
+    """
 
     lists_least = True
     goes_on = False  # no map of the longer trace is known
 
     def __init__(self, task: Task, known: Sequence[int] = ()) -> None:
-        """An engine for no steps yet.
+        """Begin with an empty prefix.
 
         Args:
             task: The problem, the limits and the speed-ups.
-            known: The labels of all steps of a map with few dstates, if one is known.
+            known: The dstate of each step of the trace in a map with few dstates; empty if none
+                is known.
         """
         self.asker = Asker(task.watch)
         self.intact = True
@@ -115,10 +120,14 @@ class FramelessEngine:
         yield from islice(self._listed(every, mode), enough or None)
 
     def _listed(self, every: Iterable[list[int]], mode: str) -> Iterator[Found]:
-        """The maps with these labels.
+        """Yield the maps with these labels.
 
-        If displacements are used, maps whose places differ come first, as the fit depends only on
-        dstates and places.
+        If displacements are used, maps that differ in their places come first. How well a map fits
+        the displacements depends only on its dstates and places.
+
+        Args:
+            every: Labels; each is the dstate of each node.
+            mode: Clingo's opt-mode for the best maps of one labelling.
         """
         left, sooner, first = iter(every), list[list[int]](), set[SSHMap]()
         while (
@@ -147,7 +156,7 @@ class FramelessEngine:
                 yield settled
 
     def _all_that_fit(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
-        """All labels with this many dstates that fit, each once, except `besides`."""
+        """Yield all labels with this many dstates that places and paths fit, except `besides`."""
         return all_accepted(
             ask=lambda: self._named.all_of(dstates, 0),
             refuse=self._fitting.why_not,
@@ -158,9 +167,10 @@ class FramelessEngine:
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._fitting.forbid_together(equalities)
-        # One dstate is at one place, so dstates that are one make all of these equalities hold.
+        # Steps at one dstate are also at one place. So if all pairs of steps were each at one
+        # dstate, all equalities would hold.
         self._named.forbid_together([(one.first, one.second) for one in equalities])
-        if self._best:  # maps of that cost that are left have some of these labels
+        if self._best:  # the remaining maps of that cost have some of these labels
             self._best = (
                 self._best[0],
                 [labels for labels in self._best[1] if self._named.is_allowed(labels)],

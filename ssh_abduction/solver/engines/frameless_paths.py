@@ -1,9 +1,10 @@
-"""The places and paths of named dstates, for the engine without frames.
+"""Finds places and paths for given dstates. The engine without frames uses it.
 
-paths_frameless.lp finds the fewest places and paths that fit labels. If labels have none, the path
-of some dstate mostly shows it. sides_frameless.lp then gets the axioms of some such paths at a
-time; a dozen are mostly enough. If no single path shows it, a minimal set of the answer's links
-without places and paths is forbidden.
+The input is a label, the number of a dstate, for each step. paths_frameless.lp finds the fewest
+places and paths that fit the labels. If none fit, then mostly some single path contradicts the
+axioms. sides_frameless.lp adds the axioms of a few such paths at a time. Mostly a dozen of them are
+enough. If no single path is contradictory, a minimal set of links that no places and paths fit is
+forbidden.
 """
 
 from __future__ import annotations
@@ -30,30 +31,33 @@ from ssh_abduction.solver.steps.chart import Link
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 
-# Give clingo this many paths, or pairs of dstates, at once. With fewer, it would be asked more
-# often; of more, most would not be needed.
+# Give clingo the axioms of this many paths, or this many forbidden pairs of dstates, at once. With
+# fewer, clingo would be asked more often. With more, most would not be needed.
 CONTRARY = 8
 # After this many conflicts, stop improving paths one by one; raise the bound from below instead.
 BETTERING = 20_000
 
-# Labels of all steps, options of clasp, and the parts of the program.
+# The labels of all steps, the options of clasp, and the parts of the program.
 _Question: TypeAlias = tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]
-# Parts of the program. TOLD: what segments imply about places and each other before any are merged.
-# PARTS: which places and paths fit labels. EACH: also list answers that differ only in paths.
+# Parts of the program. TOLD derives which places and segments are different before any are merged.
+# PARTS finds the places and paths that fit labels. EACH also lists answers that differ only in
+# paths.
 TOLD, EACH = ("base", "segments"), ("each",)
 PARTS = (*TOLD, "least", "paths")
-# Ask for at most TIGHT labels whether the pairwise distinct places are enough, within TIGHTLY
-# conflicts each: the answer mostly comes at once.
+# Ask whether the pairwise distinct places are enough, until that failed for TIGHT labels. Each
+# question may take TIGHTLY conflicts. The answer mostly comes at once.
 TIGHT, TIGHTLY = 5, 2000
 
 
 @dataclass(frozen=True)
 class _Far:
-    """Pairs of dstates, mostly one pair. Some pair is not at one place.
+    """A constraint from evidence: not all of these pairs of dstates are each at one place.
+
+    Mostly there is only one pair.
 
     Attributes:
         pairs: The pairs of dstates.
-        placed: The steps that evidence names, each with its dstate.
+        placed: The steps that the evidence names, each with its dstate.
     """
 
     pairs: tuple[tuple[int, int], ...]
@@ -61,9 +65,15 @@ class _Far:
 
     @classmethod
     def of(cls, labels: Sequence[int], equalities: Collection[Equality]) -> _Far | None:
-        """What follows for these labels if the equalities do not all hold.
+        """Translate a forbidden set of equalities of steps to a constraint on dstates.
 
-        None if nothing follows, as some equality of dstates does not hold anyway.
+        Args:
+            labels: The dstate of each step.
+            equalities: Equalities of steps that must not all hold.
+
+        Returns:
+            The constraint; None if the labels already break an equality of dstates, or do not yet
+            include all the steps.
         """
         steps = dict.fromkeys(
             step for equality in equalities for step in (equality.first, equality.second)
@@ -78,7 +88,7 @@ class _Far:
 
 @dataclass(frozen=True)
 class _Members:
-    """Links and distant dstates that perhaps no places and paths fit."""
+    """A set of links and of constraints `_Far`, for which perhaps no places and paths exist."""
 
     links: list[Link]
     far: list[_Far]
@@ -98,37 +108,38 @@ class _Members:
 
 
 class PlacesAndPaths:
-    """Finds the best places and paths for labels, or why none fit.
+    """Finds the best places and paths for labels, or the reason why none fit.
 
     Attributes:
-        named: The labels, and the control that gets what is forbidden.
+        named: The search for labels. Its control gets the rules that exclude labels.
     """
 
     def __init__(self, task: Task, asker: Asker, known: Sequence[int] = ()) -> None:
-        """Labels of no steps yet.
+        """Begin with an empty prefix.
 
         Args:
-            task: The trace, theory and speed-ups.
-            asker: It asks clingo.
-            known: The labels of all steps of a map with few dstates, if one is known.
+            task: The problem, the limits and the speed-ups.
+            asker: Asks clingo.
+            known: The dstate of each step of the trace in a map with few dstates; empty if none
+                is known.
         """
         self.named = NamedLabels(task, asker, known, self)
         self._task, self._asker = task, asker
         self._actions = dict(zip(task.log.actions, task.trace.actions, strict=True))
-        # Sets of equalities that do not all hold, some of them of places.
+        # Forbidden sets of equalities that include an equality of places.
         self._refused: list[Collection[Equality]] = []
-        self._forbidden = 0  # how many sets of links were forbidden
-        # Dstates whose paths clingo was given, as keys of `NameProgram.names`.
+        self._forbidden = 0  # the number of sets of links that were forbidden
+        # Dstates for whose paths clingo has the axioms, as keys of `NameProgram.names`.
         self._told: set[tuple[int, int]] = set()
         # The last labels, and the control for their places and paths.
         self._asked: tuple[_Question, clingo.Control] | None = None
-        # Labels whose fewest places are known, with homes and a best map; and labels for which the
-        # homes failed.
+        # For labels whose fewest places are known: the homes (`engines/homes.py`) and a best map.
+        # And the labels for which homes did not lead to a map.
         self._tight: dict[tuple[int, ...], tuple[Mapping[int, list[int]], Found]] = {}
         self._failed: set[tuple[int, ...]] = set()
 
     def forget(self) -> None:
-        """Forget the control: another one comes, for other labels."""
+        """Forget everything about the control, as a new one comes for another prefix."""
         self._told = set()
         self._forget_tight()
 
@@ -136,19 +147,26 @@ class PlacesAndPaths:
         self._tight, self._failed, self._asked = {}, set(), None
 
     def tell_again(self) -> None:
-        """Give a new control the rules of the one before."""
+        """Give a new control the axioms of paths that the one before had."""
         told, self._told = self._told, set()
         if told:
             self._tell_of([key for key in self.named.program.names() if key in told])
 
     def forbid_together(self, equalities: Collection[Equality]) -> None:
-        """From now on not all of these equalities hold."""
+        """Exclude maps in which all of these equalities hold, if one of them is of places.
+
+        Sets of equalities of dstates alone are forbidden by `named`.
+        """
         if any(equality.of == "place" for equality in equalities):
             self._refused.append(equalities)
             self._forget_tight()
 
     def _tell_of(self, dstates: Collection[tuple[int, int]]) -> None:
-        """Give clingo the axioms of the paths of these dstates, unless it has them."""
+        """Ground the axioms of order and sides for the paths of these dstates.
+
+        Args:
+            dstates: Dstates without these axioms so far, as keys of `NameProgram.names`.
+        """
         with self._asker.grounding_timed():
             control, names = self._asker.control, self.named.program.names()
             parts: list[tuple[str, list[clingo.Symbol]]] = []
@@ -159,17 +177,18 @@ class PlacesAndPaths:
                 )
                 parts.append(("sides", []))
             parts += [("path", numbers(names[dstate])) for dstate in dstates]
-            control.ground(parts)  # at once: this halves the time to ground and to search
+            control.ground(parts)  # one call for all parts halves the time to ground and to search
             self._told.update(dstates)
 
     def fits(self, labels: Sequence[int]) -> bool:
-        """Whether some places and paths fit these labels."""
+        """Whether any places and paths fit these labels."""
         return self._tightly(labels) is not None or self._has_paths(self._path_control(labels))
 
     def _tightly(self, labels: Sequence[int]) -> Found | None:
-        """A best map with these dstates, if pairwise distinct places are enough for one.
+        """Find a best map with these dstates by the shortcut of `engines/homes.py`.
 
-        None if that is unknown (`engines/homes.py`).
+        Returns:
+            The map; None if the shortcut does not apply, or fails.
         """
         key = tuple(labels)
         if key in self._tight:
@@ -197,12 +216,15 @@ class PlacesAndPaths:
         return best
 
     def _best_at_home(self, labels: Sequence[int], control: Control, fewest: int) -> Found | None:
-        """The best map at some homes, if it is proven best among maps with these dstates.
+        """Find the best map in which each place is one of its homes (`engines/homes.py`).
 
         Args:
-            labels: The dstates.
-            control: It knows the homes.
+            labels: The dstate of each step.
+            control: A control that has the possible homes.
             fewest: A lower bound on the number of paths.
+
+        Returns:
+            The map; None if it is not proven to be the best of all maps with these dstates.
         """
         places_first = (
             next(count for count in self._task.theory.priorities if count in ("places", "paths"))
@@ -227,14 +249,14 @@ class PlacesAndPaths:
                     return best
 
     def why_not(self, labels: list[int]) -> list[int] | None:
-        """These labels if no places and paths fit them, else None."""
+        """Return the labels themselves if no places and paths fit them, else None."""
         return None if self.fits(labels) else labels
 
     def _has_paths(self, control: clingo.Control) -> bool:
         return next(self._asker.answers(lambda _: True, "ignore", 1, control=control), False)
 
     def forbid(self, labels: Sequence[int]) -> None:
-        """Tell clingo why no places and paths fit these labels."""
+        """Give clingo rules that exclude these labels, as no places and paths fit them."""
         links = self._links_of(labels)
         control = self._control_for(links, parts=("base",))
         contrary = next(self._asker.answers(paths_lp.read_contraries, "ignore", 1, control=control))
@@ -259,9 +281,15 @@ class PlacesAndPaths:
             )
 
     def _turned_together(self, links: Iterable[Link], far: Iterable[_Far]) -> list[_Members]:
-        """Dstates that are far from each other though turns lead from one to the other.
+        """Find pairs of dstates that turns put at one place, though evidence says they are not.
 
-        Each with a shortest way between them; the shortest ways first.
+        Args:
+            links: All links between dstates.
+            far: The constraints from evidence.
+
+        Returns:
+            Each violated constraint, with the links of the shortest sequence of turns between its
+            dstates. At most `CONTRARY` of them, those with fewest links first.
         """
         turns = nx.Graph(
             (s, x, {"link": (s, action, x)}) for s, action, x in links if self._actions[action].turn
@@ -280,7 +308,7 @@ class PlacesAndPaths:
         return sorted(found, key=lambda members: len(members.links))[:CONTRARY]
 
     def _clashing(self, members: list[Link | _Far]) -> list[Link | _Far] | None:
-        """These links and far dstates if no places and paths fit them, else None."""
+        """Return the members themselves if no places and paths fit them, else None."""
         some = _Members.of(members)
         found = any(
             self._has_paths(self._control_for(some.links, far=some.far, single=single))
@@ -289,9 +317,9 @@ class PlacesAndPaths:
         return None if found else members
 
     def _far_away(self, labels: Sequence[int]) -> list[_Far]:
-        """The dstates that evidence says are not at one place.
+        """List the constraints of evidence about dstates that are not at one place.
 
-        Each pair comes once. Sets of pairs that are not all at one place come last.
+        Constraints on a single pair come first, each pair once. Sets of pairs come last.
         """
         away = self._task.log.pairs.elsewhere.items()
         found = {
@@ -303,7 +331,7 @@ class PlacesAndPaths:
         return alone + [far for equalities in self._refused if (far := _Far.of(labels, equalities))]
 
     def _links_of(self, labels: Sequence[int]) -> list[Link]:
-        """The links that these labels of all steps make, each once."""
+        """List the links between dstates that the labels of all steps imply, each once."""
         return list(
             dict.fromkeys((labels[t], action, labels[u]) for t, action, u in self.named.chart.links)
         )
@@ -318,15 +346,15 @@ class PlacesAndPaths:
         single: bool = False,
         parts: Iterable[str] = PARTS,
     ) -> Control:
-        """A control for the places and paths of dstates.
+        """Make a control whose answers are places and paths of dstates.
 
         Args:
             links: Links between dstates.
-            dstates: Further dstates.
-            options: Of clasp.
-            far: Dstates that are not at one place.
-            single: Merge no two places or segments unless they have to be.
-            parts: Of the program.
+            dstates: Further dstates, which may have no links.
+            options: Options of clasp.
+            far: Constraints on dstates that are not at one place.
+            single: Merge places and segments only if they must be one.
+            parts: The parts of the program to ground.
         """
         control = Control(options, self._asker.watch.check, PREPARING)
         control.load_encodings("paths_frameless", "preference")
@@ -348,9 +376,14 @@ class PlacesAndPaths:
         options: Sequence[str] = (),
         parts: Sequence[str] = (*PARTS, *EACH),
     ) -> clingo.Control:
-        """A control for the places and paths that fit these labels of all steps.
+        """Make a control whose answers are the places and paths that fit labels.
 
-        The last control is kept, as the next question often needs it.
+        The last control is kept, as the next question often needs the same one.
+
+        Args:
+            labels: The dstate of each step.
+            options: Options of clasp.
+            parts: The parts of the program to ground.
         """
         key = tuple(labels), tuple(options), tuple(parts)
         if self._asked is None or self._asked[0] != key:
@@ -370,7 +403,12 @@ class PlacesAndPaths:
         return self._asked[1]
 
     def settled(self, labels: Sequence[int], mode: str) -> Settled:
-        """The maps with these dstates."""
+        """Prepare questions about what the best maps with these dstates share.
+
+        Args:
+            labels: The dstate of each step.
+            mode: Clingo's opt-mode for the best maps.
+        """
         control = self._path_control(labels)
         reader = path_reader.PathReader(
             control, self._task.trace, self._task.theory, self.named.chart, labels
@@ -384,9 +422,9 @@ class PlacesAndPaths:
         )
 
     def improving_maps(self, labels: Sequence[int]) -> Iterator[Found]:
-        """Maps with these dstates, each as good as the one before or better, the last one best.
+        """Yield maps with these dstates, none more expensive than the one before.
 
-        There are none if no places and paths fit.
+        The last map is the best one. There is none if no places and paths fit.
         """
         if (best := self._tightly(labels)) is not None:
             yield best
@@ -403,14 +441,15 @@ class PlacesAndPaths:
         options: Sequence[str] = (),
         parts: Sequence[str] = (*PARTS, *EACH),
     ) -> Generator[Found, None, bool]:
-        """Maps with these dstates.
+        """Yield maps with these dstates.
 
         Args:
-            labels: The dstates.
-            mode: Clingo's opt-mode.
-            conflicts: The limit; -1 for none.
-            options: Of clasp.
-            parts: Of the program; without EACH there is one map for each choice of places.
+            labels: The dstate of each step.
+            mode: Clingo's opt-mode; "ignore" for a single map.
+            conflicts: Stop after this many conflicts; -1 for no limit.
+            options: Options of clasp.
+            parts: The parts of the program. Without `EACH` there is one map for each choice of
+                places.
 
         Returns:
             Whether clingo ended before the limit of conflicts.
@@ -438,7 +477,13 @@ class PlacesAndPaths:
 
 
 def _go_on_at_home(control: Control, homes: Mapping[int, list[int]], parts: Iterable[str]) -> None:
-    """Ground the other parts of a control that has TOLD, with each place at one of its homes."""
+    """Ground the remaining parts of a control, and restrict each place to its homes.
+
+    Args:
+        control: A control in which the parts `TOLD` are grounded.
+        homes: For each place, the fixed places that it may be.
+        parts: All parts of the program.
+    """
     control.add("homes", [], paths_lp.tight_facts(homes))
     control.ground(
         [(part, []) for part in ("homes", *(part for part in parts if part not in TOLD))]

@@ -1,9 +1,10 @@
-"""Maps of a theory with star=pattern, found as if places had frames.
+"""Finds maps for a theory with star=pattern by assuming that places have frames.
 
-If places have frames, dstates are nearly known before places and paths (engines/framed.py). So
-traces of thousands of steps have good maps in seconds. With star=pattern clingo gets all axioms for
-each step, and manages only a few dozen steps. But each map of `Theory.with_frames` is also a map of
-this theory. So if the world has frames, its map or one about as small is found.
+A place has a frame if its directions are numbered, and turns rotate by known right angles. Then the
+dstates hardly depend on places and paths (`engines/framed.py`), and a good map of thousands of
+steps takes seconds. With star=pattern clingo gets all axioms for each step, and only manages a few
+dozen steps. But each map of `Theory.with_frames` is also a map of the theory with star=pattern. So
+in a world with frames this finds the true map or one that is about as small.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from ssh_abduction.theory.speedups import Speedups
 
 
 def maps_with_frames(problem: Problem, watch: Watch, speedups: Speedups) -> Iterator[SSHMap]:
-    """Improve a map in which places have frames.
+    """Find ever cheaper maps of a trace in which places have frames.
 
     Args:
-        problem: The trace and a settled theory with star=pattern.
+        problem: The trace, and a theory with star=pattern and all defaults filled in.
         watch: The limits.
         speedups: The speed-ups that are on.
 
     Yields:
-        Maps of the trace. Each has fewer dstates than the one before, or as many and better paths.
-        The last one is the best in which places have frames.
+        Maps of the trace, each cheaper than the one before. The last one is the best map in which
+        places have frames.
     """
     task = Task.of(problem.changed(theory=problem.theory.with_frames()), watch, speedups)
     engine = FramedEngine(task, soon=0.0)

@@ -1,20 +1,21 @@
-"""The fewest places for given dstates, if that needs no search.
+"""Finds the fewest places for given dstates without a search, for the engine without frames.
 
-This serves the engine without frames. If the number of pairwise distinct places is enough for a
-map, it finds such a map and proves that no map has fewer places.
+Some places are pairwise distinct. If a map needs no others, no map has fewer places. This module
+narrows down the search for such a map.
 
-In a corridor of forty landmarks, driven there and back, the dstates are known at once. The places
-of the way there follow each other on one path, so they are forty different ones. Fewer places will
-not do. But clingo has to see that the forty places of the way back cannot be fewer either, and that
-is a pigeonhole problem, which takes clasp minutes.
+As an example, take a corridor of forty landmarks, driven there and back. The dstates are found at
+once. The places of the way there follow each other on one path, so they are forty distinct ones.
+No map has fewer. But to prove that the way back needs no other places is a pigeonhole problem, and
+it takes clasp minutes.
 
-So a clique of places is looked for that are pairwise distinct: they are *fixed*. Suppose that a map
-has just as many places. Then each other place is a fixed one, its *home*. Along a path, a place
-that comes after another has a home that can come after the home of the other. This leaves few
-homes, in a corridor one for each place, and clingo tries only these. If there is such a map, it has
-the fewest places, and so have the other minimal maps: all of them are found with the same few
-homes. If there is none, nothing was assumed, and all ways to merge places are tried
-(`engines/frameless_paths.py`).
+So this module finds a large clique of pairwise distinct places, which are called *fixed*. Suppose
+that a map has only as many places as there are fixed ones. Then each other place is the same as a
+fixed one, its *home*. If a place comes after another along a path, then its home can come after
+the home of the other. This leaves few possible homes. In the corridor each place has only one.
+
+Clingo then tries only these homes. If it finds a map, this map has the fewest places, and all
+minimal maps use these homes. If it finds none, the supposition was wrong, and clingo tries all ways
+to merge places (`engines/frameless_paths.py`).
 """
 
 from __future__ import annotations
@@ -31,12 +32,14 @@ from ssh_abduction.solver.engines.paths import pairwise_distinct
 
 
 def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
-    """The fixed places that each place may be, if there are no more places than fixed ones.
-
-    None if some place can be no fixed one.
+    """Find the possible homes of each place, if a map has only as many places as fixed ones.
 
     Args:
-        told: What the segments imply about places.
+        told: The places and segments, and which of them are known to be different.
+
+    Returns:
+        For each place, the fixed places that it may be the same as. None if some place can be the
+        same as no fixed one.
     """
     if any(c == p for c, p in told.elsewhere):
         return None  # the segments contradict each other: no places fit these dstates
@@ -68,7 +71,11 @@ def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
 
 
 def fewest_paths(told: Segments) -> int:
-    """A lower bound on the number of paths: the size of a clique of pairwise distinct segments."""
+    """Compute a lower bound on the number of paths, from pairwise distinct segments.
+
+    Args:
+        told: The segments, and which of them are known to be different paths.
+    """
     return len(pairwise_distinct(told.segments, told.distinct))
 
 
@@ -80,11 +87,14 @@ def _by_segment(steps: list[tuple[int, int, int]]) -> Mapping[int, list[tuple[in
 
 
 def _may_follow(pairs: list[tuple[int, int]], columns: list[int]) -> NDArray[np.bool_]:
-    """Whether one fixed place may come after another on the path of a segment: fixed x fixed.
+    """Find which fixed places may come after which others on the path of a segment.
 
     Args:
-        pairs: For each travel of the segment, the places that it leads between, in its direction.
-        columns: The fixed places.
+        pairs: For each travel of the segment, the place where it begins and the one where it ends.
+        columns: The fixed places, by number.
+
+    Returns:
+        A matrix, fixed x fixed: whether the place of the column may come after that of the row.
     """
     members = sorted({place for pair in pairs for place in pair})
     number = {place: i for i, place in enumerate(members)}

@@ -1,4 +1,4 @@
-"""A chart together with a clique of its nodes, which have names of their own."""
+"""A chart with a clique: nodes that are pairwise distinct, so each gets a name of its own."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Pinned:
     Attributes:
         chart: The nodes and the links between them.
         clique: Nodes that are pairwise distinct.
-        may_be: For each node, the names of the clique that it is not apart from.
+        may_be: For each node, the names of the clique's nodes that it may share a dstate with.
     """
 
     chart: Chart
@@ -29,7 +29,13 @@ class Pinned:
 
     @classmethod
     def of_steps(cls, log: Log, steps: int, *, largest: bool = True) -> Pinned:
-        """Chart the first steps and pin a largest clique of them, or else only the first step."""
+        """Chart the first steps and pin a clique of them.
+
+        Args:
+            log: The trace as integers.
+            steps: The number of steps.
+            largest: Pin a largest clique; if False, only the first step.
+        """
         chart = Chart.of_steps(log, steps)
         clique = chart.continuations.clique() if largest else [0]
         columns = [chart.continuations.apart_from(step) for step in clique]
@@ -37,7 +43,12 @@ class Pinned:
 
     @classmethod
     def framed(cls, chart: FramedChart, clique: Sequence[int]) -> Pinned:
-        """Pin these nodes of a chart with frames."""
+        """Pin a clique of nodes of a chart with frames.
+
+        Args:
+            chart: The nodes.
+            clique: Nodes that are pairwise distinct.
+        """
         return cls(chart, clique, _not_apart(chart.apart(others=clique)))
 
     @property

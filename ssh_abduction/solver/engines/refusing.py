@@ -1,7 +1,7 @@
-"""The loop that asks for an answer, rejects it for a reason, forbids that, and asks again.
+"""A loop that asks for an answer, checks it, forbids the reason if it is rejected, and asks again.
 
-Forbidding a reason removes only answers that are no maps. So clingo solves a relaxation until it
-rejects nothing, its bounds hold, and the first accepted answer is as good as any map.
+A rejected answer is not a map, and no map is forbidden along with it. So clingo solves a relaxation
+of the problem at each turn. Its bounds hold, and the first accepted answer is as good as any map.
 """
 
 from __future__ import annotations
@@ -21,12 +21,15 @@ def first_accepted(
     refuse: Callable[[Answer], Reason | None],
     forbid: Callable[[Reason], None],
 ) -> Answer | None:
-    """The first answer that is not rejected; None if there is no answer left.
+    """Ask for answers until one is accepted.
 
     Args:
-        ask: Gives the next answer by what is forbidden so far; None if there is none.
-        refuse: Why an answer is rejected; None if it is accepted.
-        forbid: Keeps answers from being given again for this reason.
+        ask: Returns the next answer that is not forbidden so far; None if there is none.
+        refuse: Returns the reason to reject an answer; None if it is accepted.
+        forbid: Forbids all answers that have this reason to be rejected.
+
+    Returns:
+        The first accepted answer; None if there is no answer left.
     """
     while (answer := ask()) is not None:
         reason = refuse(answer)
@@ -41,9 +44,19 @@ def first_accepted_of(
     refuse: Callable[[Answer], Reason | None],
     forbid: Callable[[Reason], None],
 ) -> Generator[Meanwhile, None, Answer | None]:
-    """As `first_accepted`, for an `ask` that takes long.
+    """Do the same as `first_accepted`, with an `ask` that yields intermediate results.
 
-    Yields what `ask` yields meanwhile. The answer is what `ask` returns.
+    Args:
+        ask: Makes a generator. It yields intermediate results, and returns the next answer that
+            is not forbidden so far, or None.
+        refuse: Returns the reason to reject an answer; None if it is accepted.
+        forbid: Forbids all answers that have this reason to be rejected.
+
+    Yields:
+        The intermediate results of `ask`.
+
+    Returns:
+        The first accepted answer; None if there is no answer left.
     """
     while (answer := (yield from ask())) is not None:
         reason = refuse(answer)
@@ -60,14 +73,14 @@ def all_accepted(
     key: Callable[[Answer], Hashable],
     known: set[Hashable],
 ) -> Generator[Answer, None, None]:
-    """All accepted answers, each once.
+    """Yield all accepted answers, each once.
 
     Args:
-        ask: Lists the answers by what is forbidden so far.
-        refuse: Why an answer is rejected; None if it is accepted.
-        forbid: Keeps answers from being given again for this reason.
-        key: Equal for answers that are the same.
-        known: The keys of answers to leave out. Those of accepted answers are added.
+        ask: Lists all answers that are not forbidden so far.
+        refuse: Returns the reason to reject an answer; None if it is accepted.
+        forbid: Forbids all answers that have this reason to be rejected.
+        key: Returns a key that is equal for answers that are the same.
+        known: The keys of answers to leave out. The keys of accepted answers are added to it.
     """
     while True:
         reason: Reason | None = None
@@ -90,14 +103,18 @@ def smaller(
     shrunk: Callable[[list[Member]], list[Member] | None],
     tries: int | None = None,
 ) -> list[Member]:
-    """A small subset of members that still has a property of all of them.
+    """Reduce a list of members to a small part that still has a property.
 
-    Leave out parts, half of the members first, single ones last.
+    Leave out ever smaller parts: at first half of the members, at last single ones.
 
     Args:
-        members: They have the property together.
-        shrunk: Given members, returns a subset with the property; None if they lack it.
-        tries: Give up after this many failed tries; None for never.
+        members: A list that has the property.
+        shrunk: Given a list, returns a part of it with the property (perhaps all of it); None if
+            the list lacks the property.
+        tries: Stop after this many failed tries; None for no limit.
+
+    Returns:
+        The remaining members. Without `tries` none of them could be left out when it was tried.
     """
     size, failed = len(members), 0
     while size := size // 2:

@@ -1,9 +1,10 @@
-"""Order and sides of visits that are one, for the engine with frames.
+"""Adds the axioms of order and sides to the search for visits. The engine with frames uses it.
 
-The axioms of order and sides are added only for paths that an answer contradicts
-(sides_framed.lp), as each path takes a rule for each two visits that may be one. In a half explored
-world the causal axioms allow fewer dstates than order and sides do, in too many ways to forbid them
-one by one. But few paths exclude nearly all of them.
+sides_framed.lp has the axioms about the order of places on a path, and about its sides. One path
+takes a rule for each pair of visits that may be at one place. So the axioms are added only for
+paths that an answer contradicts. In a half explored world the causal axioms allow fewer dstates
+than order and sides do, in too many ways to forbid them one by one. But the axioms of a few paths
+exclude nearly all of them.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 class FramedSides:
-    """The axioms of order and sides, path by path, in the control that knows visits."""
+    """Adds the axioms of order and sides, path by path, to the control that decides on visits."""
 
     def __init__(self, theory: Theory, asker: Asker) -> None:
         self._theory, self._asker = theory, asker
@@ -34,7 +35,11 @@ class FramedSides:
         self._batch = -1
 
     def extend(self, batch: int) -> None:
-        """Extend the axioms of paths to the visits of a new batch."""
+        """Extend the axioms of the paths added so far to the visits of a new batch.
+
+        Args:
+            batch: The number of the batch.
+        """
         self._batch = batch
         if self._said:
             paths = [
@@ -51,16 +56,17 @@ class FramedSides:
         labels: Sequence[int],
         standing: Mapping[int, tuple[int, int]],
     ) -> bool:
-        """Give clingo a path that these labels contradict.
+        """Add the axioms of a path that these labels contradict.
 
         Args:
-            paths: The axioms of places and paths.
+            paths: The program with the axioms of places and paths.
             chart: The nodes.
             labels: The dstate of each node.
-            standing: The visit and slot of some node at each dstate, if clingo has one.
+            standing: For each dstate that has a node in clingo, the visit and the slot (direction)
+                of such a node.
 
         Returns:
-            Whether there was such a path that clingo was not given.
+            True if axioms were added; False if there is no such path without axioms.
         """
         contrary, twice = next(
             self._asker.answers(
@@ -80,10 +86,10 @@ class FramedSides:
         return False
 
     def _say_once(self, part: str, *arguments: int) -> bool:
-        """Ground a part of sides_framed.lp, unless it was grounded before.
+        """Ground a part of sides_framed.lp for some arguments, unless that was done before.
 
         Returns:
-            Whether it was new.
+            Whether the part was grounded now.
         """
         if (part, arguments) in self._said:
             return False
