@@ -146,7 +146,7 @@ class Star:
         """Whether there is a gateway ahead, right, back and left, as four flags; or None.
 
         It is None if a gateway was not observed or is in none of these directions, if two gateways
-        are in one direction, or if two gateways are declared opposite that are not straight opposite.
+        are in one direction, or if two that are declared opposite are not straight opposite.
         """
         found: dict[int, int] = {}
         for k, gateway in enumerate(self.gateways):

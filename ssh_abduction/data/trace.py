@@ -97,7 +97,7 @@ class Trace:
         self._check_actions()
 
     def _check_actions(self) -> None:
-        """Check that all steps but the last have an action, and that equal names mean equal actions."""
+        """Check that all steps but the last have an action, and that a name means one action."""
         last = len(self.steps) - 1
         types: dict[str, tuple[int, Action]] = {}
         for i, step in enumerate(self.steps):
@@ -138,8 +138,8 @@ class Trace:
     def __getitem__(self, index: int | slice) -> Step | Trace:
         """Return a step, such as trace[3], or a trace of consecutive steps, such as trace[:20].
 
-        The first step of a slice loses its displacement, and its last step loses its action. Negative
-        indices, and slices that reach beyond the trace, work as for a list.
+        The first step of a slice loses its displacement, and the last one loses its action.
+        Negative indices, and slices that reach beyond the trace, work as for a list.
 
         Raises:
             RangeError: If there is no such step, or the slice is empty.
@@ -235,7 +235,7 @@ class Trace:
         return (self.odometry or _USUAL).covariance(here.displacement)
 
     def at(self, step: int) -> str:
-        """Return the name of a step in messages: the file and the line, or the number of the step."""
+        """Return the name of a step in messages: file and line, or the number of the step."""
         a_whole_number("step", step, TraceError)
         return f"{named(self.source)}:{step + 2}" if self.source else f"step {step}"
 
@@ -418,7 +418,7 @@ class Trace:
 
     @property
     def digest(self) -> str:
-        """A digest of the trace as a file, 16 hexadecimal digits. A report can name the trace by it."""
+        """A digest of the trace's file, 16 hexadecimal digits. Reports name the trace by it."""
         return hashlib.sha256(
             "\n".join(self.to_lines()).encode("utf-8", "backslashreplace")
         ).hexdigest()[:16]
