@@ -1,9 +1,9 @@
 """Finds the distinctive places that a robot passes: junctions, corners, dead ends, turning points.
 
-At each milestone of the trajectory, the local map gives the exits and the point where they meet. If
-three or more exits meet there, or if the corridor bends, the milestone votes for a place with its
-middle at that point. A point that most of the nearby milestones vote for is a place. The robot
-visits it as it passes.
+Milestones are scans about half a metre apart on the trajectory. At each of them, the local map
+gives the exits and the point where they meet. If three or more exits meet there, or if the corridor
+bends, the milestone votes for a place with its middle at that point. If at least half of the nearby
+milestones vote for a point, it is a place. Each time that the robot passes it is a visit.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ class Way:
     """An exit of a place.
 
     Attributes:
-        bearing: Radians counterclockwise in the frame of the track.
-        sure: Whether the exit surely is a gateway. Others are narrow or lead into unknown space.
+        bearing: Direction in radians, counterclockwise in the frame of the track.
+        sure: Whether the exit certainly is a gateway. An uncertain exit is narrow, or leads into
+            unknown space.
     """
 
     bearing: float
@@ -57,14 +58,15 @@ class Visit:
     Attributes:
         scan: Index of the scan nearest to the middle.
         middle: (x, y) middle of the place in metres, in the frame of the track.
-        begin: Index of the first scan.
-        end: Index of the last scan.
+        begin: Index of the first scan of the stay.
+        end: Index of the last scan of the stay.
         ways: Exits, counterclockwise.
-        arrived: Index of the exit by which the robot came; None at the beginning of the log.
-        left: Index of the exit by which it left; None at the end of the log.
-        axis: Direction of the walls, in radians modulo a quarter turn.
-        straight: Agreement of the walls with the axis, from 0 to 1.
-        support: Share of the nearby milestones that vote for the place.
+        arrived: Index in `ways` of the exit by which the robot came; None at the beginning of the
+            log.
+        left: Index in `ways` of the exit by which the robot left; None at the end of the log.
+        axis: Main direction of the walls, in radians modulo a quarter turn.
+        straight: How well the walls agree with the axis, from 0 to 1.
+        support: Share of the nearby milestones that vote for the place, from 0 to 1.
     """
 
     scan: int
@@ -79,7 +81,7 @@ class Visit:
     support: float = 1.0
 
     def later(self, scans: int) -> Visit:
-        """The same visit with its scan numbers shifted."""
+        """Copy the visit, with its indices of scans increased by `scans`."""
         return replace(self, scan=self.scan + scans, begin=self.begin + scans, end=self.end + scans)
 
 
@@ -92,9 +94,14 @@ class _Vote:
 
 
 def find_visits(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, ...]:
-    """Find the visits of a log, in order. Each unbroken part of the track is searched separately.
+    """Find the visits to distinctive places in a log, in order.
 
-    Corrected poses are not read.
+    Each unbroken part of the track is searched separately. Corrected poses are not read.
+
+    Args:
+        log: The scans.
+        track: Their poses.
+        scale: Width of gateways, and radius of places.
     """
     return tuple(
         visit.later(begin)
@@ -117,7 +124,7 @@ def _visits_of_span(log: RobotLog, track: Track, scale: Scale) -> tuple[Visit, .
 
 
 def _vote(maps: LocalMaps, track: Track, scale: Scale, i: int) -> _Vote | None:
-    """The vote of milestone i for a place, if it sees one."""
+    """The vote of milestone i (the index of a scan); None if it sees no place."""
     patch = maps.around(i, track.poses[i, :2], scale.half)
     open_cells, here = _start(patch, track.poses[i, :2], scale.gateway)
     if here is None:
@@ -132,13 +139,16 @@ def _vote(maps: LocalMaps, track: Track, scale: Scale, i: int) -> _Vote | None:
 
 
 def is_decisive(seen: Outlook) -> bool:
-    """Whether there are at least three exits, or two that are not opposite."""
+    """Check whether the exits show a place: at least three exits, or two that are not opposite."""
     bearings = seen.bearings
     return len(bearings) > 2 or (len(bearings) == 2 and math.pi - apart(*bearings) > BEND)
 
 
 def _supported(votes: list[_Vote], asked: list[int], track: Track, scale: Scale) -> list[Visit]:
-    """Group votes into places with enough support, once for each pass of the robot."""
+    """Group votes for about the same middle, and make a visit of each group with enough support.
+
+    Votes from different passes of the robot are in different groups.
+    """
     groups: list[list[_Vote]] = []
     for vote in votes:
         # Only recent groups are candidates: an earlier group is another pass of the place.
@@ -174,9 +184,10 @@ def _middle(group: list[_Vote]) -> Array:
 
 
 def _stay(track: Track, middle: Array, scan: int, radius: float) -> tuple[int, int]:
-    """First and last scan of the stretch around a scan in which the robot is at a place.
+    """The first and last scan of a stay at a place, around a scan at that place.
 
-    The robot is at a place while it is within the radius of the middle or still approaches it.
+    The stay extends from the given scan to both sides, as long as the next scan is within the
+    radius of the middle or nearer to the middle than the scan before.
     """
     near = np.hypot(*(track.poses[:, :2] - middle).T)
     begin = end = scan
@@ -190,7 +201,7 @@ def _stay(track: Track, middle: Array, scan: int, radius: float) -> tuple[int, i
 def _one_for_each_pass(found: list[Visit], scale: Scale) -> list[Visit]:
     """Merge consecutive visits whose middles are too close for two places.
 
-    The best supported visit stays and covers the stays of all.
+    The visit with the largest support times length is kept, and covers the stays of all.
     """
     kept: list[Visit] = []
     for visit in found:
@@ -206,7 +217,7 @@ def _one_for_each_pass(found: list[Visit], scale: Scale) -> list[Visit]:
 
 
 def _with_turnings(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
-    """Add a visit wherever the robot turned around away from all other visits."""
+    """Add a visit at each point far from other visits where the robot turned around."""
     positions, way = track.poses[:, :2], track.way
     # Compare the direction of motion before and after each scan, over a third of the radius.
     stride = scale.radius / 3
@@ -222,7 +233,7 @@ def _with_turnings(found: list[Visit], track: Track, scale: Scale) -> list[Visit
                 if angle > REVERSED:
                     turned.append((angle, i))
     visits = list(found)
-    # The sharpest turn comes first; later ones near it are the same turning point.
+    # Begin with the sharpest turn. Other turns near it belong to the same turning point.
     for _, i in sorted(turned, reverse=True):
         if all(
             math.dist(visit.middle, positions[i]) > scale.radius
@@ -235,9 +246,9 @@ def _with_turnings(found: list[Visit], track: Track, scale: Scale) -> list[Visit
 
 
 def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
-    """Add a visit at each reversal or change of direction between two visits.
+    """Add a visit between two visits if the robot turned back or changed direction between them.
 
-    A path between two neighbouring places should lead straight on.
+    Then a path between two neighbouring places leads straight on.
     """
     positions = track.poses[:, :2]
     visits: list[Visit] = []
@@ -277,7 +288,7 @@ def _with_bends(found: list[Visit], track: Track, scale: Scale) -> list[Visit]:
 
 
 def _described(visit: Visit, log: RobotLog, track: Track, scale: Scale, maps: LocalMaps) -> Visit:
-    """Add to a visit its exits, which ones the robot took, and the direction of walls."""
+    """Complete a visit: its exits, the exits that the robot took, and the direction of walls."""
     patch = maps.around(visit.scan, visit.middle, scale.half)
     ways = _ways(patch, visit.middle, scale)
     ways, arrived = _taken(ways, _crossing(track, visit, scale.radius, -1), visit.middle)
@@ -295,7 +306,7 @@ def _described(visit: Visit, log: RobotLog, track: Track, scale: Scale, maps: Lo
 
 
 def _ways(patch: Patch, middle: Array, scale: Scale) -> list[Way]:
-    """The exits seen from a middle: certain gateways, and those that may be gateways."""
+    """The exits seen from the middle of a place: first certain, then uncertain gateways."""
     sure = _outlook(patch, middle, scale.gateway, scale.radius)
     ways = [Way(bearing) for bearing in (sure.bearings if sure else ())]
     doubtful = _outlook(patch, middle, scale.doubtful, scale.radius)
@@ -308,22 +319,28 @@ def _ways(patch: Patch, middle: Array, scale: Scale) -> list[Way]:
 
 
 def _start(patch: Patch, position: Array, width: float) -> tuple[Bools, Cell | None]:
-    """The drivable cells for this width, and the one nearest to a position, at most ASTRAY away."""
+    """The mask of drivable cells for a width, and the drivable cell nearest to a position.
+
+    The cell is None if it is more than ASTRAY metres away.
+    """
     open_cells = patch.drivable(width)
     return open_cells, nearest(open_cells, patch.cell(position), ASTRAY)
 
 
 def _outlook(patch: Patch, middle: Array, width: float, radius: float) -> Outlook | None:
-    """The exits for this width seen from a middle; None if no drivable cell is near."""
+    """The exits of at least this width, seen from a middle; None if no drivable cell is near."""
     open_cells, here = _start(patch, middle, width)
     return None if here is None else outlook(open_cells, here, radius)
 
 
 def _unseen(patch: Patch, seen: Outlook, scale: Scale) -> list[float]:
-    """Bearings at which drivable space meets unobserved space at least a gateway wide."""
+    """Bearings, in radians, at which drivable space borders on unobserved space.
+
+    A border counts if it is at least a gateway wide.
+    """
     unknown = ~patch.free & ~patch.occupied
-    # Cells next to a wall also border on the unknown behind it. The border counts only away from
-    # walls.
+    # Cells next to a wall also border on the unknown space behind the wall. So only cells away from
+    # walls count.
     border = (
         ndimage.binary_dilation(unknown, iterations=2)
         & patch.free
@@ -344,9 +361,16 @@ def _unseen(patch: Patch, seen: Outlook, scale: Scale) -> list[float]:
 
 
 def _crossing(track: Track, visit: Visit, radius: float, side: int) -> Array | None:
-    """The point of entering (side -1) or leaving (side 1) the radius of a place.
+    """The point (x, y) at which the robot crosses the radius of a place.
 
-    None if the log begins or ends before that.
+    Args:
+        track: Trajectory of the robot.
+        visit: Visit to the place.
+        radius: Metres.
+        side: -1 for entering the place, 1 for leaving it.
+
+    Returns:
+        Metres, in the frame of the track; None if the log begins or ends before that point.
     """
     positions = track.poses[:, :2]
     i = visit.begin if side < 0 else visit.end
@@ -361,10 +385,11 @@ def _crossing(track: Track, visit: Visit, radius: float, side: int) -> Array | N
 
 
 def _taken(ways: list[Way], crossing: Array | None, middle: Array) -> tuple[list[Way], int | None]:
-    """Mark the exit that the robot took as certain; add one if none was seen in that direction.
+    """Mark the exit that the robot took as certain. Add one if none was seen in its direction.
 
     Returns:
-        The exits, and the index of the one that was taken.
+        The exits, and the index of the exit that the robot took. The index is None if `crossing`,
+        the point where the robot crossed the radius, is None.
     """
     if crossing is None:
         return ways, None
@@ -376,8 +401,13 @@ def _taken(ways: list[Way], crossing: Array | None, middle: Array) -> tuple[list
 
 
 def _walls(log: RobotLog, track: Track, visit: Visit) -> tuple[float, float]:
-    """Direction of the walls around a visit, modulo a quarter turn, and their agreement with it."""
-    # Multiplying angles by four makes directions a quarter turn apart equal, so that they average.
+    """The main direction of the walls around a visit, and how well they agree with it.
+
+    Returns:
+        Radians modulo a quarter turn, and the agreement from 0 to 1.
+    """
+    # Angles that differ by quarter turns are equal after multiplication by four. So they can be
+    # averaged.
     total, count = 0j, 0
     for i in range(visit.begin, visit.end + 1):
         _, normals = surfaces(log.scans[i])

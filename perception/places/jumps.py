@@ -25,10 +25,12 @@ FAR, UNUSUAL = 1.5, 3.5
 PAUSE, FASTER = 3.0, 2.0
 # A usual step longer than this many metres means that the odometry has another unit.
 LONG = 5.0
-# Odometry stands still up to STILL metres and radians. For a robot that stands still, less than
-# MOVED of the beams change by more than CHANGED metres plus CHANGED_SHARE of the range.
+# Odometry stands still if it changes by less than STILL metres and radians. A beam changed if its
+# range differs by more than CHANGED metres plus CHANGED_SHARE of the range. The robot moved if more
+# than the share MOVED of the beams changed.
 STILL, MOVED, CHANGED, CHANGED_SHARE = 1e-3, 0.35, 0.2, 0.03
-# This share after a pause, as the robot may be far away in a corridor that looks similar.
+# After a pause, this smaller share of changed beams shows a motion, because the robot may be far
+# away in a corridor that looks similar.
 MOVED_UNSEEN = 0.15
 # Odometry that stands still in more than this share of the steps is missing.
 MISSING = 0.5
@@ -46,8 +48,10 @@ ANEW = 1.0
 def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
     """Keep the odometry of one source if the poses of several sources alternate.
 
+    The odometry of the other scans is interpolated.
+
     Returns:
-        The log, and a note if there were several sources.
+        The log, and a list of notes: one if there were several sources, otherwise none.
     """
     odometry = Odometry()
     for number, scan in enumerate(log.scans):
@@ -64,13 +68,21 @@ def keep_one_source(log: RobotLog) -> tuple[RobotLog, list[str]]:
 
 
 def usual_step(log: RobotLog) -> float:
-    """Median step in metres by odometry, ignoring steps of 0; 0 if there is no other."""
+    """Compute the median step between two scans by odometry, in metres.
+
+    Steps of 0 are ignored. The result is 0 if all steps are 0.
+    """
     far = _far(log, 1)
     return float(np.median(far[far > 0])) if (far > 0).any() else 0.0
 
 
 def in_unit(log: RobotLog, count: float) -> RobotLog:
-    """Convert odometry with `count` units in a metre to metres."""
+    """Convert the odometry of a log to metres.
+
+    Args:
+        log: The log.
+        count: How many units of its odometry make a metre.
+    """
     return replace(
         log,
         scans=tuple(
@@ -84,7 +96,12 @@ def in_unit(log: RobotLog, count: float) -> RobotLog:
 
 
 def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan, ...]:
-    """The scans with odometry interpolated and extrapolated from the scans of one source."""
+    """All scans, with odometry that is inter- and extrapolated from the scans of one source.
+
+    Args:
+        scans: The scans.
+        members: Indices of the scans of that source.
+    """
     from scipy.interpolate import interp1d
 
     poses = np.array([scans[number].odometry for number in members])
@@ -97,16 +114,18 @@ def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan
 
 
 def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> list[str]:
-    """Describe the cuts and breaks of a track.
+    """Describe the cuts and breaks of a track, and turns that the odometry gets wrong.
+
+    The motion across a cut is unknown. After a break, the robot may be anywhere.
 
     Args:
-        log: The log that was followed.
-        track: Its track.
-        turned: Scans at which the robot turned differently from the odometry, and by how many
-            radians.
+        log: The log that the track was made from.
+        track: The track.
+        turned: Indices of scans at which the robot turned differently from the odometry, and the
+            differences in radians.
 
     Returns:
-        Notes in sentences.
+        Notes for the user; none if nothing is wrong.
     """
     # A cut with a step is a jump. A cut without one is a stretch in which the odometer stood still.
     steps = {
@@ -157,7 +176,11 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
 
 
 def describe_whole(log: RobotLog) -> list[str]:
-    """Describe odometry that is wrong throughout, or a log that is out of order."""
+    """Describe odometry that is wrong in the whole log, or a log that is out of order.
+
+    Returns:
+        Notes for the user; none if nothing is wrong.
+    """
     notes = []
     far_apart, to_and_fro = (
         usual_step(log),
@@ -205,14 +228,15 @@ def _where(log: RobotLog, number: int) -> str:
 
 @dataclass(frozen=True)
 class Unknown:
-    """Scans that a step with unknown odometry leads to.
+    """Scans for which the odometry of the step before them cannot be trusted, by index.
 
     Attributes:
-        unknown: Scans after an odometer jump, or a motion that it missed.
-        carried: Unknown scans to which the robot was carried while not logging.
-        doubtful: Scans after other long steps. The step is a jump if only the previous pose
-            matches.
-        still: First and last scan of each stretch in which the odometer stands still.
+        unknown: Scans after a jump of the odometer, or after a motion that the odometer missed.
+        carried: Those of `unknown` to which the robot was carried while nothing was logged.
+        doubtful: Scans after other long steps. Such a step is a jump if the scan matches only near
+            the previous pose.
+        still: First and last scan of each stretch in which the odometer stands still, though the
+            scans change.
     """
 
     unknown: frozenset[int] = frozenset()
@@ -221,12 +245,12 @@ class Unknown:
     still: tuple[tuple[int, int], ...] = ()
 
     def without(self, standing: frozenset[int]) -> Unknown:
-        """A copy without the scans in which the robot really stood still."""
+        """Make a copy in which the scans of a standing robot are not unknown."""
         return replace(self, unknown=self.unknown - (standing - self.carried), still=())
 
 
 def unknown_steps(log: RobotLog) -> Unknown:
-    """Find jumps of the odometer, and stretches where only the laser shows motion."""
+    """Find scans after a jump of the odometer or after a motion that only the laser shows."""
     if len(log) < 3:
         return Unknown()
     seconds = _seconds(log)
@@ -240,7 +264,11 @@ def unknown_steps(log: RobotLog) -> Unknown:
 
 
 def _targets(steps: NDArray[np.bool_]) -> frozenset[int]:
-    """The scans that steps lead to."""
+    """The indices of the scans that steps lead to.
+
+    Args:
+        steps: (n - 1,) mask of the steps between n scans.
+    """
     return frozenset((np.flatnonzero(steps) + 1).tolist())
 
 
@@ -249,13 +277,23 @@ def _impossible(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Find impossible steps and doubtful ones.
 
-    A step is impossible if it is long in metres, compared with the usual step, and for the time
-    that it took.
+    A step is impossible if it is long in metres, longer than the usual step, and too long for the
+    time that it took.
+
+    Args:
+        log: The n scans.
+        seconds: (n - 1,) duration of each step; None if unknown.
+        paused: (n - 1,) mask of the steps that took unusually long.
+
+    Returns:
+        Masks, (n - 1,), of the impossible and of the doubtful steps. Impossible steps are also
+        doubtful.
     """
     far, over_two = _far(log, 1), _far(log, 2)
     if not far.any():
         return np.zeros(len(far), bool), np.zeros(len(far), bool)
-    # If poses of two sources alternate, each step is a jump, but steps over two scans are not.
+    # If the poses of two sources alternate, each step is a jump, but steps to the scan after the
+    # next are not.
     usual = min(
         float(np.median(steps[steps > 0])) for steps in (far, over_two) if (steps > 0).any()
     )
@@ -272,11 +310,12 @@ def _impossible(
 def _moved_while_still(
     log: RobotLog, paused: NDArray[np.bool_]
 ) -> tuple[frozenset[int], tuple[tuple[int, int], ...]]:
-    """Find stretches in which only the laser noticed a motion.
+    """Find stretches in which the odometer stands still, but the laser shows a motion.
 
     Returns:
-        Scans after a pause, and the first and last scan of other stretches. Both are empty if the
-        odometer mostly stands still, because then there is no odometry.
+        Scans after a pause to which the robot was moved, and the first and last scan of each
+        stretch with a motion. Both are empty if the odometer mostly stands still, because then
+        there is no odometry.
     """
     still = stands_still(log)
     if still.mean() > MISSING:
@@ -296,15 +335,19 @@ def _moved_while_still(
 
 
 def stands_still(log: RobotLog) -> NDArray[np.bool_]:
-    """The steps, (n - 1,), in which the odometer repeats the same pose."""
+    """Find the steps in which the odometer repeats the same pose.
+
+    Returns:
+        Mask, (n - 1,), of the steps between n scans.
+    """
     poses = np.array([scan.odometry for scan in log.scans])
     return np.asarray(np.abs(np.diff(poses, axis=0)).max(axis=1) < STILL)
 
 
 def _change(first: Scan, last: Scan) -> float:
-    """Share of the beams that changed between two scans; 0 for scans of different lasers.
+    """The share of the beams that changed between two scans; 0 for scans of different lasers.
 
-    Only beams that hit something in either scan count.
+    The share is of the beams that were measured in both scans and hit something in at least one.
     """
     if first.laser != last.laser:
         return 0.0
@@ -318,13 +361,16 @@ def _change(first: Scan, last: Scan) -> float:
 
 
 def _far(log: RobotLog, steps: int) -> NDArray[np.float64]:
-    """Metres by odometry from each scan to the one `steps` later."""
+    """Distances in metres by odometry from each scan to the scan `steps` later, (n - steps,)."""
     positions = np.array([scan.odometry[:2] for scan in log.scans])
     return np.asarray(np.hypot(*(positions[steps:] - positions[:-steps]).T))
 
 
 def _seconds(log: RobotLog) -> NDArray[np.float64] | None:
-    """Seconds from each scan to the next; None if times are missing or run backwards."""
+    """Seconds from each scan to the next, (n - 1,).
+
+    None if times are missing, run backwards, or are all equal.
+    """
     if any(scan.time is None for scan in log.scans):
         return None
     seconds = np.diff(np.array([scan.time for scan in log.scans], dtype=float))

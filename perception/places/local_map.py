@@ -1,9 +1,9 @@
-"""Makes the local perceptual map: free space around the robot, from a short stretch of scans.
+"""Makes the local perceptual map: a grid of the free space around the robot.
 
-A window of scans moves along the log. Each grid cell counts how many scans of the window saw
-through it, and how many hit an obstacle in it. Scans that leave the window are subtracted. The grid
-is a torus that scrolls with the robot. There is no global map, so drift matters only within a
-window (Beeson, Modayil & Kuipers 2010).
+A window of consecutive scans moves along the log. Each grid cell counts how many scans of the
+window saw through the cell, and how many hit an obstacle in it. Scans that leave the window are
+subtracted. The grid is a torus that scrolls with the robot. There is no global map, so drift
+matters only within a window (Beeson, Modayil & Kuipers 2010).
 """
 
 from __future__ import annotations
@@ -41,11 +41,14 @@ _EIGHT = np.ones((3, 3), bool)
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A square section of a local map.
+    """A square section of a local map; masks have the shape (rows, columns).
+
+    Rows count along x and columns along y of the frame of the track.
 
     Attributes:
         free: Mask of cells that were seen to be free.
-        occupied: Mask of cells with an obstacle. Other cells that are not free are unobserved.
+        occupied: Mask of cells with an obstacle. Cells that are neither free nor occupied are
+            unobserved.
         trail: Mask of cells that the robot drove over within the window.
         corner: (x, y) centre of cell (0, 0) in metres, in the frame of the track.
     """
@@ -57,29 +60,29 @@ class Patch:
 
     @cached_property
     def clearance(self) -> Array:
-        """(rows, columns) metres to the nearest cell that is not free."""
+        """The distance from each cell to the nearest cell not free: (rows, columns), metres."""
         return np.asarray(ndimage.distance_transform_edt(np.pad(self.free, 1))[1:-1, 1:-1]) * CELL
 
     @cached_property
     def room(self) -> Array:
-        """(rows, columns) metres to the nearest occupied cell."""
+        """The distance from each cell to the nearest occupied cell: (rows, columns), metres."""
         return np.asarray(ndimage.distance_transform_edt(~self.occupied)) * CELL
 
     @cached_property
     def _met(self) -> Bools:
-        """Cells at which a ray stops: occupied cells and their next neighbours."""
+        """Mask of cells at which a ray stops: occupied cells and their next neighbours."""
         return np.asarray(ndimage.binary_dilation(self.occupied, np.ones((2, 2), bool)))
 
     def free_along(self, begin: Array, directions: Array, most: float) -> Array:
-        """Free distance from a position in several directions.
+        """Measure the free distance from a position in several directions.
 
         Args:
-            begin: (x, y) in metres.
+            begin: (x, y) in metres, in the frame of the track.
             directions: (..., 2) unit vectors.
             most: Largest distance in metres.
 
         Returns:
-            (...) metres to the first obstacle, at most `most`.
+            (...) metres to the first obstacle in each direction, at most `most`.
         """
         far = np.arange(0.0, most, CELL / 2)
         cells = np.rint(
@@ -89,19 +92,26 @@ class Patch:
         return np.where(met.any(axis=-1), far[met.argmax(axis=-1)], most)
 
     def drivable(self, width: float) -> Bools:
-        """Mask of cells for a vehicle of this width in metres, and the robot's own trail."""
+        """Find the cells in which the middle of a vehicle can be.
+
+        Args:
+            width: Width of the vehicle in metres.
+
+        Returns:
+            Mask of the cells with enough room, and of those on the robot's own trail.
+        """
         return np.asarray(
             (self.clearance >= width / 2)
             | ndimage.binary_dilation(self.trail, _EIGHT, iterations=2)
         )
 
     def cell(self, position: Array | Sequence[float]) -> Cell:
-        """The cell of a position, which may lie outside the patch."""
+        """Compute the cell (row, column) of a position (x, y); it may lie outside the patch."""
         row, column = np.rint((np.asarray(position) - self.corner) / CELL).astype(int)
         return int(row), int(column)
 
     def position(self, cell: Array | Cell) -> Array:
-        """The centre of a cell in metres, in the frame of the track."""
+        """Compute the centre (x, y) of a cell in metres, in the frame of the track."""
         return np.asarray(cell) * CELL + self.corner
 
 
@@ -111,7 +121,7 @@ class LocalMaps:
     Args:
         scans: Scans of the log.
         track: Their poses.
-        reach: Metres of trajectory before and after a scan that belong to its window.
+        reach: Metres of trajectory. The window of a scan reaches this far before and after it.
     """
 
     def __init__(self, scans: Sequence[Scan], track: Track, reach: float) -> None:
@@ -129,7 +139,7 @@ class LocalMaps:
 
         Args:
             scan: Index of the scan whose window is used.
-            middle: (x, y) in metres.
+            middle: (x, y) of the centre of the patch in metres, in the frame of the track.
             half: Half the side of the patch in metres.
         """
         # The window stays within one unbroken part of the track.
@@ -145,15 +155,22 @@ class LocalMaps:
         occupied = (met > 0) & (met >= OCCUPIED * (met + passed))
         trail = self._trail(begin, end, first, passed.shape)
         free = ((passed > 0) & ~occupied) | ndimage.binary_dilation(trail, _EIGHT, iterations=2)
-        # A cell between two beams may have been missed. Close gaps of up to two cells, but not
-        # through obstacles.
+        # A cell between two beams may have been missed. So close gaps of up to two cells, but do
+        # not free cells with an obstacle.
         closed = ndimage.binary_closing(np.pad(free, 3), _EIGHT)[3:-3, 3:-3]
         return Patch((free | closed) & ~(occupied & ~free), occupied & ~trail, trail, first * CELL)
 
     def _trail(
         self, begin: int, end: int, first: NDArray[np.int64], shape: tuple[int, ...]
     ) -> Bools:
-        """Mask of the cells on the trajectory of the window."""
+        """Mask of the cells on the trajectory of the window.
+
+        Args:
+            begin: First scan of the window.
+            end: Scan after the last of the window.
+            first: Cell at the corner of the patch, counted from the origin.
+            shape: Rows and columns of the patch.
+        """
         path = self._track.poses[begin:end, :2]
         legs = [
             np.linspace(a, b, 2 + int(math.dist(a, b) / CELL)) for a, b in itertools.pairwise(path)
@@ -189,7 +206,10 @@ class LocalMaps:
             self._end -= 1
 
     def _cells(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The cells that a scan looked through and those in which it hit something."""
+        """The cells that scan i looked through, and the cells in which it hit something.
+
+        Both are indices in the torus.
+        """
         scan, pose = self._scans[i], self._track.poses[i]
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         x = pose[0] + cos * scan.laser.mount[0] - sin * scan.laser.mount[1]
@@ -210,20 +230,24 @@ class LocalMaps:
         return np.setdiff1d(passed, ends, assume_unique=True), ends
 
     def _numbers(self, x: Array, y: Array) -> NDArray[np.int64]:
-        """Unique indices in the torus of the cells of positions."""
+        """The indices in the torus of the cells of positions, ascending and each once."""
         rows, columns = (np.rint(values / CELL).astype(np.int64) % self._side for values in (x, y))
         return np.unique(rows * self._side + columns)
 
 
 def distances(open_cells: Bools, seeds: Bools, limit: float) -> Array:
-    """Distance in metres from the nearest seed to each cell through open cells.
+    """Compute the distance from each cell to the nearest seed, along open cells.
 
-    Waves are octagons, which are off by at most 4 %.
+    Waves spread from the seeds. They are octagons, not circles, so distances are off by up to 4 %.
 
     Args:
         open_cells: Mask of the cells that may be crossed.
         seeds: Mask of the cells to start from.
-        limit: Largest distance in metres; beyond it the result is infinite.
+        limit: Largest distance in metres.
+
+    Returns:
+        (rows, columns) metres; infinite for cells beyond the limit, and for cells that cannot be
+        reached.
     """
     padded = np.pad(open_cells, 1)
     width = padded.shape[1]

@@ -1,7 +1,8 @@
 """Turns the visits of a log into a trace.
 
-Each step has what the robot saw at a dstate. Turns and travels connect steps. A star is the exits
-seen at a place.
+A visit is a stay at a place. Each step of the trace has what the robot saw at a distinctive state
+(a place and a heading there). Turns and travels connect steps. The star of a step is the exits seen
+at its place, as directions relative to its heading.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ AGREE = 0.2
 # Standard deviations between two visits of the middle of a place, in metres, and of the direction
 # of an exit, in radians.
 MIDDLE, DIRECTION = 0.4, 0.1
-# These deviations for the middle of a door (more exact), and for the line between doors.
+# The same deviations if places are doors: those of the middle of a door, which is seen more
+# exactly, and of the direction from one door to the next.
 THRESHOLD, ACROSS = 0.05, 0.05
 # Additional standard deviations of each displacement, beside those of scan matching, in metres and
 # radians.
@@ -49,7 +51,7 @@ BEAMS = np.radians(np.arange(-90.0, 91.0))
 
 
 def has_right_angles(visits: Sequence[Visit]) -> bool:
-    """Whether the exits that the robot took meet at right angles, as walls do."""
+    """Check whether most exits that the robot took are parallel or at right angles to the walls."""
     taken = [
         abs(_off(visit.ways[k].bearing - visit.axis, QUARTER)) < OFF
         for visit in visits
@@ -72,7 +74,8 @@ def to_trace(
         name: Name of the trace.
 
     Returns:
-        Steps with images, stars and displacements, and the actions between them.
+        A trace with one or two steps a visit. A step has an image, the displacement from the
+        previous step, the next action and, unless places are doors, a star.
     """
     # Exits are rounded to multiples of the stride, in radians. Paths from door to door have any
     # direction.
@@ -83,13 +86,14 @@ def to_trace(
     steps: list[Step] = []
     last: tuple[Visit, Pose] | None = None
     for number, visit in enumerate(visits):
-        # One step for the heading of arrival and one for that of departure, if they differ.
+        # Make a step for the heading of arrival, and another one if the robot leaves with a
+        # different heading.
         patch = maps.around(visit.scan, visit.middle, scale.half)
         came = (
             None if visit.arrived is None else wrapped(visit.ways[visit.arrived].bearing + math.pi)
         )
         went = None if visit.left is None else visit.ways[visit.left].bearing
-        # A single visit without arrival and departure has the heading of the robot.
+        # If the visit has neither arrival nor departure, take the heading of the robot.
         headings = [heading for heading in (came, went) if heading is not None] or [
             float(track.poses[visit.scan, 2])
         ]
@@ -129,7 +133,19 @@ def _step(
     stride: float | None,
     number: int,
 ) -> Step:
-    """Make one step; its displacement leads from the last step, unless the track is cut between."""
+    """Make one step, without its action.
+
+    Args:
+        log: The scans.
+        track: Their poses.
+        visit: Visit that the step belongs to.
+        pose: Pose of the step, at the middle of the place.
+        patch: Local map around the middle.
+        last: Visit and pose of the last step; None for the first step. The displacement leads from
+            this pose, unless the track is cut between.
+        stride: Angle in radians that exits are rounded to; None if places are doors.
+        number: Index of the visit.
+    """
     onward = covariance = None
     cuts = [] if last is None else track.cuts_between(last[0].scan, visit.scan)
     if last is not None and not cuts:
@@ -139,7 +155,7 @@ def _step(
     extra: dict[str, object] = {"scan": visit.scan, "visit": number}
     if scan.time is not None:
         extra["time"] = scan.time
-    if cuts:  # Why there is no displacement.
+    if cuts:  # They explain why there is no displacement.
         extra["cuts"] = cuts
     truth = None
     seen = between(_pose(track, visit.scan), pose)
@@ -159,20 +175,21 @@ def _step(
 
 
 def _aligned(visits: Sequence[Visit], stride: float) -> list[Visit]:
-    """Align the exits of all visits to multiples of a stride from the direction of the walls.
+    """Round the bearing of each exit to a multiple of an angle, counted from the walls.
 
-    So an exit has the same direction at each visit. An exit that is far from all multiples becomes
-    uncertain. If the walls show none, the previous visit's axis is used.
+    So an exit has the same bearing at each visit. An exit that is far from all multiples becomes
+    uncertain. If the walls at a visit show no clear direction, that of the previous visit is used.
 
     Args:
         visits: The visits, in order.
-        stride: Angle in radians.
+        stride: The angle, in radians.
     """
     aligned: list[Visit] = []
     axis = next((visit.axis for visit in visits if visit.straight >= AGREE), 0.0)
     count = round(2 * math.pi / stride)
     for visit in visits:
-        # Walls show the axis up to quarter turns. The turn nearest to the last axis prevents jumps.
+        # Walls show the axis only up to quarter turns. Take the one nearest to the last axis, so
+        # that the axis does not jump.
         here = visit.axis if visit.straight >= AGREE else axis
         axis = axis + _off(here - axis, QUARTER)
         ways: dict[int, Way] = {}
@@ -210,7 +227,12 @@ def _pose(track: Track, scan: int) -> Pose:
 
 
 def _star(visit: Visit, heading: float, stride: float) -> tuple[float | Gateway | None, ...]:
-    """The star of a visit relative to a heading: bearings in degrees, clockwise."""
+    """The exits of a visit as seen with a heading, clockwise.
+
+    Returns:
+        With a stride of a quarter turn, four numbers, for ahead, right, behind and left: 1 for an
+        exit, 0 for none, None for an uncertain exit. Otherwise gateways with bearings in degrees.
+    """
     seen = [(-math.degrees(wrapped(way.bearing - heading)), way.sure) for way in visit.ways]
     if stride == QUARTER:
         quarters = {round(bearing / 90) % 4: sure for bearing, sure in seen}
@@ -222,7 +244,7 @@ def _star(visit: Visit, heading: float, stride: float) -> tuple[float | Gateway 
 
 
 def _image(patch: Patch, middle: Array, heading: float) -> Array:
-    """The ranges, (181,), that a laser in the middle of a place would measure."""
+    """The ranges that a laser in the middle of a place would measure: (181,), metres."""
     far = np.arange(0.0, min(patch.free.shape) * CELL / 2, CELL / 2)
     angles = heading + BEAMS
     cells = np.rint(
@@ -242,7 +264,15 @@ def _image(patch: Patch, middle: Array, heading: float) -> Array:
 
 
 def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> Covariance:
-    """Covariance of the displacement between two dstates, in the frame of the first."""
+    """The covariance of the displacement between two steps, in the frame of the first.
+
+    Args:
+        track: Trajectory of the robot.
+        begin: Scan of the first step.
+        end: Scan of the last step.
+        first: Pose of the first step.
+        last: Pose of the last step.
+    """
     if begin > end:
         begin, end = end, begin
     total = np.zeros((3, 3))
@@ -250,8 +280,8 @@ def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> 
     for i in range(begin + 1, end + 1):
         pose = track.poses[i - 1]
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
-        # An error of an increment rotates and shifts all later poses: the end moves with the arm
-        # from there.
+        # An error of this increment rotates and shifts all later poses. The last step moves as the
+        # end of an arm that begins here.
         arm = np.array(
             [
                 [cos, -sin, -(y - track.poses[i, 1])],
@@ -270,7 +300,14 @@ def _covariance(track: Track, begin: int, end: int, first: Pose, last: Pose) -> 
 
 
 def _with_turns(steps: list[Step], stride: float | None, visits: Sequence[Visit]) -> list[Step]:
-    """Add the turns within visits, rounded to the stride; None allows any angle."""
+    """Add the turns between two steps of a visit.
+
+    Args:
+        steps: The steps. Those that end with a travel have their action.
+        stride: Angle in radians that turns are rounded to; None if places are doors, so that turns
+            may have any angle.
+        visits: The visits.
+    """
     done = list(steps)
     for i, step in enumerate(steps[:-1]):
         if step.action is None:
@@ -288,7 +325,12 @@ def _with_turns(steps: list[Step], stride: float | None, visits: Sequence[Visit]
 
 
 def _turn(clockwise: float, stride: float) -> Action:
-    """A turn in degrees, rounded to the nearest multiple of a stride in radians."""
+    """The action of a turn, rounded to the nearest multiple of a stride.
+
+    Args:
+        clockwise: Angle of the turn in degrees.
+        stride: Angle in radians.
+    """
     rounded = round(clockwise / math.degrees(stride)) * round(math.degrees(stride)) % 360
     names = {90: "right", 180: "around", 270: "left"}
     if rounded in names:
@@ -299,7 +341,12 @@ def _turn(clockwise: float, stride: float) -> Action:
 
 
 def _any_turn(clockwise: float, back: bool) -> Action:
-    """A turn in degrees towards another door; "around" if it leads back to the door of arrival."""
+    """The action of a turn in a building whose places are doors.
+
+    Args:
+        clockwise: Angle of the turn in degrees.
+        back: Whether the robot leaves by the exit of arrival. Then the action is "around".
+    """
     if back:
         return Action.of("around")
     degrees = round(clockwise % 360, 1)

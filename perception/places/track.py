@@ -1,13 +1,14 @@
 """Follows the robot from scan to scan: odometry, corrected by matching each scan with recent ones.
 
-A scan is matched from points to lines (Chen & Medioni 1992; Censi 2008): the pose moves until the
-points of the scan lie on the walls that the last scans saw. Odometry is a prior. In a bare
-corridor, walls do not show how far the robot went. The odometer decides. Nothing is global: errors
-accumulate along the trajectory, as the covariances of the increments state.
+Points are matched with lines (Chen & Medioni 1992; Censi 2008): the pose moves until the points of
+the scan lie on the walls that the last scans saw. Odometry is a prior. In a bare corridor, walls do
+not show how far the robot went, so the odometer decides. An increment is the motion from one scan
+to the next. There is no global map, so errors of increments accumulate along the trajectory. Each
+increment has a covariance.
 
-If an odometer jumps (`jumps`), the scan is matched near the previous pose without it. If it
-matches, the track goes on. Only the increment is unknown. If nothing in the scan was seen before,
-the robot may be anywhere, and the track is broken: a new trajectory begins.
+If the odometer jumps (`jumps`), the scan is matched near the previous pose without odometry. If it
+matches, the track goes on, and only the increment is unknown: this is a cut. If nothing in the scan
+was seen before, the robot may be anywhere. Then the track is broken, and a new trajectory begins.
 """
 
 from __future__ import annotations
@@ -67,14 +68,14 @@ ALIKE = 0.03
 
 @dataclass(frozen=True)
 class Trust:
-    """Standard deviations of the increments of an odometer, for scan matching.
+    """Standard deviations of the errors of an odometer from one scan to the next.
 
     Attributes:
-        way: Error along the motion, as a share of it; half of that across.
-        offset: Constant error in metres.
-        turning: Error of a turn, as a share of it.
-        drift: Error of the heading in radians a metre.
-        angle: Constant error of the heading in radians.
+        way: Error along the motion, as a share of its length; half of that across.
+        offset: Additional error of the position, in metres.
+        turning: Error of the heading, as a share of the turn.
+        drift: Error of the heading for each metre, in radians.
+        angle: Additional error of the heading, in radians.
     """
 
     way: float = 0.1
@@ -84,7 +85,14 @@ class Trust:
     angle: float = 0.02
 
     def covariance(self, onward: Pose) -> Array:
-        """Covariance of an increment, (3, 3), in the frame of the robot before it."""
+        """Compute the covariance of a motion by odometry.
+
+        Args:
+            onward: Motion ahead and to the left in metres, and turn in radians.
+
+        Returns:
+            (3, 3), in the frame of the robot before the motion.
+        """
         way = math.hypot(onward[0], onward[1])
         along, across = self.offset + self.way * way, self.offset + self.way * way / 2
         heading = self.angle + self.turning * abs(onward[2]) + self.drift * way
@@ -97,14 +105,14 @@ class Track:
 
     Attributes:
         poses: (n, 3) x, y in metres and heading in radians, in the frame of the first scan.
-        covariances: (n, 3, 3) covariance of the increment to each scan, in the frame of the robot
-            at the previous scan; zeros for the first.
-        shares: (n,) share of each scan that lies on known walls; 1 for the first. Empty if nothing
-            was matched.
-        cuts: Scans before which the motion is unknown because the odometer jumped. No displacement
-            crosses a cut.
-        breaks: Cuts after which the robot may be anywhere, because nothing was seen before. Neither
-            a path nor a place crosses a break.
+        covariances: (n, 3, 3) covariance of the motion from the previous scan to each scan, in the
+            frame of the robot at the previous scan; zeros for the first scan.
+        shares: (n,) share of the points of each scan that lie on known walls; 1 for the first scan.
+            Empty if nothing was matched.
+        cuts: Indices of scans before which the motion is unknown because the odometer jumped. No
+            displacement crosses a cut.
+        breaks: Those of `cuts` after which the robot may be anywhere, because the scan shows
+            nothing that was seen before. Neither a path nor a place crosses a break.
     """
 
     poses: Array
@@ -115,36 +123,43 @@ class Track:
 
     @cached_property
     def way(self) -> Array:
-        """Metres travelled up to each scan, (n,)."""
+        """The distance travelled up to each scan: (n,), metres."""
         return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.poses[:, :2], axis=0).T))])
 
     @cached_property
     def spans(self) -> tuple[tuple[int, int], ...]:
-        """First scan of each unbroken part, and the scan after its last."""
+        """For each unbroken part, the index of its first scan and the index after its last."""
         return tuple(pairwise((0, *self.breaks, len(self.poses))))
 
     def span_of(self, scan: int) -> tuple[int, int]:
-        """The unbroken part that contains a scan."""
+        """Find the unbroken part with a scan: its first scan, and the scan after its last."""
         return self.spans[bisect(self.breaks, scan)]
 
     def part(self, begin: int, end: int) -> Track:
-        """An unbroken part as a track of its own, in the same frame."""
+        """Copy an unbroken part, scans begin … end - 1, to a track of its own in the same frame."""
         some = slice(begin, end)
         cuts = tuple(cut - begin for cut in self.cuts if begin < cut < end)
         return Track(self.poses[some], self.covariances[some], self.shares[some], cuts)
 
     def cuts_between(self, first: int, last: int) -> list[int]:
-        """The cuts after scan `first` and up to scan `last`."""
+        """List the cuts after scan `first` and up to scan `last`."""
         return [cut for cut in self.cuts if first < cut <= last]
 
 
 def wrapped(angle: float) -> float:
-    """The same angle in [-pi, pi)."""
+    """Convert an angle in radians to the equal angle in [-pi, pi)."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def follow(log: RobotLog, trust: Trust | None = None) -> Track:
-    """Follow the robot through a log. Corrected poses are not read."""
+    """Compute the trajectory of a robot from its log, by odometry and scan matching.
+
+    Corrected poses are not read.
+
+    Args:
+        log: The scans with odometry.
+        trust: Errors of the odometer; None for those of a usual one.
+    """
     steps = unknown_steps(log)
     follower = _Follower(log, trust or Trust(), steps)
     track = follower.followed(steps.carried)
@@ -166,12 +181,12 @@ def follow(log: RobotLog, trust: Trust | None = None) -> Track:
 
 @dataclass(frozen=True)
 class _Follower:
-    """Follows a log.
+    """Computes the track of a log.
 
     Attributes:
         log: The log.
-        trust: Standard deviations of the odometer.
-        steps: Steps with unknown odometry.
+        trust: Standard deviations of the errors of the odometer.
+        steps: Scans for which the odometry of the step before them cannot be trusted.
     """
 
     log: RobotLog
@@ -191,8 +206,8 @@ class _Follower:
             if i > 0:
                 onward = between(self.log.scans[i - 1].odometry, scan.odometry)
                 pose, covariance, share = poses[-1], self.trust.covariance((0.0, 0.0, 0.0)), 0.0
-                # Match with the odometry, or without it if it is unknown or if it is doubtful and
-                # matches badly.
+                # Match the scan with the odometry. If the odometry is unknown, or if it is doubtful
+                # and the scan matches badly, match without it.
                 if i in carried:
                     breaks.append(i)
                 elif i in self.steps.unknown:
@@ -232,11 +247,20 @@ class _Follower:
 def _bridged(
     points: Array, normals: Array, recent: deque[tuple[Array, Array]], last: Pose, before: Pose
 ) -> tuple[Pose, Array, float] | None:
-    """Match a scan without odometry, near the previous pose and at constant velocity.
+    """Match a scan without odometry.
+
+    Two guesses are tried: the robot moved as it did before, or it stood still.
+
+    Args:
+        points: (m, 2) points of the scan in metres.
+        normals: (m, 2) unit normals.
+        recent: Points and normals of previous scans, in the frame of the track.
+        last: Pose of the previous scan.
+        before: Motion to the previous scan.
 
     Returns:
-        The pose, the covariance of the increment and the share of points on walls; None if it
-        matches nowhere.
+        The pose, the covariance of the motion, and the share of the points on walls; None if the
+        scan matches at neither guess.
     """
     wide = np.diag(UNKNOWN) ** 2
     onward, stayed = (
@@ -247,9 +271,10 @@ def _bridged(
 
 
 def _carried(log: RobotLog, track: Track) -> list[int]:
-    """Find scans from which on all is unseen, although the odometer does not jump.
+    """Find scans to which the robot was carried while nothing was logged.
 
-    There the robot was carried, unlogged.
+    That scan and the next ones show nothing that was seen before, although the odometer does not
+    jump.
     """
     found: list[int] = []
     for i in np.flatnonzero(track.shares < STRANGE).tolist():
@@ -283,7 +308,11 @@ def _carried(log: RobotLog, track: Track) -> list[int]:
 
 
 def turned_wrongly(log: RobotLog, track: Track) -> list[tuple[int, float]]:
-    """Well-matched scans that turned differently from the odometry, by how many radians."""
+    """Find scans that match well but turned differently from the odometry.
+
+    Returns:
+        The index of each such scan, and its turn minus that of the odometry, in radians.
+    """
     found: list[tuple[int, float]] = []
     for i in range(1, len(log)):
         told = between(log.scans[i - 1].odometry, log.scans[i].odometry)[2]
@@ -298,7 +327,7 @@ def _as_pose(row: Array) -> Pose:
 
 
 def surfaces(scan: Scan) -> tuple[Array, Array]:
-    """Points of a scan on a smooth surface, and the normals of the surface.
+    """Find the points of a scan that lie on a smooth surface, and the normals of the surface.
 
     Returns:
         (m, 2) points in metres and (m, 2) unit normals, in the frame of the robot.
@@ -344,19 +373,19 @@ def _matched(
     onward: Pose,
     prior: Array,
 ) -> tuple[Pose, Array, float]:
-    """Match a scan with walls.
+    """Match a scan with the walls that previous scans saw.
 
     Args:
         points: (m, 2) points of the scan in metres.
         normals: (m, 2) unit normals.
         recent: Points and normals of previous scans, in the frame of the track.
         last: Pose of the previous scan.
-        onward: Expected increment.
-        prior: (3, 3) covariance of the increment.
+        onward: Expected motion since the previous scan.
+        prior: (3, 3) covariance of that motion.
 
     Returns:
-        The pose, the covariance of the increment in the frame of the robot at the previous scan,
-        and the share of the points on walls.
+        The pose; the covariance of the motion, in the frame of the robot at the previous scan; and
+        the share of the points on walls.
     """
     turn: Array = np.eye(3)
     turn[:2, :2] = _rotation(last[2])
@@ -382,15 +411,15 @@ def _matched(
 
 
 def _accumulating(information: Array, prior: Array) -> Array:
-    """The covariance that an increment adds to the error of the track in the long run, (3, 3).
+    """The covariance that one step adds to the error of the track in the long run, (3, 3).
 
-    In directions without walls, the error of the odometer accumulates fully. In the others, a pose
-    is measured against the mean of n previous scans, so little error is passed on: each error
-    shifts later poses by 2 / (n + 1) of itself.
+    In directions in which no wall shows the position, the error of the odometer accumulates fully.
+    In the other directions, a pose is measured against the mean of the n previous scans. So an
+    error shifts later poses by only 2 / (n + 1) of itself.
 
     Args:
-        information: Information of the pose by odometer and walls.
-        prior: Information of the odometer alone.
+        information: (3, 3) inverse covariance of the pose by odometer and walls.
+        prior: (3, 3) inverse covariance of the pose by the odometer alone.
     """
     posterior = np.linalg.inv(information)
     by_odometer = posterior @ prior
@@ -402,7 +431,10 @@ def _accumulating(information: Array, prior: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Points of a scan, in the frame of the robot, and walls, in the frame of the track."""
+    """Moves a scan until its points lie on walls.
+
+    Points are in the frame of the robot, walls in the frame of the track.
+    """
 
     points: Array
     normals: Array
@@ -415,10 +447,10 @@ class _Fit:
 
         Args:
             guess: (3,) initial pose.
-            weight: (3, 3) information of the guess.
+            weight: (3, 3) inverse covariance of the guess.
 
         Returns:
-            The share of the points on walls, the pose, and its information, (3, 3).
+            The share of the points on walls, the pose, (3,), and its inverse covariance, (3, 3).
         """
         information, pose, share = weight, guess, 0.0
         for count in range(ROUNDS):
@@ -440,7 +472,7 @@ class _Fit:
             jacobian = np.column_stack(
                 [normal, arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]]
             )
-            # Cauchy weights: points that are far off count little.
+            # Cauchy weights give little influence to points that are far off.
             weights = 1 / (TOGETHER * ROUGHNESS**2 * (1 + (off / (2 * ROUGHNESS)) ** 2))
             astray = pose - guess
             astray[2] = wrapped(astray[2])
@@ -463,5 +495,5 @@ def points_turned(angle: float, points: Array) -> Array:
 
 
 def _moved(pose: Pose | Array, points: Array) -> Array:
-    """Transform points, (n, 2), out of the frame of a pose."""
+    """Transform points, (n, 2), from the frame of a pose to the frame that the pose is given in."""
     return np.asarray(points_turned(pose[2], points) + np.asarray(pose[:2]))
