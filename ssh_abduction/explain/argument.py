@@ -13,9 +13,9 @@ step 0 is at a place on the path that steps 1 and 2 define
 step 4 would be at a place to the right of that path
 no place on a path lies right or left of it
 
-The argument rests on a minimal set of axioms and steps. Its conclusions come from clingo, which
-finds those that hold in all maps that satisfy the axioms named so far. So each line is a
-consequence of the lines and axioms before it.
+The argument uses a minimal set of links. A link is an axiom at one step. Each line of the argument
+adds a link, and clingo finds the conclusions that hold in all maps that satisfy the links so far.
+So each line is a consequence of the lines before it and its link.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from ssh_abduction.explain.piece import Piece
 from ssh_abduction.explain.wording import Words, that_path
 from ssh_abduction.solver import facts
 
-# An argument about at most this many steps may mention all of them. In a longer piece it mentions
-# only the steps that the axioms name, to keep the number of conclusions small.
+# In a piece of at most this many steps, an argument may mention all steps. In a longer piece it
+# mentions only the steps of its links, to keep the number of conclusions small.
 FEW_STEPS = 14
-# Axioms that give a dstate one value of something. A map shows one value only, so these axioms
-# should hold in a map for the checker.
+# Axioms that allow only one value of something per dstate (or per dstate and action). A map lists
+# only one value, so a map that the checker gets should satisfy these axioms.
 SHOWN = ("one_place", "one_course", "one_heading", "functional_view", "deterministic")
-# Preferred conclusions, if one of several suffices as a premise.
+# If one of several conclusions suffices as a premise, earlier ones in this list are preferred.
 _PREFERRED = (
     "on",
     "right",
@@ -68,27 +68,30 @@ def derive(
 ) -> Derivation:
     """Find an argument that two steps are one dstate in all maps, or in none.
 
-    The caller has to know that this is so.
+    The caller must already have proved this for the piece.
 
     Args:
-        piece: Steps of the trace that suffice.
-        trace: The whole trace, whose displacements count.
+        piece: Steps of the trace that suffice for the proof.
+        trace: The whole trace. The argument may cite its displacements.
         first: The earlier step of the pair.
-        second: The later step.
-        one: Whether the steps are one dstate.
-        stop: Called now and then; if it returns True, Interrupted is raised.
+        second: The later step of the pair.
+        one: True to argue that the steps are one dstate, False that they are different dstates.
+        stop: Called now and then. If it returns True, Interrupted is raised.
+
+    Returns:
+        The argument, line by line.
     """
     return Argument(piece, trace, first, second, one, stop).derivation()
 
 
 @dataclass(frozen=True)
 class _Line:
-    """The new conclusions of some links and the lines before; none if these contradict each other.
+    """A line of an argument: new conclusions from some links and the lines before it.
 
     Attributes:
-        group: The links: axioms and steps.
-        conclusions: What follows from them.
-        supposed: Whether the line holds only under the supposition.
+        group: The links, pairs of an axiom and a step.
+        conclusions: The new conclusions. Empty if the line reaches a contradiction.
+        supposed: Whether the line holds only under the supposition that leads to a contradiction.
     """
 
     group: tuple[tuple[str, int], ...]
@@ -97,7 +100,11 @@ class _Line:
 
 
 class Argument:
-    """Finds an argument. Steps are counted in the piece until they are put into words."""
+    """The search for an argument about two steps.
+
+    Inside this class steps are counted in the piece. Words have the steps of the whole trace.
+    Parameters as in `derive`.
+    """
 
     def __init__(
         self,
@@ -121,7 +128,7 @@ class Argument:
         self._words = Words(piece, trace)
 
     def _named_steps(self) -> Iterable[int]:
-        """The steps that the argument speaks of."""
+        """List the steps, counted in the piece, that conclusions may mention."""
         size = len(self._piece.steps)
         if size <= FEW_STEPS or self._piece.theory.level == "causal":
             return range(size)
@@ -133,7 +140,7 @@ class Argument:
         return [t for t in named if 0 <= t < size]
 
     def derivation(self) -> Derivation:
-        """The argument in words."""
+        """Find the argument and put it into words."""
         self._draw_all()
         inferences, summary = self._told()
         first, second = (self._piece.steps[k] for k in self._pair)
@@ -159,8 +166,8 @@ class Argument:
     def _draw_all(self) -> None:
         """Order the links such that each one, with those before it, gives a new conclusion.
 
-        First conclude what holds in every map. If that does not decide the pair, or only by several
-        links at once, suppose the opposite and go on until there is a contradiction.
+        First draw the conclusions that hold in every map. If they do not decide the pair, or only
+        by several links at once, suppose the opposite and go on until there is a contradiction.
         """
         goal = facts.conclusion("one_dstate" if self._one else "two_dstates", *self._pair)
         left = list(self._links)
@@ -196,7 +203,17 @@ class Argument:
         assumed: Sequence[Assumption],
         known: frozenset[clingo.Symbol],
     ) -> tuple[tuple[str, int], ...] | None:
-        """The first link that gives a new conclusion."""
+        """Find the first link of `left` that gives a new conclusion or a contradiction.
+
+        Args:
+            placed: The links in the argument so far.
+            left: The links not yet in the argument.
+            assumed: The supposition, if there is one.
+            known: The conclusions so far.
+
+        Returns:
+            The link, alone in a tuple; None if no single link gives anything new.
+        """
         for link in left:
             active = _active([*placed, link])
             if assumed and not self._axioms.consistent(active, assumed):
@@ -213,10 +230,10 @@ class Argument:
             self._born.update(dict.fromkeys(new, len(self._lines)))
             self._lines.append(_Line(group, new, supposed))
 
-    # What of it the argument needs
+    # Which conclusions the argument needs
 
     def _told(self) -> tuple[tuple[Inference, ...], str]:
-        """The lines that the argument needs, each after its premises, and the summary."""
+        """Put the needed lines into words, each after its premises, and write the summary."""
         last = self._lines[-1]
         goal = (
             None
@@ -265,9 +282,14 @@ class Argument:
     def _support(
         self, conclusion: clingo.Symbol | None
     ) -> tuple[list[clingo.Symbol], tuple[tuple[str, int], ...]]:
-        """A minimal set of earlier conclusions that a conclusion follows from, and its links.
+        """Find a minimal set of earlier conclusions that imply a conclusion, and its links.
 
-        The links are those of its line, and earlier ones that are needed again.
+        Args:
+            conclusion: The conclusion; None for the contradiction at the end.
+
+        Returns:
+            The earlier conclusions, and the links: those of the line of the conclusion, and earlier
+            ones that are needed again.
         """
         line = self._line_of(conclusion)
         number = len(self._lines) - 1 if conclusion is None else self._born[conclusion]
@@ -296,10 +318,10 @@ class Argument:
         ], again + line.group
 
     def _rank(self, symbol: clingo.Symbol) -> tuple[bool, bool, int, int, tuple[int, ...]]:
-        """Sort key of premises; those of lower rank are preferred.
+        """Compute a sort key of premises. Premises with lower keys are preferred.
 
-        What holds in every map should be about the first step of the pair, and what is supposed
-        about the second one.
+        Premises that hold in every map should be about the first step of the pair, and premises
+        under the supposition about the second step.
         """
         name, steps = facts.read_conclusion(symbol)
         supposed = self._lines[self._born[symbol]].supposed
@@ -345,14 +367,14 @@ class Argument:
         premises: dict[clingo.Symbol | None, list[clingo.Symbol]],
         links: dict[clingo.Symbol | None, tuple[tuple[str, int], ...]],
     ) -> str:
-        """The last inference with two premises or more, and its axioms."""
+        """Summarise the argument: the last inference with two or more premises, and its axioms."""
         conclusion = goal
         while len(premises[conclusion]) == 1:
             conclusion = premises[conclusion][0]
         self._words.know(self._born)
         if not premises[conclusion]:
             conclusion = goal
-        # the supposition itself says these about the pair
+        # these conclusions about the pair only repeat the supposition
         obvious = (self._pair, ("one_place", "one_dstate", "two_dstates"))
         told = [
             self._words.of(facts.read_conclusion(p), would=self._lines[self._born[p]].supposed)
@@ -375,7 +397,10 @@ class Argument:
     # Is each link needed?
 
     def _checked_links(self) -> Iterable[Link]:
-        """The links in the order of the argument, each with a map that breaks it and few others."""
+        """Yield the links in the order of the argument, each with a map that shows it is needed.
+
+        The map satisfies all other links but not the conclusion of the argument.
+        """
         theory = self._piece.theory
         names = {axiom for axiom, _ in self._links} | set(unchecked(theory))
         left_out = [axiom for axiom in theory.axioms if axiom not in names]
@@ -393,7 +418,10 @@ class Argument:
             )
 
     def _map_without(self, link: tuple[str, int]) -> SSHMap:
-        """A map in which the other links hold, and the axioms in SHOWN as far as possible."""
+        """Find a map with the supposition in which all links but this one hold.
+
+        The axioms in SHOWN hold in the map at as many steps as possible.
+        """
         supposed = [self._supposed]
         active = _active(other for other in self._links if other != link)
         for axiom in SHOWN:

@@ -1,4 +1,4 @@
-"""The axioms of a piece of a trace in clingo, which can be switched on and off step by step."""
+"""The axioms of a piece of a trace in clingo. Each can be switched on or off at each step."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from ssh_abduction.theory.settle import displacement_of
 POLL = 0.05
 # Steps that are grounded between two calls of `stop`.
 AT_A_TIME = 8
-# At most this many rejected returns that end at one step get a sentence.
+# At most this many rejected returns with the same last step get a sentence.
 MOST_SENTENCES = 3
 
 # An atom and whether it is true.
 Assumption: TypeAlias = tuple[clingo.Symbol, bool]
-# Equalities that cannot all hold.
+# Equalities (two steps are one dstate or at one place, or not) that cannot all hold.
 Refusal: TypeAlias = frozenset[Equality]
 
 
@@ -32,9 +32,14 @@ class Interrupted(Exception):  # noqa: N818 - not an error
 
 
 class _Answer(NamedTuple):
-    """A model of clingo: the dstate and place of each step, and the map they make.
+    """A model of clingo, read as a map.
 
     If axioms are relaxed, the map may break some of them.
+
+    Attributes:
+        labels: The dstate of each step.
+        places: The place of each step; None for a step at no place.
+        ssh_map: The map.
     """
 
     labels: tuple[int, ...]
@@ -42,18 +47,18 @@ class _Answer(NamedTuple):
     ssh_map: SSHMap
 
     def has(self, equalities: Collection[Equality]) -> bool:
-        """Whether all these equalities hold in the model."""
+        """Tell whether all these equalities hold in the model."""
         named = {"dstate": self.labels, "place": self.places}
         return all((named[e.of][e.first] == named[e.of][e.second]) == e.holds for e in equalities)
 
 
 class _Seen(NamedTuple):
-    """A model of clingo in the course of an argument.
+    """A model that clingo found during an argument.
 
     Attributes:
-        conclusions: The conclusions that hold in it.
-        broken: The `active` atoms of the axioms and steps that it breaks.
-        one: The atoms of the pairs of steps that are one dstate.
+        conclusions: The conclusions that hold in the model.
+        broken: The `active` atoms (an axiom at a step) that the model breaks.
+        one: The atoms of the pairs of steps that are one dstate in the model.
     """
 
     conclusions: frozenset[clingo.Symbol]
@@ -65,21 +70,22 @@ class _Seen(NamedTuple):
         return cls(*facts.read_argument(model))
 
     def suits(self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption]) -> bool:
-        """Whether these axioms and assumptions hold in it."""
+        """Tell whether these axioms and assumptions hold in the model."""
         return self.broken.isdisjoint(active) and all(
             (symbol in self.one) == true for symbol, true in assumed
         )
 
 
 def _forget(_: clingo.Model) -> None:
-    """Ignore a model, if only its existence matters."""
+    """Ignore a model. For queries that ask only whether a model exists."""
 
 
 class Axioms:
     """The axioms of a piece of a trace, in clingo.
 
-    Some evidence can only reject a whole map. Such a rejection is added as a constraint, and clingo
-    is asked again.
+    Some evidence can only judge a whole map. If it rejects a map of clingo, the reason is added as
+    a constraint, and clingo is asked again. An axiom that can be switched has an `active` atom for
+    each step.
     """
 
     def __init__(self, piece: Piece, stop: Callable[[], bool], *, relaxed: bool = False) -> None:
@@ -87,15 +93,15 @@ class Axioms:
 
         Args:
             piece: The piece of a trace.
-            stop: Called now and then; if it returns True, Interrupted is raised.
-            relaxed: Whether each axiom can be switched on or off at each step.
+            stop: Called now and then. If it returns True, Interrupted is raised.
+            relaxed: Whether each axiom can be switched on or off at each step. Otherwise all hold.
         """
         trace, theory = piece.trace, piece.theory
         self._trace, self._theory, self._first = trace, theory, piece.steps[0]
         self._problem = piece.problem
         self._evidence = piece.problem.evidence
         self._stop = stop
-        self._refusals = 0  # constraints that were added since
+        self._refusals = 0  # constraints added so far, because evidence rejected a map
         self._conclusions: list[clingo.Symbol] = []
         self._seen: list[_Seen] = []
         self._last_core: tuple[int, ...] = ()  # clingo's literals of the last unsat core
@@ -146,24 +152,28 @@ class Axioms:
 
     @property
     def instances(self) -> tuple[clingo.Symbol, ...]:
-        """The `active` atom of each axiom and step, if the axioms are relaxed."""
+        """The `active` atom of each axiom at each step; empty unless the axioms are relaxed."""
         return tuple(self._pairs)
 
     def consistent(
         self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()
     ) -> bool:
-        """Whether there is a map.
+        """Tell whether there is a map.
 
         Args:
             active: If the axioms are relaxed, the `active` atoms of those that have to hold.
-            assumed: Atoms and whether they are true in the map.
+            assumed: Pairs of an atom and whether it has to be true in the map.
         """
         return self.map_with(active, assumed) is not None
 
     def map_with(
         self, active: Sequence[clingo.Symbol] = (), assumed: Sequence[Assumption] = ()
     ) -> SSHMap | None:
-        """A map as `consistent` asks for, or None if there is none."""
+        """Find a map. Parameters as in `consistent`.
+
+        Returns:
+            The map, or None if there is none.
+        """
         while answer := self._answer(active, assumed):
             refused = self._refused(answer, {self._pairs[symbol] for symbol in active})
             if refused is None:
@@ -176,7 +186,10 @@ class Axioms:
         return None
 
     def tell_of(self, steps: Iterable[int]) -> None:
-        """Make `consequences` speak about these steps (encodings/derivation.lp)."""
+        """Set the steps that the conclusions of `consequences` are about.
+
+        The conclusions are those of encodings/derivation.lp.
+        """
         self._control.add("told_of", [], facts.told_of(steps))
         self._control.ground([("told_of", []), ("conclusions", [])])
         self._conclusions = facts.conclusions_of(self._control)
@@ -189,17 +202,20 @@ class Axioms:
         assumed: Sequence[Assumption] = (),
         known: Collection[clingo.Symbol] = (),
     ) -> frozenset[clingo.Symbol]:
-        """The conclusions that hold in all maps in which these axioms hold.
+        """Find the conclusions that hold in all maps in which these axioms hold.
 
-        There has to be such a map.
+        The caller must know that there is such a map.
 
         Args:
-            active: The `active` atoms of the axioms and steps.
-            assumed: Atoms and whether they are true.
-            known: Conclusions that are known to hold.
+            active: The `active` atoms of the axioms that hold.
+            assumed: Pairs of an atom and whether it is true.
+            known: Conclusions that are already known to hold in all these maps.
+
+        Returns:
+            The conclusions, including the known ones.
         """
         # Clingo's cautious reasoning loses atoms under assumptions. So each query asks for a model
-        # in which some doubtful conclusion fails, until there is none.
+        # in which at least one unproven conclusion fails, until there is none.
         found = frozenset(self._conclusions)
         holding = active if self._drawn.isdisjoint(active) else [*active, *self._placed]
         for answer in self._seen:
@@ -210,7 +226,8 @@ class Axioms:
             nonlocal found
             seen = _Seen.of(model)
             found &= seen.conclusions
-            if not self._refusals:  # else a model does not show every axiom that it breaks
+            # with added constraints, a model does not list every axiom that it breaks
+            if not self._refusals:
                 self._seen.append(seen)
 
         doubtful = found - frozenset(known)
@@ -228,18 +245,20 @@ class Axioms:
         """Find a minimal subset of the assumptions that contradicts these axioms.
 
         Args:
-            active: The `active` atoms of the axioms and steps.
-            assumed: Atoms and whether they are true. Earlier ones are preferred.
+            active: The `active` atoms of the axioms that hold.
+            assumed: Pairs of an atom and whether it is true. Earlier pairs are preferred in the
+                subset.
 
         Returns:
             The subset, or None if the assumptions are consistent with the axioms.
         """
-        # Bisect for the shortest prefix that contradicts the axioms together with what is needed.
-        # Its last assumption is needed. Unsat cores of clingo shorten the prefix.
+        # Bisect for the shortest prefix of the assumptions that, with the assumptions in `needed`,
+        # contradicts the axioms. Its last assumption is needed. Unsat cores shorten the prefix.
         needed: list[Assumption] = []
         rest = list(assumed)
         while self._solve(_forget, active, needed):
-            least, most = 0, len(rest)  # `most` of the rest suffice, `least` do not
+            # the first `most` assumptions of the rest suffice, the first `least` do not
+            least, most = 0, len(rest)
             if self._solve(_forget, active, [*rest, *needed]):
                 return None
             most = min(most, 1 + max((rest.index(a) for a in self._of_last_core(rest)), default=-1))
@@ -261,7 +280,7 @@ class Axioms:
         return needed
 
     def _of_last_core(self, assumed: Sequence[Assumption]) -> list[Assumption]:
-        """Those of these assumptions that are in the last unsat core."""
+        """List the assumptions, among these, that are in the last unsat core."""
         core = set(self._last_core)
         literals = [
             (assumption, self._control.symbolic_atoms[assumption[0]]) for assumption in assumed
@@ -275,7 +294,7 @@ class Axioms:
     def _answer(
         self, active: Sequence[clingo.Symbol], assumed: Sequence[Assumption] = ()
     ) -> _Answer | None:
-        """A model of clingo in which these axioms hold."""
+        """Find a model of clingo in which these axioms hold; None if there is none."""
         found: list[_Answer] = []
 
         def keep(model: clingo.Model) -> None:
@@ -291,7 +310,7 @@ class Axioms:
         active: Sequence[clingo.Symbol],
         assumed: Sequence[Assumption],
     ) -> bool:
-        """Whether there is a model. `keep` is called with each one found."""
+        """Tell whether there is a model, and call `keep` with the model found."""
         if self._stop():
             raise Interrupted
         assumptions = [*((symbol, True) for symbol in active), *assumed]
@@ -307,9 +326,16 @@ class Axioms:
     def _refused(
         self, answer: _Answer, active: Collection[tuple[str, int]]
     ) -> tuple[str, Refusal] | None:
-        """Equalities of a model that some evidence rejects, with the name of its axiom.
+        """Find equalities of a model that some evidence rejects.
 
-        If the axioms are relaxed, the axiom has to be active at the last of the steps.
+        Args:
+            answer: The model.
+            active: The pairs (axiom, step) that have to hold, if the axioms are relaxed. Then a
+                rejection counts only if its axiom is active at the step of `_judged_at`.
+
+        Returns:
+            The name of the axiom of the evidence and the equalities; None if all evidence accepts
+            the model.
         """
         for evidence in self._evidence:
             if not self._pairs:
@@ -335,29 +361,49 @@ class Axioms:
         return None
 
     def _judged_at(self, axiom: str, refusal: Refusal) -> int:
-        """The step at which the axiom has to be active for this rejection."""
+        """Find the step at which the axiom has to be active for this rejection to count."""
         return len(self._trace) - 1 if axiom == Planar.axiom else _last_step(refusal)
 
     def _refused_together(
         self, displacement: Displacement, answer: _Answer, step: int
     ) -> Refusal | None:
-        """Two returns of a model that are rejected together; the later one ends at `step`."""
+        """Find two returns of a model that displacements reject together.
+
+        A return is two steps at one dstate or at one place.
+
+        Args:
+            displacement: The evidence of displacements.
+            answer: The model.
+            step: The last step of the later return.
+
+        Returns:
+            The two equalities; None if no such pair is rejected.
+        """
         if displacement.joint == 1:
             return None
         return displacement.returns_of(self._trace).refused_at(answer.labels, answer.places, step)
 
     def _forbid(self, refusal: Refusal, where: clingo.Symbol | None = None) -> None:
-        """Add the constraint that not all equalities hold, if the atom `where` holds."""
+        """Add a constraint that these equalities do not all hold.
+
+        Args:
+            refusal: The equalities.
+            where: An atom. If given, the constraint applies only while this atom is true.
+        """
         name = f"told_{self._refusals}"
         self._refusals += 1
         self._control.add(name, [], facts.forbidden_equalities(refusal, where))
         self._control.ground([(name, [])])
 
     def sentences(self, clash: Sequence[tuple[str, int]]) -> tuple[str, ...]:
-        """What displacements say about the returns in a clash, as `Explanation.sentences`.
+        """Describe the returns that displacements reject in a clash, as `Explanation.sentences`.
 
-        The other axioms of the clash have models, and each of them has a return that is rejected.
-        The clearest rejected return is forbidden until no model is left.
+        Without its displacements the clash has models. Each of these models has a return (two steps
+        at one dstate or at one place) that displacements reject. The method describes and forbids
+        the most clearly rejected return, and repeats this until no model is left.
+
+        Args:
+            clash: Pairs of an axiom and a step, counted in the piece.
         """
         displacement = displacement_of(self._problem)
         steps = [t for axiom, t in clash if displacement and axiom == displacement.axiom]
@@ -396,10 +442,13 @@ class Axioms:
         return tuple(dict.fromkeys(sentence for found in clearest_first for _, sentence in found))
 
     def smallest_clash(self, assumed: Sequence[Assumption] = ()) -> list[tuple[str, int]]:
-        """A minimal set of pairs of axiom and step that leaves no map.
+        """Find a minimal set of pairs (axiom, step) that no map satisfies.
 
-        There are many such sets. To get a short one, whole axioms are dropped before single steps,
-        once in the order of the axioms and once in reverse, and the smaller result is returned.
+        There are many minimal sets. To get a short one, whole axioms are dropped before single
+        steps, once in the order of the axioms and once in reverse. The smaller result is returned.
+
+        Args:
+            assumed: Pairs of an atom and whether it is true in the map.
         """
         found = [
             self._shrunk(list(order), assumed) for order in (self._pairs, reversed(self._pairs))
@@ -412,8 +461,12 @@ class Axioms:
     def _shrunk(
         self, kept: list[clingo.Symbol], assumed: Sequence[Assumption]
     ) -> list[clingo.Symbol]:
-        """The pairs that are left after dropping unneeded ones in their order."""
-        # the last unsat core: as long as all of it is kept, clingo need not be asked
+        """Drop unneeded pairs (axiom, step) in their order, whole axioms first.
+
+        Returns:
+            The `active` atoms of the pairs that are left.
+        """
+        # the last unsat core: as long as all of it is kept, there is no map
         core: set[clingo.Symbol] | None = None
 
         def clash(some: list[clingo.Symbol]) -> bool:
@@ -438,5 +491,5 @@ class Axioms:
 
 
 def _last_step(refusal: Refusal) -> int:
-    """The last step that these equalities are about."""
+    """Find the last step that these equalities are about."""
     return max(max(e.first, e.second) for e in refusal)

@@ -1,4 +1,4 @@
-"""The argument why two steps are different dstates in every map, or one dstate in every map."""
+"""An argument why two steps are different dstates in every map, or one dstate in every map."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from ssh_abduction.checker.checker import Violation
 from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.explain.no_map import Clash
 
-# More reasons than this get a line each.
+# If an inference has more reasons than IN_A_LINE, each gets a line of its own.
 IN_A_LINE, INDENT = 2, " " * 7
-# A summary of more parts than this is not printed.
+# A summary with more parts than this is not printed.
 BRIEF = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """An axiom at one step that an argument needs.
+    """An axiom at one step, without which an argument fails.
 
     Attributes:
         axiom: The name of the axiom.
-        step: The step. If the axiom is about several steps at once, the last one is named.
-        without: A map of the piece in which the other links hold but the conclusion does not.
-        violations: The axioms of the argument that this map breaks, by the checker.
+        step: The step. If the axiom is about several steps at once, this is the last of them.
+        without: A map of the steps of the argument. It satisfies all other links, but not the
+            conclusion.
+        violations: The violations that the checker finds in this map, by axioms of the argument.
     """
 
     axiom: str
@@ -38,10 +39,10 @@ class Inference:
     """One line of an argument.
 
     Attributes:
-        says: The conclusions, in words.
-        because: The axioms that they follow from, in words.
-        links: These axioms, with their steps.
-        premises: The other lines that they follow from, counted from 0.
+        says: The conclusions, each as a clause.
+        because: The axioms that the conclusions follow from, each as a clause.
+        links: The same axioms by name, each with its steps.
+        premises: The indices (from 0) of the earlier lines that the conclusions follow from.
         supposed: Whether the line holds only under the supposition that leads to a contradiction.
     """
 
@@ -52,7 +53,7 @@ class Inference:
     supposed: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `explain --json` prints it."""
+        """Return the line as plain data, as `explain --json` prints it."""
         return {
             "says": list(self.says),
             "because": list(self.because),
@@ -64,17 +65,18 @@ class Inference:
 
 @dataclass(frozen=True, slots=True)
 class Derivation:
-    """Why two steps are different dstates in every consistent map, or one dstate in every map.
+    """An argument why two steps are different dstates in every map, or one dstate in every map.
 
     Attributes:
         steps: The steps of the trace that suffice for the argument.
         first: The earlier step of the pair.
-        second: The later step.
-        one: Whether the steps are one dstate.
-        links: A minimal set of axioms and steps.
+        second: The later step of the pair.
+        one: True if the steps are one dstate in every map, False if they differ in every map.
+        links: The axioms, each at one step, that the argument needs. None can be left out.
         inferences: The argument, line by line.
-        supposition: What the lines that say so suppose; None if none does.
-        summary: The last inference of the argument in one sentence.
+        supposition: The clause that the lines with `supposed` suppose; None if there is no such
+            line.
+        summary: The last inference with several premises, in one sentence.
     """
 
     steps: tuple[int, ...]
@@ -88,7 +90,7 @@ class Derivation:
 
     @property
     def clashes(self) -> tuple[Clash, ...]:
-        """The axioms in the order of the argument, each with its steps."""
+        """The axioms of the links in the order of the argument, each with all its steps."""
         return clashes_of((link.axiom, link.step) for link in self.links)
 
     @property
@@ -108,7 +110,7 @@ class Derivation:
         return "\n".join([*lines, f"in short: {self.summary}"] if len(parts) <= BRIEF else lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, without the maps of the links."""
+        """Return the argument as plain data, without the maps of the links."""
         return {
             "steps": list(self.steps),
             "clashes": [
@@ -121,7 +123,7 @@ class Derivation:
 
 
 def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[Clash, ...]:
-    """Axioms in the order of their first links, each with its steps."""
+    """Group links (pairs of an axiom and a step) by axiom, in the order of first links."""
     steps: dict[str, set[int]] = {}
     for axiom, step in links:
         steps.setdefault(axiom, set()).add(step)
@@ -129,7 +131,7 @@ def clashes_of(links: Iterable[tuple[str, int]]) -> tuple[Clash, ...]:
 
 
 def _lines_of(inference: Inference, number: int) -> Iterator[str]:
-    """The lines that print an inference: its conclusions, premises, axioms and their steps."""
+    """Yield the lines that print an inference: conclusions, premises, axioms and their steps."""
     lines = ", ".join(str(premise + 1) for premise in inference.premises)
     by = f" (from {'line' if len(inference.premises) == 1 else 'lines'} {lines})" if lines else ""
     names = "; ".join(f"{link.axiom}, {_steps(link.steps)}" for link in inference.links)

@@ -1,4 +1,4 @@
-"""Explain why a trace has no map, and which single observation would mend it."""
+"""Explain why a trace has no map, and find single observations whose change gives it a map."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory, checked_theory
 
 NEW_VIEW = "a view never seen"
-# Share of the time that is left for each search of the whole trace.
+# Share of the remaining time that each search of the whole trace may take.
 SHARE = 0.45
 
 
@@ -31,17 +31,21 @@ def explain_trace(
     time_limit: float | None = None,
     memory_limit: int | None = None,
 ) -> TraceExplanation:
-    """Explain why a trace has no map, and which single observation would mend it.
+    """Explain why a trace has no map, and find single observations whose change gives it a map.
 
-    An observation is a view, a star (openings), an action, a displacement, or asserted pair. Each
-    one in the clashing stretch is replaced by other values from the trace, or dropped. It is a mend
-    if the whole trace then has a map.
+    An observation is a view, a star (openings), an action, a displacement, or an asserted pair.
+    First the shortest stretch of the trace without a map is found. Each observation in this stretch
+    is then replaced by other values from the trace, or dropped. It is a mend if the whole trace
+    then has a map.
 
     Args:
         trace: The trace, with views.
         theory: The theory; Theory.topological() if None.
-        time_limit: Seconds, as for `explain_pair`.
-        memory_limit: MiB, as for `explain_pair`.
+        time_limit: Seconds; None for no limit. At the limit the answer says what is known by then.
+        memory_limit: MiB; None for no limit.
+
+    Returns:
+        Whether the trace has a map. If it has none, also the reason and the mends.
     """
     return TraceQuestion(
         trace, checked_theory(theory), time_limit=time_limit, memory_limit=memory_limit
@@ -50,14 +54,16 @@ def explain_trace(
 
 @dataclass(frozen=True, slots=True)
 class Mend:
-    """An observation without which the trace has a map.
+    """An observation whose change gives a trace a map.
 
     Attributes:
         step: The step of the observation; the later step of an asserted pair.
-        kind: view, star, action, displacement; or same, different, elsewhere for an asserted pair.
-        seen: What the trace says.
-        instead: A value that leaves a map; None if it is enough to drop the observation.
-        proven: Whether the whole changed trace is known to have a map, not only the stretch.
+        kind: "view", "star", "action" or "displacement"; "same", "different" or "elsewhere" for an
+            asserted pair.
+        seen: The value in the trace, in words.
+        instead: A value, in words, with which there is a map; None if the observation is dropped.
+        proven: Whether the whole changed trace is known to have a map, not only the stretch that
+            had none.
     """
 
     step: int
@@ -76,7 +82,7 @@ class Mend:
         return f"{what}, {'the trace' if self.proven else 'at least that stretch'} would have a map"
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `explain --json` prints it."""
+        """Return the mend as plain data, as `explain --json` prints it."""
         return {
             "step": self.step,
             "kind": self.kind,
@@ -89,14 +95,16 @@ class Mend:
 
 @dataclass(frozen=True, slots=True)
 class TraceExplanation:
-    """Why a trace has no map, and which single observations would mend it.
+    """The reason why a trace has no map, and the single observations that would mend it.
 
     Attributes:
-        possible: Whether the trace has a map; None if a limit ended the search before.
-        clash: A minimal clash; None if the trace has a map or the search ended before.
-        mends: The single observations without which there is a map, by step.
-        complete: Whether all observations of the clashing stretch were tried.
-        stopped: The limit that ended the search, if one did.
+        possible: Whether the trace has a map; None if a limit ended the search before this was
+            known.
+        clash: A stretch of the trace without a map, and a minimal set of axioms that clash there.
+            None if the trace has a map, or if a limit ended the search before.
+        mends: The observations whose change gives a map, sorted by step.
+        complete: Whether all observations of the stretch were tried.
+        stopped: The limit that ended the search; None if it ended by itself.
     """
 
     possible: bool | None
@@ -107,7 +115,7 @@ class TraceExplanation:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The answer in words."""
+        """The answer in words, a tuple of sentences."""
         if self.possible:
             return ("the trace has a map; name two steps to ask whether they are one dstate",)
         if self.clash is None:
@@ -123,7 +131,7 @@ class TraceExplanation:
         return "\n".join(self.sentences)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `explain --json` prints it."""
+        """Return the answer as plain data, as `explain --json` prints it."""
         return {
             "possible": self.possible,
             "sentences": list(self.sentences),
@@ -135,7 +143,7 @@ class TraceExplanation:
 
 
 class TraceQuestion(Question[TraceExplanation]):
-    """Asks why a trace has no map, and what would mend it. Parameters as in `explain_trace`."""
+    """The search for why a trace has no map and for its mends. Parameters as in `explain_trace`."""
 
     def __init__(
         self,
@@ -152,7 +160,11 @@ class TraceQuestion(Question[TraceExplanation]):
         self._complete = False
 
     def known(self, why: Stop | None = None) -> TraceExplanation:
-        """What is known so far."""
+        """Return what is known so far.
+
+        Args:
+            why: The reason that is about to end the search; None if there is none.
+        """
         mends = tuple(sorted(self._mends, key=lambda mend: (mend.step, mend.kind)))
         return TraceExplanation(
             self._possible, self._clash, mends, self._complete, why or self.stopped
@@ -188,7 +200,7 @@ class TraceQuestion(Question[TraceExplanation]):
         self._complete = True
 
     def _suits(self, trace: Trace, theory: Theory) -> bool:
-        """Whether the changed trace still has what the theory reads."""
+        """Tell whether a changed trace still has all that the theory reads."""
         try:
             settle(trace, theory)
         except AbductionError:
@@ -196,7 +208,7 @@ class TraceQuestion(Question[TraceExplanation]):
         return True
 
     def _has_map(self, trace: Trace, theory: Theory) -> bool | None:
-        """Whether a whole trace has a map; None if there is no answer in time."""
+        """Tell whether a whole trace has a map; None if there is no answer in time."""
         search = self._solved(trace, theory, 1, self._watch.left() * SHARE)
         found = next(iter(search), None)
         self._ended(search)
@@ -207,9 +219,12 @@ class TraceQuestion(Question[TraceExplanation]):
     def _observations(
         self, stretch: range
     ) -> Iterator[tuple[int, str, str, Iterable[tuple[str | None, Trace, Theory]]]]:
-        """Each observation of a stretch: its step, kind, value, and what it could have been.
+        """List the observations of a stretch, with their alternatives.
 
-        Each alternative is the other value in words, and the changed trace and theory.
+        Yields:
+            The step, kind and value of an observation, and its alternatives. An alternative is the
+            other value in words (None if the observation is dropped), the changed trace, and the
+            changed theory.
         """
         trace, theory = self.trace, self.theory
         for t in stretch:
@@ -286,7 +301,7 @@ def _with_step(trace: Trace, t: int, step: Step) -> Trace:
 
 
 def _names(stem: str) -> Iterator[str]:
-    """Names that begin with a stem."""
+    """Yield names without end: the stem, then the stem with 2, 3, … after it."""
     yield stem
     number = 1
     while True:

@@ -7,8 +7,8 @@
 >>> explanation.first, explanation.last, explanation.axioms[0]
 (0, 3, 'functional_view')
 
-The explanation is the shortest stretch of the trace that has no map, and a minimal set of axioms
-and steps that clash there.
+The explanation is a stretch of the trace (consecutive steps) that has no map, and a minimal set of
+axioms at steps that clash there. With fewer steps at either end the stretch has a map.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from ssh_abduction.theory.theory import Theory
 
 @dataclass(frozen=True, slots=True)
 class Clash:
-    """An axiom that must fail at one of these steps, given the other clashes.
+    """An axiom that cannot hold at all these steps together with the other axioms of a clash.
 
     Attributes:
         axiom: The name of the axiom.
-        steps: The steps. If the axiom is about several steps at once, the last one is named.
+        steps: The steps. If the axiom is about several steps at once, the last one is listed.
     """
 
     axiom: str
@@ -40,16 +40,17 @@ class Clash:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """A stretch of the trace without a map, and a minimal set of axioms and steps that clash.
+    """A stretch of the trace without a map, and a minimal set of axioms at steps that clash.
 
-    Dropping any one clash, even at only one of its steps, leaves a map.
+    The set is minimal: without any one of its axioms, even at only one step, the rest has a map.
 
     Attributes:
         first: The first step of the stretch.
         last: The last step of the stretch.
         clashes: The axioms that clash, each with its steps.
-        sentences: If displacements clash (`one_pose`), for each of the steps at most three returns
-            that end there, are impossible, and take part in the clash, the clearest first.
+        sentences: If displacements take part in the clash (axiom `one_pose`), sentences about the
+            returns (two steps at one dstate or place) that displacements rule out. At most three
+            for each last step of a return, the clearest first. Otherwise empty.
     """
 
     first: int
@@ -71,7 +72,7 @@ class Explanation:
         return f"no map satisfies the axioms: {where}: {', '.join(parts)}"
 
     def to_dict(self) -> dict[str, object]:
-        """Plain data, as `solve --json` prints it."""
+        """Return the explanation as plain data, as `solve --json` prints it."""
         return {
             "first": self.first,
             "last": self.last,
@@ -85,20 +86,20 @@ def explain(
 ) -> Explanation | None:
     """Explain why a trace has no map.
 
-    Steps are dropped from the end and then from the start until the stretch is as short as
-    possible. Then axioms are dropped one by one until those that are left are all needed for the
-    clash.
+    Steps are dropped from the end and then from the start, as long as the rest has no map. Then
+    axioms are dropped one by one, until all that are left are needed for the clash.
 
     Args:
         trace: The trace, with views.
         theory: The theory; Theory.topological() if None.
-        stop: Called now and then; if it returns True, Interrupted is raised.
+        stop: Called now and then. If it returns True, Interrupted is raised.
 
     Returns:
         The explanation, or None if the trace has a map.
 
     Raises:
-        TraceError, TheoryError: As `solve` does, and if the theory has `jumped`.
+        TraceError: As `solve` does.
+        TheoryError: As `solve` does, and if the theory allows wrong displacements (`jumped`).
         Interrupted: `stop` returned True.
     """
     problem = settle(trace, theory)
@@ -133,7 +134,7 @@ def explain(
 
 
 def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = None) -> str | None:
-    """Say why displacements keep two steps from being one dstate, or at one place.
+    """Say why displacements rule out that two steps are one dstate, or at one place.
 
     Args:
         trace: The trace, with displacements.
@@ -142,7 +143,8 @@ def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = Non
         theory: The theory; Theory.topological() if None.
 
     Returns:
-        A sentence, or None if displacements allow that the steps are one.
+        A sentence. None if displacements allow that the steps are one dstate, or if the theory does
+        not use displacements.
 
     Raises:
         TraceError: The trace has no such step, or both steps are the same.
@@ -165,16 +167,16 @@ def why_apart(trace: Trace, first: int, second: int, theory: Theory | None = Non
 
 
 def shortest(longest: int, has_no_map: Callable[[int], bool]) -> int | None:
-    """Find the least length that has no map, by doubling and bisection.
+    """Find the least number of steps that has no map, by doubling and bisection.
 
-    This is exact because more steps never bring a map back.
+    This is exact: if some steps have no map, more steps have none either.
 
     Args:
-        longest: The greatest length to try.
-        has_no_map: Whether a length has no map.
+        longest: The greatest number of steps to try.
+        has_no_map: A function that tells whether a number of steps has no map.
 
     Returns:
-        The length, or None if even the longest one has a map.
+        The number of steps, or None if even the longest stretch has a map.
     """
     short, long = 0, 1
     while not has_no_map(long):

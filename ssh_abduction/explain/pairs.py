@@ -7,10 +7,11 @@
 >>> explanation.verdict.value, explanation.derivation.axioms[-1]
 ('different', 'path_between_sides')
 
-First a few steps around the pair are tried. What they rule out, the whole trace rules out, because
-more steps never bring a map back. So a pair in a long trace may take no longer than one in a short
-trace. The whole trace is searched only for what the few steps leave open: its minimal maps, and the
-best map in which the steps are one dstate, or are not.
+A pair has two sides: the maps in which the steps are one dstate, and the maps in which they differ.
+First only a few steps around the pair are searched. If these steps have no map of a side, the whole
+trace has none, because more steps only add constraints. So a pair in a long trace may take no
+longer than a pair in a short one. If both sides stay possible, the whole trace is searched for its
+minimal maps, and for the best map of each side.
 """
 
 from __future__ import annotations
@@ -32,15 +33,18 @@ from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Cost, Status, Stop, facts
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-# Pieces of at most this many steps are tried before the whole trace; that takes less than a second.
+# Pieces of at most this many steps are tried before the whole trace. That takes less than a second.
 SMALL = 14
 # Pieces of at most this many steps are tried for the argument. Larger ones take minutes to ground.
 LARGE = 40
-# If axioms may not survive a cut, a trace of at most this many steps is tried as a whole.
+# Some theories allow no pieces: a map of the trace, cut to a piece, may break an axiom. Then a
+# trace of at most this many steps is tried as a whole.
 UNCUT = 24
-# Seconds to look for any map if the verdict does not depend on it; or a tenth of the time limit.
+# If a few steps decide the verdict, a search only confirms that the trace has a map. It may take
+# this many seconds, or a tenth of the time limit if that is more.
 CONFIRMING = 5.0
-# Share of the time that is left for the minimal maps, then for the best map of the other side.
+# Share of the remaining time that the search for minimal maps may take, and then the search for the
+# best map of the other side.
 SHARE = 0.45
 
 
@@ -65,14 +69,18 @@ def explain_pair(
         time_limit: Seconds, as for `solve`. When a limit or Ctrl-C ends the search, the answer says
             what is known by then.
         memory_limit: MiB, as for `solve`.
-        max_maps: Count the steps in at most this many minimal maps; None for all.
+        max_maps: List at most this many minimal maps, to count those in which the steps are one
+            dstate; None for all.
+
+    Returns:
+        The verdict. If it holds in every map, also an argument for it.
 
     Raises:
         TraceError: The trace has no such step, or both steps are the same; and as `solve` does.
         TheoryError: As `solve` does.
 
     Reference:
-        Kuipers & Beeson 2002, section 4.2, for why x0 and x4 of the rectangle differ.
+        Kuipers & Beeson 2002, section 4.2: why x0 and x4 of the rectangle differ.
     """
     a_count_of_maps(max_maps, SolverError)
     return PairQuestion(
@@ -87,7 +95,11 @@ def explain_pair(
 
 
 class PairQuestion(Question[PairExplanation]):
-    """Asks whether two steps are one dstate, and why. Parameters as in `explain_pair`."""
+    """The search for whether two steps are one dstate, and why. Parameters as in `explain_pair`.
+
+    A side of the pair is True for the maps in which the steps are one dstate, and False for the
+    maps in which they differ.
+    """
 
     def __init__(
         self,
@@ -111,16 +123,20 @@ class PairQuestion(Question[PairExplanation]):
             raise TraceError(f"step: expected two steps, got {first} twice; take another one")
         self.first, self.second = int(min(first, second)), int(max(first, second))
         self._maps = max_maps
-        self._sides = {True: Side(), False: Side()}  # by whether the steps are one
-        self._minimal = {True: False, False: False}  # whether a minimal map is such
+        self._sides = {True: Side(), False: Side()}
+        self._minimal = {True: False, False: False}  # whether the side has a minimal map
         self._minimum: Cost | None = None
         self._listed = False
         self._derivation: Derivation | None = None
         self._clash: Explanation | None = None
-        self._ruling_out: dict[bool, Piece] = {}  # a piece of the trace that has no such map
+        self._ruling_out: dict[bool, Piece] = {}  # a piece of the trace without a map of the side
 
     def known(self, why: Stop | None = None) -> PairExplanation:
-        """What is known so far."""
+        """Return what is known so far.
+
+        Args:
+            why: The reason that is about to end the search; None if there is none.
+        """
         verdict = self._verdict()
         stopped = why or self.stopped
         return PairExplanation(
@@ -155,19 +171,19 @@ class PairQuestion(Question[PairExplanation]):
         return Verdict.UNKNOWN
 
     def _is_dearer(self, side: Side) -> bool:
-        """Whether all maps of this side are known to cost more than the minimum."""
+        """Tell whether all maps of this side are known to cost more than the minimum."""
         if self._minimum is None or side.cost is None or not side.proven:
             return False
         return side.cost.preferred_by(self.theory) > self._minimum.preferred_by(self.theory)
 
     def _is_beaten(self, side: Side, by: Side) -> bool:
-        """Whether all maps of this side are known to cost more than a map of the other side."""
+        """Tell whether all maps of this side are known to cost more than a map of the side `by`."""
         if side.cost is None or not side.proven or by.cost is None:
             return False
         return side.cost.preferred_by(self.theory) > by.cost.preferred_by(self.theory)
 
     def _find_out(self) -> None:
-        # if a few steps around the pair rule out a side, so does the whole trace
+        # if a few steps around the pair have no map of a side, the whole trace has none
         for one in (True, False):
             self._ask_pieces(one, SMALL)
             if self._sides[one].possible is False:
@@ -193,7 +209,7 @@ class PairQuestion(Question[PairExplanation]):
     # Few steps around the pair
 
     def _ask_pieces(self, one: bool, most: int) -> None:
-        """Find a piece of at most `most` steps that has no map of a side."""
+        """Find a piece of at most `most` steps that has no map of the side `one`."""
         for steps in self._pieces(most):
             piece = Piece.of(self.problem, steps)
             if not self._has_map(piece, one):
@@ -202,9 +218,10 @@ class PairQuestion(Question[PairExplanation]):
                 return
 
     def _pieces(self, most: int) -> Iterator[list[int]]:
-        """Steps around the pair, from few to many.
+        """Yield lists of steps around the pair, from few to at most `most`.
 
-        If some axiom may not survive a cut to fewer steps, there is only the whole trace.
+        If the theory has rules of the user or faults, a map of the trace, cut to fewer steps, may
+        break an axiom. Then only the whole trace is yielded, if it is short.
         """
         whole = range(len(self.trace))
         if self.theory.rules or self.theory.has_faults:
@@ -220,7 +237,7 @@ class PairQuestion(Question[PairExplanation]):
                 for t in range(middle - width, middle + width + 1)
                 if t in whole
             }
-            # a short way from one step to the other says much
+            # all steps between the pair are useful if they are few
             if self.second - self.first <= most // 2:
                 near |= set(range(self.first, self.second + 1))
             steps = sorted(near)
@@ -235,7 +252,7 @@ class PairQuestion(Question[PairExplanation]):
         return Axioms(piece, self._over).consistent(assumed=[(facts.are_one(*pair), one)])
 
     def _shrunk(self, piece: Piece, one: bool) -> Piece:
-        """Drop the steps at the ends of a piece that are not needed to rule out a side."""
+        """Drop steps at the ends of a piece, as long as the rest has no map of the side `one`."""
         if self.theory.rules or self.theory.has_faults:
             return piece
         for t in (*piece.steps, *reversed(piece.steps)):
@@ -254,7 +271,8 @@ class PairQuestion(Question[PairExplanation]):
     def _list_minimal_maps(self, settled: bool) -> None:
         """List minimal maps, and count those of each side.
 
-        If the verdict is final, only ask whether there is any map.
+        Args:
+            settled: Whether the verdict is already final. Then only look for any one map.
         """
         left = self._watch.left()
         seconds = (
@@ -280,7 +298,7 @@ class PairQuestion(Question[PairExplanation]):
         self._ended(search)
 
     def _find_best(self, one: bool) -> None:
-        """Find the best map of a side."""
+        """Find the best map of the side `one`."""
         name = "same" if one else "different"
         theory = self.theory.replace(
             **{name: (*getattr(self.theory, name), (self.first, self.second))}
@@ -308,7 +326,7 @@ class PairQuestion(Question[PairExplanation]):
         ):
             self._minimal[one] = True
             self._sides[one] = replace(self._sides[one], maps=max(1, self._sides[one].maps))
-        # both best maps are known although minimal maps were not listed in time
+        # the best maps of both sides are known, although minimal maps were not listed in time
         elif self._minimum is None and all(
             side.proven and side.cost for side in self._sides.values()
         ):

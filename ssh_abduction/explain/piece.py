@@ -1,4 +1,4 @@
-"""Pieces of a trace: some of its steps, as a trace of their own."""
+"""Pieces of a trace: some of its steps, made into a trace of their own."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from ssh_abduction.theory.theory import Theory
 
 @dataclass(frozen=True)
 class Piece:
-    """Some steps of a trace as a trace of their own.
+    """Some steps of a trace, made into a trace of their own.
 
-    A map of the whole trace, restricted to these steps, satisfies the axioms there. So if the piece
-    has no map, the trace has none.
+    A map of the whole trace, restricted to these steps, satisfies the axioms at these steps. So if
+    the piece has no map, the whole trace has none.
 
     Attributes:
-        problem: The steps, numbered from 0, and the theory, with asserted pairs in these numbers.
-            Across a gap the action and displacement are unknown.
-        steps: The steps of the whole trace, ascending.
-        facts: Clingo facts: what displacements say about pairs of steps across gaps.
+        problem: A trace of these steps, numbered from 0, and the theory, with asserted pairs
+            renumbered. Where steps are left out, the action and the displacement are unknown.
+        steps: The steps by their numbers in the whole trace, ascending.
+        facts: Clingo facts: the pairs of steps that displacements rule out as one dstate or at one
+            place. Empty if no steps are left out between the first and the last.
     """
 
     problem: Problem
@@ -31,22 +32,22 @@ class Piece:
 
     @property
     def trace(self) -> Trace:
-        """The steps of the piece."""
+        """The trace of the piece, with steps numbered from 0."""
         return self.problem.trace
 
     @property
     def theory(self) -> Theory:
-        """The theory of the piece."""
+        """The theory, with asserted pairs by the numbers of the piece."""
         return self.problem.theory
 
     @staticmethod
     def of(problem: Problem, steps: Sequence[int]) -> Piece:
-        """The piece with these steps of a trace, ascending."""
+        """Cut the piece with these steps, ascending, out of the trace of a problem."""
         trace, theory = problem.trace, problem.theory
         kept: list[Step] = []
         for k, t in enumerate(steps):
             step = trace.steps[t]
-            # nothing is known about the action and the displacement across a gap
+            # where steps are left out, the action and the displacement are unknown
             if k + 1 == len(steps):
                 step = replace(step, action=None)
             elif steps[k + 1] != t + 1:
@@ -73,9 +74,14 @@ class Piece:
 
 
 def _said_across(problem: Problem, number: Mapping[int, int]) -> str:
-    """What displacements say about pairs of these steps, as facts.
+    """Write clingo facts about the pairs of steps that displacements rule out.
 
-    They are computed from the whole trace: the piece lacks the displacements across its gaps.
+    The facts are computed from the whole trace, as the piece lacks the displacements of the steps
+    that are left out.
+
+    Args:
+        problem: The whole trace and the theory.
+        number: The number in the piece of each step of the piece.
     """
     displacement = displacement_of(problem)
     if displacement is None:

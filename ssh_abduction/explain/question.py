@@ -21,13 +21,19 @@ from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
 _Answer = TypeVar("_Answer")
-SHORTEST = 0.05  # seconds that a search has at least
+SHORTEST = 0.05  # the least time limit of a search in seconds
 
 
 class Question(ABC, Generic[_Answer]):
-    """A question under limits.
+    """A question about a trace under limits of time and memory.
 
-    `answer` may be called once. `known` may be called in any thread while it runs.
+    `answer` may be called once. `known` may be called from any thread while `answer` runs.
+
+    Args:
+        trace: The trace.
+        theory: The theory; Theory.topological() if None.
+        time_limit: Seconds; None for no limit.
+        memory_limit: MiB; None for no limit.
     """
 
     def __init__(
@@ -50,7 +56,7 @@ class Question(ABC, Generic[_Answer]):
         self._search: Search | None = None
 
     def answer(self) -> _Answer:
-        """Find the answer."""
+        """Find the answer. At a limit or Ctrl-C, return what is known by then."""
         self._watch.start()
         with suppress(Interrupted, KeyboardInterrupt, LimitError):
             try:
@@ -62,24 +68,24 @@ class Question(ABC, Generic[_Answer]):
 
     @abstractmethod
     def known(self, why: Stop | None = None) -> _Answer:
-        """What is known so far.
+        """Return what is known so far.
 
         Args:
-            why: What is about to end the search, if something is.
+            why: The reason that is about to end the search; None if there is none.
         """
 
     @abstractmethod
     def _find_out(self) -> None:
-        """Find the answer, until a limit raises an exception."""
+        """Find the answer and store it in attributes. A limit raises an exception."""
 
     def interrupt(self) -> None:
-        """End soon with what is known; called from another thread or a signal handler."""
+        """Make `answer` return soon. Call this from another thread or a signal handler."""
         self._watch.interrupted = True
         if self._search is not None:
             self._search.interrupt()
 
     def _over(self) -> bool:
-        """Whether a limit has been reached."""
+        """Tell whether a limit has been reached, and store it in `stopped`."""
         try:
             self._watch.check()
         except LimitError as limit:
@@ -87,7 +93,14 @@ class Question(ABC, Generic[_Answer]):
         return self.stopped is not None
 
     def _solved(self, trace: Trace, theory: Theory, maps: int | None, seconds: float) -> Search:
-        """A search for maps that ends within `seconds`."""
+        """Make a search for maps.
+
+        Args:
+            trace: The trace.
+            theory: The theory.
+            maps: List at most this many maps; None for all.
+            seconds: The time limit of the search; infinity for none.
+        """
 
         def end_with_this(_: Progress) -> None:
             if self._over():
@@ -105,7 +118,7 @@ class Question(ABC, Generic[_Answer]):
         return search
 
     def _ended(self, search: Search) -> None:
-        """Note why a search ended early."""
+        """Store in `stopped` why a search ended early, if a limit of this question was reached."""
         self._search = None
         if search.stopped in ("interrupted", "memory limit"):
             self.stopped = search.stopped

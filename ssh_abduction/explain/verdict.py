@@ -1,4 +1,4 @@
-"""The answer to the question whether two steps are one dstate, and why."""
+"""The answer to whether two steps of a trace are one dstate, and why."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 class Verdict(Enum):
-    """What the maps of a trace say about two steps."""
+    """The relation of two steps in the maps of a trace: one dstate, or different dstates."""
 
     # different dstates, or one dstate, in every consistent map
     DIFFERENT = "different"
@@ -32,13 +32,15 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """What is known about the maps in which two steps are one dstate, or in which they differ.
+    """What is known about one side of a pair of steps.
+
+    A side is all maps in which the steps are one dstate, or all maps in which they differ.
 
     Attributes:
-        possible: Whether there is such a map; None if unknown.
-        cost: The cost of the best known one; None if none is known.
-        proven: Whether no such map costs less.
-        maps: How many of the listed minimal maps are such.
+        possible: Whether this side has a map; None if unknown.
+        cost: The cost of the best known map of this side; None if no map is known.
+        proven: Whether it is proven that no map of this side costs less.
+        maps: The number of listed minimal maps that are on this side.
     """
 
     possible: bool | None = None
@@ -47,7 +49,7 @@ class Side:
     maps: int = 0
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `explain --json` prints it."""
+        """Return the side as plain data, as `explain --json` prints it."""
         return {
             "possible": self.possible,
             "cost": self.cost.to_dict() if self.cost else None,
@@ -58,19 +60,21 @@ class Side:
 
 @dataclass(frozen=True, slots=True)
 class PairExplanation:
-    """Whether two steps are one dstate, and why.
+    """The answer to whether two steps are one dstate, and why.
 
     Attributes:
         first: The earlier step.
         second: The later step.
-        verdict: What the maps say.
+        verdict: The relation of the two steps in the maps of the trace.
         same: What is known about the maps in which the steps are one dstate.
-        different: What is known about the maps in which they are different dstates.
-        listed: Whether all minimal maps were listed, so that `maps` of both sides counts all.
-        derivation: The argument for what holds in every map; None if there is none in time.
-        clash: Why the trace has no map, if it has none.
-        stopped: The limit that ended the search, if one did.
-        theory: The theory, without `auto`.
+        different: What is known about the maps in which the steps are different dstates.
+        listed: Whether all minimal maps were listed, so that `same.maps` and `different.maps` count
+            all of them.
+        derivation: The argument, if the verdict holds in every map. None otherwise, or if no
+            argument was found in time.
+        clash: Why the trace has no map; None if it has one, or if the reason is not known.
+        stopped: The limit that ended the search; None if it ended by itself.
+        theory: The theory, with all values `auto` resolved.
     """
 
     first: int
@@ -86,12 +90,12 @@ class PairExplanation:
 
     @property
     def proven(self) -> bool:
-        """Whether the verdict is final."""
+        """Whether the verdict is final: anything but UNKNOWN."""
         return self.verdict is not Verdict.UNKNOWN
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The verdict in words, and the cost of the best map that contradicts it."""
+        """The verdict in words, and the cost of the best map that contradicts it, as sentences."""
         pair = f"steps {self.first} and {self.second}"
         verdict = {
             Verdict.DIFFERENT: f"{pair} are different dstates in every map",
@@ -107,7 +111,7 @@ class PairExplanation:
         return (verdict, *self._of_maps(), *self._of_costs())
 
     def _of_maps(self) -> Iterator[str]:
-        """The number of maps of each kind, or why there is none."""
+        """Yield sentences: the number of maps of each side, or why the trace has no map."""
         maps = self.same.maps + self.different.maps
         if self.verdict is Verdict.DISAGREE and maps > 1:
             of = f"{'the' if self.listed else 'the first'} {maps} minimal maps"
@@ -122,7 +126,7 @@ class PairExplanation:
                     yield f"a map with step {self.first} {equal} step {self.second} has {cost}"
 
     def _of_costs(self) -> Iterator[str]:
-        """The cost of the best map that contradicts the verdict."""
+        """Yield a sentence about the cost of the best map that contradicts the verdict."""
         lost, won, equal = (
             (self.same, self.different, "=")
             if self.verdict is Verdict.DIFFERENT_IN_MINIMAL
@@ -141,9 +145,9 @@ class PairExplanation:
 
     @property
     def assuming(self) -> dict[str, str]:
-        """The cost of assuming that the steps are one dstate, and that they are not, in words.
+        """The cost, in words, of assuming something about the steps.
 
-        The keys are `same` and `different`.
+        A dict with two keys: `same` (the steps are one dstate) and `different` (they are not).
         """
         sides = {"same": self.same, "different": self.different}
         best = min(
@@ -178,7 +182,7 @@ class PairExplanation:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `explain --json` prints it."""
+        """Return the answer as plain data, as `explain --json` prints it."""
         return {
             "steps": [self.first, self.second],
             "verdict": self.verdict.value,
@@ -193,13 +197,13 @@ class PairExplanation:
 
 
 def _counts(cost: Cost, names: Iterable[str]) -> Iterator[tuple[str, float]]:
-    """The preferred counts of a cost, by name."""
+    """Yield the name and number of each count. Tenths of dstates are converted to dstates."""
     for name in names:
         yield ("tenths", cost.tenths / 10) if name == "tenths" else (name, getattr(cost, name))
 
 
 def _in_words(cost: Cost, names: Iterable[str]) -> str:
-    """The preferred counts of a cost in words."""
+    """Put the counts with these names into words."""
     return (
         ", ".join(f"{number:g} {_noun(name, number)}" for name, number in _counts(cost, names))
         or "no count is preferred"
@@ -212,9 +216,9 @@ def _noun(name: str, number: float) -> str:
 
 
 def _difference(lost: Cost, won: Cost, theory: Theory) -> str:
-    """Compare the cost of a map with a better one.
+    """Compare in words the cost `lost` of a map with the cost `won` of a better map.
 
-    Name the first preferred count in which they differ, and the equal counts before it.
+    The text names the first preferred count in which the two differ, and the equal counts before.
     """
     same: list[str] = []
     for (name, one), (_, other) in zip(

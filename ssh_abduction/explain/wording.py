@@ -1,4 +1,4 @@
-"""Arguments in words: conclusions and axioms as English clauses."""
+"""Put arguments into words: conclusions and axioms as English clauses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ssh_abduction.solver import facts
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.fields import EXCUSED
 
-# Axioms that the action before a step breaks.
+# Axioms that are broken at a step because of the action before it.
 OF_ACTIONS = EXCUSED["slipped"] | {"branch_side"}
 
 _WORDS = {
@@ -35,7 +35,7 @@ _WORDS = {
     "left": "step {0} {is} at a place to the left of {path1}",
     "turned": "steps {0} and {1} {are} at one place, and step {1} {faces} {turn} step {0}",
 }
-# How a step faces that is turned by 0 to 3 quarters clockwise from another one.
+# How a step faces relative to another one, if it is turned 0, 1, 2 or 3 quarters clockwise.
 _TURNED = (
     "the same way as",
     "a quarter to the right of",
@@ -45,7 +45,12 @@ _TURNED = (
 
 
 class Words:
-    """Turns conclusions and axioms into English clauses."""
+    """A writer of English clauses for conclusions and axioms.
+
+    Args:
+        piece: The piece of the trace that the argument is about.
+        trace: The whole trace.
+    """
 
     def __init__(self, piece: Piece, trace: Trace) -> None:
         self._piece, self._trace = piece, trace
@@ -54,7 +59,7 @@ class Words:
         self._courses: set[tuple[int, int]] = set()
 
     def know(self, conclusions: Iterable[clingo.Symbol]) -> None:
-        """Name paths by the pairs of steps along them in these conclusions."""
+        """Read from these conclusions which pairs of steps are along one course, to name paths."""
         self._courses = {
             (steps[0], steps[1])
             for name, steps in map(facts.read_conclusion, conclusions)
@@ -62,7 +67,12 @@ class Words:
         }
 
     def of(self, conclusion: tuple[str, tuple[int, ...]], *, would: bool) -> str:
-        """A conclusion as a clause, with `would` if it is only supposed."""
+        """Put a conclusion into a clause.
+
+        Args:
+            conclusion: The name of the conclusion and its steps, counted in the piece.
+            would: Whether to write "would be" instead of "is", because it is only supposed.
+        """
         name, steps = conclusion
         if name in (
             "one_dstate",
@@ -92,7 +102,7 @@ class Words:
         )
 
     def _path(self, t: int) -> str:
-        """The path of a step of the piece, named by a known travel along it if there is one."""
+        """Name the path of step t of the piece, by a known travel along it if there is one."""
         pairs = sorted(
             (j - i, abs(i - t), i, j) for i, j in self._courses if t in (i, j) and j == i + 1
         )
@@ -110,14 +120,14 @@ class Words:
         *,
         short: bool = False,
     ) -> str:
-        """Why an axiom at a step of the piece gives these conclusions.
+        """Put into a clause why an axiom at a step gives some conclusions.
 
         Args:
             axiom: The name of the axiom.
             t: The step, counted in the piece.
-            said: The conclusions.
-            pair: The steps that the argument is about.
-            short: Whether to give only the sentence of the axiom.
+            said: The conclusions, each a name and its steps, counted in the piece.
+            pair: The two steps that the argument is about, counted in the piece.
+            short: Whether to write only the sentence of the axiom, without what was seen or done.
         """
         steps, sentence = self._piece.steps, self._sentences.get(axiom, axiom).rstrip(".")
         sentence = sentence[:1].lower() + sentence[1:]
@@ -151,7 +161,7 @@ class Words:
 
 
 def that_path(sentence: str) -> str:
-    """Replace the second mention of a path by `that path`."""
+    """Replace repeated mentions of a path by `that path`, unless another path was mentioned."""
     seen = set[str]()
 
     def name(match: re.Match[str]) -> str:
