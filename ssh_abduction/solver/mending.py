@@ -1,9 +1,9 @@
 """Find maps with faults in theories with places: guess the faults, mend the trace, and solve it.
 
 A fault is a view, an action or a displacement of the trace that a map treats as wrong. To *mend* a
-trace is to correct its faults: replace a wrong view by another view and a wrong action by an unknown
-one, and leave out a wrong displacement. So a map with faults is a map without faults of a mended
-trace, and all fast engines can solve a mended trace.
+trace is to correct its faults: replace a wrong view by another view and a wrong action by an
+unknown one, and leave out a wrong displacement. So a map with faults is a map without faults of a
+mended trace, and all fast engines can solve a mended trace.
 
 Two methods guess which steps have faults. If places have frames, visits are merged robustly
 (`guesses/voting.py`). In any case, the causal theory with faults is solved (`engines/faulty.py`).

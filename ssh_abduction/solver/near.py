@@ -5,8 +5,8 @@ dstate more may become minimal when it is cut to a prefix. So the readable encod
 (`encodings/*.lp`) get the whole trace here, and a rule that fixes the number of dstates.
 
 If the theory prefers few paths or places first, the number of paths or places is fixed instead.
-Excuses (pairs of paths that an axiom is not applied to) are not counted: a map may have any number
-of them above the minimum.
+Excuses (pairs of paths that an axiom is not applied to) are never fixed: adding an excuse never
+makes a map inconsistent.
 """
 
 from __future__ import annotations

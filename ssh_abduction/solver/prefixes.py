@@ -1,39 +1,43 @@
-"""Solve for a prefix, replay its maps to the end of the trace, and extend the prefix if they fail.
+"""Solve a prefix of the trace, replay its maps to the end, and extend the prefix if a replay fails.
 
-Grounding the axioms for a whole trace costs more than the square of its length. But once a map is
-closed, the rest of the trace only re-traverses it. So a search solves for a prefix, replays the
-maps found over the whole trace (`steps/log.py`), and extends the prefix, in the same clingo
-control, while a replay stops early. This is exact.
+Grounding the axioms for n steps takes more than n² time. But once the robot has seen everything,
+the rest of the trace only repeats links that the map has. So a search solves a *prefix*, the first
+steps of the trace. Then it replays each map that it finds: it follows the links of the map along
+the rest of the trace (`steps/log.py`). If a replay stops early, the prefix is extended in the same
+clingo control. The result is exact.
 
-*Claim.* Let every minimal map of a prefix, of cost c, replay to the end of the trace. Then the
-replayed maps are exactly the minimal maps of the trace, and c is their cost.
+*Claim.* Let c be the cost of the minimal maps of a prefix, and let all of these maps replay to the
+end of the trace. Then the replayed maps are exactly the minimal maps of the trace, and c is their
+cost.
 
-*Proof.* (1) A map of the trace, cut down to the prefix, is a map of the prefix. Every axiom forbids
-a pattern of links, observations and names, and a cut removes patterns. What the axioms ask for (a
-course, an order, a side, a heading), the map of the trace has. A course that only a later travel
-supports is dropped together with that travel. Cutting adds no dstate, place, path or excuse, so no
-count grows. The minimum of the prefix therefore bounds that of the trace from below.
+*Proof.* (1) A map of the trace that is cut down to the prefix is a map of the prefix. Every axiom
+forbids a pattern of links, observations and names, and a cut only removes patterns. Some axioms
+demand a course, an order, a side or a heading: the cut map keeps those of the whole map. If only a
+later travel supports a course, the cut drops both. A cut adds no dstate, place, path or excuse, so
+no count grows. Therefore the minimum of the prefix is a lower bound on that of the trace.
 (2) A map that replays to the end has the same links and observations over the whole trace as over
-the prefix. The axioms speak of nothing else, so the replayed map satisfies them, at cost c. By (1),
-c is the minimum.
-(3) A minimal map F of the trace has cost c by (2). Cut down to the prefix it costs at most c in
-every count, and at least c in the order of preference by (1). So the cut is one of the minimal maps
-of the prefix, R. As actions are deterministic and replaying R meets only links of R, F has the
-labels of the replayed R, the same links, and so the same support for every course: F is the
-replayed R. Different R replay to different maps, as they differ on the prefix already. ∎
+the prefix. The axioms read nothing else, so the replayed map satisfies them, and it costs c. By
+(1), c is the minimum.
+(3) Let F be a minimal map of the trace. By (2) it costs c. The cut of F costs at most c in every
+count, and by (1) no less than c in the order of preference. So the cut is one of the minimal maps
+of the prefix; call it R. Actions are deterministic, and the replay of R meets only links of R. So F
+has the same labels and links as the replayed R, and the same travels support its courses: F is the
+replayed R. Two different minimal maps of the prefix differ in the prefix, so they replay to
+different maps. ∎
 
-*Names for paths.* Grounding grows with the square of the number of names for paths, and most traces
-have far more segments than their maps have paths. So a control starts with a few names. What it
-finds minimal stands if no map with more paths can be as good. Where fewest paths come first, this
-holds once there is any map. Where fewest dstates come first, it holds once there are half as many
-names as dstates in the minimal map: every path holds the two ends of a travel, and a dstate is
-along one path (with all_on_paths a path may hold one dstate alone). Otherwise the control is made
-again with more names. At most one for each segment of the prefix is enough for any map.
+*Names for paths.* Grounding grows with the square of the number of names for paths. Most traces
+have far more segments than their maps have paths, so a control starts with a few names. Its minimum
+is right if no map with more paths can be as good. If the theory minimises paths first, this is so
+once there is any map. If it minimises dstates first, this is so once there are half as many names
+as the minimal map has dstates: every path has the two ends of a travel, and no dstate is along two
+paths. (Without the axiom course_needs_travel a path may have a single dstate. Then there must be as
+many names as dstates.) Otherwise the search makes a new control with more names. One name for each
+segment of the prefix is enough for any map.
 
-A map whose replay stops early is no answer. The longer prefix says how it continues. The claim
-needs determinism, one place, course and heading for each dstate, and axioms that survive the cut.
-`theory/speedups.py` lists the theories for which this is known. For any other theory, the prefix is
-the whole trace.
+A map whose replay stops early is no answer. A longer prefix shows how it continues. The claim needs
+determinism; one place, course and heading for each dstate; and axioms that a cut map still
+satisfies. `theory/speedups.py` lists the theories for which this is known. For any other theory,
+the prefix is the whole trace.
 """
 
 from __future__ import annotations
@@ -57,23 +61,23 @@ from ssh_abduction.theory.evidence import Equality
 
 _log = log_of(__name__)
 
-FIRST_PREFIX = 8  # steps of the first prefix, which is solved at once
-# At most this many maps are held until a prefix proves long enough. Further maps stream, so that
-# memory stays constant.
+FIRST_PREFIX = 8  # steps of the first prefix, which takes clingo no time
+# Hold at most this many maps until the prefix proves long enough. If there are more, give all of
+# them at once and the others as they come, so that memory stays constant.
 HELD_BACK = 1000
-# If all maps are wanted and evidence may reject some, remember at most this many. Up to then,
-# forbid each rejected set and list anew. After that, leave out rejected maps one by one.
+# If all maps are wanted and evidence may reject some, remember up to this many maps. Until then,
+# forbid each rejected set of equalities and list anew. After that, skip rejected maps one by one.
 REMEMBERED = 10_000
 # Names for paths to begin with. Few traces need more, and grounding grows with their square.
 FIRST_PATHS = 8
 
 
 class Prefixes:
-    """Finds the minimum and lists the minimal maps by growing prefixes.
+    """Finds the minimal cost and lists the minimal maps by growing prefixes.
 
     Attributes:
-        engine: Holds the axioms for the prefix.
-        start: The size of the first prefix.
+        engine: The engine, which has the axioms for the prefix.
+        start: The number of steps of the first prefix.
     """
 
     def __init__(
@@ -85,15 +89,15 @@ class Prefixes:
         most: int,
         report: Callable[[], None],
     ) -> None:
-        """Nothing is solved yet.
+        """Solve nothing yet.
 
         Args:
             task: The task of the search.
-            known: What is known about the trace.
-            judging: Checks maps.
+            known: What is known about the maps of the trace. The results are added to it.
+            judging: Says which maps the evidence rejects.
             engine: The engine to begin with.
-            most: The number of maps that are wanted; 0 for all.
-            report: Called now and then.
+            most: The number of maps wanted; 0 for all.
+            report: Called now and then to report progress.
         """
         self.engine = engine
         self._task, self._known, self._judging, self._most, self._report = (
@@ -112,14 +116,14 @@ class Prefixes:
         self.engine, self.start = engine, start
 
     def find_minimum(self) -> None:
-        """Extend the prefix until a minimal map of it replays to the end, or it has no map.
+        """Extend the prefix until one of its minimal maps replays to the end, or it has no map.
 
-        Sets the status accordingly.
+        Set `known.status` to OPTIMAL or UNSATISFIABLE, and `known.best` to the map.
         """
         size, steps = min(len(self._task.trace), self.start), len(self._task.trace)
         while True:
             if size == steps:
-                self._task.watch.use_reserve(LAST)  # the reserve is kept for this search
+                self._task.watch.use_reserve(LAST)  # it was reserved for this search
             _log.debug("%s is given %d of %d steps", type(self.engine).__name__, size, steps)
             self.engine.grow(size)
             minimal = self.minimise()
@@ -144,7 +148,7 @@ class Prefixes:
             size = self.engine.next_size(len(replayed.labels))
 
     def minimise(self) -> Found | None:
-        """A minimal map of the prefix that no evidence rejects; None if it has no map."""
+        """Find a minimal map of the prefix that no evidence rejects; None if there is none."""
 
         def why_refused(found: Found) -> frozenset[Equality] | None:
             refusal = self._judging.refusal(found.map)
@@ -158,7 +162,10 @@ class Prefixes:
         return first_accepted(self._minimise_as_told, why_refused, self._forbid)
 
     def _forbid(self, equalities: frozenset[Equality]) -> None:
-        """Forbid all maps with these equalities. Changes the engine if this one cannot do it."""
+        """Forbid all maps that have all of these equalities.
+
+        If the engine cannot do it, go on with a `StepEngine`.
+        """
         if self._tell(equalities):
             return
         _log.debug("%s cannot be told so: the readable encodings go on", type(self.engine).__name__)
@@ -171,16 +178,20 @@ class Prefixes:
         self.engine.forbid(equalities)
 
     def _tell(self, equalities: frozenset[Equality]) -> bool:
-        """Forbid all maps with these equalities, in this engine. Returns whether it can."""
+        """Let the present engine forbid all maps that have all of these equalities.
+
+        Returns:
+            Whether it can do so.
+        """
         can_be_told = isinstance(self.engine, StepEngine) or all(
             equality.holds for equality in equalities
         )
         return can_be_told and self.engine.forbid(equalities)
 
     def _minimise_as_told(self) -> Found | None:
-        """A minimal map of the prefix under clingo's constraints; None if the prefix has none.
+        """Find a minimal map of the prefix, not yet judged by evidence; None if there is none.
 
-        Better maps of the whole trace are kept on the way.
+        Keep each better map of the whole trace that comes up on the way.
         """
         while True:
             minimal = None
@@ -206,14 +217,18 @@ class Prefixes:
                 return minimal
 
     def _predicts_all(self, found: Found, replayed: Replay) -> bool:
-        """Whether a map of the prefix is one of the whole trace and no evidence rejects it."""
+        """Whether a map of the prefix replays to the end, and no evidence rejects the result."""
         whole = replayed.outcome is Outcome.PREDICTED
         return whole and not self._judging.why_refused(self._whole(found.map, replayed))
 
     def _name_more_paths(self, cost: tuple[int, ...] | None) -> bool:
-        """Begin a control with more names for paths, if the minimal cost needs them.
+        """Start a new control with more names for paths, if the proof of the minimum needs them.
 
-        Returns whether it did.
+        Args:
+            cost: The preferred counts of a minimal map of the prefix; None if it has no map.
+
+        Returns:
+            Whether there is a new control.
         """
         needed = paths_needed(self._task, self.engine.size, cost)
         if needed <= self.engine.paths:
@@ -225,9 +240,9 @@ class Prefixes:
         return True
 
     def minimal_maps(self) -> Iterator[SSHMap]:
-        """List every minimal map once, after the prefix has proven long enough."""
-        streamed: list[int] = []  # prefixes whose completely replayed maps were given
-        held: list[SSHMap] = []  # maps of this prefix that replay
+        """Yield every minimal map once, after `find_minimum` has proven the minimal cost."""
+        streamed: list[int] = []  # sizes of the prefixes whose replayed maps were given
+        held: list[SSHMap] = []  # maps of this prefix that replay to the end
         try:
             while True:
                 held.clear()
@@ -237,7 +252,7 @@ class Prefixes:
                 self.engine.grow(self.engine.next_size(stuck))
                 self._name_more_paths(self._known.cost)
         except (LimitError, StageTimeError):
-            yield from held  # they replay at the proven cost: they are minimal
+            yield from held  # these maps replay to the end at the minimal cost: they are minimal
             raise
         yield from held
 
@@ -246,16 +261,22 @@ class Prefixes:
     ) -> Generator[SSHMap, None, int]:
         """Find the minimal maps of this prefix that replay to the end.
 
-        They are held back, or given if they are many or the prefix is the whole trace.
+        Append the maps to `held`. Yield them instead if there are many, or if the prefix is the
+        whole trace.
+
+        Args:
+            held: Gets the maps.
+            streamed: The sizes of earlier prefixes whose maps were given. Maps that already replay
+                from such a prefix are left out.
 
         Returns:
-            The farthest step at which a replay fails; 0 if all maps replay and none are missing.
+            The farthest step at which a replay fails; 0 if all minimal maps replay to the end.
         """
         enough = min(HELD_BACK, self._most + 1) if self._most else HELD_BACK
         asked = self._most and self._most + 1
         streaming = self.engine.size == len(self._task.trace)
         stuck, telling = 0, True
-        given = set[SSHMap]()  # or held back, if some maps may be rejected
+        given = set[SSHMap]()  # maps that were yielded or held, if evidence may reject others
         while True:
             came, refusal = 0, None
             for found in self.engine.maps_of_cost(self._known.cost, asked):
@@ -289,13 +310,13 @@ class Prefixes:
                     streaming = True
                     yield from held
                     held.clear()
-            if refusal:  # list anew; forbid the rejected maps if the engine can
+            if refusal:  # list anew, without the rejected maps if the engine can forbid them
                 telling = self._tell(refusal)
                 continue
             if stuck or not asked or came < asked:
                 break
-            # clingo stopped at the number of maps asked for, but evidence rejected some of
-            # them: there may be others
+            # clingo stopped at the number of maps asked for. But evidence rejected some of these,
+            # so ask for more.
             asked *= 2
         if stuck and streaming:
             streamed.append(self.engine.size)
@@ -304,8 +325,15 @@ class Prefixes:
     def _replay(self, ssh_map: SSHMap, known: int | None = None) -> Replay:
         """Replay the trace over a map of a prefix.
 
-        `known` is the number of steps of the prefix that make links. If stars are compared within
-        tolerance, those of all steps must agree.
+        If stars (the openings seen at a step) need to agree only within tolerance, the stars of all
+        steps are compared at the end, too.
+
+        Args:
+            ssh_map: The map.
+            known: Use only the links between this many first steps; None for all of the prefix.
+
+        Returns:
+            The labels of the steps that the map explains, and how the replay ended.
         """
         log = self._task.log
         replayed = log.replay(
@@ -328,9 +356,9 @@ class Prefixes:
         return replayed
 
     def _whole(self, ssh_map: SSHMap, replayed: Replay) -> SSHMap:
-        """A map of a prefix as a map of all steps that replay over it.
+        """Extend a map of a prefix to all steps that a replay explains.
 
-        If stars are compared within tolerance, its headings are those that all stars allow.
+        If stars need to agree only within tolerance, give the map headings that all stars allow.
         """
         whole = replace(ssh_map, labels=replayed.labels)
         if not self._in_tolerance or len(ssh_map.labels) == len(replayed.labels):

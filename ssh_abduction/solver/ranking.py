@@ -1,4 +1,8 @@
-"""Rank equally minimal maps by how well they close, if the trace has displacements."""
+"""Rank equally minimal maps by how well their poses agree with the displacements of the trace.
+
+A map *closes* well if the displacements (how the robot moved, by its odometry) along each loop of
+the map nearly add up to nothing. `fit.py` measures this by a chi-square.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +18,17 @@ from ssh_abduction.runtime.clock import heeding, look_at_clock
 from ssh_abduction.solver.asp.limits import LimitError, Watch
 from ssh_abduction.theory.evidence.displacement import jumped
 
-# At most this many maps are ranked, so that memory stays constant. Later maps keep their order.
+# Rank at most this many maps, so that memory stays constant. Later maps keep their order.
 RANKED = 1000
-# A warning about the noise of the odometry needs a chi-square of the best map that is at most this
-# probable, in either direction,
+# Warn about the noise of the odometry only if the chi-square of the best map is so high, or so low,
+# that its probability is at most this.
 DOUBTED = 1e-3
-# and standard deviations that are too small or too large by these factors. Smaller errors change no
-# answer.
+# Warn, besides, only if standard deviations are too small by the first of these factors, or too
+# large by the second. Smaller errors change no answer.
 TOO_SMALL, TOO_LARGE = 1.5, 2.0
-# A displacement of at most this many standard deviations may be that of a robot standing still.
+# With a displacement of at most this many standard deviations, the robot may have stood still.
 STANDING = 2.0
-NEVER_LESS = 0.01  # the least factor; displacements that agree exactly would make it 0
+NEVER_LESS = 0.01  # the least factor to name; if displacements agree exactly it would be 0
 
 OVERTIME = 0.3  # seconds beyond the limit for the fit of the first map
 
@@ -32,9 +36,9 @@ _Key: TypeAlias = tuple[tuple[int, ...], tuple[int | None, ...], tuple[int, ...]
 
 
 class Ranking:
-    """Computes how well the maps of one trace close.
+    """Computes how well the maps of one trace agree with its displacements.
 
-    Maps that differ only in paths close alike. Their fit is computed once.
+    Maps that differ only in paths agree equally well, so their fit is computed only once.
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -42,7 +46,7 @@ class Ranking:
         self._known: dict[_Key, Fit] = {}
 
     def fitted(self, ssh_map: SSHMap) -> SSHMap:
-        """The same map with its fit."""
+        """The same map with its field `fit`: the poses, and how well they agree."""
         from ssh_abduction.solver.fit import fit  # loads scipy
 
         key = ssh_map.labels, tuple(s.place for s in ssh_map.dstates), jumped(ssh_map)
@@ -51,12 +55,12 @@ class Ranking:
         return replace(ssh_map, fit=self._known[key])
 
     def ranked(self, maps: Iterator[SSHMap], over: Callable[[], bool]) -> Iterator[SSHMap]:
-        """The same maps, the one that closes best first.
+        """Yield the same maps with their fit, the one with the least chi-square first.
 
         Args:
-            maps: The maps as they are found.
-            over: Whether the limits are over. Then the maps keep their order and get no fit. The
-                first one may use OVERTIME seconds more for its fit.
+            maps: The maps as they are found. Only the first RANKED of them are sorted.
+            over: Returns whether a limit is over. From then on, maps get no fit and stay in their
+                order. Only the first map may use OVERTIME seconds more for its fit.
         """
         overtime = Watch(OVERTIME)
 
@@ -88,12 +92,12 @@ class Ranking:
 def in_order(maps: Sequence[SSHMap], counts: Iterable[int]) -> tuple[SSHMap, ...]:
     """Sort maps into an order that is the same in each run.
 
-    Maps that close best come first. Equal ones are sorted by their labels, then by their places,
-    then by their courses, numbered by first visit.
+    Maps with the least chi-square come first. Equal ones are sorted by labels, then by places,
+    paths, directions and faults.
 
     Args:
-        maps: The maps.
-        counts: The number of maps of each level. Each level is sorted by itself. Maps beyond the
+        maps: The maps, level by level. A level is the maps of one cost.
+        counts: The number of maps in each level. Each level is sorted by itself. Maps after the
             last level keep their order.
     """
     left = iter(maps)
@@ -119,9 +123,9 @@ def _order(ssh_map: SSHMap) -> tuple[object, ...]:
 
 
 def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
-    """The relative probabilities of rival maps by displacements alone: exp(-chi2/2), normalised.
+    """The probability of each map by displacements alone: exp(-chi2/2), so that the sum is 1.
 
-    Empty unless all of them have a fit.
+    Empty unless all maps have a fit.
     """
     squares = [ssh_map.fit.chi2 for ssh_map in maps if ssh_map.fit]
     if not squares or len(squares) < len(maps):
@@ -131,14 +135,20 @@ def weights(maps: Sequence[SSHMap]) -> tuple[float, ...]:
 
 
 def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
-    """A warning if the best map contradicts the noise that the odometry claims; else None."""
+    """A sentence that warns of a wrong noise model, if the best map contradicts it; else None.
+
+    Args:
+        fit: The fit of the best map; None if it has none.
+        trace: The trace, with the noise model of its odometry.
+    """
     if fit is None or fit.dof < 1 or min(fit.p, 1 - fit.p) > DOUBTED / 2:
         return None
     factor = max(math.sqrt(fit.chi2 / fit.dof), NEVER_LESS)
     if 1 / TOO_LARGE < factor < TOO_SMALL:
         return None
     if factor < 1 and trace.odometry and trace.odometry.offset:
-        # The error of a dstate's measured pose counts at each displacement there: that is too much.
+        # The fit adds the error of a dstate's pose to every displacement there. That is too much,
+        # so a small chi-square says nothing.
         return None
     how, told = ("smaller", "tight") if factor > 1 else ("larger", "loose")
     return (
@@ -150,9 +160,10 @@ def noise_warning(fit: Fit | None, trace: Trace) -> str | None:
 
 
 def units_warning(trace: Trace) -> str | None:
-    """A warning if displacements cannot tell travel from standing still, as if in kilometres.
+    """A sentence that warns if all displacements are as small as their noise; else None.
 
-    None if they can, or if no travel has a displacement.
+    This happens if displacements are in kilometres instead of metres. Only travels with a
+    displacement count. If there is none, there is no warning.
     """
     ways: list[float] = []
     sigmas: list[float] = []

@@ -1,4 +1,7 @@
-"""Read a solution's JSON field by field. An error names the field that is wrong."""
+"""Read the JSON of a solution field by field. An error names the field that is wrong.
+
+Each function takes a `FieldReader`, which checks fields and knows the name of the file.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,14 @@ from ssh_abduction.theory.theory import Theory
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """The parts of a file that only the search or the trace could compute again.
+    """The parts of a solution's file that cannot be computed from its maps alone.
 
     Attributes:
-        certificate: Why no map has fewer dstates.
-        written_certificate: The certificate as in the file, with its words.
-        warnings: What makes the trace suspicious, a sentence each.
-        explanation: Why there is no map.
+        certificate: The proof that no map has fewer dstates; None if the file has none.
+        written_certificate: The certificate as in the file, with the actions that distinguish its
+            steps; None if the file has none.
+        warnings: Sentences that say what makes the trace suspicious.
+        explanation: Why there is no map, as in the file; None if the file does not say.
     """
 
     certificate: Certificate | None
@@ -33,7 +37,16 @@ class Recorded:
 
     @classmethod
     def of(cls, read: FieldReader, record: Mapping[str, Any], steps: int) -> Recorded:
-        """Read a record of a solution for a trace of `steps` steps. Raises MapError."""
+        """Read these parts from the record of a solution.
+
+        Args:
+            read: Checks the fields.
+            record: The fields of the solution.
+            steps: The number of steps of the trace.
+
+        Raises:
+            MapError: A field is wrong.
+        """
         written = (
             None
             if record.get("certificate") is None
@@ -55,14 +68,15 @@ class Recorded:
 
 @dataclass(frozen=True, slots=True)
 class Support:
-    """What backs a solution up: its certificate, and warnings about its trace.
+    """The data behind a solution's certificate and its warnings.
 
     Attributes:
         basis: The data for the certificate. None if the theory lacks an axiom that the
-            certificate needs.
-        odometry_warning: A fault of the odometry: the best map contradicts its noise, or
-            displacements do not distinguish travel from standing still.
-        recorded: What the file says, in a solution that was read from one.
+            certificate needs, or if the solution was read from a file.
+        odometry_warning: A sentence that warns of wrong odometry; None if there is nothing to warn
+            of.
+        recorded: The certificate and warnings of the file, if the solution was read from a file;
+            else None.
     """
 
     basis: Basis | None = None
@@ -71,14 +85,17 @@ class Support:
 
     @property
     def certificate(self) -> Certificate | None:
-        """Why no map has fewer dstates. Computed when it is first asked for."""
+        """The proof that no map has fewer dstates; None if there is none.
+
+        It is computed at the first use.
+        """
         if self.recorded is not None:
             return self.recorded.certificate
         return self.basis.certificate if self.basis else None
 
 
 def backbone_in(read: FieldReader, record: Mapping[str, Any], steps: int) -> Backbone | None:
-    """What the minimal maps share; None if the file lacks it. Raises MapError."""
+    """Read the backbone (what all minimal maps share); None if there is none. Raises MapError."""
     if record.get("backbone") is None:
         return None
     return Backbone.from_dict(record["backbone"], steps, f"{read.where}: backbone")
@@ -117,7 +134,7 @@ def _whole(read: FieldReader, value: Any, name: str) -> int:
 
 
 def theory_in(value: Any, where: str) -> Theory:
-    """The theory of a solution. Raises MapError."""
+    """Read the theory of a solution. Raises MapError if it is not one."""
     try:
         return Theory.from_dict(value)
     except TheoryError as error:
@@ -125,7 +142,7 @@ def theory_in(value: Any, where: str) -> Theory:
 
 
 def cost_in(read: FieldReader, value: Any, name: str) -> Cost:
-    """What a map costs. Raises MapError."""
+    """Read the cost of a map from the field `name`. Raises MapError."""
     record = read.mapping(value, name)
     if unknown := set(record) - {*COUNTS, "faults"}:
         raise read.wrong(name, f"numbers of {', '.join(COUNTS)} and faults", sorted(unknown))
@@ -134,7 +151,7 @@ def cost_in(read: FieldReader, value: Any, name: str) -> Cost:
 
 
 def bound_in(read: FieldReader, value: Any) -> Bound:
-    """The proven lower bounds. Raises MapError."""
+    """Read the proven lower bounds. Raises MapError."""
     record = read.mapping(value, "bound")
     counts = {str(k): _whole(read, v, f"bound.{k}") for k, v in record.items() if k in COUNTS}
     if unknown := set(record) - {*counts, "cost"}:
@@ -145,7 +162,7 @@ def bound_in(read: FieldReader, value: Any) -> Bound:
 
 
 def effort_in(read: FieldReader, record: Mapping[str, Any]) -> Effort:
-    """What the search did. Raises MapError."""
+    """Read what the search did: prefix, times, grounding and evidence. Raises MapError."""
     prefix = read.integer(record.get("prefix", 0), "prefix")
     times = read.mapping(record.get("seconds", {}), "seconds")
     seconds = Seconds(
@@ -166,7 +183,18 @@ def effort_in(read: FieldReader, record: Mapping[str, Any]) -> Effort:
 
 
 def levels_in(read: FieldReader, record: Mapping[str, Any], maps: int) -> tuple[Level, ...]:
-    """The levels of the maps: one level of all maps if the file names none. Raises MapError."""
+    """Read the levels: how many of the maps have which cost.
+
+    If the file has no levels, all maps are one level.
+
+    Args:
+        read: Checks the fields.
+        record: The fields of the solution.
+        maps: The number of maps in the file.
+
+    Raises:
+        MapError: A field is wrong, or the levels do not add up to this number of maps.
+    """
     complete = record.get("minimal_listed", record.get("complete")) is True
     if "levels" not in record:
         if not maps or record.get("cost") is None:
