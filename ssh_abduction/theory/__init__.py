@@ -1,4 +1,4 @@
-"""Which axioms hold, where they are written, and which speed-ups they allow."""
+"""Theories: which axioms hold, in which encodings they are, and which speed-ups they allow."""
 
 from ssh_abduction.theory.fields import CAUSAL, CHOICES, COUNTS, Count
 from ssh_abduction.theory.speedups import Speedups

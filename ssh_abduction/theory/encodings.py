@@ -1,4 +1,7 @@
-"""Finds the `.lp` files, and reads from their comments what each axiom says and when it holds."""
+"""Find the encodings (`.lp` files), and read in their comments what each axiom says.
+
+The comments also say for which theories an axiom holds.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from pathlib import Path
 
 from ssh_abduction.data.files import shipped
 
-# Each file needs those before it. Files that users add come after them, sorted by name.
+# Each of these files needs the ones before it. Files that users add follow, sorted by name.
 FIRST = (
     "causal",
     "topological",
@@ -29,15 +32,19 @@ _WITH = re.compile(r"^% @with (?P<names>.+)$")
 
 @dataclass(frozen=True)
 class Axiom:
-    """One axiom.
+    """An axiom, as the comments of its encoding describe it.
+
+    A condition is a text about the fields of a theory, such as "star=frame".
 
     Attributes:
         name: The name, as in `violation(name,…)`.
-        sentence: What it says.
-        source: Where it comes from.
+        sentence: What the axiom says.
+        source: The publication that it is from; may be empty.
         level: The name of its encoding.
-        subject: Conditions on a theory without which the axiom has no subject (`% @when`).
-        conditions: All conditions that switch it on: those, and the ones behind `if`.
+        subject: Conditions for a theory to have what the axiom is about, such as stars
+            (`% @when`).
+        conditions: All conditions for a theory to have the axiom: `subject`, and those after `if`
+            in the comment of the axiom.
     """
 
     name: str
@@ -52,14 +59,15 @@ class Axiom:
         return all(_holds(condition, choices) for condition in self.conditions)
 
     def has_subject_in(self, choices: Mapping[str, object]) -> bool:
-        """Whether a theory with these fields has the subject of the axiom."""
+        """Whether a theory with these fields has what the axiom is about, such as stars."""
         return all(_holds(condition, choices) for condition in self.subject)
 
 
 def _holds(condition: str, choices: Mapping[str, object]) -> bool:
-    """Whether a condition holds.
+    """Whether a condition holds in a theory with these fields.
 
-    Its form is `field=value|value`, `field`, `field|field` (any of these), or `not field`.
+    The condition is `field=value|value` (the field has one of these values), `field` or
+    `field|field` (one of these fields is true), or `not field`.
     """
     if "=" in condition:
         field, values = condition.split("=")
@@ -70,19 +78,22 @@ def _holds(condition: str, choices: Mapping[str, object]) -> bool:
 
 
 def folder() -> Path:
-    """The folder of the encodings, in the installed package or beside it in a checkout."""
+    """Return the folder of the encodings, in the installed package or beside it in a checkout."""
     return shipped("encodings")
 
 
 def path(name: str) -> str:
-    """The path of an encoding, readable or fast."""
+    """Return the path of a readable encoding or, if none has this name, of a fast one."""
     readable = folder() / f"{name}.lp"
     return str(readable if readable.exists() else folder() / "fast" / f"{name}.lp")
 
 
 @cache
 def levels() -> tuple[str, ...]:
-    """The encodings with axioms, in the order to load them, also those that users add."""
+    """Return the names of all encodings with axioms, in the order to load them.
+
+    Encodings that users add to the folder are included.
+    """
     found = [
         file.stem
         for file in folder().glob("*.lp")
@@ -95,7 +106,7 @@ def levels() -> tuple[str, ...]:
 
 @cache
 def axioms() -> tuple[Axiom, ...]:
-    """All axioms, in the order of the files."""
+    """Return all axioms, in the order of the files."""
     return tuple(
         axiom
         for level in levels()
@@ -104,7 +115,12 @@ def axioms() -> tuple[Axiom, ...]:
 
 
 def axioms_in(text: str, level: str) -> list[Axiom]:
-    """The axioms in the comments of an encoding."""
+    """Read the axioms in the comments of an encoding.
+
+    Args:
+        text: The content of the encoding.
+        level: Its name.
+    """
     found: list[Axiom] = []
     subject: tuple[str, ...] = ()
     for line in _unwrapped(text):
@@ -126,9 +142,9 @@ def axioms_in(text: str, level: str) -> list[Axiom]:
 
 
 def _unwrapped(text: str) -> list[str]:
-    """The lines of an encoding, with each `% @axiom` comment joined to its continuation lines.
+    """Return the lines of an encoding, with each `% @axiom` comment on one line.
 
-    A continuation line starts with `%` and at least three spaces.
+    A line that continues such a comment starts with `%` and at least three spaces.
     """
     lines: list[str] = []
     for line in text.splitlines():
@@ -140,9 +156,12 @@ def _unwrapped(text: str) -> list[str]:
 
 
 def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
-    """The encodings that a theory with these fields needs, in the order to load them.
+    """Return the names of the encodings that a theory needs, in the order to load them.
 
     An axiom that is left out (`without`) still needs its encoding.
+
+    Args:
+        choices: The fields of the theory.
     """
     return tuple(
         level
@@ -153,10 +172,10 @@ def needed_by(choices: Mapping[str, object]) -> tuple[str, ...]:
 
 @cache
 def paths(name: str) -> tuple[str, ...]:
-    """The files of an encoding: those that it shares (`% @with` at its head), then its own.
+    """Return the paths of the files of an encoding: files that it shares, then its own.
 
-    Clingo's `#include` is not used, because it prefers a file of that name in the working
-    directory.
+    A line `% @with` names the shared files. Clingo's `#include` is not used, because it prefers a
+    file of that name in the working directory.
     """
     own = path(name)
     return (*(path(shared) for shared in _said(own, _WITH)), own)
@@ -164,14 +183,17 @@ def paths(name: str) -> tuple[str, ...]:
 
 @cache
 def keeps(*names: str) -> frozenset[str]:
-    """The axioms that these fast encodings keep, as they and the files they share say."""
+    """Return the names of the axioms for which these fast encodings are exact.
+
+    The lines `% @keeps` of the encodings, and of the files that they share, list them.
+    """
     return frozenset(
         axiom for name in names for file in paths(name) for axiom in _said(file, _KEEPS)
     )
 
 
 def _said(file: str, head: re.Pattern[str]) -> list[str]:
-    """The names in all lines of a file that begin with `head`."""
+    """Return the names in all lines of a file that match `head`."""
     lines = Path(file).read_text(encoding="utf-8").splitlines()
     return [
         name for line in lines if (match := head.match(line)) for name in match["names"].split()

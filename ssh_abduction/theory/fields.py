@@ -22,11 +22,12 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "star": ("auto", "none", "alike", "pattern", "frame", "gateways"),
     "displacement": ("auto", "none", "use"),
 }
-# Readings of stars that compare the directions of gateways within their spreads.
+# Values of `star` for which gateways match if their directions agree within their spreads.
 IN_TOLERANCE = ("alike", "gateways")
 COUNTS: tuple[Count, ...] = ("dstates", "paths", "places", "excuses")
-# The default preferences. Displacements distinguish places, so the fewest places are seldom
-# too few. Without them, the fewest paths are the better choice (docs/measurements/truth.md).
+# What is minimised by default. Displacements show that places differ, so a map with the fewest
+# places seldom has too few. Without displacements, it is better to minimise paths before places
+# (docs/measurements/truth.md).
 AUTO: tuple[Count, ...] = ("auto",)
 PREFERRED: tuple[Count, ...] = ("dstates", "paths", "places")
 WITH_DISPLACEMENTS: tuple[Count, ...] = ("dstates", "places", "paths")
@@ -47,8 +48,8 @@ EXCUSED = {
     },
     "jumped": {"one_pose"},
 }
-DEAREST = 1000.0  # dstates that a fault may cost at most
-MOST_JOINT = 2  # returns that may be tested together at most
+DEAREST = 1000.0  # the most dstates that a fault may cost
+MOST_JOINT = 2  # the most returns that may be tested together
 MOST_STEPS = 2**31  # the numbers of steps are below this: clingo's numbers have 32 bits
 ASSERTIONS = ("same", "different", "elsewhere")
 FAULTS = ("misread", "misseen", "slipped", "jumped")
@@ -56,7 +57,11 @@ CAUSAL = "Theory.causal() (--theory causal)"  # for error messages
 
 
 def normalise(theory: Theory) -> None:
-    """Check all fields of a new theory, and bring each into one form. Raises TheoryError."""
+    """Check all fields of a new theory, and convert each to its standard form.
+
+    Raises:
+        TheoryError: A field is wrong, or two fields contradict each other.
+    """
     for name, values in CHOICES.items():
         if not isinstance(getattr(theory, name), str) or getattr(theory, name) not in values:
             raise TheoryError(
@@ -101,7 +106,7 @@ def normalise(theory: Theory) -> None:
 
 
 def choice(name: str, value: str) -> str:
-    """A choice for an error message: how to make it in Python and in the shell."""
+    """Say how to set a field in Python and in the shell, such as "star=none (--star none)"."""
     flag = f"--{name} {value}" if name == "star" else f"--set {name}={value}"
     return f"{name}={value} ({flag})"
 
@@ -189,18 +194,18 @@ def _set_names(theory: Theory, field: str, allowed: Iterable[str]) -> None:
 
 
 class _Checked(tuple[Pair, ...]):
-    """Pairs that are checked. A theory made from another one need not check its pairs again."""
+    """Pairs that were checked. If a theory is made from another one, they are not checked again."""
 
 
 def _pairs(field: str, value: Any) -> tuple[Pair, ...]:
-    """Pairs of steps, each once and with the earlier step first.
+    """Check pairs of steps, and return each once, with the earlier step first.
 
     Args:
         field: The name of the field.
         value: Pairs of numbers, or texts such as "3,12".
 
     Raises:
-        TheoryError: The value is of another form.
+        TheoryError: The value has another form.
     """
     if isinstance(value, _Checked):
         return value

@@ -1,4 +1,4 @@
-"""What is known about pairs of steps before the search."""
+"""Which pairs of steps are known, before the search, to be equal or different."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ Earlier: TypeAlias = Mapping[int, frozenset[int]]
 class Pairs:
     """What is known about pairs of steps before the search.
 
-    Each mapping leads from a step to earlier steps.
+    Each attribute is a dict from a step to the set of earlier steps with which it forms a pair.
 
     Attributes:
-        apart: They are different dstates. This includes all pairs of `elsewhere`.
-        elsewhere: They are at different places.
-        one: They are one dstate.
+        apart: Pairs of steps at different dstates (distinctive states: places and directions).
+            All pairs of `elsewhere` are included.
+        elsewhere: Pairs of steps at different places.
+        one: Pairs of steps at one dstate.
     """
 
     apart: Earlier = field(default_factory=dict)
@@ -33,13 +34,19 @@ class Pairs:
         elsewhere: Iterable[tuple[int, int]] = (),
         one: Iterable[tuple[int, int]] = (),
     ) -> Pairs:
-        """Make a value of pairs whose steps come in any order."""
+        """Make Pairs of pairs of steps. The two steps of a pair may come in any order.
+
+        Args:
+            apart: Steps at different dstates. Those of `elsewhere` are added.
+            elsewhere: Steps at different places.
+            one: Steps at one dstate.
+        """
         away = list(elsewhere)
         return Pairs(_earlier([*apart, *away]), _earlier(away), _earlier(one))
 
     @staticmethod
     def joined(several: Sequence[Pairs]) -> Pairs:
-        """The knowledge of several kinds of evidence together."""
+        """Return the union of several Pairs."""
         if len(several) <= 1:
             return several[0] if several else NO_PAIRS
         return Pairs(
@@ -54,18 +61,19 @@ class Pairs:
 
     @cached_property
     def asked_for(self) -> frozenset[int]:
-        """The later step of each pair."""
+        """The later steps of all pairs."""
         return frozenset((*self.apart, *self.one))
 
     def allow(
         self, step: int, labels: Sequence[int], place_of: Sequence[int | None] | None = None
     ) -> bool:
-        """Whether a step may have its label, by its pairs with earlier steps.
+        """Whether the pairs of a step and earlier steps allow the step its label.
 
         Args:
             step: The step.
             labels: The dstate of each step.
-            place_of: The place of each dstate, if known.
+            place_of: The place of each dstate, if known. Without it, `elsewhere` is checked as
+                different dstates only.
         """
         if step not in self.asked_for:
             return True
@@ -81,7 +89,11 @@ class Pairs:
         )
 
     def broken_by(self, labels: Sequence[int]) -> list[tuple[int, int]]:
-        """The pairs of the first steps that their labels contradict."""
+        """List the pairs that contradict some labels, as (earlier step, later step).
+
+        Args:
+            labels: The dstate of each of the first steps. Pairs with other steps are ignored.
+        """
         size = len(labels)
         wrong = [(i, t) for i, t in pairs_in(self.apart) if t < size and labels[i] == labels[t]]
         return wrong + [
@@ -90,12 +102,12 @@ class Pairs:
 
 
 def pairs_in(earlier: Earlier) -> list[tuple[int, int]]:
-    """The pairs of a mapping, the earlier step first."""
+    """List the pairs of a dict such as `Pairs.one`, as (earlier step, later step)."""
     return [(i, t) for t, others in earlier.items() for i in others]
 
 
 def _united(several: Sequence[Earlier]) -> Earlier:
-    """The union of these mappings."""
+    """Return the union of several dicts."""
     first, *rest = several
     united = dict(first)
     for earlier in rest:
@@ -105,7 +117,7 @@ def _united(several: Sequence[Earlier]) -> Earlier:
 
 
 def _earlier(pairs: Iterable[tuple[int, int]]) -> dict[int, frozenset[int]]:
-    """The earlier steps, by the later step of each pair."""
+    """Return a dict from the later step of the pairs to the set of its earlier steps."""
     found: dict[int, set[int]] = {}
     for i, j in pairs:
         found.setdefault(max(i, j), set()).add(min(i, j))

@@ -1,6 +1,6 @@
-"""Whether edges between places can be drawn in the plane without a crossing.
+"""Decide whether edges between places can be drawn in the plane without a crossing.
 
-The order of the edges around a place may be known in part.
+The order of the edges around a place may be known only in part.
 
 >>> three_edges = [("a", "b"), ("a", "b"), ("a", "b")]
 >>> can_be_drawn(three_edges, lambda place, ends: True)
@@ -8,10 +8,11 @@ True
 >>> is_planar({"a": (0, 2, 4), "b": (5, 3, 1)}), is_planar({"a": (0, 2, 4), "b": (1, 3, 5)})
 (True, False)
 
-Edge e has the two ends 2e and 2e + 1. The ends around each place, clockwise, make a *rotation
-system*. To trace a face, go along an edge and leave by the next end around the place. A drawing in
-the plane without crossings has this rotation system exactly if V - E + F = 2 for each connected
-part (Euler; Edmonds 1960; Mohar & Thomassen, Graphs on Surfaces, 2001, chapter 3).
+Edge e has the two ends 2e and 2e + 1. The clockwise orders of the ends around all places are a
+*rotation system*. To trace a face, go along an edge, leave by the next end around the place, and so
+on. The rotation system has a drawing in the plane without crossings exactly if V - E + F = 2 for
+each connected part, with V places, E edges and F faces (Euler; Edmonds 1960; Mohar & Thomassen,
+Graphs on Surfaces, 2001, chapter 3).
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ Step = TypeVar("Step")
 
 
 def is_planar(around: Mapping[Place, Ends]) -> bool:
-    """Whether a rotation system can be drawn in the plane.
+    """Whether edges can be drawn without crossings if their order around each place is given.
 
     Args:
-        around: For each place, the ends of edges around it, clockwise from any end. It contains
-            both ends of each edge.
+        around: For each place, the ends of edges around it, clockwise from any end. Edge e has the
+            ends 2e and 2e + 1. Both ends of each edge must be given.
     """
     places = [place for place, ends in around.items() if ends]
     edges = sum(len(around[place]) for place in places) // 2
@@ -41,7 +42,7 @@ def is_planar(around: Mapping[Place, Ends]) -> bool:
 
 
 def _faces(around: Mapping[Place, Ends]) -> int:
-    """The number of faces of a rotation system, without those around places without edges."""
+    """Count the faces of a rotation system. Places without edges are ignored."""
     following = {
         end: ends[i - len(ends) + 1] for ends in around.values() for i, end in enumerate(ends)
     }
@@ -56,7 +57,7 @@ def _faces(around: Mapping[Place, Ends]) -> int:
 
 
 def _parts(around: Mapping[Place, Ends]) -> int:
-    """The number of connected parts, without places that have no edges."""
+    """Count the connected parts of a rotation system. Places without edges are ignored."""
     place_of = {end: place for place, ends in around.items() for end in ends}
     parts = 0
     left = set(place_of.values())
@@ -73,13 +74,13 @@ def _parts(around: Mapping[Place, Ends]) -> int:
 def can_be_drawn(
     edges: Sequence[tuple[Place, Place]], allows: Callable[[Place, Ends], bool]
 ) -> bool:
-    """Whether the ends around each place have an order in which the edges do not cross.
+    """Whether the ends of edges around each place have an order so that the edges do not cross.
 
     Args:
-        edges: The two places of each edge.
-        allows: Whether some ends may lie around a place in this clockwise order, starting from
-            any of them. A part of an allowed order must be allowed. An allowed order of some ends
-            must be a part of an allowed order of all ends.
+        edges: The two places of each edge. Edge e has the ends 2e and 2e + 1.
+        allows: Returns whether some ends may lie around a place in this clockwise order, starting
+            from any of them. If it allows an order, it must allow each part of the order, and some
+            order of all ends that contains it.
     """
     place_of = [place for edge in edges for place in edge]
     if not all(allows(place, ()) for place in set(place_of)):
@@ -95,7 +96,13 @@ def can_be_drawn(
 
 
 def _on_rings(place_of: Sequence[Place]) -> set[int]:
-    """The edges without dead ends: a dead end fits in wherever its edge begins."""
+    """Return the edges that are not in dead ends.
+
+    Edges in dead ends can be added to any drawing of the others.
+
+    Args:
+        place_of: The place of each end of an edge.
+    """
     ends_at: dict[Place, set[int]] = {}
     for end, place in enumerate(place_of):
         ends_at.setdefault(place, set()).add(end)
@@ -110,7 +117,7 @@ def _on_rings(place_of: Sequence[Place]) -> set[int]:
 
 
 def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
-    """The allowed clockwise orders of some ends, beginning with the first."""
+    """List the clockwise orders of some ends that are allowed. Each begins with the first end."""
     orders: list[Ends] = [()]
     for end in ends:
         longer = (
@@ -125,7 +132,18 @@ def _orders(ends: Sequence[int], allows: Callable[[Ends], bool]) -> list[Ends]:
 def _one_place_more(
     drawn: dict[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
 ) -> Iterator[dict[Place, Ends]]:
-    """The ways to draw one more place: a neighbour of a drawn place that has the fewest ways."""
+    """Draw one more place, in each possible way.
+
+    The place is a neighbour of a drawn place, and has the fewest possible ways of all neighbours.
+
+    Args:
+        drawn: The ends around each drawn place, clockwise.
+        orders: The allowed clockwise orders of ends around each place.
+        place_of: The place of each end.
+
+    Returns:
+        For each way, the ends around each place that is drawn then.
+    """
     near = {
         place_of[end ^ 1]: None
         for ends in drawn.values()
@@ -150,9 +168,15 @@ def _one_place_more(
 def _leaves_room(
     drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
 ) -> bool:
-    """Whether each connected part of the other places fits into one face of the drawing.
+    """Whether each connected part of the places that are not drawn fits into one face.
 
-    Such a part counts as one place. Its ends are in the order in which the face meets them.
+    To test this, shrink each such part to one place. Its ends are in the order in which the face
+    meets them.
+
+    Args:
+        drawn: The ends around each drawn place, clockwise.
+        orders: The allowed clockwise orders of ends around each place.
+        place_of: The place of each end.
     """
     part = _parts_of_rest(drawn, orders, place_of)
     following = {
@@ -160,7 +184,7 @@ def _leaves_room(
     }
     met: dict[
         Place, list[int]
-    ] = {}  # the ends of each part, in the order in which a face meets them
+    ] = {}  # the ends of each part, in the order in which its face meets them
     left = set(following)
     while left:
         here = start = left.pop()
@@ -187,7 +211,11 @@ def _leaves_room(
 def _parts_of_rest(
     drawn: Mapping[Place, Ends], orders: Mapping[Place, Sequence[Ends]], place_of: Sequence[Place]
 ) -> dict[Place, Place]:
-    """For each place that is not drawn, one place that stands for its connected part."""
+    """Find the connected parts of the places that are not drawn.
+
+    Returns:
+        A dict from each of these places to one place of its part, the same for the whole part.
+    """
     part: dict[Place, Place] = {}
     for first in orders:
         queue = [] if first in drawn or first in part else [first]
@@ -209,9 +237,14 @@ def _parts_of_rest(
 def has_way(
     start: State, steps: Sequence[Step], ways: Callable[[State, Step], Iterator[State]]
 ) -> bool:
-    """Whether all steps can be done from a start, each in one of its ways.
+    """Whether some choice of one way for each step leads through all steps.
 
-    A depth-first search without recursion, as there may be many steps.
+    This is a depth-first search without recursion, because there may be many steps.
+
+    Args:
+        start: The state before the first step.
+        steps: The steps.
+        ways: Yields the states to which a step can lead from a state.
     """
     gone: list[Iterator[State]] = []
     state = start

@@ -19,13 +19,14 @@ from ssh_abduction.data.errors import TheoryError, brief, is_writable
 from ssh_abduction.data.files import read_at_most
 from ssh_abduction.theory.encodings import Axiom, axioms_in
 
-# Bytes that a file of rules may have at most. This rejects devices that never end.
+# The most bytes of a file of rules. This rejects devices that never end.
 LARGEST = 2**24
-# Outside of block comments: strings, line comments and the start of a block comment, which may hold
-# any character. The group matches what rules must not have: a character that is not ASCII, and
-# scripts, in which % starts no comment.
+# Outside of block comments, match strings, line comments and the start of a block comment: these
+# may contain any character. The group matches what rules must not contain: a character that is not
+# ASCII, or `#script`, because % starts no comment in a script.
 _OUTSIDE = re.compile(r'"(?:\\["\\n]|[^"\\\n])*"|%\*|%[^\n]*|([^\x01-\x7f]|#script\b)')
-# Inside of block comments, which nest: their start and end, and line comments, which hide both.
+# Inside of block comments, which nest, match their start and end, and line comments: a start or end
+# in a line comment does not count.
 _INSIDE = re.compile(r"%\*|\*%|%[^\n]*")
 
 
@@ -33,8 +34,8 @@ _INSIDE = re.compile(r"%\*|\*%|%[^\n]*")
 class Rules:
     """A file of rules.
 
-    `ssh_abduction.solver.asp.rules` checks that clingo can read it. A byte order mark is dropped,
-    and each line ends in a line feed.
+    The text gets line feeds as line ends, and no byte order mark.
+    `ssh_abduction.solver.asp.rules` checks that clingo can read it.
 
     Attributes:
         name: The name of the file, for messages.
@@ -45,7 +46,11 @@ class Rules:
     text: str = field(repr=False)
 
     def __post_init__(self) -> None:
-        """Raise TheoryError for text that makes clingo's lexer abort the process or end early."""
+        """Convert the line ends, and check the text.
+
+        Raises:
+            TheoryError: The text would make clingo's lexer abort the process or stop too early.
+        """
         if not isinstance(self.name, str) or not isinstance(self.text, str):
             raise TheoryError(
                 f"rules: expected a name and a text, got {brief(self.name)} and "
@@ -80,12 +85,14 @@ class Rules:
 
     @property
     def axioms(self) -> tuple[Axiom, ...]:
-        """The axioms in comments `% @axiom(name) sentence`."""
+        """The axioms that the text declares in comments `% @axiom(name) sentence`."""
         return tuple(axioms_in(self.text, self.name))
 
     @classmethod
     def of(cls, value: Any) -> Rules:
-        """Make Rules of Rules, of the path of a file, or of the output of `to_dict`.
+        """Make Rules of the path of a file, or of a dict with `name` and `text`.
+
+        Rules are returned as they are.
 
         Raises:
             TheoryError: The file cannot be read, or has wrong characters.
@@ -116,10 +123,13 @@ class Rules:
 
     @classmethod
     def all_of(cls, value: Any) -> tuple[Rules, ...]:
-        """Make Rules of a list, or of one entry. A text may hold several paths with commas.
+        """Make a tuple of Rules of one value or of a list.
+
+        Args:
+            value: Values as for `of`. A text may contain several paths, separated by commas.
 
         Raises:
-            TheoryError: An entry is wrong.
+            TheoryError: A value is wrong.
         """
         if isinstance(value, str):
             value = [part.strip() for part in value.split(",") if part.strip()]
@@ -134,7 +144,7 @@ class Rules:
 
 
 def _stray(text: str) -> int:
-    """The position of the first forbidden character or script; -1 if there is none."""
+    """Return the position of the first character or script that is not allowed; -1 without one."""
     depth = at = 0
     while found := (_INSIDE if depth else _OUTSIDE).search(text, at):
         if found.re is _OUTSIDE and found[1]:

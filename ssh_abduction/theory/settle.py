@@ -1,4 +1,4 @@
-"""Settle a theory for one trace: replace each `auto` by the value that fits the trace.
+"""Adapt a theory to one trace: replace each `auto` by the value that fits the trace.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.theory.settle import settle
@@ -25,7 +25,7 @@ Star: TypeAlias = Literal["auto", "none", "alike", "pattern", "frame", "gateways
 
 @dataclass(frozen=True)
 class Problem:
-    """A trace, and its theory without `auto`. All code that works on a trace gets it.
+    """A trace and a theory without `auto`: the input of all code that works on a trace.
 
     Attributes:
         trace: The trace.
@@ -40,16 +40,19 @@ class Problem:
 
     @classmethod
     def of(cls, trace: Trace, theory: Theory) -> Problem:
-        """The problem of a theory that has no `auto`."""
+        """Make a problem of a trace and a theory that has no `auto`."""
         return cls(trace, theory, evidence_of(theory))
 
     @cached_property
     def pairs(self) -> Pairs:
-        """What the evidence that cannot be excused says about pairs of steps."""
+        """Which steps are one dstate, different dstates, or at different places, by all evidence.
+
+        Evidence that a fault may excuse is left out.
+        """
         return pairs_of(self.trace, self.theory, self.evidence)
 
     def changed(self, trace: Trace | None = None, theory: Theory | None = None) -> Problem:
-        """A problem with another trace or theory. It keeps what is known.
+        """Return a problem with another trace or theory. It reuses what the evidence has computed.
 
         Args:
             trace: Another trace, such as this one with more steps, or a part of it.
@@ -60,14 +63,15 @@ class Problem:
 
 
 def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = None) -> Problem:
-    """Replace each `auto`, and check that the trace has what the axioms need.
+    """Replace each `auto` in a theory, and check that the trace has what the axioms need.
 
     A step whose view is unknown may be at any dstate.
 
     Args:
         trace: The trace.
         theory: The theory; Theory.topological() by default.
-        known: A problem about the same trace, or about its first steps, to take knowledge from.
+        known: A problem with the same trace, or with its first steps. What its evidence has
+            computed is reused.
 
     Raises:
         TraceError: All views, the kind of an action, or a star is missing.
@@ -79,7 +83,7 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
     displacement = theory.displacement
     if displacement == "auto":
         displacement = "use" if trace.has_displacements else "none"
-    # If returns are counted, this may be a part of a trace, perhaps one without displacements.
+    # If the theory gives `returns`, the trace may be a part of one, without displacements.
     if displacement == "use" and not trace.has_displacements and not theory.returns:
         mend = f"add them to the steps, or take {choice('displacement', 'none')}"
         raise TheoryError(
@@ -106,18 +110,25 @@ def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = N
 
 
 def count_returns(problem: Problem) -> int:
-    """The number of returns that may be true, rounded up to a power of two; 0 if none are used."""
+    """Return the number of returns that may be true, rounded up to a power of two.
+
+    A return is a pair of visits at one place, or of steps at one dstate. The number is 0 if the
+    theory does not use displacements.
+    """
     displacement = displacement_of(problem)
     return displacement.count_returns(problem.trace) if displacement else 0
 
 
 def displacement_of(problem: Problem) -> Displacement | None:
-    """The evidence of displacements, if the theory uses it."""
+    """Return the evidence of displacements; None if the theory does not use it."""
     return next((e for e in problem.evidence if isinstance(e, Displacement)), None)
 
 
 def _star_of(trace: Trace, theory: Theory) -> Star:
-    """How to read stars (the openings seen at a place)."""
+    """Return the value of `star` that fits the trace, or raise TheoryError.
+
+    It says how to read stars (the openings seen at a place).
+    """
     star = theory.star
     if star == "auto":
         star = "frame" if trace.has_stars else "none"
