@@ -1,4 +1,4 @@
-"""What a robot can do, by what it sees."""
+"""Learn which actions a robot can do, and relate them to what it sees."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from ssh_abduction.rivals.machines import Seen
 
 
 class Abilities:
-    """What a robot can do here, and wherever it sees something.
+    """The actions that a robot can do: now, ever, and wherever the same is seen.
 
     Attributes:
         here: The actions that the robot can do now, by name.
-        ever: All actions that it could ever do, by name.
+        ever: All actions that the robot could do at some step so far, by name.
     """
 
     def __init__(self) -> None:
@@ -23,7 +23,12 @@ class Abilities:
         self._names: dict[tuple[object, object], set[str]] = {}
 
     def note(self, seen: Step, can: Collection[Action | str]) -> None:
-        """Note what the robot can do at the current step."""
+        """Record the actions that the robot can do at the current step.
+
+        Args:
+            seen: What the robot sees at this step.
+            can: The actions, as objects or names.
+        """
         self.here = {action.name: action for action in map(Action.of, can)}
         self.ever |= self.here
         for star in {seen.star, None}:
@@ -31,6 +36,13 @@ class Abilities:
             names.intersection_update(self.here)
 
     def names(self, seen: Seen) -> set[str]:
-        """The names of the actions that the robot can do wherever it sees this."""
+        """The names of the actions that the robot could do at every step with this view and star.
+
+        The star is the set of openings that are seen. If the robot never saw this star with this
+        view, the view alone decides.
+
+        Args:
+            seen: A view and a star.
+        """
         names = self._names.get((seen.view, seen.star))
         return names or self._names.get((seen.view, None), set())

@@ -1,4 +1,4 @@
-"""Runs work in another process while the robot drives."""
+"""Run work in the background while the robot drives."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Result = TypeVar("Result")
 
 
 class BackgroundTask(Generic[Result]):
-    """Work in the background. It ends when this object is garbage collected, or the program ends.
+    """Work that runs in a thread. It is stopped when this object is garbage collected.
 
     Args:
-        work: Called in a thread. It starts a process for what takes long, and stops when its
-            watch is interrupted.
+        work: The function that does the work and returns its result. It should start a process for
+            what takes long, and stop when the watch that it is given is interrupted.
     """
 
     def __init__(self, work: Callable[[Watch], Result | None]) -> None:
@@ -32,7 +32,7 @@ class BackgroundTask(Generic[Result]):
         return self._found.done()
 
     def result(self) -> Result | None:
-        """Wait for the result; None if nothing was found or the work was interrupted."""
+        """Wait for the result, and return it; None if there is none or the work was stopped."""
         return self._found.result()
 
 

@@ -1,9 +1,12 @@
-"""Makes maps of a growing trace from guesses, in another process. For places with frames.
+"""Make maps of a growing trace from guesses, in another process.
 
-The maps are consistent by the axioms of the theory (`solver/engines/framed.py`), but perhaps not
-minimal. A map that the trace contradicts is *mended*: its dstates stay as far as possible, and
-what does not fit becomes new. Separate paths (`solver/engines/paths.py`) then decide whether the
-result is a map.
+A guess labels each step with a dstate (distinctive state: a place and a direction), and may
+contradict an axiom. This needs a theory that numbers the directions at each place (a frame).
+
+The maps satisfy the axioms of the theory (`solver/engines/framed.py`), but need not be minimal. To
+*mend* a map that later steps contradict, keep as many of its dstates as possible and add new
+dstates for what does not fit. Then `solver/engines/paths.py` looks for paths, and so decides
+whether the result is a map.
 """
 
 from __future__ import annotations
@@ -22,7 +25,14 @@ from ssh_abduction.theory.theory import Theory
 
 
 def guessed_map(trace: Trace, theory: Theory, speedups: Speedups, watch: Watch) -> SSHMap | None:
-    """A map made of a guess, if one is found soon."""
+    """Make a map from a guess; None if none is found soon.
+
+    Args:
+        trace: The trace.
+        theory: The theory without `auto`.
+        speedups: The speed-ups that are on.
+        watch: Limits the work, and can interrupt it.
+    """
     found = FramedEngine(Task.of(Problem.of(trace, theory), watch, speedups)).map_of_guess()
     return found.map if found else None
 
@@ -32,8 +42,15 @@ def mended_map(
 ) -> SSHMap | None:
     """Mend a map of the first steps of a trace that the later steps contradict.
 
+    Args:
+        trace: The whole trace.
+        theory: The theory without `auto`.
+        known: The map of the first steps.
+        speedups: The speed-ups that are on.
+        watch: Limits the work, and can interrupt it; None for no limit.
+
     Returns:
-        A map of the trace with new dstates for whatever does not fit; None if there is none.
+        A map of the whole trace, with new dstates for whatever does not fit; None if none is found.
     """
     watch = watch or Watch()
     found = FramedEngine(Task.of(Problem.of(trace, theory), watch, speedups)).map_mended_from(
@@ -43,16 +60,16 @@ def mended_map(
 
 
 class MapGuess(BackgroundTask[SSHMap]):
-    """A map of a growing trace, made in another process from a guess, or from a known map.
+    """A background task that makes a map of a growing trace in another process.
 
-    The trace grows meanwhile and may contradict the map, so the map is mended at the end.
+    The trace grows meanwhile and may contradict the map. So the task mends the map before it ends.
 
     Args:
-        steps: The steps of the trace so far. The caller may append more.
-        odometry: The odometry of the trace.
+        steps: The steps of the trace so far. The caller may append more to this list.
+        odometry: The noise model of the trace's displacements.
         theory: The theory without `auto`.
-        speedups: Which speed-ups are on.
-        known: A map of the first steps to mend; None makes one from a guess.
+        speedups: The speed-ups that are on.
+        known: A map of the first steps, to be mended; None makes a map from a guess first.
     """
 
     def __init__(
@@ -73,7 +90,7 @@ class MapGuess(BackgroundTask[SSHMap]):
         speedups: Speedups,
         known: SSHMap | None = None,
     ) -> MapGuess | None:
-        """Begin a guess; None without a second processor, or if guesses are switched off."""
+        """Start the task; None if there is only one processor, or guesses are switched off."""
         wanted = speedups.annealed and speedups.processes and has_processors(speedups)
         return MapGuess(steps, odometry, theory, speedups, known) if wanted else None
 

@@ -1,4 +1,7 @@
-"""Solves a trace with faults in the time of a step, or in another process."""
+"""Solve a trace with faults, either within the time limit of a step or in another process.
+
+Faults are steps that a map treats as wrong: a misread view, or an action that slipped.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +17,11 @@ from ssh_abduction.solver import Bound, Status, Stop, Watch, has_processors, in_
 from ssh_abduction.theory.speedups import Speedups
 from ssh_abduction.theory.theory import Theory
 
-# A trace is solved in the background for this many seconds. Then the longer trace is worth more.
+# A search in the background stops after this many seconds. The trace is much longer by then, and a
+# search for the longer trace is worth more.
 MEANWHILE = 60.0
-# After a search that proved nothing, or did not list all, the trace grows by this factor, and by
-# this many steps at least, before the next one.
+# After each search with a time limit the trace has to grow by this factor, and by at least this
+# many steps, before the next search.
 RETRY = 1.05
 PAUSE = 2
 # A search was slow if it took this many times the time limit.
@@ -26,7 +30,16 @@ OVERRUN = 2
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """What solving a trace of `steps` steps found, as in Solution. It can be sent to a process."""
+    """The parts of a Solution that are needed here. Unlike a Solution, it can be pickled.
+
+    Attributes:
+        steps: The number of steps of the trace that was solved.
+        status: How much is proven.
+        maps: The minimal maps, or the best map found in time.
+        bound: The proven lower bound of the cost.
+        complete: Whether `maps` are all minimal maps.
+        stopped: The limit that ended the search; None if no limit did.
+    """
 
     steps: int
     status: Status
@@ -44,7 +57,16 @@ def solved(
     speedups: Speedups,
     watch: Watch | None = None,
 ) -> Solved:
-    """What `solve` finds for the steps so far."""
+    """Run `solve` on a trace and return the parts of its solution that are needed.
+
+    Args:
+        trace: The steps so far.
+        theory: The theory without `auto`.
+        limit: Seconds for the search; None for no limit.
+        maps: List at most this many maps; None lists all.
+        speedups: The speed-ups that are on.
+        watch: Not used. Functions that run in another process take it.
+    """
     found = solve(
         trace, theory.of_steps(0, len(trace)), time_limit=limit, max_maps=maps, speedups=speedups
     )
@@ -52,7 +74,14 @@ def solved(
 
 
 class BackgroundSolve(BackgroundTask[Solved]):
-    """Solves the steps so far in another process."""
+    """A background task that solves a trace in another process, for at most MEANWHILE seconds.
+
+    Args:
+        trace: The steps so far.
+        theory: The theory without `auto`.
+        maps: List at most this many maps; None lists all.
+        speedups: The speed-ups that are on.
+    """
 
     def __init__(self, trace: Trace, theory: Theory, maps: int | None, speedups: Speedups) -> None:
         super().__init__(partial(_solve, trace, theory, maps, speedups))
@@ -61,7 +90,7 @@ class BackgroundSolve(BackgroundTask[Solved]):
     def begun(
         trace: Trace, theory: Theory, maps: int | None, speedups: Speedups
     ) -> BackgroundSolve | None:
-        """Begin to solve; None without a second processor, or if processes are switched off."""
+        """Start the task; None if there is only one processor, or processes are switched off."""
         can_begin = speedups.processes and has_processors(speedups)
         return BackgroundSolve(trace, theory, maps, speedups) if can_begin else None
 
@@ -73,15 +102,15 @@ def _solve(
 
 
 class FaultSolver:
-    """Solves a growing trace with faults again when that is due.
+    """Solves a growing trace with faults again each time that it has grown enough.
 
     Args:
-        options: What a step may use.
-        searches: Number of earlier searches.
+        options: The time limit and the other options of a step.
+        searches: The number to start counting searches from.
 
     Attributes:
-        searches: Number of steps that solved the trace.
-        background: The search in the background, if one is under way.
+        searches: Number of searches so far, except those in the background.
+        background: The search in the background; None if none is running.
     """
 
     def __init__(self, options: StepOptions, searches: int = 0) -> None:
@@ -89,28 +118,29 @@ class FaultSolver:
         self.background: BackgroundSolve | None = None
         self._options = options
         self._next_search = 0  # no search before the trace has this many steps
-        # clingo cannot be stopped while it grounds a step. If that took too long once, later
-        # searches run in the background.
+        # clingo cannot be stopped while it grounds a step. If the last search took far too long,
+        # the next one runs in the background.
         self._is_slow = False
 
     def is_due(self, trace: Trace) -> bool:
-        """Whether the trace has grown enough since the last search."""
+        """Whether the trace has grown enough since the last search to be solved again."""
         return len(trace) >= self._next_search
 
     def make_due(self) -> None:
-        """Search at the next step: the last search proved the cost."""
+        """Make the next search due at once, whatever the last one found."""
         self._next_search = 0
 
     def solve(self, trace: Trace, theory: Theory, has_map: bool) -> Solved | None:
-        """Solve the trace in the time of a step.
+        """Solve the trace within the time limit of a step, or in the background.
 
         Args:
             trace: The steps so far.
             theory: The theory without `auto`.
-            has_map: Whether some map is known. Then a slow search may run in the background.
+            has_map: Whether some map is known. If so, and the last search was slow, the search runs
+                in the background.
 
         Returns:
-            What was found; None if the search goes on in the background.
+            The result; None if the search runs in the background.
         """
         steps, options = len(trace), self._options
         limit = options.time_limit
@@ -125,14 +155,21 @@ class FaultSolver:
         return found
 
     def begin_in_background(self, trace: Trace, theory: Theory) -> bool:
-        """Solve the trace in another process, if none does; False if that is impossible."""
+        """Start a search in another process, unless one is running.
+
+        Returns:
+            Whether a search is running there. False if processes cannot be used.
+        """
         self.background = self.background or BackgroundSolve.begun(
             trace, theory, self._options.max_maps, self._options.speedups
         )
         return self.background is not None
 
     def finished(self) -> Solved | None:
-        """What the background search found, if it is done. Its trace may lack the last steps."""
+        """Take the result of the search in the background; None if it is not done.
+
+        The trace that it solved may lack the last steps.
+        """
         if self.background and self.background.done():
             background, self.background = self.background, None
             return background.result()

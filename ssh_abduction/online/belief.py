@@ -1,4 +1,7 @@
-"""A belief: where a robot may be in a map, and how sure that is."""
+"""A belief: the probabilities that a robot is at each dstate of a map, or at none of them.
+
+A dstate (distinctive state) is a place and the direction that the robot faces there.
+"""
 
 from __future__ import annotations
 
@@ -13,30 +16,31 @@ from numpy.typing import NDArray
 from ssh_abduction.data.checks import a_number
 from ssh_abduction.data.errors import LocaliserError
 
-# The robot is located if one dstate has this probability.
+# The robot is located if one dstate has at least this probability.
 LOCATED = 0.9
-# A belief has collapsed if an observation is so much less probable than at a place of which nothing
-# is known: evidence of ten to one against the belief, which Jeffreys calls strong.
+# A belief has collapsed if the observation is at most this factor times as probable as at an
+# unknown place: evidence of ten to one against the belief, which Jeffreys calls strong.
 COLLAPSED = 0.1
-# The share of unknown places that are akin to those of the map, before anything is seen of them.
+# The share of unknown places that are akin to those of the map, before anything is seen there.
 AKIN = 0.5
 # A lost robot is found again if the entropy of its belief is at most this many bits higher than
 # before it was lost.
 AS_SURE = 0.1
-# Smaller probabilities are left out of JSON: of 10,000 dstates nearly all have next to none.
+# Smaller probabilities are left out of JSON, as nearly all of 10,000 dstates have about 0.
 LEAST_TOLD = 0.001
 # Keeps logarithms finite.
 TINY = np.finfo(float).tiny
 
 
 class Verdict(Enum):
-    """A belief in one word.
+    """A belief summed up in one word. NOWHERE comes before LOCATED, and LOCATED before LOST.
 
     Attributes:
-        LOCATED: One dstate has at least the probability LOCATED.
-        UNSURE: Several dstates are possible, as when localisation begins.
-        LOST: A belief collapsed, and the robot is not found again yet.
-        NOWHERE: More likely than not, the robot is at no dstate of the map.
+        LOCATED: One dstate has at least a probability of 0.9.
+        UNSURE: No dstate is that probable, as when localisation begins.
+        LOST: An observation was very improbable by an earlier belief, and the robot has not been
+            found again since.
+        NOWHERE: The robot is at no dstate of the map, with a probability above 0.5.
     """
 
     LOCATED = "located"
@@ -47,13 +51,13 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observation:
-    """What a robot observes, as far as it distinguishes dstates. `localiser.py` has f and q.
+    """How well an observation o fits each dstate x. `localiser.py` defines f and q.
 
     Attributes:
-        where: Some dstates.
-        ratio: f(o|x) / q(o) of each of these dstates; 0 for all others.
-        novel: Probability that the place looks like none of the dstates, given this observation.
-            Before it, to look like any dstate or like none was equally likely.
+        where: The ids of k dstates, (k,), or a slice of all dstates.
+        ratio: f(o|x) / q(o) for each of these dstates, (k,). For all others it is 0.
+        novel: Probability that the place looks like no dstate of the map, given o, if before o it
+            was as likely to look like each dstate as like none.
     """
 
     where: NDArray[np.intp] | slice
@@ -66,20 +70,19 @@ NOVEL = Observation(np.empty(0, np.intp), np.empty(0), 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """Where a robot may be, once it has observed something.
+    """The probabilities that a robot is at each dstate of a map, or nowhere in it.
 
     Attributes:
-        probabilities: The probability of each dstate, (N,), read-only. With `nowhere` they sum
-            to 1.
+        probabilities: The probability of each dstate by id, (N,), read-only. Together with
+            `nowhere` they sum to 1.
         nowhere: Probability that the robot is at no dstate of the map.
-        normaliser: Probability of the observation by the belief before it, divided by its
-            probability at an unknown place: 1 / (α q(o)) of equation 2 of
-            `localiser.py`. Below COLLAPSED the belief has collapsed.
-        sure: Entropy in bits of the belief before the one that collapsed; None if the robot is not
-            lost.
-        akin: Probability that places are akin to those of the map, if the robot is nowhere.
-        seen: The observation; None if there was none. It says what to expect next among akin
-            places.
+        normaliser: Probability of the last observation by the belief before it, divided by its
+            probability at an unknown place: 1 / (α q(o)) of equation 2 in `localiser.py`. Below 0.1
+            the belief has collapsed.
+        sure: Entropy in bits of the last belief before the collapse; None if the robot is not lost.
+        akin: If the robot is nowhere, the probability that the places there follow each other as
+            those of the map do.
+        seen: The last observation; None if there was none.
     """
 
     probabilities: NDArray[np.float64]
@@ -99,7 +102,7 @@ class Belief:
 
     @cached_property
     def likeliest(self) -> int:
-        """The most probable dstate, the first of several. The robot may be likelier nowhere."""
+        """The id of the most probable dstate, even if `nowhere` is more probable."""
         return int(self.probabilities.argmax())
 
     @property
@@ -109,31 +112,32 @@ class Belief:
 
     @cached_property
     def entropy(self) -> float:
-        """The entropy in bits: 0 if the robot is at one dstate, or nowhere, for certain."""
+        """The entropy in bits. It is 0 if one dstate, or `nowhere`, has the probability 1."""
         p = self.probabilities
         inside = p @ np.log2(np.maximum(p, TINY))
         return max(0.0, -float(inside + self.nowhere * np.log2(max(self.nowhere, TINY))))
 
     @property
     def collapsed(self) -> bool:
-        """Whether the observation was far less probable by the belief before it than anywhere.
+        """Whether `normaliser` is below 0.1: the observation shows that the last belief was wrong.
 
-        Then the earlier belief was wrong.
+        The observation is then ten times as probable at an unknown place as by that belief.
         """
         return self.normaliser < COLLAPSED
 
     @property
     def lost(self) -> bool:
-        """Whether a belief collapsed, and the robot has not been found since.
+        """Whether a belief collapsed and the robot has not been found again since.
 
-        It is found if it is located, or if the belief is as sure as it was before. The second
-        matters if nothing that a robot sees and does distinguishes some dstates.
+        The robot is found again if one dstate has a probability of at least 0.9, or if the entropy
+        is about as low as before the collapse. The second condition is for maps with dstates that
+        no observation distinguishes.
         """
         return self.sure is not None
 
     @property
     def verdict(self) -> Verdict:
-        """The belief in one word."""
+        """The belief summed up in one word: located, unsure, lost or nowhere."""
         if self.nowhere > 0.5:
             return Verdict.NOWHERE
         if self.probability >= LOCATED:
@@ -142,14 +146,17 @@ class Belief:
 
     @property
     def dstate(self) -> int | None:
-        """The dstate that the robot most probably is at; None for nowhere in the map."""
+        """The id of the most probable dstate; None if `nowhere` is above 0.5."""
         return None if self.verdict is Verdict.NOWHERE else self.likeliest
 
     def found_again(self, sure: float) -> bool:
-        """Whether a robot that was lost is found again.
+        """Whether this belief finds a lost robot again. See `lost` for the conditions.
 
         Args:
-            sure: Entropy in bits of the belief before it was lost.
+            sure: Entropy in bits of the last belief before the collapse.
+
+        Raises:
+            LocaliserError: `sure` is negative or no number.
         """
         a_number("sure", sure, LocaliserError, 0, what="bits of entropy")
         return self.nowhere <= 0.5 and (
@@ -157,14 +164,24 @@ class Belief:
         )
 
     def above(self, least: float) -> tuple[tuple[int, float], ...]:
-        """The dstates of at least this probability, with it, the most probable first."""
+        """List pairs (dstate, probability), the most probable first.
+
+        Args:
+            least: Leave out dstates with a smaller probability.
+
+        Raises:
+            LocaliserError: `least` is no probability.
+        """
         a_number("least", least, LocaliserError, 0, 1, what="a probability")
         found = np.flatnonzero(self.probabilities >= least)
         found = found[np.argsort(-self.probabilities[found], kind="stable")]
         return tuple((int(s), float(self.probabilities[s])) for s in found)
 
     def to_dict(self) -> dict[str, Any]:
-        """The belief as `localise --json` prints it (docs/reference/formats.md)."""
+        """The belief as a dict for JSON, as `localise --json` prints it.
+
+        docs/reference/formats.md describes the keys.
+        """
         return {
             "verdict": self.verdict.value,
             "dstate": self.dstate,
@@ -179,5 +196,5 @@ class Belief:
 
 
 def _rounded(value: float) -> float:
-    """Round to six significant digits, as more of them say nothing."""
+    """Round to six significant digits."""
     return float(f"{value:.6g}")

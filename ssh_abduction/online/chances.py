@@ -1,4 +1,4 @@
-"""Probabilities that what a map says does not hold."""
+"""Probabilities of errors that the localiser allows for: misread views, slipped actions, …"""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from ssh_abduction.data.errors import LocaliserError, brief, is_finite
 
 @dataclass(frozen=True, slots=True)
 class Chances:
-    """How likely it is, at each step, that what a map says does not hold.
+    """The probabilities, for each step, that the robot and the map disagree.
 
-    Faults are taken to be rare: one step in a hundred, as in openFABMAP, which leaves
-    0.01 (1 - sFactor) to what its model does not say. 0.1 is RTAB-Map's default (Labbé and Michaud
-    2013) for a robot that comes to a place that it does not know (Bayes/PredictionLC), and for one
-    that comes back (1 - Bayes/VirtualPlacePriorThr).
+    The defaults are those of other localisers. `misread` and `slipped` are 0.01, as openFABMAP
+    leaves 0.01 (1 - sFactor) to what its model does not explain. `unmapped` and `reentered` are
+    0.1, as in RTAB-Map (Labbé and Michaud 2013): Bayes/PredictionLC for a robot that comes to an
+    unknown place, and 1 - Bayes/VirtualPlacePriorThr for a robot that comes back.
 
     Attributes:
-        misread: Probability that the observation is not of the dstate that the robot is at: a
-            person stands in front of the laser, or a cluster is wrong.
-        slipped: Probability that the action does not lead where the link says: it failed, or the
-            robot was kidnapped.
-        unmapped: Probability that a robot of which nothing is known is at no dstate of the map.
-            It also holds for the end of an action without a link in the map.
+        misread: Probability that the observation does not fit the dstate where the robot is. For
+            example, a person stands in front of the laser, or an image got the wrong view.
+        slipped: Probability that the action does not lead where the link of the map says: it
+            failed, or the robot was kidnapped.
+        unmapped: Probability that the robot is at no dstate of the map, if nothing is known of
+            where it is: at the start, after a slip, and after an action that has no link.
         reentered: Probability that a robot at no dstate of the map is at one after its next action.
     """
 
@@ -42,8 +42,8 @@ class Chances:
 
     @classmethod
     def none(cls) -> Chances:
-        """The map holds without exception (equation 4 of `localiser.py`).
+        """Make chances for a map that holds without exception (equation 4 of `localiser.py`).
 
-        An observation that the map does not allow then restarts localisation.
+        Localisation then restarts at an observation that the map does not allow.
         """
         return cls(misread=0.0, slipped=0.0, unmapped=0.0, reentered=1.0)

@@ -1,7 +1,9 @@
-"""Consistent maps of a trace that grows, for when there is no time to find a minimal map.
+"""Maps of a growing trace that satisfy the axioms, for when finding a minimal map takes too long.
 
-A *draft* is a map of fewer steps that goes on like a sketch (`solver/guesses/tree.py`).
-A *sketch* is made of all steps; it is larger, and is the last resort.
+A dstate (distinctive state) is a place and a direction. A *sketch* (`solver/guesses/tree.py`) is
+made without a search: a step gets a new dstate unless the axioms imply which one it is at. A
+*draft* begins with a good map of the first steps, and goes on as a sketch does. A sketch from the
+first step on is larger than a draft, and is the last resort.
 """
 
 from __future__ import annotations
@@ -17,33 +19,38 @@ from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.speedups import row
 
-# At most this many drafts are kept. Each takes time at every step, and mostly one of the first
-# goes on for long.
+# At most this many drafts are kept, as each takes time at every step. Mostly one of the best
+# remains consistent for long.
 DRAFTS = 3
 
 
 @dataclass(slots=True)
 class Draft:
-    """A sketch, and how many of its first steps make a map that no evidence rejects."""
+    """A sketch, with the progress of testing it against the evidence.
+
+    Attributes:
+        sketch: The sketch.
+        passed: The number of first steps for which no evidence rejected it.
+    """
 
     sketch: Sketch
     passed: int = 0
 
 
 class Drafts:
-    """Drafts and sketches of the steps so far.
+    """Keeps drafts and sketches of the steps so far.
 
     Args:
         problem: The steps so far, and the theory without `auto`.
-        judging: Evidence and the checker, for this theory.
+        judging: Judges maps by the evidence and the checker, for this theory.
     """
 
     def __init__(self, problem: Problem, judging: Judging) -> None:
         trace, theory, evidence = problem.trace, problem.theory, problem.evidence
         self._theory, self._judging = theory, judging
         self._has_evidence = bool(evidence)
-        # Evidence is asked as a sketch grows. The other axioms hold by construction, or the
-        # checker is asked about them.
+        # Evidence judges a sketch as it grows. The other axioms hold by construction, or the
+        # checker judges them.
         self._other_axioms = theory.replace(
             without=(*theory.without, *(kind.axiom for kind in evidence))
         )
@@ -62,20 +69,30 @@ class Drafts:
         return bool(self._drafts)
 
     def first(self) -> SSHMap | None:
-        """The best draft, whether or not it is consistent."""
+        """The best draft, which need not be consistent; None if there is no draft."""
         return self._drafts[0].sketch.map() if self._drafts else None
 
     def maps(self) -> list[SSHMap]:
-        """All drafts, the best first."""
+        """The maps of all drafts, the best first. They need not be consistent."""
         return [draft.sketch.map() for draft in self._drafts]
 
     def follow(self, action: Action, step: Step) -> None:
-        """Keep what a new step, after this action, does not contradict."""
+        """Extend drafts and sketches by a step, and drop those that it contradicts.
+
+        Args:
+            action: The action before the step.
+            step: The new step.
+        """
         self._drafts = [draft for draft in self._drafts if draft.sketch.extend(action, step)]
         self._sketches = [draft for draft in self._sketches if draft.sketch.extend(action, step)]
 
     def add(self, ssh_map: SSHMap, trace: Trace) -> None:
-        """Extend a map of the first steps of a trace, unless it contradicts the later ones."""
+        """Make a draft of a map of the first steps, unless the later steps contradict it.
+
+        Args:
+            ssh_map: The map.
+            trace: The steps so far, of which the first ones are mapped.
+        """
         if not self._may_sketch:
             return
         known = len(ssh_map.labels)
@@ -85,11 +102,18 @@ class Drafts:
             self._drafts = sorted([*self._drafts, Draft(sketch)], key=self._cost)[:DRAFTS]
 
     def clear(self) -> None:
-        """Drop the drafts, as minimal maps are known."""
+        """Drop all drafts. The sketches stay."""
         self._drafts = []
 
     def best(self, trace: Trace, pairs: Pairs) -> SSHMap | None:
-        """The best consistent draft, or else a consistent sketch, if there is one."""
+        """The best consistent draft, else a consistent sketch, else None.
+
+        Drafts that turn out to be inconsistent are dropped.
+
+        Args:
+            trace: The steps so far.
+            pairs: What the evidence says about pairs of these steps.
+        """
         while self._drafts:
             if self._is_consistent(self._drafts[0], trace, pairs):
                 return self._drafts[0].sketch.map()
@@ -104,7 +128,7 @@ class Drafts:
         return Cost.of(draft.sketch.map()).preferred_by(self._theory)
 
     def _is_consistent(self, draft: Draft, trace: Trace, pairs: Pairs) -> bool:
-        """Whether a draft satisfies the evidence and the other axioms."""
+        """Whether a draft satisfies the evidence and all other axioms."""
         sketch, steps = draft.sketch, len(trace)
         if self._has_evidence and draft.passed < steps:
             ssh_map = sketch.map()

@@ -1,4 +1,7 @@
-"""What dstates show and where actions lead: equations 3 and 4 of `localiser.py`."""
+"""Estimate what dstates show and where actions lead: equations 3 and 4 of `localiser.py`.
+
+A dstate (distinctive state) is a place and the direction that the robot faces there.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +19,12 @@ from ssh_abduction.online.belief import Observation
 
 @dataclass(frozen=True)
 class Links:
-    """Where an action leads.
+    """Where one action a leads from each of the N dstates.
 
     Attributes:
-        leads: p(x'|x,a), (N, N), x' by x: a column for each dstate with a known end.
-        missing: 1 for each dstate with an unknown end, else 0, (N,).
+        leads: The probabilities p(x'|x,a), (N, N). Row x' is the end, column x the start. The
+            column of a dstate sums to 1, or is 0 if it is unknown where a leads from there.
+        missing: 1 for each dstate from which it is unknown where a leads, else 0, (N,).
     """
 
     leads: sparse.csr_array
@@ -28,14 +32,18 @@ class Links:
 
 
 def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]:
-    """For each view v the dstates that show it, and their f(v|x) / q(v).
+    """For each view v, find the dstates x that show it, and the ratios f(v|x) / q(v).
 
     Args:
-        ssh_map: The map. It says what dstates without a step of the trace show (equation 4).
-        trace: The trace of the map's labels, from which f is estimated (equation 3), if there is
-            one.
+        ssh_map: The map. It says what a dstate shows if no step of the trace is at this dstate
+            (equation 4).
+        trace: The trace that was mapped, to estimate f by counting (equation 3); None takes all
+            views from the map.
+
+    Returns:
+        The observation for each view. A view that no dstate shows is missing.
     """
-    # How many steps at each dstate show each view.
+    # Count the steps at each dstate that show each view.
     counts = Counter[tuple[int, View]]()
     if trace is not None:
         counts.update(
@@ -64,15 +72,15 @@ def view_ratios(ssh_map: SSHMap, trace: Trace | None) -> dict[View, Observation]
 
 
 def transitions(ssh_map: SSHMap, trace: Trace | None) -> dict[str, Links]:
-    """The end of each action.
+    """Find where each action leads, by its name.
 
     Args:
-        ssh_map: The map. Its links hold if the trace does not have an action at a dstate
-            (equation 4).
-        trace: The trace of the map's labels, from which probabilities are estimated (equation 3),
-            if there is one.
+        ssh_map: The map. Its links say where an action leads from a dstate if the trace does not
+            have that action there (equation 4).
+        trace: The trace that was mapped, to estimate probabilities by counting (equation 3); None
+            takes all links from the map.
     """
-    # How often each action led from each dstate to each other.
+    # Count how often each action led from one dstate to another.
     counts = Counter[tuple[int, str, int]]()
     labels = ssh_map.labels
     if trace is not None:

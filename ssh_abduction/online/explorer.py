@@ -1,35 +1,39 @@
-"""Drives a robot by experiments until one map is left that is closed and beyond doubt.
+"""Drive a robot by experiments until one map is left that is closed and beyond doubt.
 
     see  ->  minimal maps of all that was seen  ->  next experiment  ->  do its actions  ->  see …
 
-`OnlineMapper` keeps the maps. The explorer looks for a new experiment when the last one is done,
-when clingo was asked, and when rivals were refuted:
+A dstate (distinctive state) is a place and the direction that the robot faces there. A *return* is
+a pair of visits that a map has at one place. `OnlineMapper` keeps the minimal maps of the steps so
+far.
 
-1. If known links distinguish minimal maps, the actions that do (`rivals/explore.py`).
-2. Else the shortest tour through all that is untried in the first map (`rivals/tour.py`). It puts
-   off looking around at places that it will come back to.
-3. Else an untried action for which minimal maps predict different outcomes.
-4. Else actions that distinguish the map from one without one of its returns (`return_doubts.py`).
+The explorer looks for a new experiment when the last one is done, when clingo has searched again,
+and when the number of maps has changed. It takes the first of these that exists:
+
+1. Known links whose ends differ between the minimal maps (`rivals/explore.py`).
+2. The shortest tour through all untried actions of the first map (`rivals/tour.py`). The tour does
+   not look around at a place yet if it comes back there later.
+3. An untried action for which the minimal maps predict different outcomes.
+4. Actions that distinguish the map from a map without one of its returns (`return_doubts.py`).
 
 When it is done
 ---------------
 1. *Unique.* All minimal maps have the same dstates and the same places. They may differ in paths.
-2. *Closed.* At each dstate that the robot can get to, each action that it can do there was tried,
-   or the axioms imply where it leads.
-3. *Beyond doubt.* A minimal map may still have too few dstates, as it merges whatever may be one.
-   So each return of the map is doubted. The best map in which the two visits are not at one place
-   (by the causal theory: the two steps are not one dstate) is a rival if it has at most `margin`
-   dstates more. An experiment distinguishes the two maps, and then the doubt is weighed again.
-   The cost of such a map can only grow with the trace, so a dispelled doubt stays dispelled until
-   the minimal maps themselves have more dstates.
+2. *Closed.* At each dstate that the robot can reach, each action that it can do there was tried, or
+   the axioms imply where the action leads.
+3. *Beyond doubt.* A minimal map may still have too few dstates, as it merges all that can be
+   merged. So the explorer doubts each return of the map. It looks for the best map in which the two
+   visits are not at one place (by the causal theory: the two steps are not one dstate). This map is
+   a rival if it has at most `margin` dstates more than the minimal map. After an experiment that
+   distinguishes the two, the doubt is weighed again. The cost of such a rival can only grow with
+   the trace. So a dispelled doubt stays dispelled until the minimal maps have more dstates.
 
-If no experiment distinguishes such a rival from the minimal map, there are two cases. Both may be
-the same map and differ only in the past of the robot; that is no doubt. Or the rival is
-another map, as closed as the minimal one, that predicts the same for ever: a symmetric world has
-such maps. Then the exploration ends as `inseparable`, and not as `done`.
+If no experiment distinguishes a rival from the minimal map, there are two cases. The two may be the
+same map and differ only in the past of the robot; that is no doubt. Or the rival is another map
+that is also closed and will always predict the same, as in a symmetric world. In this second case
+the exploration ends as `inseparable`, and not as `done`.
 
-This does not prove that the map is true. A world may hide more than `margin` dstates, and of the
-rivals without a return only the best is looked at. docs/how-to/exploring.md measures how often the
+This does not prove that the map is true. A world may have more than `margin` further dstates, and
+only the best rival without a return is examined. docs/how-to/exploring.md measures how often the
 map is true.
 """
 
@@ -55,11 +59,11 @@ from ssh_abduction.runtime.deprecated import renamed_parameters
 from ssh_abduction.solver import Solution, Status, check_limit, find_backbone, solve
 from ssh_abduction.theory.theory import Theory, checked_theory
 
-# If nothing is left to do but the map is not proven minimal, it is solved for this many times
+# If nothing is left to do but the map is not proven minimal, solve the trace for this many times
 # the time limit of a step.
 LONGER = 5
-# A place that has shown at most this many dstates on a tour may still be another one than the map
-# takes it for. A place with four sides has this many.
+# If a tour has seen at most this many dstates of a place, the place may still be another one than
+# the map says. A place with four sides has this many.
 DOUBTED = 4
 
 Ending: TypeAlias = Literal["done", "inseparable", "steps", "time", "contradicted"]
@@ -73,38 +77,41 @@ _ENDINGS: dict[Ending, str] = {
 
 
 class Robot(Protocol):
-    """What an explorer drives."""
+    """The robot that an explorer drives. Implement these three methods."""
 
     def look(self) -> Step:
-        """What is seen here: a view, perhaps a star, and the displacement since the last look.
+        """Return what the robot sees here: a view, and whatever else the theory uses.
 
-        In simulation it may have the truth, which the explorer does not use.
+        This may be a star (the openings around the robot), and the displacement since the last
+        look. A simulation may add the truth. The explorer does not use the truth to decide.
         """
 
     def can(self) -> Collection[Action | str]:
-        """The actions that the robot can do here. They should be the same if all looks alike."""
+        """Return the actions that are possible here, the same ones wherever `look` is the same."""
 
     def do(self, action: Action) -> None:
-        """Do an action."""
+        """Do an action, and return when it is done."""
 
 
 @dataclass(frozen=True, slots=True)
 class Exploration:
-    """What an explorer found out.
+    """The result of an exploration.
 
     Attributes:
-        steps: Number of done actions.
-        ending: Why it ended. "done": one map is left, nothing in it is untried, and no return is in
-            doubt. "inseparable": nothing that the robot can do distinguishes the rivals that are
-            left, or the minimal map from `rival`. "steps": all steps are spent. "time": there was
-            no time to prove which maps are minimal, or to weigh a doubt. "contradicted": no map
-            explains what was seen.
+        steps: Number of actions that the robot did.
+        ending: Why the exploration ended.
+            "done": one map is left, nothing in it is untried, and no return is in doubt.
+            "inseparable": nothing that the robot can do distinguishes the remaining minimal maps,
+            or the minimal map from `rival`.
+            "steps": all actions that it was allowed are spent.
+            "time": there was no time to prove which maps are minimal, or to weigh a doubt.
+            "contradicted": no map explains what was seen.
         is_unique: Whether all minimal maps have the same dstates and the same places.
         is_true: Whether the map is unique and its dstates and places are the true ones, as far as
-            the robot drove. None if its looks hold no truth.
-        solution: The minimal maps of all that was seen.
-        rival: A map with more dstates that also explains all, is closed, and predicts the same for
-            ever, if one was found. Then the world may be larger than the unique minimal map.
+            the robot drove; None if what the robot saw came without the truth.
+        solution: The minimal maps of all that was seen, or the best map found in time.
+        rival: A map with more dstates that also explains everything, and that nothing the robot
+            can do distinguishes from the minimal map; None if none was found.
     """
 
     steps: int
@@ -116,7 +123,7 @@ class Exploration:
 
     @property
     def sentence(self) -> str:
-        """The result as a sentence."""
+        """One sentence that says whether the map is unique, and why the exploration ended."""
         truth = (
             {None: "", True: ", and true", False: ", and not true"}[self.is_true]
             if self.is_unique
@@ -142,17 +149,17 @@ class Explorer:
     """Drives a robot until its minimal map is unique, closed, and beyond doubt.
 
     Args:
-        robot: What it drives.
-        theory: Which axioms and which preference; Theory.topological() by default.
-        margin: A return is in doubt while some map without it has at most this many dstates more; 0
-            doubts nothing.
-        time_limit: Seconds that a step, and the weighing of one doubt, may take, about; None waits
-            for exact answers.
+        robot: The robot, with the methods `look`, `can` and `do`.
+        theory: The axioms, and what to minimise; Theory.topological() by default.
+        margin: Doubt a return (two visits that the map has at one place) while some map without
+            this return has at most this many dstates more. 0 doubts nothing.
+        time_limit: Seconds for each step, and again for weighing each doubt. A step may take a
+            little longer. None waits for exact answers.
         max_maps: Keep at most this many maps; None keeps all.
 
     Raises:
-        TraceError: The robot's looks do not fit the theory.
-        TheoryError: The theory has faults.
+        TraceError: What the robot sees does not fit the theory, or an argument is wrong.
+        TheoryError: The theory allows faults (misread, slipped).
 
     Attributes:
         mapper: The mapper that keeps the minimal maps.
@@ -225,7 +232,7 @@ class Explorer:
 
     @property
     def trace(self) -> Trace:
-        """All that was seen and done, with the truth that the robot's looks have."""
+        """The steps so far: what was seen and done, with the truth if `look` returned any."""
         trace = self.mapper.trace
         return replace(
             trace,
@@ -237,11 +244,18 @@ class Explorer:
 
     @property
     def solution(self) -> Solution:
-        """The minimal maps of all that was seen, or the best map found in time."""
+        """The minimal maps of the steps so far, or the best map found in time."""
         return self._longer or self.mapper.solution
 
     def explore(self, steps: int) -> Exploration:
-        """Do at most this many actions, and say what was found out."""
+        """Do actions until nothing is left to find out, and return the result.
+
+        Args:
+            steps: The largest number of actions to do.
+
+        Raises:
+            TraceError: `steps` is negative or no whole number, or what the robot sees does not fit.
+        """
         if not is_whole(steps) or steps < 0:
             raise TraceError(f"steps: expected a number of actions, 0 or more, got {brief(steps)}")
         while steps > 0 and self.step():
@@ -251,7 +265,7 @@ class Explorer:
         return self.result
 
     def step(self) -> bool:
-        """Do one action. False if nothing is left to do, or there is no map to go by."""
+        """Do one action. Return False if nothing is left to do, or no map is known."""
         self._is_stuck = not self._planned()
         if self._is_stuck:
             return False
@@ -278,7 +292,7 @@ class Explorer:
 
     @property
     def result(self) -> Exploration:
-        """What was found out so far."""
+        """The result so far."""
         solution = self.solution
         unique = _is_unique(solution)
         rival = next(iter(self._doubts.twins.values()), None)
@@ -292,7 +306,11 @@ class Explorer:
         )
 
     def _ending(self, unique: bool) -> Ending:
-        """Why the exploration ended, or would end now."""
+        """Say why the exploration ended, or would end now.
+
+        Args:
+            unique: Whether all minimal maps have the same dstates and places.
+        """
         if self.solution.status is Status.UNSATISFIABLE:
             return "contradicted"
         if not self._is_stuck:
@@ -304,7 +322,11 @@ class Explorer:
         return "done" if unique else "inseparable" if self.solution.complete else "time"
 
     def _is_true(self, unique: bool) -> bool | None:
-        """Whether the unique map is true; None if the robot's looks hold no truth."""
+        """Whether the map is unique and true; None if the robot's steps have no truth.
+
+        Args:
+            unique: Whether all minimal maps have the same dstates and places.
+        """
         if all(truth is None for truth in self._truths):
             return None
         if not unique:
@@ -315,7 +337,7 @@ class Explorer:
         )
 
     def _look(self) -> Step:
-        """What the robot sees. Raises TraceError if that is no Step with a view."""
+        """Let the robot look. Raise TraceError if it returns anything but a Step with a view."""
         seen = self._robot.look()
         if not isinstance(seen, Step) or seen.view is None:
             raise TraceError(
@@ -325,7 +347,7 @@ class Explorer:
         return seen
 
     def _planned(self) -> bool:
-        """Whether there is a next action. If so, the plan begins with it."""
+        """Make a plan if none is left. Return whether the robot can do its first action."""
         able = self._abilities.here
         if self._plan and self._plan[0] not in able:
             self._plan = []
@@ -334,7 +356,7 @@ class Explorer:
         return bool(self._plan) and self._plan[0] in able
 
     def _next_plan(self) -> tuple[str, ...]:
-        """The actions of the next experiment; none if nothing is left to find out."""
+        """Find the actions of the next experiment; empty if nothing is left to find out."""
         maps = list(self.solution.maps)
         found = self._experiment(maps)
         # No known links distinguish the maps: try what is untried.
@@ -351,7 +373,7 @@ class Explorer:
         return self._doubting_plan(self.solution.maps[0])
 
     def _solve_longer(self) -> Solution:
-        """Solve all steps in more time than a step has."""
+        """Solve the whole trace with LONGER times the time limit of a step."""
         limit = None if self._time_limit is None else LONGER * self._time_limit
         mapper = self.mapper
         found = solve(mapper.trace, mapper.theory, time_limit=limit, max_maps=self._max_maps)
@@ -361,7 +383,14 @@ class Explorer:
         return found
 
     def _doubting_plan(self, best: SSHMap) -> tuple[str, ...]:
-        """Actions that test the map against one without one of its returns."""
+        """Find actions that distinguish a map from a rival without one of its returns.
+
+        Args:
+            best: The minimal map.
+
+        Returns:
+            The actions; an empty tuple if no doubt is left that the robot can test.
+        """
         trace, theory, dstates = self.mapper.trace, self.mapper.theory, len(best.dstates)
         for doubt in self._doubts.open(best, trace):
             rival = self._doubts.rival(doubt, trace, theory, dstates)
@@ -377,7 +406,7 @@ class Explorer:
         return ()
 
     def _experiment(self, maps: list[SSHMap]) -> Experiment:
-        """The experiment that distinguishes maps, or tries what is untried in them."""
+        """Find an experiment that distinguishes maps, or that tries an untried action."""
         return next_experiment(
             maps,
             self.mapper.trace,
@@ -388,7 +417,7 @@ class Explorer:
         )
 
     def _tour(self, ssh_map: SSHMap) -> tuple[str, ...]:
-        """The shortest tour through all that is untried in a map."""
+        """Find the shortest tour through all untried actions of a map; empty if none is left."""
         return next_tour(
             ssh_map,
             self.mapper.trace,
@@ -407,7 +436,7 @@ def _is_unique(solution: Solution) -> bool:
         return False
     if solution.complete:
         return True
-    # Not all maps are listed: then the proof of what all of them share decides.
+    # If not all maps are listed, the proof of what all of them share decides.
     shared = solution.backbone
     return (
         shared is not None

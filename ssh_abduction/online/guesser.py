@@ -1,4 +1,7 @@
-"""Guesses and mends maps while the robot drives, if clingo finds no minimal map in time."""
+"""Guess and mend maps while the robot drives, for when clingo finds no minimal map in time.
+
+To mend a map is to change it so that it fits a step that contradicts it.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +28,14 @@ MENDING = 5e-7
 
 
 class Guesser:
-    """Makes maps of a growing trace: from guesses, and by mending contradicted maps.
+    """Makes maps of a growing trace, from guesses and by mending maps.
 
-    A map is mended at once if a step has time for that, and else in another process, where also
-    one guess after another becomes a map.
+    A map is mended at once if the step has time for that, and in another process otherwise. That
+    process also makes maps from guesses, one after the other.
 
     Args:
         trace: The steps so far.
-        options: What a step may use.
+        options: The time limit and the other options of a step.
     """
 
     def __init__(self, trace: Trace, options: StepOptions) -> None:
@@ -43,18 +46,24 @@ class Guesser:
         self._mending = MENDING
 
     def follow(self, trace: Trace) -> None:
-        """Take in the last step of a trace."""
+        """Add the last step of a trace, which has one step more than before."""
         self._steps[-1:] = trace.steps[-2:]
 
     def finished(self) -> SSHMap | None:
-        """The map of the guess under way, if it is done. It may lack the last steps."""
+        """Take the map that the other process made; None if it is not done, or found none.
+
+        The map may lack the last steps of the trace.
+        """
         if self.guess and self.guess.done():
             guess, self.guess = self.guess, None
             return guess.result()
         return None
 
     def suits(self, theory: Theory) -> bool:
-        """Whether maps can be guessed for a theory, and the steps are few enough for that."""
+        """Whether to guess maps.
+
+        Steps need a time limit, the theory has to allow guesses, and the trace may not be too long.
+        """
         return (
             self.options.time_limit is not None
             and row("visits").holds_for(theory)
@@ -64,16 +73,20 @@ class Guesser:
     def mend_or_guess(
         self, trace: Trace, theory: Theory, contradicted: SSHMap | None, began: float
     ) -> SSHMap | None:
-        """Mend a contradicted map if this step has time for it; else begin a guess, if one is due.
+        """Mend a contradicted map at once, or start a guess in another process.
+
+        A map is mended at once if this step has time for it. Otherwise start to mend the map, or to
+        make one from a guess if that is due, in another process.
 
         Args:
             trace: The steps so far.
             theory: The theory without `auto`.
-            contradicted: The best map so far, if the last step contradicts it.
+            contradicted: The best map of the steps before the last, if the last step contradicts
+                all known maps; else None.
             began: When the step began, by `time.perf_counter`.
 
         Returns:
-            The mended map of all steps, if there is one.
+            The mended map of all steps; None if none was made at once.
         """
         steps, now = len(trace), time.perf_counter()
         assert self.options.time_limit is not None
@@ -89,7 +102,7 @@ class Guesser:
         return None
 
     def _begin(self, trace: Trace, theory: Theory, known: SSHMap | None) -> None:
-        """Begin to guess a map, or to mend a known one, in another process."""
+        """Start to mend `known`, or without it to guess a map, in another process."""
         from ssh_abduction.online.background_guess import MapGuess  # loads numpy
 
         if not known:

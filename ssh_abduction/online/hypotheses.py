@@ -1,24 +1,26 @@
-"""Rival explanations of a trace with faults while it grows, and the probability of each.
+"""Rival explanations of a growing trace with faults, and the probability of each.
 
-A rival is a map of all steps so far, with its faults. If it predicts a new step it goes on in
-one way. If it does not, it goes on in each way that it allows:
+A *rival* is a map of all steps so far, with its *faults*: the steps that it treats as wrong. A
+dstate (distinctive state) is a place and a direction. When a new step comes, a rival that predicts
+it is extended in one way. Any other rival is extended in each of these ways:
 
-    contradicted  the observation is misread, and the robot is where the link leads; or the action
-                  slipped, to each dstate that looks like this, or to a new one
-    unknown       a new link leads to each dstate that looks like this, or to a new one
+    contradicted  The observation is misread, and the robot is where the link leads. Or the action
+                  slipped, and the robot is at one of the dstates that look like this, or at a new
+                  dstate.
+    unknown       A new link leads to one of the dstates that look like this, or to a new dstate.
 
-Links to known dstates and new dstates are for the causal theory alone. If there are places and
-paths, only the axioms say what a new link may be.
+New links and new dstates are for the causal theory alone. In a theory with places and paths, only
+the axioms say where a new link may lead.
 
-Rivals are weighed. The price of a fault says how it compares with a dstate, and the cheapest kind
-has the probability of a fault in `Chances` of the localiser. A price does not say how many ways
-there were: a link, and an action that slipped, leads to one of N dstates, and a misread view is one
-of V. Let λ be the logarithm of the odds that a dstate is worth. Then
+Each rival has a weight. The theory gives the price of a fault in dstates, and the cheapest kind of
+fault has the probability `Chances.misread`. A price does not count alternatives: a new link, or an
+action that slipped, leads to one of N dstates, and a misread view is one of V views. Let λ be the
+logarithm of the odds that correspond to the price of one dstate. Then
 
     weight = exp(-λ cost) N^-(links and slips) V^-(misreadings)
 
-What happens after a fault decides between its explanations: a link that one explanation has to
-assume and another one predicts is evidence against the first.
+What happens after a fault decides between its explanations. If one explanation has to assume a link
+that another one predicts, the weight of the first one falls.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.solver import Cost, observation
 from ssh_abduction.theory.theory import Theory
 
-# As `observation` returns it: the view, and the star (openings) if used.
+# As `observation` returns it: the view, and the star (the openings seen) or None.
 Seen = tuple[object, object]
 # What a dstate costs, in tenths of dstates.
 DSTATE = 10
@@ -41,15 +43,16 @@ DSTATE = 10
 
 @dataclass(frozen=True, slots=True)
 class Rival:
-    """An explanation of all steps so far.
+    """An explanation of all steps so far: a map, and how it was extended.
 
     Attributes:
-        map: A map of the first steps, or of all.
-        labels: The dstate of each step.
-        shows: What each dstate looks like.
-        links: The dstate that an action leads to, by dstate and action.
-        faults: What is ignored.
-        cost: The counts that the theory prefers, first to last.
+        map: The map that the solver found, of the first steps or of all.
+        labels: The dstate of each step so far.
+        shows: The view and star of each dstate.
+        links: For each dstate and name of an action, the dstate that the action leads to.
+        faults: The observations and actions that are treated as wrong.
+        cost: The counts that the theory minimises, the most important first. Dstates, with the
+            price of faults, count in tenths.
     """
 
     map: SSHMap
@@ -61,7 +64,13 @@ class Rival:
 
     @classmethod
     def of(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Rival:
-        """A map of the trace, or of its first steps, as a rival."""
+        """Make a rival of a map.
+
+        Args:
+            ssh_map: A map of the trace or of its first steps.
+            trace: The trace.
+            theory: The theory without `auto`.
+        """
         wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
         looks: dict[int, Seen] = {}
         for t, label in enumerate(ssh_map.labels):
@@ -80,17 +89,17 @@ class Rival:
 
     @property
     def here(self) -> int:
-        """The dstate that the robot is in."""
+        """The id of the dstate where the robot is after the last step."""
         return self.labels[-1]
 
     @property
     def places(self) -> list[int | None]:
-        """The place of each dstate; None if it has none."""
+        """The place of each dstate; None for a dstate without a place."""
         known = self.map.dstates
         return [s.place for s in known] + [None] * (len(self.shows) - len(known))
 
     def explained(self) -> SSHMap:
-        """The map of all steps, with its faults."""
+        """Make the map of all steps so far, with its faults."""
         if len(self.map.labels) == len(self.labels):
             return self.map
         known = self.map.dstates
@@ -109,19 +118,29 @@ class Rival:
         )
 
     def contradiction(self, action: str, seen: Seen) -> int | None:
-        """The dstate that an action leads to, if it looks different from `seen`; else None."""
+        """Find the dstate that contradicts what is seen after an action.
+
+        Args:
+            action: The name of the action.
+            seen: The view and star after it.
+
+        Returns:
+            The dstate that the action leads to, if it shows something else; None if it shows
+            `seen`, or if the map has no link for the action.
+        """
         there = self.links.get((self.here, action))
         return None if there is None or self.shows[there] == seen else there
 
     def is_unknown(self, action: str) -> bool:
-        """Whether an action was never tried at the robot's dstate."""
+        """Whether there is no link for an action at the dstate where the robot is."""
         return (self.here, action) not in self.links
 
     def future(self) -> tuple[object, ...]:
-        """The predictions of the map from here on, as a value to compare two maps.
+        """Summarise what the map predicts from here on, as a value that can be compared.
 
-        It is equal for maps that agree on dstates, links and where the robot is, up to renaming,
-        however they explain the past. Of unreachable dstates it holds only the number.
+        Two maps have equal values if they have the same dstates, the same links, and the robot at
+        the same dstate, up to renaming. The past does not count. For dstates that cannot be
+        reached from here, only their number counts.
         """
         ends: dict[int, list[tuple[str, int]]] = {}
         for (s, action), x in self.links.items():
@@ -138,12 +157,12 @@ class Rival:
         return tuple(self.shows[s] for s in reached), tuple(links), len(self.shows)
 
     def ways_on(self, action: str, step: Step, seen: Seen, theory: Theory) -> Iterator[Rival]:
-        """The rivals that this one becomes with one more step; those that cost nothing come first.
+        """Yield the extensions of this rival by one step. Those without extra cost come first.
 
         Args:
             action: The name of the action before the step.
             step: The step.
-            seen: What the step shows.
+            seen: The view and star of the step.
             theory: The theory without `auto`.
         """
         t, there = len(self.labels), self.links.get((self.here, action))
@@ -184,14 +203,14 @@ class Rival:
         faults: Sequence[Fault] = (),
         tenths: int = 0,
     ) -> Rival:
-        """The rival whose next step is at the dstate `there`.
+        """Extend this rival by a step at the dstate `there`.
 
         Args:
             there: The dstate of the step.
-            link: The action of a new link to it, if there is one.
-            new: What the dstate shows, if it is new.
-            faults: What is ignored besides.
-            tenths: What these faults cost, in tenths of dstates.
+            link: The name of the action if this step adds a link; else None.
+            new: The view and star of the dstate if it is new; else None.
+            faults: The faults that this step adds.
+            tenths: The cost of these faults, in tenths of dstates.
         """
         tenths += DSTATE if new else 0
         return Rival(
@@ -206,13 +225,13 @@ class Rival:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Weighs rivals.
+    """Computes the weights of rivals. The head of this module has the formula.
 
     Attributes:
-        odds: Negative logarithm of the probability of a fault of the cheapest kind, in nats.
-        price: What such a fault costs, in tenths of dstates.
-        dstates: Number N of dstates.
-        views: Number V of views.
+        odds: Negative natural logarithm of the probability of the cheapest kind of fault.
+        price: The cost of such a fault, in tenths of dstates.
+        dstates: Number N of dstates, at least 2.
+        views: Number V of views, at least 2.
     """
 
     odds: float
@@ -222,12 +241,19 @@ class Scale:
 
     @classmethod
     def of(cls, theory: Theory, chance: float, dstates: int, views: int) -> Scale:
-        """The scale for a theory whose cheapest fault has the probability `chance` at each step."""
+        """Make the scale for a theory.
+
+        Args:
+            theory: The theory, with faults.
+            chance: Probability of its cheapest kind of fault, at each step.
+            dstates: Number of dstates.
+            views: Number of views.
+        """
         cheapest = min(round(10 * price) for price in (theory.misread, theory.slipped) if price)
         return cls(-math.log(chance), cheapest, max(dstates, 2), max(views, 2))
 
     def improbability(self, rival: Rival) -> float:
-        """The negative logarithm of the weight, in nats."""
+        """Compute the negative natural logarithm of the weight of a rival."""
         kinds = Counter(fault.kind for fault in rival.faults)
         ways = (len(rival.links) + kinds["slipped"]) * math.log(self.dstates)
         return (
@@ -237,7 +263,7 @@ class Scale:
         )
 
     def shares(self, rivals: Sequence[Rival]) -> list[float]:
-        """The probability of each rival, if one of them is true. They sum to 1."""
+        """Compute the probability of each rival, given that one of them is true."""
         improbable = [self.improbability(rival) for rival in rivals]
         least = min(improbable, default=0.0)
         weights = [math.exp(least - nats) for nats in improbable]

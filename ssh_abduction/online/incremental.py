@@ -1,4 +1,4 @@
-"""Asks clingo for the minimal maps of a trace that grows, in one control that is kept."""
+"""Find the minimal maps of a growing trace with clingo, without grounding it anew each time."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ PAUSE = 2
 
 
 class IncrementalSolver:
-    """Searches again, going on from the last search.
+    """Searches for minimal maps of a growing trace. Each search continues the last one.
 
     Args:
-        options: What a step may use.
-        searches: Number of earlier searches.
+        options: The time limit and the other options of a step.
+        searches: The number to start counting searches from.
 
     Attributes:
-        searches: Number of searches.
-        search: The last search, None before the first.
-        solution: The last answer, without its maps.
+        searches: Number of searches so far.
+        search: The last search; None before the first.
+        solution: The last solution, without its maps; None before the first search.
     """
 
     def __init__(self, options: StepOptions, searches: int = 0) -> None:
@@ -36,11 +36,11 @@ class IncrementalSolver:
         self._next_search = 0  # no search before the trace has this many steps
 
     def is_due(self, trace: Trace) -> bool:
-        """Whether the trace has grown enough for the next search."""
+        """Whether the trace has grown enough since a search that ran out of time."""
         return len(trace) >= self._next_search
 
     def make_due(self) -> None:
-        """Search at the next step: the last search proved the cost."""
+        """Make the next search due at once, whatever the last one found."""
         self._next_search = 0
 
     def maps(self, trace: Trace, theory: Theory, known: SSHMap | None) -> tuple[SSHMap, ...]:
@@ -49,7 +49,8 @@ class IncrementalSolver:
         Args:
             trace: The steps so far.
             theory: The theory without `auto`.
-            known: A map that is known to be minimal; only the others remain to be found.
+            known: A map that is known to be minimal, so that only the others are searched for; None
+                if no minimal map is known.
 
         Returns:
             The minimal maps, or the best map found in time. `solution.status` says which.
@@ -64,7 +65,7 @@ class IncrementalSolver:
             speedups=self.options.speedups,
             minimal=known,
         )
-        # Unranked, as ranking takes longer than a step may.
+        # The maps are not ranked, as ranking takes longer than a step may.
         found = tuple(search.unranked())
         self.search, self.solution = search, search.solution()
         was_stopped = search.stopped in ("time limit", "interrupted")

@@ -1,4 +1,7 @@
-"""Keeps the minimal maps of a trace without faults current, for one theory without `auto`."""
+"""Keep the minimal maps of a growing trace up to date, for a theory that allows no faults.
+
+A fault is a step that a map treats as wrong.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +21,12 @@ from ssh_abduction.theory.theory import Theory
 
 
 class MapKeeper:
-    """Keeps the minimal maps current, or else the best map that can be had in time.
+    """Keeps the minimal maps up to date, or the best map that is found in time.
 
     Args:
-        problem: The steps so far, and the theory without `auto`, without faults.
-        options: What a step may use.
-        before: The keeper that this one follows. It has fewer steps.
+        problem: The steps so far, and the theory without `auto` and without faults.
+        options: The time limit and the other options of a step.
+        before: The keeper of fewer steps that this one replaces; None for the first.
     """
 
     standing = None  # only a theory with faults has one
@@ -58,14 +61,17 @@ class MapKeeper:
 
     @property
     def searches(self) -> int:
-        """The number of calls of clingo."""
+        """The number of searches by clingo so far."""
         return self.solver.searches
 
     def restarted(self, problem: Problem) -> MapKeeper:
-        """A keeper for the theory that fits one more step.
+        """Make a keeper for a theory that changed with the last step.
 
-        Minimal maps of fewer steps need not be minimal by that theory. They go on as drafts, if
-        displacements also judged them.
+        The minimal maps so far need not be minimal by the new theory. They become drafts (maps to
+        be extended step by step) if the old theory already used displacements.
+
+        Args:
+            problem: The steps so far, with one more, and the new theory.
         """
         trace = problem.trace
         keeper = MapKeeper(problem, self._options, before=self)
@@ -79,7 +85,11 @@ class MapKeeper:
         return keeper
 
     def take(self, problem: Problem) -> None:
-        """Take in the last step of a trace: keep the maps that predict it."""
+        """Add the last step: keep the maps that predict it, and drop those that it contradicts.
+
+        Args:
+            problem: The steps so far, with one more, and the theory.
+        """
         self._previous = self._best_known()
         self._problem, trace = problem, problem.trace
         self.guesser.follow(trace)
@@ -96,7 +106,7 @@ class MapKeeper:
             self.drafts.add(replayed.map(), trace)
 
     def answer(self, began: float) -> Solution:
-        """Find what is not known of the steps so far, and say what is.
+        """Search for minimal maps of the steps so far if needed, and return what is known.
 
         Args:
             began: When the step began, by `time.perf_counter`.
@@ -106,13 +116,13 @@ class MapKeeper:
         return self._solution(began)
 
     def _best_known(self) -> SSHMap | None:
-        """The first minimal map, or else the best draft."""
+        """The first minimal map, else the best draft, else None."""
         if self.minimal.maps:
             return self.minimal.maps[0].map()
         return self.drafts.first()
 
     def _find(self, began: float) -> None:
-        """Ask clingo for the minimal maps; if it has no time for them, guess maps."""
+        """Search for minimal maps with clingo. If it runs out of time, guess or mend a map."""
         if not self.minimal.is_settled(self._options.max_maps) and self.solver.is_due(self.trace):
             self._ask()
         guessed = self.guesser.finished()
@@ -127,7 +137,7 @@ class MapKeeper:
                 self.drafts.add(mended, self.trace)
 
     def _ask(self) -> None:
-        """Let clingo say what the minimal maps are, or the best map that it finds in time."""
+        """Search for minimal maps with clingo, and keep them, or the best map as a draft."""
         known = self.minimal.maps[0].map() if self.minimal.status is Status.OPTIMAL else None
         found = self.solver.maps(self.trace, self.theory, known)
         said = self.solver.solution
@@ -140,7 +150,11 @@ class MapKeeper:
             self.drafts.add(found[0], self.trace)
 
     def _solution(self, began: float) -> Solution:
-        """The answer for the steps so far: the minimal maps, or else one consistent map."""
+        """The solution for the steps so far: the minimal maps, else one consistent map, else none.
+
+        Args:
+            began: When the step began, by `time.perf_counter`.
+        """
         asked = self.solver.solution
         assert asked is not None
         minimal, steps = self.minimal, len(self.trace)

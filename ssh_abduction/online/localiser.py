@@ -1,4 +1,6 @@
-"""Locates a robot in a known map by Markov localisation over dstates.
+"""Locate a robot in a known map by Markov localisation over dstates.
+
+A dstate (distinctive state) is a place and the direction that the robot faces there.
 
 Reference: Kuipers & Beeson 2002, equations 1 to 4.
 
@@ -21,10 +23,10 @@ observed o:
     p(v|x) = 1 if x shows v, else 0;                   (4)   if the map holds without exception
     p(x'|x,a) = 1 if a link leads there, else 0
 
-A map alone says (4), and so does the trace that it explains. As no robot is without faults,
-`Chances` says how likely it is that they do not hold, and there is one hypothesis more: the robot
-is nowhere that the map knows. Let f be (3) or (4), or what a recogniser's distances say of an image
-(perception/likelihood.py). Then
+A map without its trace gives (4); a map with its trace gives (3). Robots make errors, so `Chances`
+gives the probabilities that (3) and (4) do not hold. There is also one more hypothesis: the robot
+is *nowhere*, that is, at no dstate of the map. Let f be (3) or (4), or the probability of an image
+by a recogniser's distances (perception/likelihood.py). Then
 
     p(o|x)        = (1 - misread) f(o|x) + misread q(o)
     q(o)          = (Σ_x f(o|x) + g(o)) / (N + 1)
@@ -33,21 +35,22 @@ is nowhere that the map knows. Let f be (3) or (4), or what a recogniser's dista
     p(x'|nowhere) = reentered / N
     e(x')         = (1 - unmapped) / N,  e(nowhere) = unmapped
 
-e is the prior of global localisation. q is the observation at an unknown
-place. It looks like one of the N dstates, or like none of them (g), each as likely.
+e is the prior of global localisation. q(o) is the probability of an observation at an unknown
+place. Such a place looks like one of the N dstates or like none of them (g), all equally likely.
 
-Nowhere is of two kinds, equally likely when the robot gets there. A *strange* place: earlier
-observations predict nothing. A place *akin* to the map: what follows is what follows in the
-map on average, over the n dstates that look like o and have a link for a:
+There are two kinds of places outside the map, equally likely when the robot gets there. At a
+*strange* place, earlier observations predict nothing. At a place *akin* to the map, what follows is
+what follows in the map on average. The average is over the n dstates that look like o and have a
+link for a:
 
     p(o'|strange) = q(o')
     p(o'|akin)    = (n · mean over these x of Σ_x' f(x'|x,a) f(o'|x') + q(o')) / (n + 1)
                     of a novel o': q(o')
 
-Without the second kind a robot in another maze would be located in this one, because views
-after turns fit any maze. All p(o|·) are divided by q(o), which changes no belief. So views
-and images are weighed alike, and the normaliser says how probable an observation was, compared with
-an unknown place.
+Without the second kind, a robot in another maze would be located in this one, because the views
+after turns fit any maze. All p(o|·) are divided by q(o), which changes no belief. It has two
+effects: views and images have weights of one scale, and the normaliser compares the probability of
+an observation with that at an unknown place.
 """
 
 from __future__ import annotations
@@ -71,20 +74,23 @@ if TYPE_CHECKING:
 
 
 class Localiser:
-    """Follows a robot in a map: each step maps a belief to the next.
+    """Computes beliefs about where a robot is in a known map, one after each step.
 
     Args:
-        ssh_map: The map. Its links and views say (4).
-        recogniser: Reads images in place of views. It was trained on the labels of this map, such
-            as `BootstrapLearner.recogniser_`.
-        trace: The trace of the map's labels. Then probabilities are estimated from it (3). It may
-            break the rules of a map.
-        chances: How likely it is that the map does not hold.
+        ssh_map: The map. Its dstates must have the ids 0, 1, 2, …
+        recogniser: A recogniser trained on the labels of this map, such as
+            `BootstrapLearner.recogniser_`. The localiser then reads images instead of views. None
+            reads views.
+        trace: The trace that was mapped, to estimate probabilities by counting (equation 3 of this
+            module). Its steps may contradict the map. None takes all probabilities as 0 or 1 from
+            the map's links and views (equation 4).
+        chances: The probabilities of errors; Chances() by default.
 
     Raises:
         MapError: The map is malformed, or is not of the trace.
         TraceError: `trace` is not a Trace.
-        LocaliserError: The recogniser has other labels than the map has dstates.
+        LocaliserError: The recogniser has labels that are no dstates of the map, or `chances` is
+            no Chances.
         PerceptionError: The distances of the recogniser cannot be read.
     """
 
@@ -121,16 +127,18 @@ class Localiser:
 
     @property
     def prior(self) -> Belief:
-        """The belief of global localisation: all dstates are equally likely."""
+        """The belief before anything is observed: all dstates are equally likely."""
         unmapped = self.chances.unmapped
         return Belief(_frozen(np.full(self._number, (1 - unmapped) / self._number)), unmapped)
 
     def start(self, view: View | None = None, image: ArrayLike | None = None) -> Belief:
-        """The belief after the first observation. Without view and image it is the prior.
+        """Compute the belief after the first observation.
+
+        Without view and image it is the prior: all dstates are equally likely.
 
         Args:
-            view: What is seen, for a localiser without a recogniser.
-            image: Ranges in metres, (d,), for one with a recogniser.
+            view: The view, for a localiser without a recogniser.
+            image: The d ranges of the laser in metres, (d,), for a localiser with a recogniser.
 
         Raises:
             TraceError: The view is malformed.
@@ -146,14 +154,15 @@ class Localiser:
         view: View | None = None,
         image: ArrayLike | None = None,
     ) -> Belief:
-        """The belief after an action and what was observed then: equations 1 and 2.
+        """Compute the belief after an action and the next observation (equation 2).
+
+        Without view and image, only the action counts.
 
         Args:
             belief: The belief before the action.
-            action: The action.
-            view: What is seen then, for a localiser without a recogniser.
-            image: Ranges in metres, (d,), for one with a recogniser. Without view and image nothing
-                was observed.
+            action: The action, or its name.
+            view: The view after it, for a localiser without a recogniser.
+            image: The d ranges of the laser in metres, (d,), for a localiser with a recogniser.
 
         Raises:
             TraceError: The action or the view is malformed.
@@ -168,9 +177,10 @@ class Localiser:
         return self._after(belief, Action.of(action).name, self._observation(view, image))
 
     def beliefs(self, trace: Trace) -> Iterator[Belief]:
-        """The belief after each step of another trace, beginning with the prior.
+        """Yield the belief after each step of another trace.
 
-        With a recogniser the images of the trace are read, and its views are not.
+        Before its first step, all dstates are equally likely. A localiser with a recogniser reads
+        the images of the trace and ignores its views.
 
         Raises:
             TraceError: No step has a view, and there is no recogniser.
@@ -184,7 +194,7 @@ class Localiser:
             yield belief
 
     def _observed(self, trace: Trace) -> Iterator[Observation | None]:
-        """What each step of a trace says of where the robot is."""
+        """Yield the observation of each step of a trace; None for a step without a view."""
         if self._seen is not None:
             from perception.images import images_of
 
@@ -199,7 +209,7 @@ class Localiser:
         yield from (self._of_view(step.view) for step in trace)
 
     def _observation(self, view: View | None, image: ArrayLike | None) -> Observation | None:
-        """What a view or an image says about dstates."""
+        """Make an observation of a view or an image; None if there is neither."""
         if self._seen is not None:
             if image is None:
                 return None
@@ -215,10 +225,12 @@ class Localiser:
         return None if view is None else self._shown.get(view, NOVEL)
 
     def _spread(self, ratios: NDArray[np.float64]) -> Observation:
-        """An image as an observation, by f(o|x) / q(o) of the recogniser's classes.
+        """Make an observation of an image.
 
-        A dstate without an image in the recogniser is like a place that is not in the map: its
-        looks are unknown.
+        For a dstate that the recogniser knows no image of, the ratio is 1, as at an unknown place.
+
+        Args:
+            ratios: f(o|x) / q(o) of the image, for each dstate x that the recogniser knows.
         """
         assert self._seen is not None
         spread = np.ones(self._number)
@@ -228,7 +240,7 @@ class Localiser:
         )
 
     def _after(self, belief: Belief, action: str, seen: Observation | None) -> Belief:
-        """The belief after an action and an observation."""
+        """Compute the belief after an action and an observation, and whether the robot is lost."""
         found = self._weighed(
             self._moved(belief, action), seen, self._alike(belief.seen, action, seen)
         )
@@ -238,10 +250,11 @@ class Localiser:
         return replace(found, sure=sure)
 
     def _moved(self, belief: Belief, action: str) -> Belief:
-        """The belief after an action, before anything is observed: the sum of equation 2."""
+        """Compute the belief after an action and before the observation: the sum in equation 2."""
         chances, p = self.chances, belief.probabilities
         links = self._links.get(action)
-        # `anywhere` is the probability that no link says where the robot is now.
+        # `anywhere` is the probability that the robot was in the map, and that no link leads to
+        # where it is now: the action slipped, or has no link.
         if links is None:
             moved, anywhere = np.zeros(self._number), 1 - belief.nowhere
         else:
@@ -260,7 +273,13 @@ class Localiser:
         return Belief(moved, entered + stayed, akin=akin)
 
     def _alike(self, before: Observation | None, action: str, seen: Observation | None) -> float:
-        """p(o'|akin) / q(o') of the observation `seen` after an action, by the one `before` it."""
+        """Compute p(o'|akin) / q(o') for two observations with an action between them.
+
+        Args:
+            before: The observation o before the action; None if there was none.
+            action: The name of the action.
+            seen: The observation o' after it; None if there was none.
+        """
         links = self._links.get(action)
         if before is None or seen is None or links is None:
             return 1.0
@@ -288,22 +307,22 @@ class Localiser:
         return alike
 
     def _weighed(self, expected: Belief, seen: Observation | None, alike: float = 1.0) -> Belief:
-        """The belief once something is observed: the product of equation 2, and its α.
+        """Compute the belief after an observation o: the product in equation 2, normalised.
 
         Args:
-            expected: The belief before that.
-            seen: The observation.
+            expected: The belief before the observation.
+            seen: The observation; None if there was none.
             alike: p(o|akin) / q(o).
         """
         weights = self._products(expected, seen)
         unknown = expected.akin * alike + 1 - expected.akin  # p(o|nowhere) / q(o)
         nowhere = expected.nowhere * unknown
         normaliser = total = float(weights.sum()) + nowhere
-        # No dstate allows this after what was believed, so localisation restarts.
+        # The observation is impossible by the belief before it, so localisation restarts.
         if not total:
             weights, nowhere = self._products(self.prior, seen), self.prior.nowhere
             total = float(weights.sum()) + nowhere
-        # No dstate allows it whatever came before.
+        # The observation is impossible at every dstate, so the robot is nowhere.
         if not total:
             nowhere = total = 1.0
         weights /= total
@@ -316,7 +335,12 @@ class Localiser:
         )
 
     def _products(self, expected: Belief, seen: Observation | None) -> NDArray[np.float64]:
-        """p(o|x) / q(o) times the probability of each dstate x."""
+        """Multiply the probability of each dstate x by p(o|x) / q(o), (N,).
+
+        Args:
+            expected: The belief before the observation o.
+            seen: The observation; None multiplies by 1.
+        """
         p = expected.probabilities
         if seen is None:
             return p.copy()
@@ -325,9 +349,9 @@ class Localiser:
         return products
 
     def _likelihood(self, recogniser: Any) -> ImageLikelihood:
-        """How probable images are at the dstates that the recogniser knows.
+        """Make what computes the probabilities of images at the dstates that a recogniser knows.
 
-        Raises LocaliserError if these are not dstates of the map.
+        Raises LocaliserError if a label of the recogniser is no dstate of the map.
         """
         from perception.likelihood import ImageLikelihood
 
@@ -342,7 +366,7 @@ class Localiser:
 
 
 def _checked(ssh_map: object) -> SSHMap:
-    """A map whose dstates have the ids 0, 1, 2, …. Raises MapError for anything else."""
+    """Return the map if its dstates have the ids 0, 1, 2, …; raise MapError otherwise."""
     if not isinstance(ssh_map, SSHMap):
         raise MapError(
             f"map: expected an SSHMap, got {brief(ssh_map)}; "

@@ -1,4 +1,4 @@
-"""Keeps the minimal maps of a trace current, step by step, while the robot drives.
+"""Keep the minimal maps of a trace up to date, step by step, while the robot drives.
 
 >>> from ssh_abduction import OnlineMapper, Theory
 >>> mapper = OnlineMapper("end", Theory.topological())
@@ -10,10 +10,11 @@
 
 Most steps are replayed, without asking clingo
 ----------------------------------------------
-Let M be all minimal maps of the steps so far, of cost c. A map *predicts* a new step if it has a
-link for the action at the robot's dstate, and the dstate at its end shows what is seen. If that
-dstate shows something else, the map *contradicts* the step. If the map has no such link, the step
-is *unknown* to it.
+A dstate (distinctive state) is a place and the direction that the robot faces there. Let M be the
+set of all minimal maps of the steps so far, and c their cost. Consider the link of a map for the
+new action at the robot's dstate. The map *predicts* the new step if the dstate at the end of this
+link shows what is seen. If that dstate shows something else, the map *contradicts* the step. If
+there is no such link, the step is *unknown* to the map.
 
 *Claim.* If some map of M predicts the step and it is unknown to none, then the maps that predict
 it are all minimal maps of the longer trace.
@@ -25,35 +26,38 @@ actions are deterministic, and a dstate has one observation, by functional_view 
 the stars (openings seen). (`observation` reads a star as these axioms do: a rotated pattern is no
 contradiction.) So R predicts the step, and F is the replayed R, by (3). ∎
 
-Otherwise clingo is asked, in the one control that is kept. It is asked for all maps of cost c if
-some map of M predicts the step, and else for the minimum, which is at least the last proven bound.
-If prefixes are not exact for a theory (`theory/speedups.py`), solve the trace again at each step.
+In all other cases clingo searches, in one control that is kept from step to step. If some map of M
+predicts the step, clingo searches for all maps of cost c. Otherwise it searches for the minimal
+cost, which is at least the last proven bound. If prefixes are not exact for a theory
+(`theory/speedups.py`), the trace is solved again at each step.
 
-*Evidence* may also contradict a map that predicts the step: the new step is not where the map says,
-or cannot be there together with other returns. The proof stays the same, as what evidence says of
-fewer steps it also says of more. So evidence is asked about returns to the new step only.
+*Evidence* may also contradict a map that predicts the step: by the displacements, the new step is
+not where the map says, or cannot be there together with other returns. The proof stays the same,
+because evidence that rejects a map of fewer steps also rejects it for more steps. So evidence has
+to test only returns to the new step.
 
 A theory that depends on the trace
 ----------------------------------
-Two parts of a theory depend on the whole trace, so they may change as it grows. Displacements
-are used from the first one on; from then on places are preferred to paths. And the probability of
-rejecting a true map is shared among the returns that may be true; their number is rounded up to a
-power of two. When either changes, the minimal maps so far may not be minimal any more, so
-they are searched again. That happens once for each doubling. Then less is rejected, so the maps
-so far go on as drafts.
+Two parts of a theory depend on the whole trace, and may change as it grows. First, displacements
+are used as soon as there is one; from then on, places are minimised before paths. Second, the
+probability of rejecting a true map is shared among all returns that may be true. Their number is
+rounded up to a power of two, so that it changes only when it doubles. When one of the two parts
+changes, the minimal maps so far may not be minimal any more, so clingo searches again. As a larger
+number of returns rejects less, the maps so far become drafts.
 
 When time is short
 ------------------
 A map that predicts the step is minimal even if there is no time to look for others. When no map
-predicts the step and time is short, the answer is feasible: a consistent map, and the last bound,
-which holds for the longer trace by (1). The map is a draft (`drafts.py`), or one that is guessed or
-mended (`guesser.py`). clingo is asked again when the trace has grown (`incremental.py`). It goes on
-from the state in which it stopped, and may prove a map minimal again.
+predicts the step and time is short, the answer is *feasible*: it has a consistent map, and the last
+bound, which holds for the longer trace by (1). The map is a draft (`drafts.py`), or is guessed or
+mended (`guesser.py`). clingo searches again when the trace has grown (`incremental.py`). It
+continues from the state in which it stopped, and may prove a map minimal again.
 
 If faults are allowed
 ---------------------
-Then `recovery.py` keeps the maps. If all maps are contradicted, it says what broke, keeps a belief
-over what may be true, and restores the map. `standing` says how sure it is.
+Faults are steps that a map treats as wrong. If the theory allows them, `recovery.py` keeps the
+maps. When a step contradicts all maps, it says what broke, lists what may be true with
+probabilities, and restores the map when the evidence decides. `standing` says how sure it is.
 """
 
 from __future__ import annotations
@@ -81,27 +85,28 @@ if TYPE_CHECKING:
 
 
 class OnlineMapper:
-    """Keeps the minimal maps current while a robot drives.
+    """Keeps the minimal maps of a trace up to date while a robot drives.
 
     Args:
-        view: What is seen at first.
-        theory: Which axioms and which preference; Theory.topological() by default. With faults
-            (misread, slipped) `standing` says how sure the map is. The first step decides
-            star=auto, and the first displacement decides displacement=auto.
-        star: The openings seen at first, as in Step, if the theory uses stars.
-        confidence: Probability that the first view and star are right, as in Step. For theories
-            with faults.
-        odometry: Errors of displacements that come without a covariance, as in Trace; None for the
-            defaults.
-        time_limit: Seconds that a step may take, about, as clingo cannot be stopped while it
-            grounds a step. None waits for the exact answer.
+        view: The view at the first step.
+        theory: The axioms, and what to minimise; Theory.topological() by default. If it allows
+            faults (misread, slipped), `standing` says how sure the map is. `star="auto"` uses stars
+            if the first step has one. `displacement="auto"` uses displacements from the first one
+            on.
+        star: The star of the first step: the openings seen, as in Step. None if there is none.
+        confidence: Probability that the first view and star are right, as in Step. Only theories
+            with faults use it.
+        odometry: The noise model of displacements without a covariance, as in Trace; None takes
+            the default one.
+        time_limit: Seconds for each step. A step may take a little longer, as clingo cannot be
+            stopped while it grounds. None waits for the exact answer.
         max_maps: Keep at most this many maps; None keeps all.
-        speedups: Which speed-ups are on; none changes the answer.
+        speedups: The speed-ups that are on. None of them changes the answer.
 
     Attributes:
         trace: The steps so far.
         theory: The theory, without `auto`.
-        solution: The answer for the steps so far.
+        solution: The minimal maps of the steps so far, or the best map found in time.
     """
 
     @renamed_parameters("limit", "maps")
@@ -152,15 +157,15 @@ class OnlineMapper:
 
     @property
     def searches(self) -> int:
-        """The number of calls of clingo."""
+        """The number of searches by clingo so far."""
         return self._keeper.searches
 
     @property
     def standing(self) -> Standing:
-        """How sure the map is, what broke, and what may be true.
+        """How sure the map is, which steps contradicted it, and what may be true.
 
         Raises:
-            TheoryError: The theory has no faults. Then `solution` says everything.
+            TheoryError: The theory allows no faults, so there is no standing; see `solution`.
         """
         if self._keeper.standing is None:
             raise TheoryError(
@@ -185,20 +190,20 @@ class OnlineMapper:
         covariance: Sequence[Sequence[float]] | None = None,
         confidence: float | None = None,
     ) -> Solution:
-        """Take in an action and what is seen after it, and return the minimal maps.
+        """Add an action and the step after it, and return the new solution.
 
         Args:
-            action: What the robot did.
-            view: What it sees now.
-            star: The openings that it sees now, if the theory uses stars.
+            action: The action that the robot did: an Action, its name, or a dict of its fields.
+            view: The view now.
+            star: The star now: the openings seen, as in Step. None if there is none.
             displacement: [dx, dy, dtheta] of the action, in metres and radians, as in Step; None
                 if it is unknown.
-            covariance: Of the displacement, (3, 3); None takes it from the odometry.
-            confidence: Probability that the view and the star are right, as in Step. It scales
-                what it costs to ignore them.
+            covariance: The covariance of the displacement, (3, 3); None takes that of the odometry.
+            confidence: Probability that the view and the star are right, as in Step. The lower it
+                is, the less it costs to treat them as wrong.
 
         Raises:
-            TraceError: The step does not fit the theory or the trace. The mapper stays as it was.
+            TraceError: The step does not fit the theory or the trace. The mapper is unchanged then.
         """
         began = time.perf_counter()
         done, number = Action.of(action), len(self._steps)
@@ -239,7 +244,7 @@ class OnlineMapper:
 
 
 def _known(view: View, step: int) -> View:
-    """The view of a step. Raises TraceError if it is unknown, which only whole traces allow."""
+    """Return the view of a step. Raise TraceError if it is None, which only `solve` allows."""
     if view is None:
         raise TraceError(
             f"step {step}: view: expected one while a robot drives, got none; "

@@ -1,4 +1,4 @@
-"""One map as a graph of moves: its links, and what its paths imply."""
+"""A map as a graph of moves, for planning routes: its links, and moves that its paths imply."""
 
 from __future__ import annotations
 
@@ -16,28 +16,32 @@ from ssh_abduction.output.layout import located
 if TYPE_CHECKING:
     from ssh_abduction.data.maps import Pose
 
-# A dstate by its number; or a course (place, path, direction) that no dstate of the map faces.
+# The number of a dstate (distinctive state: a place and a direction). Or a course (place, path,
+# direction) that no dstate of the map faces.
 Node: TypeAlias = "int | tuple[int, int, int]"
-# Costs of moves in a route by places. Among routes of equally many places fewer actions win, and
-# among equally many actions known moves.
+# Costs of moves in a route by places. Among routes with equally many travels, the one with fewer
+# actions wins. Among those with equally many actions, the one with more known moves wins.
 KNOWN_MOVE, UNTRIED_MOVE, OPEN_TURN = 1.0, 1.5, 2.5
 # Cost of an action in a route by metres, so that fewer actions win among routes of equal length.
 MICROMETRE = 1e-6
 
 
 class MoveGraph:
-    """One map as a graph of moves.
+    """A directed graph whose edges are the moves that are possible in a map, with costs.
+
+    Nodes are dstates, and also courses (place, path, direction) that no dstate faces. Edges are
+    links; for routes by places also moves that paths imply.
 
     Args:
         ssh_map: The map.
-        by: What a route shall have the fewest of: "actions", "places" or "metres".
+        by: What the shortest route minimises: "actions", "places" or "metres".
 
     Raises:
         MapError: The map has no poses for "metres", or no paths for "places".
 
     Attributes:
         map: The map.
-        by: See above.
+        by: What the shortest route minimises.
     """
 
     def __init__(self, ssh_map: SSHMap, by: str) -> None:
@@ -53,8 +57,8 @@ class MoveGraph:
                 "by: expected actions or metres, got places: the map has no paths; "
                 "solve with --theory topological, or take --by actions"
             )
-        # A travel costs more than all turns that it might spare: a route has no more moves than
-        # there are courses.
+        # One travel costs more than all turns of a route together, as a route has at most as many
+        # moves as there are dstates and courses.
         courses = 2 * sum(len(path.order) for path in ssh_map.paths)
         self._travel_cost = OPEN_TURN * (len(ssh_map.dstates) + courses)
         self._graph = self._of_links()
@@ -62,14 +66,17 @@ class MoveGraph:
             self._add_implied()
 
     def nodes(self, name: int | str, field: str) -> tuple[set[Node], str]:
-        """The dstates that a name means, and what to call them.
+        """Find the dstates that a user names.
 
         Args:
-            name: The number of a dstate, or a place as "p3".
-            field: The parameter, for messages.
+            name: The number of a dstate, or a place such as "p3" for all dstates there.
+            field: The parameter that the name was given for, for messages.
+
+        Returns:
+            The dstates, and words for them, such as "dstate 4" or "place 3".
 
         Raises:
-            MapError: There is no such dstate or place. The message names the range.
+            MapError: There is no such dstate or place. The message names those that exist.
         """
         count, text = len(self.map.dstates), str(name)
         if isinstance(name, str) and text[:1] == "p" and _is_number(text[1:]):
@@ -84,15 +91,24 @@ class MoveGraph:
         )
 
     def nodes_at_places_of(self, nodes: AbstractSet[Node]) -> set[Node]:
-        """All nodes at the places of some nodes."""
+        """Find all nodes that are at the same places as the given nodes."""
         places = {self._place(node) for node in nodes}
         return {node for node in self._graph if self._place(node) in places}
 
     def shortest(
         self, here: AbstractSet[Node], there: AbstractSet[Node], closed: AbstractSet[Node]
     ) -> list[Node] | None:
-        """The shortest way from some nodes to others without closed ones; None if none exists."""
-        # A place is closed if all its dstates are. Then its other courses are also closed.
+        """Find the shortest way between two sets of nodes.
+
+        Args:
+            here: The nodes where the way may begin.
+            there: The nodes where it may end.
+            closed: The nodes that it must not visit.
+
+        Returns:
+            The nodes of the way, with both ends; None if there is no way.
+        """
+        # If all dstates of a place are closed, close its other courses, too.
         closed_places = {
             self._place(node)
             for node in closed
@@ -108,38 +124,38 @@ class MoveGraph:
         return None if found is None else way[found[2]]
 
     def dstates_from(self, here: AbstractSet[Node]) -> int:
-        """The number of dstates reachable from some nodes."""
+        """Count the dstates that can be reached from the given nodes, with these."""
         reached = nx.multi_source_dijkstra_path_length(self._graph, here)
         return sum(isinstance(node, int) for node in reached)
 
     def action(self, source: Node, target: Node) -> str | None:
-        """The action of a move; None for a turn that the map has no action for."""
+        """The name of the action of a move; None if paths imply the move but not its action."""
         action: str | None = self._graph.edges[source, target]["action"]
         return action
 
     def is_known(self, source: Node, target: Node) -> bool:
-        """Whether a link gives this move, and not only the paths of the map."""
+        """Whether the map has a link for this move, so that the robot did it before."""
         return not self._graph.edges[source, target]["implied"]
 
     def course(self, node: Node) -> tuple[int | None, int | None, int | None]:
-        """The place, path and direction of a node; None if it has none."""
+        """The place, path and direction of a node. Each is None if the node has none."""
         if isinstance(node, tuple):
             return node
         s = self.map.dstates[node]
         return s.place, s.path, s.direction
 
     def metres(self, source: Node, target: Node) -> float | None:
-        """The length of a move in a straight line; None if the map has no poses."""
+        """The straight distance of a move in metres; None if the map has no poses."""
         if self._poses is None:
             return None
         a, b = (self._pose(node, self._poses) for node in (source, target))
         return math.hypot(a.x - b.x, a.y - b.y)
 
     def _of_links(self) -> nx.DiGraph[Any]:
-        """The graph of the links between dstates."""
+        """Make the graph of all dstates and the links between them."""
         graph: nx.DiGraph[Any] = nx.DiGraph()
         graph.add_nodes_from(s.id for s in self.map.dstates)
-        # In reverse, so that of several actions between two dstates the first by name stays.
+        # Sort in reverse, so that the first action by name remains if several join two dstates.
         for source, action, target in sorted(self.map.links, reverse=True):
             if source != target:
                 cost = self._cost(source, target, KNOWN_MOVE)
@@ -147,9 +163,9 @@ class MoveGraph:
         return graph
 
     def _add_implied(self) -> None:
-        """Add what the paths of the map imply.
+        """Add the moves that the paths of the map imply.
 
-        Paths lead both ways, and at a place the robot can turn to each path.
+        A path leads both ways, and at a place the robot can turn to each path through this place.
         """
         travel, around = self._only_action(onward=True), self._only_action(onward=False)
         facing: dict[Node, Node] = {}  # the first dstate of each course
@@ -175,18 +191,30 @@ class MoveGraph:
                     self._imply(course, other, around if self._is_around(course, other) else None)
 
     def _imply(self, source: Node, target: Node, action: str | None) -> None:
-        """Add a move that the paths of the map imply, unless a link gives it."""
+        """Add a move that the paths of the map imply, unless the map has a link for it.
+
+        Args:
+            source: The start.
+            target: The end.
+            action: The name of its action; None if it is unknown.
+        """
         if not self._graph.has_edge(source, target):
             cost = self._cost(source, target, UNTRIED_MOVE if action else OPEN_TURN)
             self._graph.add_edge(source, target, action=action, implied=True, cost=cost)
 
     def _is_around(self, source: Node, target: Node) -> bool:
-        """Whether two courses of one place are the two ways along one path."""
+        """Whether two nodes at one place face the two directions of one path."""
         (_, path, way), (_, other, other_way) = self.course(source), self.course(target)
         return path is not None and path == other and way != other_way
 
     def _cost(self, source: Node, target: Node, move: float) -> float:
-        """The cost of a move; `move` is its cost in a route by places within one place."""
+        """Compute the cost of a move.
+
+        Args:
+            source: The start.
+            target: The end.
+            move: The cost in a route by places. A travel to another place costs more in addition.
+        """
         if self.by == "actions":
             return 1.0
         if self.by == "metres":
@@ -195,10 +223,13 @@ class MoveGraph:
         return move + (self._travel_cost if travels else 0.0)
 
     def _only_action(self, *, onward: bool) -> str | None:
-        """The action that moves along paths, if there is exactly one; else None.
+        """Find the only action that moves on along a path, or the only one that turns around.
 
         Args:
-            onward: Whether from place to place, or turning around.
+            onward: Whether to find the action from place to place, or the one that turns around.
+
+        Returns:
+            The name of the action; None if the links of the map have none or several.
         """
         dstates, names = self.map.dstates, set()
         for source, action, target in self.map.links:
@@ -209,7 +240,12 @@ class MoveGraph:
         return names.pop() if len(names) == 1 else None
 
     def _dstates_at(self, place: int, field: str) -> set[Node]:
-        """The dstates at a place. Raises MapError if it has none."""
+        """Find the dstates at a place. Raise MapError if the map has no such place.
+
+        Args:
+            place: The number of the place.
+            field: The parameter that it was given for, for messages.
+        """
         members: set[Node] = {s.id for s in self.map.dstates if s.place == place}
         if not members:
             known = sorted({s.place for s in self.map.dstates if s.place is not None})
@@ -223,12 +259,12 @@ class MoveGraph:
         return members
 
     def _place(self, node: Node) -> int:
-        """The place of a node; a number of its own for a dstate without one."""
+        """The place of a node. A dstate without a place gets a negative number of its own."""
         place = self.course(node)[0]
         return -1 - int(node) if place is None and isinstance(node, int) else int(place or 0)
 
     def _pose(self, node: Node, poses: tuple[Pose, ...]) -> Pose:
-        """The pose of a node; for a course, of the first dstate at its place."""
+        """The pose of a dstate. A course has the pose of the first dstate at its place."""
         if isinstance(node, int):
             return poses[node]
         return poses[next(s.id for s in self.map.dstates if s.place == node[0])]

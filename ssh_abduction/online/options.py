@@ -1,4 +1,4 @@
-"""What the solver may use at each step while a robot drives."""
+"""The limits and speed-ups for each step while a robot drives."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from ssh_abduction.theory.speedups import Speedups
 
 @dataclass(frozen=True, slots=True)
 class StepOptions:
-    """What the solver may use at each step.
+    """The limits and speed-ups for solving at each step.
 
     Attributes:
-        time_limit: Seconds that a step may take, about; None waits for the exact answer.
+        time_limit: Seconds for each step. A step may take a little longer. None waits for the exact
+            answer.
         max_maps: Keep at most this many minimal maps; None keeps all.
-        speedups: Which speed-ups are on.
+        speedups: The speed-ups that are on.
     """
 
     time_limit: float | None

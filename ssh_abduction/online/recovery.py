@@ -1,7 +1,8 @@
-"""Recovers from faults while the robot drives.
+"""Recover from faults while the robot drives.
 
-If a step contradicts all minimal maps, the mapper falls back to a belief, until evidence restores
-the map.
+A fault is a step that a map treats as wrong: a misread view, or an action that slipped. If a step
+contradicts all minimal maps, the mapper keeps several explanations with probabilities, until later
+steps decide which map is right. A dstate (distinctive state) is a place and a direction.
 
 >>> from ssh_abduction import OnlineMapper, Theory
 >>> mapper = OnlineMapper("v0", Theory.causal().replace(misread=1.5, slipped=3))
@@ -17,21 +18,23 @@ the map.
 
 The paper's own future work is "robust error-recovery during exploration, by falling back from
 logical inference to Markov localisation when low-probability events violate the abstraction, until
-the logical representation can be restored" (Kuipers & Beeson 2002). Here these are three things:
+the logical representation can be restored" (Kuipers & Beeson 2002). This module keeps three things:
 
-* **Minimal maps**, proven, with their faults. While some of them predict what is seen they stay
-  minimal, by the claim in `mapper.py`, which also holds with faults: a minimal map of the longer
-  trace that ignores the last step would, without that step, cost less than the minimum. By the
-  causal theory no minimal map is lost if an action was never tried, because only a link to a
-  dstate that looks right costs nothing. If no minimal map goes on, solve the trace again: in the
-  time of a step, and else in another process while the robot drives (`background_solve.py`).
-* **Rivals** (`rival_maps.py`): besides the minimal maps, all explanations that cost a little more,
+* **Minimal maps**, proven, with their faults. As long as some of them predict what is seen, they
+  stay minimal by the claim in `mapper.py`. The claim also holds with faults: suppose that a minimal
+  map of the longer trace treats the last step as wrong. Without that step it would cost less than
+  the minimum. By the causal theory no minimal map is lost if an action was never tried, because
+  only a link to a dstate that looks right costs nothing. If no minimal map predicts the step, solve
+  the trace again: within the time of a step, or in another process while the robot drives
+  (`background_solve.py`).
+* **Rivals** (`rival_maps.py`): besides the minimal maps, explanations that cost a little more,
   each with its probability (`hypotheses.py`).
-* **Where the robot is** (`standing.py`), by Markov localisation in the best map, from the dstate
-  before the one at which the map broke. The robot may be nowhere that this map knows.
+* **Where the robot is** (`standing.py`), by Markov localisation in the best map. It begins just
+  before the first step that contradicted the map. The robot may be at no dstate of the map.
 
-The mapper is certain if one map is minimal, proven, and has the probability CERTAIN among its
-rivals. After something broke, localisation must also have the robot located there.
+The mapper is certain if one map is proven minimal and has a probability of at least CERTAIN (0.99)
+among its rivals. After a contradiction, two more things are needed: a later step was predicted,
+and localisation finds the robot where this map has it.
 """
 
 from __future__ import annotations
@@ -47,15 +50,15 @@ from ssh_abduction.theory.settle import Problem
 
 
 class Recovery:
-    """Keeps the maps with faults current, and says how sure they are.
+    """Keeps the maps up to date for a theory that allows faults, and says how sure they are.
 
     Args:
-        problem: The steps so far, and the theory without `auto`, with faults.
-        options: What a step may use.
-        before: The keeper that this one follows. It has fewer steps.
+        problem: The steps so far, and the theory without `auto` and with faults.
+        options: The limits and speed-ups for each step.
+        before: The Recovery of fewer steps that this one replaces; None for the first.
 
     Attributes:
-        standing: How sure the maps are; None before the first answer.
+        standing: How sure the best map is; None before the first answer.
     """
 
     def __init__(
@@ -74,15 +77,23 @@ class Recovery:
 
     @property
     def searches(self) -> int:
-        """The number of steps that solved the trace."""
+        """The number of searches by clingo so far, except those in the background."""
         return self.solver.searches
 
     def restarted(self, problem: Problem) -> Recovery:
-        """A keeper for the theory with one more step, with nothing proven."""
+        """Make a Recovery for a theory that changed with the last step. Nothing is proven there.
+
+        Args:
+            problem: The steps so far, with one more, and the new theory.
+        """
         return Recovery(problem, self._options, before=self)
 
     def take(self, problem: Problem) -> None:
-        """Take in the last step of a trace: let the rivals go on with it."""
+        """Add the last step: extend all rivals by it, and note if it contradicts the best map.
+
+        Args:
+            problem: The steps so far, with one more, and the theory.
+        """
         trace = problem.trace
         self._trace, lead = trace, self._maps.lead
         if lead and self._confidence.known is None:
@@ -108,7 +119,7 @@ class Recovery:
         return solution
 
     def _solve(self) -> None:
-        """Solve the trace in the time of a step, and go on in the background if that is short."""
+        """Solve the trace within the time of a step. If it runs out, go on in the background."""
         found = self.solver.solve(self._trace, self._theory, has_map=bool(self._maps.rivals))
         if found is None:
             return
@@ -117,7 +128,11 @@ class Recovery:
             self.solver.begin_in_background(self._trace, self._theory)
 
     def _solution(self, began: float) -> Solution:
-        """The answer for the steps so far: the minimal maps, or else the best rival."""
+        """The solution for the steps so far: the minimal maps, else the best rival, else no map.
+
+        Args:
+            began: When the step began, by `time.perf_counter`.
+        """
         maps, steps = self._maps, len(self._trace)
         maps.drop_inconsistent()
         lead, solved = maps.lead, maps.solved
@@ -144,7 +159,7 @@ class Recovery:
         )
 
     def _status(self) -> Status:
-        """How much is proven of the maps."""
+        """The status of the solution: how much is proven about its maps."""
         if self._maps.is_proven:
             return Status.OPTIMAL
         if self._maps.rivals:

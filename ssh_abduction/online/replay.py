@@ -1,4 +1,7 @@
-"""Minimal maps that are replayed while they predict what the robot sees."""
+"""Keep minimal maps by replaying them, as long as they predict what the robot sees.
+
+To replay a map is to follow its links along the steps of the trace.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,11 @@ from ssh_abduction.theory.theory import Theory
 
 
 class ReplayedMap:
-    """A map, with the labels of the steps that it has predicted since it was found.
+    """A map that is extended by each new step that it predicts.
 
     Args:
         ssh_map: A map of all steps so far.
-        seen: What each of these steps shows, as `observation` gives it.
+        seen: What each of these steps shows, as `observation` returns it.
     """
 
     def __init__(self, ssh_map: SSHMap, seen: Sequence[object]) -> None:
@@ -29,12 +32,15 @@ class ReplayedMap:
         self._sights = dict(zip(self._labels, seen, strict=True))
 
     def follow(self, action: str, seen: object, pairs: Pairs) -> Outcome:
-        """Follow the map over one more step, and say whether it predicted the step.
+        """Extend the map by one step if it predicts the step.
 
         Args:
             action: The name of the action before the step.
-            seen: What the step shows.
-            pairs: What evidence says of pairs of steps.
+            seen: What the step shows, as `observation` returns it.
+            pairs: What evidence says about pairs of steps.
+
+        Returns:
+            Whether the map predicts the step, contradicts it, or has no link for the action.
         """
         there = self._links.get((self._labels[-1], action))
         if there is None:
@@ -48,26 +54,27 @@ class ReplayedMap:
         return Outcome.PREDICTED
 
     def map(self) -> SSHMap:
-        """The map of all steps so far."""
+        """Make the map of all steps so far."""
         if len(self._map.labels) < len(self._labels):
             self._map = replace(self._map, labels=tuple(self._labels))
         return self._map
 
 
 class MinimalMaps:
-    """The minimal maps of the steps so far, and whether they are proven and all.
+    """The minimal maps of the steps so far, with how much is proven about them.
 
     Args:
         trace: The steps so far.
         theory: The theory without `auto`.
-        judging: Evidence and the checker, for this theory.
+        judging: Judges maps by the evidence and the checker, for this theory.
 
     Attributes:
-        maps: The minimal maps; those that clingo found, if each step is solved again.
+        maps: The minimal maps. If `replays` is false, the maps that clingo found last, which may
+            not be proven minimal.
         status: UNKNOWN until clingo has proven which maps are minimal.
         complete: Whether `maps` are all minimal maps.
-        cost: What a minimal map costs.
-        replays: Whether minimal maps may be replayed, by the claim in `mapper.py`.
+        cost: The counts of a minimal map; None if they are unknown.
+        replays: Whether the claim in `mapper.py` holds for the theory, so that maps are replayed.
     """
 
     def __init__(self, trace: Trace, theory: Theory, judging: Judging) -> None:
@@ -80,21 +87,21 @@ class MinimalMaps:
         self._seen: list[object] = [observation(step, theory) for step in trace.steps]
 
     def follow(self, action: Action, trace: Trace, pairs: Pairs) -> list[ReplayedMap]:
-        """Keep the maps that predict the last step. If none does, nothing is proven any more.
+        """Keep the maps that predict the last step. If none does, reset the status to UNKNOWN.
 
         Args:
             action: The action before the last step.
             trace: The steps so far, one more than before.
-            pairs: What evidence says of pairs of these steps.
+            pairs: What evidence says about pairs of these steps.
 
         Returns:
-            The maps in which the last action was never tried, if no map is kept.
+            If no map is kept, the maps that have no link for the action; else an empty list.
         """
         self._seen.append(observation(trace.steps[-1], self._theory))
         outcomes = [(m, self._outcome(m, trace, action.name, pairs)) for m in self.maps]
         untried = [m for m, outcome in outcomes if outcome is Outcome.UNKNOWN]
         self.maps = [m for m, outcome in outcomes if outcome is Outcome.PREDICTED]
-        # A map in which the action was never tried may go on to other minimal maps.
+        # A map without a link for the action may be extended to further minimal maps.
         self.complete = self.complete and not untried
         if not self.replays:
             self.maps = []
@@ -104,7 +111,14 @@ class MinimalMaps:
         return untried
 
     def _outcome(self, replayed: ReplayedMap, trace: Trace, action: str, pairs: Pairs) -> Outcome:
-        """What a map and evidence say of the last step."""
+        """Extend a map by the last step if both the map and the evidence allow it.
+
+        Args:
+            replayed: The map.
+            trace: The steps so far.
+            action: The name of the action before the last step.
+            pairs: What evidence says about pairs of these steps.
+        """
         outcome = replayed.follow(action, self._seen[-1], pairs)
         if outcome is Outcome.PREDICTED and not self._judging.allows_grown(
             trace, replayed.map(), len(trace) - 1
@@ -115,17 +129,28 @@ class MinimalMaps:
     def replace(
         self, found: Iterable[SSHMap], status: Status, complete: bool, cost: Cost | None
     ) -> None:
-        """Take what clingo proved. Known minimal maps stay if clingo listed fewer in time."""
+        """Take the result of a search. Known minimal maps stay if it listed fewer.
+
+        Args:
+            found: The maps that clingo found.
+            status: How much is proven.
+            complete: Whether these are all minimal maps.
+            cost: The counts of a minimal map; None if there is no map.
+        """
         maps, was_proven = list(found), self.status is Status.OPTIMAL
         self.status, self.complete, self.cost = status, complete, cost
         if len(maps) >= len(self.maps) or not was_proven:
             self.maps = [ReplayedMap(m, self._seen) for m in maps]
 
     def is_settled(self, max_maps: int | None) -> bool:
-        """Whether clingo could add nothing."""
+        """Whether another search would find nothing new.
+
+        Args:
+            max_maps: The number of maps to keep at most; None for all.
+        """
         return self.status is Status.OPTIMAL and (self.complete or len(self.maps) == max_maps)
 
     @property
     def is_impossible(self) -> bool:
-        """Whether no map of these steps, nor of more, satisfies the axioms."""
+        """Whether it is proven that these steps have no map, however the trace goes on."""
         return self.status is Status.UNSATISFIABLE and self.replays

@@ -1,4 +1,7 @@
-"""Doubts about the returns of a map: may the robot be at another place than the map says?"""
+"""Doubt the returns of a map: is the robot really back at the place that the map says?
+
+A return is a pair of steps that a map has at one place.
+"""
 
 from __future__ import annotations
 
@@ -10,24 +13,25 @@ from ssh_abduction.data.trace import Trace
 from ssh_abduction.solver import solve
 from ssh_abduction.theory.theory import Theory
 
-# Two steps that are at one place in the map, or by the causal theory at one dstate.
+# Two steps that the map has at one place, or by the causal theory at one dstate (distinctive
+# state: a place and a direction).
 Doubt: TypeAlias = tuple[int, int]
 
 
 class ReturnDoubts:
-    """The returns of minimal maps that are in doubt.
+    """Keeps track of the returns of minimal maps that are in doubt.
 
     A return is in doubt while some map without it has at most `margin` dstates more than the
     minimal maps.
 
     Args:
-        margin: See above; with 0 no return is doubted.
-        time_limit: Seconds for weighing one doubt; None waits for exact answers.
+        margin: Number of dstates; 0 doubts no return.
+        time_limit: Seconds for finding a map without one return; None waits for the exact answer.
 
     Attributes:
-        undecided: Doubts that could not be weighed in time.
-        twins: For some doubts, a map without the return that no experiment can tell from
-            the minimal map.
+        undecided: Returns for which there was too little time to decide.
+        twins: For each such return, a map without it that no experiment distinguishes from the
+            minimal map. The caller adds them.
     """
 
     def __init__(self, margin: int, time_limit: float | None) -> None:
@@ -37,11 +41,18 @@ class ReturnDoubts:
         self._least: dict[Doubt, int] = {}  # lower bound of the dstates of a map without the return
 
     def open(self, ssh_map: SSHMap, trace: Trace) -> Iterator[Doubt]:
-        """The returns of a map that are in doubt, the latest first: least is known of these."""
+        """Yield the returns of a map that are in doubt, the latest first.
+
+        The least is known about the latest ones.
+
+        Args:
+            ssh_map: A minimal map.
+            trace: The steps so far.
+        """
         if not self._margin:
             return
         at = [ssh_map.dstates[label].place if ssh_map.places else label for label in ssh_map.labels]
-        # The robot comes to a place by a travel, and to a dstate by any action.
+        # A travel brings the robot to a place. Any action brings it to a dstate.
         moves = [
             t
             for t, action in enumerate(trace.actions, 1)
@@ -58,13 +69,16 @@ class ReturnDoubts:
                 yield doubt
 
     def rival(self, doubt: Doubt, trace: Trace, theory: Theory, dstates: int) -> SSHMap | None:
-        """The best map without a return; None if it has too many dstates, or was not found in time.
+        """Find the best map without a return. Without such a map, stop doubting the return.
 
         Args:
-            doubt: The return.
+            doubt: The two steps of the return.
             trace: The steps so far.
             theory: The theory without `auto`.
-            dstates: How many dstates a minimal map has.
+            dstates: The number of dstates of a minimal map.
+
+        Returns:
+            The map; None if it has more than `margin` dstates too many, or was not found in time.
         """
         kind = "different" if theory.level == "causal" else "elsewhere"
         denied = theory.replace(**{kind: (*getattr(theory, kind), doubt)})
@@ -78,11 +92,11 @@ class ReturnDoubts:
         return None
 
     def dispel(self, doubt: Doubt, dstates: int) -> None:
-        """Stop doubting a return until minimal maps have more than `dstates` dstates."""
+        """Stop doubting a return as long as the minimal maps have at most `dstates` dstates."""
         self._least[doubt] = dstates + self._margin + 1
 
     def reopen(self) -> None:
-        """Weigh again what was undecided or had a twin, as more was seen."""
+        """Doubt the undecided returns and those with a twin again, as more was seen since."""
         for doubt in (*self.twins, *self.undecided):
             self._least.pop(doubt, None)
         self.undecided, self.twins = set(), {}

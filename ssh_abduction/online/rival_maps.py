@@ -1,4 +1,7 @@
-"""The minimal maps of a trace with faults while it grows, and rivals that cost little more."""
+"""Keep the minimal maps of a growing trace with faults, and rivals that cost a little more.
+
+A fault is a step that a map treats as wrong. A rival is one map of all steps so far.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +23,18 @@ from ssh_abduction.theory.theory import Theory
 RARE = Chances().misread
 # At most this many rivals cost more than the minimal maps.
 RIVALS = 50
-# Rivals are dropped if they are less probable than the best one times this.
+# Rivals that are less probable than this share of the most probable one are dropped.
 LEAST_SHARE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What one more step changed.
+    """The effect of one more step on the rivals.
 
     Attributes:
-        lost_proof: Whether the minimal maps are not proven any more, or perhaps not all.
-        broke: A sentence, if the best map expected something else; else None.
+        lost_proof: Whether the step undid a proof: the maps are not proven minimal any more, or
+            further minimal maps may exist.
+        broke: A sentence about what the best map expected instead; None if it predicted the step.
     """
 
     lost_proof: bool = False
@@ -38,20 +42,20 @@ class Change:
 
 
 class RivalMaps:
-    """The rivals of the steps so far, the best one first.
+    """The rivals of the steps so far, with how much is proven about them.
 
     Args:
-        problem: The steps so far, and the theory without `auto`, with faults.
-        max_maps: Keep at most this many minimal maps; None keeps all.
-        judging: Evidence and the checker, for this theory.
+        problem: The steps so far, and the theory without `auto` and with faults.
+        max_maps: Keep at most this many of the cheapest rivals; None keeps all.
+        judging: Judges maps by the evidence and the checker, for this theory.
 
     Attributes:
-        rivals: The rivals. Those that are minimal come first.
-        solved: The last answer of the solver.
-        bound: The best lower bound so far.
+        rivals: The rivals. The cheapest come first, then the others by their probability.
+        solved: The last result of the solver; None before the first.
+        bound: The best lower bound of the cost so far.
         is_proven: Whether the cheapest rivals are proven minimal.
-        is_complete: Whether these are all minimal maps.
-        is_impossible: Whether no map satisfies the axioms.
+        is_complete: Whether the list of minimal maps is proven complete.
+        is_impossible: Whether it is proven that no map satisfies the axioms.
     """
 
     def __init__(self, problem: Problem, max_maps: int | None, judging: Judging) -> None:
@@ -65,7 +69,7 @@ class RivalMaps:
         self._least: tuple[int, ...] = ()  # what a minimal map costs, while proven
         self._replays = row("prefixes").holds_for(theory.replace(misread=0, slipped=0))
         self._has_evidence = bool(problem.evidence)
-        # Under the two causal axioms alone, `Rival.ways_on` lists all links that can be assumed.
+        # Under the two causal axioms alone, `Rival.ways_on` lists all links that are possible.
         self._lists_links = (
             theory.level == "causal"
             and not self._has_evidence
@@ -83,12 +87,12 @@ class RivalMaps:
 
     @property
     def lead(self) -> Rival | None:
-        """The best rival."""
+        """The best rival; None if there is none."""
         return self.rivals[0] if self.rivals else None
 
     @property
     def minimal(self) -> list[Rival]:
-        """The rivals that are proven minimal."""
+        """The rivals that are proven minimal; empty without a proof."""
         if not self.is_proven:
             return []
         return [rival for rival in self.rivals if rival.cost == self._least]
@@ -101,11 +105,15 @@ class RivalMaps:
         )
 
     def is_minimal(self, rival: Rival) -> bool:
-        """Whether a rival has the cost of a minimal map."""
+        """Whether a rival has the cost that was last proven minimal."""
         return rival.cost == self._least
 
     def follow(self, problem: Problem) -> Change:
-        """Let the rivals go on with the last step of a trace, which is one step longer."""
+        """Extend the rivals by the last step.
+
+        Args:
+            problem: The steps so far, with one more, and the theory.
+        """
         self._problem, trace = problem, problem.trace
         t = len(trace) - 1
         self._views.add(trace.steps[t].view)
@@ -118,7 +126,7 @@ class RivalMaps:
         contradicted = lead.contradiction(done.name, seen) if lead else None
         has_unknown = any(rival.is_unknown(done.name) for rival in self.minimal)
         self.rivals = self._gone_on(self.rivals, t)
-        if not self._replays:  # what a map of fewer steps says of more is not known
+        if not self._replays:  # a minimal map of fewer steps says nothing about more steps
             self.rivals, self.is_proven, self.is_complete = [], False, False
             return Change()
         lost_proof = False
@@ -131,7 +139,12 @@ class RivalMaps:
         return Change(lost_proof)
 
     def absorb(self, found: Solved) -> None:
-        """Take the solver's answer for the steps so far, or for the first of them."""
+        """Take in a result of the solver: add its maps to the rivals, and note what is proven.
+
+        Args:
+            found: The result for the steps so far, or for the first of them. In the second case,
+                its maps are extended by the later steps.
+        """
         steps, self.solved = len(self._trace), found
         if (found.bound.tenths or 0) >= (self.bound.tenths or 0):
             self.bound = found.bound
@@ -142,7 +155,7 @@ class RivalMaps:
         optimal = found.status is Status.OPTIMAL and bool(rivals)
         if optimal:
             self.is_proven, self.is_complete, self._least = True, found.complete, rivals[0].cost
-        # Let the maps go on with the steps that came since.
+        # Extend the maps by the steps that came since the search began.
         for t in range(found.steps, steps):
             action = self._trace.actions[t - 1].name
             has_unknown = any(r.is_unknown(action) for r in rivals if self.is_minimal(r))
@@ -150,7 +163,7 @@ class RivalMaps:
             self.is_complete = self.is_complete and (self._lists_links or not has_unknown)
         if optimal and not any(self.is_minimal(rival) for rival in rivals):
             self.is_proven = self.is_complete = False
-        # Keep the other rivals, but for those that complete minimal maps rule out.
+        # Keep the other rivals. If all minimal maps are listed, drop those that seem as cheap.
         told = {(rival.labels, rival.faults) for rival in rivals}
         others = [
             rival
@@ -161,7 +174,13 @@ class RivalMaps:
         self.rivals = self._ranked([*rivals, *others])
 
     def is_outgrown(self, found: Solved) -> bool:
-        """Whether an answer for fewer steps costs less than what is proven since."""
+        """Whether a result for fewer steps has no map, or maps cheaper than the proven minimum.
+
+        Such a result is out of date. The answer is False if nothing is proven now.
+
+        Args:
+            found: The result.
+        """
         if not self.is_proven:
             return False
         return (
@@ -169,9 +188,9 @@ class RivalMaps:
         )
 
     def drop_inconsistent(self) -> None:
-        """Drop the best rival until the checker finds it consistent.
+        """Drop the best rival, again and again, until the checker finds the best one consistent.
 
-        Proven maps are consistent, and so are all rivals of the causal axioms alone.
+        This is not needed if the maps are proven, or if only the causal axioms hold.
         """
         if self.is_proven or self._lists_links:
             return
@@ -180,10 +199,13 @@ class RivalMaps:
             del self.rivals[0]
 
     def undecided(self) -> tuple[list[Rival], list[float]]:
-        """The rivals that evidence has to decide between, and their probabilities.
+        """The rivals that later steps have to decide between.
 
-        Among rivals with the same faults the preference of the theory decides, as it does if
-        nothing is ignored: no evidence ever refutes a superfluous dstate.
+        Among rivals with the same faults, only the cheapest ones by the theory count, because no
+        evidence ever refutes a superfluous dstate.
+
+        Returns:
+            The rivals, and the probability of each.
         """
         least: dict[frozenset[Fault], tuple[int, ...]] = {}
         for rival in self.rivals:
@@ -193,14 +215,14 @@ class RivalMaps:
         return rivals, self._shares(rivals)
 
     def _gone_on(self, rivals: Iterable[Rival], t: int) -> list[Rival]:
-        """Extend the rivals of the steps before `t` by step `t`, and rank the results."""
+        """Extend rivals of the steps before `t` by step `t`, and rank the results."""
         done, step = self._trace.steps[t - 1].action, self._trace.steps[t]
         assert done
         seen = observation(step, self._theory)
         new = [
             way for rival in rivals for way in rival.ways_on(done.name, step, seen, self._theory)
         ]
-        # Evidence is asked of the new step only: it rejects no more of the earlier ones.
+        # Evidence tests only the new step, as it has already tested the earlier ones.
         if self._has_evidence:
             trace = self._trace.prefix(t + 1)
             pairs = self._problem.changed(trace, self._theory.of_steps(0, t + 1)).pairs
@@ -213,9 +235,10 @@ class RivalMaps:
         return self._ranked(new)
 
     def _ranked(self, rivals: list[Rival]) -> list[Rival]:
-        """The rivals that are probable enough, the best first.
+        """Sort rivals, the best first, and drop the improbable ones.
 
-        All of the cheapest stay, up to the limit of listed maps.
+        The cheapest rivals come first, and at most `max_maps` of them stay. Then come up to RIVALS
+        others that are probable enough, by probability.
         """
         if not rivals:
             return []
@@ -234,12 +257,19 @@ class RivalMaps:
         return ranked[: ties + RIVALS]
 
     def _shares(self, rivals: list[Rival]) -> list[float]:
-        """The probability of each rival."""
+        """Compute the probability of each rival. They sum to 1."""
         dstates = len(min(rivals, key=lambda rival: rival.cost).shows)
         return Scale.of(self._theory, RARE, dstates, len(self._views)).shares(rivals)
 
     def _sentence(self, t: int, lead: Rival, there: int, seen: Seen) -> str:
-        """Say what broke at a step that the best map expected at the dstate `there`."""
+        """Describe a step that contradicts the best map.
+
+        Args:
+            t: The number of the step.
+            lead: The best map.
+            there: The dstate at which this map expected the step.
+            seen: The view and star of the step.
+        """
         kinds = [kind for kind in ("misread", "slipped") if getattr(self._theory, kind)]
         expected = lead.shows[there]
         what = (

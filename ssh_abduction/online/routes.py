@@ -1,4 +1,6 @@
-"""Routes: the actions that lead from one dstate or place to another, and the views to expect.
+"""Plan routes: the actions that lead from one dstate or place to another, and the views on the way.
+
+A dstate (distinctive state) is a place and the direction that the robot faces there.
 
 >>> from ssh_abduction import Theory, Trace, route, solve
 >>> loop = Trace.from_steps(["a", "b", "c", "a", "b"], ["east", "east", "west", "east"])
@@ -8,12 +10,12 @@
 >>> print(found.sentence)
 from dstate 0 to dstate 2: 2 actions
 
-The Spatial Semantic Hierarchy knows two levels to plan at (Kuipers 2000, "The Spatial Semantic
-Hierarchy"). At the *causal* level a route is a chain of links: each of its actions was taken there
-before. At the *topological* level it is a chain of places and paths: a path leads both ways, and at
-a place the robot can turn to each path of it. So a route by places may lead where no chain of links
-does, as back along a street that was driven one way only. The moves that were never tried are
-marked, and a turn that the map has no action for is left open.
+The Spatial Semantic Hierarchy has two levels for planning (Kuipers 2000, "The Spatial Semantic
+Hierarchy"). At the *causal* level, a route is a chain of links: the robot did each action there
+before. At the *topological* level, a route is a chain of places and paths: a path leads both ways,
+and at a place the robot can turn to each path through the place. So a route by places exists even
+if there is no chain of links, for example back along a street that was driven one way only. Moves
+that were never tried are marked. A turn for which the map has no action gets the action None.
 """
 
 from __future__ import annotations
@@ -41,16 +43,15 @@ class Move:
     """One move of a route, and where it ends.
 
     Attributes:
-        action: What to do; None if the robot has to turn to another path and the map has no action
-            for that turn.
-        known: Whether a link says the move, so that the robot did it before. Else the paths of the
-            map imply it.
-        dstate: The end of the move; None if the robot never faced that way there.
-        view: The view to expect there; None if the map does not know it.
-        place: The place there; None if the map has none.
-        path: The path that the robot faces along there; None if the map has none.
-        direction: The direction along this path.
-        metres: The length of the move in a straight line; None if the map has no poses.
+        action: The name of the action; None if the map does not know which action does this move.
+        known: Whether the map has a link for the move, so that the robot did it before. Otherwise
+            the paths of the map imply the move.
+        dstate: The dstate at the end; None if the robot never faced that way there.
+        view: The view to expect at the end; None if it is unknown.
+        place: The place at the end; None if the dstate has no place.
+        path: The path that the robot faces along at the end; None if there is none.
+        direction: The direction along this path, +1 or -1; None if there is no path.
+        metres: The straight length of the move; None if the map has no poses.
     """
 
     action: str | None
@@ -63,7 +64,7 @@ class Move:
     metres: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """The move as plain data."""
+        """The move as a dict for JSON, with its attributes as keys."""
         return {name: getattr(self, name) for name in self.__slots__ if name != "metres"} | (
             {} if self.metres is None else {"metres": round(self.metres, 4)}
         )
@@ -75,16 +76,16 @@ class Route:
 
     Attributes:
         map: The number of the map, from 1.
-        by: What the route has the fewest of: actions, places, or metres.
-        start: The dstate that it begins at.
-        goal: The dstate or the place that it leads to, in words.
-        view: What is seen at the start.
-        place: The place of the start; None if the map has none.
-        moves: What to do, and what is seen after it.
-        agree: The numbers of the listed maps in which these actions lead along links to the same
-            views, from where the robot was at `start`. Empty for a route with a move that was
-            never tried.
-        maps: Number of listed maps.
+        by: What the route minimises: "actions", "places" or "metres".
+        start: The dstate where it begins.
+        goal: The dstate or place where it ends, in words.
+        view: The view at the start.
+        place: The place of the start; None if the dstate has no place.
+        moves: The moves, in order.
+        agree: The numbers, from 1, of the maps in which the same actions lead to the same views.
+            Each map begins where it has the robot at the steps that this map has at `start`. Empty
+            if some move was never tried.
+        maps: The number of maps that were compared.
     """
 
     map: int
@@ -99,38 +100,38 @@ class Route:
 
     @property
     def actions(self) -> tuple[str | None, ...]:
-        """The actions, in their order; None for a turn that the map has no action for."""
+        """The names of the actions in order; None for a move whose action is unknown."""
         return tuple(move.action for move in self.moves)
 
     @property
     def views(self) -> tuple[View | None, ...]:
-        """The views to expect: at the start, and after each move."""
+        """The views to expect, at the start and after each move; None for an unknown one."""
         return (self.view, *(move.view for move in self.moves))
 
     @property
     def dstates(self) -> tuple[int | None, ...]:
-        """The dstates on the way, the start first."""
+        """The dstates at the start and after each move; None for one where the robot never was."""
         return (self.start, *(move.dstate for move in self.moves))
 
     @property
     def places(self) -> tuple[int | None, ...]:
-        """The places on the way, that of the start first."""
+        """The places at the start and after each move; None for a dstate without a place."""
         return (self.place, *(move.place for move in self.moves))
 
     @property
     def metres(self) -> float | None:
-        """The length of the route; None if the map has no poses."""
+        """The length of the route in metres; None if the map has no poses."""
         lengths = [move.metres for move in self.moves]
         return math.fsum(x for x in lengths if x is not None) if None not in lengths else None
 
     @property
     def is_known(self) -> bool:
-        """Whether the robot has done each of these moves before."""
+        """Whether the robot has done all of these moves before."""
         return all(move.known for move in self.moves)
 
     @property
     def sentence(self) -> str:
-        """The route in one sentence."""
+        """One sentence with the ends of the route and its length."""
         parts = [counted(len(self.moves), "actions")]
         if self.metres is not None and self.moves:
             parts.append(f"{self.metres:.1f} m")
@@ -147,7 +148,10 @@ class Route:
         return f"from dstate {self.start} to {self.goal}: {', '.join(parts)}"
 
     def to_dict(self) -> dict[str, Any]:
-        """The route as plain data, as `route --json` prints it (docs/reference/formats.md)."""
+        """The route as a dict for JSON, as `route --json` prints it.
+
+        docs/reference/formats.md describes the keys.
+        """
         length = self.metres
         return {
             "map": self.map,
@@ -176,20 +180,21 @@ def route(
     avoid: Iterable[int | str] = (),
     map: int | str = 1,
 ) -> Route:
-    """The shortest route from one dstate or place to another.
+    """Find the shortest route from one dstate or place to another.
 
     Args:
         maps: A solution, maps of one trace, or one map.
-        start: The number of a dstate, or a place as "p3"; None for where the robot was last.
-        goal: The number of a dstate, or a place as "p3": any dstate there.
-        by: "actions" or "metres" go through links, so that each move was made before. "places" has
-            the fewest travels along the paths of the map, whether or not they were driven that way.
-        avoid: Dstates, and places as "p3", that the route may not touch.
-        map: Which map: its number, from 1, or its id.
+        start: The number of a dstate, or a place such as "p3", which means any dstate there; None
+            for the dstate of the last step.
+        goal: The number of a dstate, or a place such as "p3", which means any dstate there.
+        by: What to minimise. "actions" and "metres" use links only, so the robot did each move
+            before. "places" minimises travels, and also uses moves that the paths of the map imply.
+        avoid: Dstates, and places such as "p3", that the route must not visit.
+        map: The number of the map to use, from 1, or its id.
 
     Raises:
-        MapError: There is no such dstate, place or map, no route exists, or metres are asked of a
-            map without poses.
+        MapError: There is no such dstate, place or map; no route exists; the map has no poses for
+            "metres", or no paths for "places".
     """
     if not isinstance(by, str) or by not in BY:
         raise MapError(
@@ -232,7 +237,7 @@ def route(
 
 
 def told_action(move: Move) -> str:
-    """What to do, in words: the action, or the path to turn to."""
+    """Say what to do in a move: its action or, if that is unknown, the path to turn to."""
     if move.action is not None:
         return printable(move.action)
     if move.path is None:
@@ -241,7 +246,7 @@ def told_action(move: Move) -> str:
 
 
 def _closed(graph: MoveGraph, avoid: Iterable[int | str]) -> set[Node]:
-    """The nodes that a route may not touch."""
+    """Find the nodes that a route must not visit."""
     names: Iterable[int | str] = (
         [avoid]
         if isinstance(avoid, str | int)
@@ -254,7 +259,7 @@ def _closed(graph: MoveGraph, avoid: Iterable[int | str]) -> set[Node]:
 
 
 def _move(graph: MoveGraph, source: Node, target: Node) -> Move:
-    """A move along an edge of the graph."""
+    """Make the move along an edge of the graph."""
     place, path, direction = graph.course(target)
     dstate = target if isinstance(target, int) else None
     return Move(
@@ -276,7 +281,7 @@ def _raise_no_route(
     closed: AbstractSet[Node],
     told: str,
 ) -> NoReturn:
-    """Say why there is no route, and what to do about it."""
+    """Raise MapError with the reason why there is no route, and what to do about it."""
     if closed and graph.shortest(here, there, set()) is not None:
         raise MapError(
             f"avoid: expected a way round what is avoided, got none to {told}; avoid less"
@@ -293,9 +298,12 @@ def _raise_no_route(
 def _agreeing(
     ssh_map: SSHMap, start: int, moves: Sequence[Move], maps: Sequence[SSHMap]
 ) -> tuple[int, ...]:
-    """The numbers of the maps in which the moves lead to the same views.
+    """Find the maps in which the moves of a route lead to the same views.
 
-    In each map they begin at the dstates where the robot was when `ssh_map` has it at `start`.
+    Each map begins where it has the robot at the steps that `ssh_map` has at `start`.
+
+    Returns:
+        The numbers of these maps, from 1.
     """
     steps = [t for t, label in enumerate(ssh_map.labels) if label == start]
     agree = []
@@ -310,7 +318,14 @@ def _agreeing(
 def _leads_to(
     leads: dict[tuple[int, str], int], ssh_map: SSHMap, dstate: int, moves: Sequence[Move]
 ) -> bool:
-    """Whether the links of a map lead from a dstate along these moves, to the views expected."""
+    """Whether a map has links for the actions of these moves, and they lead to the same views.
+
+    Args:
+        leads: The dstate that each link leads to, by its dstate and the name of its action.
+        ssh_map: The map.
+        dstate: The dstate where the moves begin.
+        moves: The moves, with the views to expect.
+    """
     for move in moves:
         target = leads.get((dstate, move.action or ""))
         if target is None or ssh_map.dstates[target].view != move.view:

@@ -1,4 +1,4 @@
-"""Chooses the `auto` options for a growing trace."""
+"""Choose values for the `auto` options of a theory while the trace grows."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from ssh_abduction.theory.theory import Theory
 
 
 class TheorySettler:
-    """Chooses `star` by the first step, and `displacement` and `returns` by the steps so far.
+    """Replaces each `auto` of a theory by the value that fits the steps so far.
+
+    The first step decides how to use stars (the openings seen at a step). All steps so far decide
+    whether displacements are used, and how many returns of the robot are counted.
 
     Args:
         theory: The theory as the user gave it.
-        first: A trace of the first step.
+        first: A trace with only the first step.
 
     Raises:
         TheoryError: The theory needs stars, but the first step has none.
@@ -28,7 +31,16 @@ class TheorySettler:
         self._theory = theory.replace(star=settled.star)
 
     def settled(self, trace: Trace, known: Problem | None = None) -> Problem:
-        """The theory for the steps so far, with what is known about fewer steps."""
+        """Choose the values of `auto` for the steps so far.
+
+        Args:
+            trace: The steps so far.
+            known: The problem of fewer steps, to reuse what its evidence computed; None if there is
+                none.
+
+        Returns:
+            The trace, with its theory without `auto`.
+        """
         theory = self._theory
         if theory.displacement == "auto":
             theory = theory.replace(displacement="use" if trace.has_displacements else "none")
@@ -37,7 +49,12 @@ class TheorySettler:
         return settle(trace.prefix(1), theory, known).changed(trace)
 
     def is_settled(self, problem: Problem, trace: Trace) -> bool:
-        """Whether the theory for the steps before the last also fits all steps."""
+        """Whether a theory chosen for fewer steps is still the right choice.
+
+        Args:
+            problem: The problem of the steps before the last.
+            trace: All steps so far.
+        """
         theory = problem.theory
         if theory.displacement == "none":
             return self._theory.displacement == "none" or trace.steps[-1].displacement is None
@@ -48,7 +65,14 @@ class TheorySettler:
         return count_returns(Problem(trace, theory, evidence))
 
     def check_star(self, step: Step, number: int) -> None:
-        """Raise TraceError for a star after a first step that had none."""
+        """Raise TraceError if this step has a star but the first step had none.
+
+        This holds for `star="auto"`.
+
+        Args:
+            step: The step.
+            number: The number of the step, for the message.
+        """
         if self._refuses_stars and step.star is not None:
             raise TraceError(
                 f"step {number}: star: expected none, as the first step has none; "

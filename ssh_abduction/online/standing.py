@@ -1,4 +1,7 @@
-"""How sure a mapper is of its map if faults are allowed, and what may be true."""
+"""Say how sure a mapper is of its map if faults are allowed, and which explanations are possible.
+
+A fault is a step that a map treats as wrong: a misread view, or an action that slipped.
+"""
 
 from __future__ import annotations
 
@@ -16,22 +19,24 @@ from ssh_abduction.online.localiser import Localiser
 from ssh_abduction.online.rival_maps import RARE, RivalMaps
 from ssh_abduction.theory.theory import Theory
 
-# A map may be certain if it has this probability among its rivals.
+# A map can be certain only if it has at least this probability among its rivals.
 CERTAIN = 0.99
-# At most this many hypotheses are reported; the last of them stands for all others.
+# At most this many hypotheses are reported. If there are more, the last one is for all others.
 TOLD = 10
-# Localisation begins at most this many steps ago.
+# Localisation begins at most this many steps before the last one.
 REPLAYED = 200
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """What may be true.
+    """One possible explanation of the steps so far, with its probability.
 
     Attributes:
-        weight: Its probability. The weights of all hypotheses sum to 1.
-        map: A map of all steps so far, with its faults; None for all other hypotheses together.
-        said: What it ignores since the mapper was last certain, and where the robot is.
+        weight: The probability. The weights of all hypotheses sum to 1.
+        map: A map of all steps so far, with its faults; None if this entry is for all remaining
+            hypotheses together, or if no map is known.
+        said: Text that names the new faults since the mapper was last certain, and the dstate where
+            the robot is.
     """
 
     weight: float
@@ -44,17 +49,17 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """How sure the mapper is of its map.
+    """How sure the mapper is of its map, and which explanations are possible.
 
     Attributes:
-        certain: Whether the first map of the solution is proven minimal, and evidence leaves no
-            other from here on. The past need not be certain: two hypotheses may have the same map
-            and the robot in the same dstate, and differ in the step that they ignore.
-        broke: A sentence for each step at which the best map expected something else, since the
-            mapper was last certain. If this step makes it certain again, they are still listed.
-        hypotheses: What may be true, the most probable first.
-        where: Where the robot is in the first map, or nowhere, by Markov localisation since
-            something broke; None if nothing broke.
+        certain: Whether the first map of the solution is proven minimal, and nearly all hypotheses
+            predict the same from here on. They may still differ in the past: which step to treat as
+            wrong.
+        broke: A sentence for each step that contradicted the best map since the mapper was last
+            certain. The step at which it becomes certain again still lists them.
+        hypotheses: The possible explanations, the most probable first.
+        where: The belief about where the robot is in the first map, by Markov localisation that
+            begins just before the first of these steps; None if there is no such step.
     """
 
     certain: bool
@@ -69,11 +74,11 @@ class Standing:
 
 
 def chances_of(theory: Theory) -> Chances:
-    """The chances of localisation that correspond to the prices of faults.
+    """Convert the prices of faults in a theory to probabilities for localisation.
 
-    A fault that costs twice as much as another is as rare as two of the other. A kind of fault
-    that the theory does not allow counts as twice the price here. Otherwise localisation would
-    take every error for the only kind that it knows.
+    A fault that costs twice as much as another one is as rare as two of the other kind. If the
+    theory allows only one kind of fault, the other kind gets twice its price. Otherwise
+    localisation would take every error for the only kind that it knows.
     """
     cheapest = min(price for price in (theory.misread, theory.slipped) if price)
     misread, slipped = (
@@ -85,22 +90,29 @@ def chances_of(theory: Theory) -> Chances:
 
 @dataclass(frozen=True, slots=True)
 class _Located:
-    """A belief in one map after some steps, with the localiser to go on with."""
+    """The belief in one map after the first steps, and the localiser that continues it.
 
-    map_key: object  # its dstates and links
+    Attributes:
+        map_key: The dstates and links of the map.
+        localiser: The localiser in this map.
+        belief: The belief.
+        steps: The number of actions that the belief includes.
+    """
+
+    map_key: object
     localiser: Localiser
     belief: Belief
     steps: int
 
 
 class Confidence:
-    """Says how sure the mapper is, from step to step.
+    """Computes how sure the mapper is after each step.
 
     Args:
-        theory: The theory without `auto`, with faults.
+        theory: The theory without `auto` and with faults.
 
     Attributes:
-        known: The map that was certain last, or else the best before anything broke.
+        known: The map that was certain last; else the best map after the first answer; None before.
     """
 
     def __init__(self, theory: Theory) -> None:
@@ -110,17 +122,22 @@ class Confidence:
         self._located: _Located | None = None
 
     def note(self, step: int, broke: str | None) -> None:
-        """Note what broke at a step, if something did."""
+        """Record that a step contradicted the best map.
+
+        Args:
+            step: The number of the step.
+            broke: A sentence about it; None if the step contradicted nothing.
+        """
         if broke:
             self._broke.append((step, broke))
 
     def standing(self, maps: RivalMaps, trace: Trace, listed: Sequence[SSHMap]) -> Standing:
-        """How sure the mapper is now.
+        """Compute how sure the mapper is now.
 
         Args:
-            maps: The rivals of the steps so far.
+            maps: The rivals (the possible maps) of the steps so far.
             trace: The steps so far.
-            listed: The maps of the solution.
+            listed: The maps of the solution, the best one first.
         """
         broke = tuple(sentence for _, sentence in self._broke)
         lead = maps.lead
@@ -142,9 +159,15 @@ class Confidence:
         return standing
 
     def _has_recovered(self, where: Belief, lead: Rival, trace: Trace) -> bool:
-        """Whether a step was predicted since something broke, and localisation agrees.
+        """Whether the mapper has recovered from the last step that contradicted the best map.
 
-        It agrees if it has the robot at the dstate of the best map, more likely than not.
+        This needs a later step, and localisation has to agree with the best map: it gives more than
+        half of the probability to the dstate where this map has the robot.
+
+        Args:
+            where: The belief about where the robot is.
+            lead: The best map.
+            trace: The steps so far.
         """
         return (
             self._broke[-1][0] < len(trace) - 1
@@ -155,7 +178,12 @@ class Confidence:
     def _hypotheses(
         self, rivals: Sequence[Rival], shares: Sequence[float]
     ) -> tuple[Hypothesis, ...]:
-        """The most probable rivals as hypotheses, and one for all others."""
+        """Make hypotheses of the most probable rivals, and one for all others together.
+
+        Args:
+            rivals: The rivals.
+            shares: The probability of each.
+        """
         order = sorted(range(len(shares)), key=lambda i: -shares[i])
         first = order if len(order) <= TOLD else order[: TOLD - 1]
         told = [Hypothesis(shares[i], rivals[i].explained(), self._said(rivals[i])) for i in first]
@@ -165,14 +193,18 @@ class Confidence:
         return tuple(told)
 
     def _said(self, rival: Rival) -> str:
-        """What a rival ignores since the mapper was certain, and where the robot is."""
+        """Describe a rival: its new faults since the mapper was certain, and the robot's dstate."""
         excused = set(self.known.faults) if self.known else set()
         new = sorted(set(rival.faults) - excused, key=lambda fault: fault.step)
         faults = ", ".join(str(fault) for fault in new) or "nothing else is disbelieved"
         return f"{faults}; the robot is at dstate {rival.here} of {len(rival.shows)}"
 
     def _locate(self, lead: Rival, trace: Trace) -> Belief:
-        """Locate the robot in the best map, from where it was just before something broke."""
+        """Locate the robot in the best map.
+
+        Begin where this map has the robot just before the first step that contradicted the best
+        map since the mapper was certain, but at most REPLAYED steps back.
+        """
         t = len(trace) - 1
         key = (lead.shows, frozenset(lead.links.items()))
         if self._located is not None and self._located.map_key == key:
@@ -193,9 +225,15 @@ class Confidence:
 
 
 def _is_decided(maps: RivalMaps, rivals: Sequence[Rival], shares: Sequence[float]) -> bool:
-    """Whether the minimal maps are all known and agree on the future, with nearly all rivals.
+    """Whether the future is decided, whatever the past.
 
-    They may disagree on the past.
+    All minimal maps must be known and predict the same from here on. Rivals that predict this too
+    must have at least the probability CERTAIN, together with the minimal maps.
+
+    Args:
+        maps: The rivals of the steps so far.
+        rivals: The rivals that later steps have to decide between.
+        shares: The probability of each of them.
     """
     if not maps.is_complete:
         return False
