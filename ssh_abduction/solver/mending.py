@@ -103,7 +103,7 @@ class Mending:
         yield from self._by_rare_dstates()
 
     def minimal_maps(self, most: int) -> tuple[SSHMap, ...] | None:
-        """List all minimal maps, if it is certain that there are no others.
+        """List the minimal maps, if all of them are maps of traces that were mended.
 
         Call this after the iteration over `maps` has ended.
 
@@ -111,7 +111,8 @@ class Mending:
             most: The number of maps to list for each mended trace; 0 for all.
 
         Returns:
-            The maps; None if some may be missing, or if the best map costs more than the bound.
+            The maps; None if another mended trace may have some, or if the best map costs more than
+            the bound.
         """
         if self._best is None or self._best.cost[0] != self.bound or not self._cheapest:
             return None

@@ -1,4 +1,7 @@
-"""The answer for one trace: a frozen value without a solver. Importing it does not load clingo."""
+"""The answer for one trace: a frozen value that needs no solver.
+
+Importing this module does not load clingo.
+"""
 
 from __future__ import annotations
 
@@ -57,21 +60,22 @@ class Solution:
         status: What is proven.
         maps: The minimal maps (status optimal), or the best map found (feasible). With `within`,
             maps with more dstates follow.
-        cost: The cost of the first map; None if there is no map. All minimal maps share the
-            counts that the theory prefers.
+        cost: The counts of the first map; None if there is no map. All minimal maps share the
+            counts that the theory minimises.
         bound: Proven lower bounds on the counts of any map.
         complete: Whether no further map exists: no minimal one and, with `within`, none to list.
-        theory: The theory, with its stars settled.
-        steps: The length of the trace.
+        theory: The theory. Each `auto` in it is replaced by the value that was used.
+        steps: The number of steps of the trace.
         effort: What the search did: time, grounding, prefix, and evidence.
         stopped: Why the search ended before it was complete; None if it did not.
-        partial: If no map of the whole trace was found, the best map of its first steps.
+        partial: A map of the first steps, if no map of the whole trace was found; else None.
         within: The number of dstates above the minimum that a listed map may have.
-        levels: The minimal maps, and with `within` the maps for each greater number of dstates.
-        shared: What all minimal maps share, also those not in `maps`, as the search found out.
-            None if it found out no more than `maps` show.
-        trace: The trace; None in a solution that was read from a file without it.
-        support: The basis of the certificate and of the warnings.
+        levels: The cost and the number of the minimal maps. With `within`, the same for each
+            greater number of dstates.
+        shared: The backbone (what all minimal maps share) as the search found it, also from maps
+            that are not in `maps`; None if it is to be computed from `maps`.
+        trace: The trace; None in a solution that was read from a file without its trace.
+        support: The data behind the certificate and the warnings.
     """
 
     status: Status
@@ -108,7 +112,11 @@ class Solution:
     def __getitem__(self, index: slice) -> tuple[SSHMap, ...]: ...
 
     def __getitem__(self, index: int | slice) -> SSHMap | tuple[SSHMap, ...]:
-        """The map at a position, or several maps for a slice. Raises RangeError."""
+        """The map at a position, or a tuple of maps for a slice.
+
+        Raises:
+            RangeError: There is no map at this position.
+        """
         return (
             self.maps[index]
             if isinstance(index, slice)
@@ -119,7 +127,7 @@ class Solution:
         return f"<Solution {self.headline}>"
 
     def _repr_html_(self) -> str:
-        """The card that notebooks show: how the search ended, the backbone, and the first map."""
+        """The HTML that notebooks show: how the search ended, the summary, and the first map."""
         parts = []
         if self.status is not Status.UNSATISFIABLE:
             parts.append(cards.paragraph(self.summary))
@@ -144,7 +152,7 @@ class Solution:
 
     @property
     def headline(self) -> str:
-        """One line: the status, the cost, and the number of minimal maps or the bound."""
+        """A line with the status, the cost, and the number of minimal maps or the bound."""
         why = f" ({self.stopped})" if self.stopped else ""
         steps = counted(self.steps, "steps")
         bounds = [f"{k} ≥ {v:g}" for k, v in self.bound.to_dict().items()]
@@ -168,7 +176,7 @@ class Solution:
 
     @property
     def costs(self) -> tuple[Cost, ...]:
-        """The cost of each map."""
+        """The cost of each map in `maps`."""
         levels = self.levels or ((Level(self.cost, self.count),) if self.cost else ())
         cost_of = (level.cost for level in levels for _ in range(level.count))
         return tuple(
@@ -178,22 +186,25 @@ class Solution:
 
     @property
     def minimal_maps(self) -> tuple[SSHMap, ...]:
-        """The maps that are proven to be minimal."""
+        """The maps that are proven to be minimal; empty unless the status is optimal."""
         if self.status is not Status.OPTIMAL:
             return ()
         return self.maps[: self.levels[0].count] if self.levels else self.maps
 
     @property
     def minimal_listed(self) -> bool:
-        """Whether all minimal maps were given, even if not all maps `within` more were."""
+        """Whether the search gave all minimal maps.
+
+        Unlike `complete`, this says nothing of the further maps that `within` asks for.
+        """
         return self.complete or (bool(self.levels) and self.levels[0].complete)
 
     @property
     def backbone(self) -> Backbone | None:
-        """What the minimal maps share, as far as it is known; None without a minimal map.
+        """The backbone: what the known minimal maps share; None if no minimal map is known.
 
-        If not all minimal maps were listed, it is proven only if the search went on to prove it.
-        `find_backbone` proves it afterwards.
+        If not all minimal maps were listed, the backbone need not hold for all of them. Then it is
+        not `proven`, and `find_backbone` can prove it.
         """
         if self.shared is not None:
             return self.shared
@@ -204,25 +215,31 @@ class Solution:
 
     @property
     def summary(self) -> str:
-        """One sentence: how many minimal maps there are, and where they differ."""
+        """A sentence that says how many minimal maps there are, and in which steps they differ."""
         return summary_of(self, self.count, self.backbone)
 
     @property
     def weights(self) -> tuple[float, ...]:
-        """The probability of each map by displacements alone; empty without displacements."""
+        """The probability of each map by displacements alone.
+
+        They add up to 1. Empty if displacements are not used.
+        """
         return weights(self.maps)
 
     @property
     def certificate(self) -> Certificate | None:
         """The proof that no map has fewer dstates; None if the theory lacks an axiom for it.
 
-        It is computed at the first use.
+        It is computed at the first use. In a solution from a file it is the one of the file.
         """
         return self.support.certificate
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What makes the trace suspicious: a step that looks like noise, or wrong odometry."""
+        """Sentences that say what makes the trace suspicious.
+
+        One may name a step that looks like noise, another the noise or the units of the odometry.
+        """
         if self.support.recorded is not None:
             return self.support.recorded.warnings
         noise = [self.noise.sentence(self.trace)] if self.noise and self.trace else []
@@ -231,10 +248,10 @@ class Solution:
 
     @property
     def noise(self) -> Noise | None:
-        """The step that looks like noise; None if there is no such step.
+        """The step that looks like noise; None if there is no such step, or the map is small.
 
-        Because of this step alone, most steps before it are dstates of their own. The search for
-        it runs at the first use.
+        Because of this step alone, most steps before it are dstates of their own. It is computed
+        at the first use; a solution from a file has None.
         """
         few = self.cost is not None and self.cost.dstates <= LEAST
         basis = self.support.basis
@@ -242,33 +259,38 @@ class Solution:
 
     @property
     def count(self) -> int:
-        """The number of maps."""
+        """The number of maps in this solution."""
         return len(self.maps)
 
     @property
     def prefix(self) -> int:
-        """How many of the first steps were given to clingo."""
+        """The number of first steps of the trace that were given to clingo."""
         return self.effort.prefix
 
     @property
     def seconds(self) -> Seconds:
-        """The time that the search took."""
+        """The wall-clock time of the search: `total`, `ground` and `solve`, in seconds."""
         return self.effort.seconds
 
     @property
     def grounding(self) -> Grounding:
-        """The size of the ground program that clingo solved last."""
+        """The numbers of rules and atoms of the ground program that clingo solved last."""
         return self.effort.grounding
 
     @property
     def evidence(self) -> Mapping[str, Mapping[str, int]]:
-        """For each kind of evidence, how many pairs and sets of equalities it ruled out."""
+        """What each kind of evidence excluded, by its name.
+
+        "pairs" is the number of excluded pairs of steps. "refused" is the number of sets of
+        equalities that were rejected during the search.
+        """
         return self.effort.evidence
 
     def to_dict(self) -> dict[str, Any]:
         """The answer as plain data, as `solve --json` prints it (docs/reference/formats.md).
 
-        The reason why there is no map and the runner-up are left out, as each needs a search.
+        Two fields of `solve --json` are missing, as each needs another search: why there is no map,
+        and the runner-up.
 
         Raises:
             MapError: The maps are not those that the search gave.
@@ -310,7 +332,8 @@ class Solution:
 
         Args:
             path: The file; "-" for standard input.
-            trace: The trace that was solved. If it is given, the maps are checked against it.
+            trace: The trace that was solved. If it is given, the maps are checked against it, and
+                the solution keeps it.
 
         Raises:
             MapError: The file has another version, or contradicts itself or the trace.
@@ -319,12 +342,13 @@ class Solution:
 
     @classmethod
     def from_dict(cls, data: Any, where: str = "solution", trace: Trace | None = None) -> Solution:
-        """Read an answer that `to_dict` made plain data.
+        """Make a solution from the plain data that `to_dict` returns.
 
         Args:
             data: The plain data.
-            where: What error messages call the data.
-            trace: The trace that was solved. If it is given, the maps are checked against it.
+            where: The name of the data in error messages.
+            trace: The trace that was solved. If it is given, the maps are checked against it, and
+                the solution keeps it.
 
         Raises:
             MapError: The data have another version, or contradict themselves or the trace.
@@ -359,7 +383,11 @@ class Solution:
 
 
 def _checked_record(read: FieldReader, data: Any) -> Mapping[str, Any]:
-    """The fields of a solution, if the data are one of this version. Raises MapError."""
+    """The fields of a solution, after a check that the data are one, in a readable version.
+
+    Raises:
+        MapError: They are not.
+    """
     record, where = read.mapping(data, ""), read.where
     if "maps" not in record and "labels" in record:
         raise MapError(f"{where}: maps: expected a solution, got one map; take SSHMap.load")
@@ -381,7 +409,7 @@ def _checked_record(read: FieldReader, data: Any) -> Mapping[str, Any]:
 def _check_steps(
     where: str, maps: tuple[SSHMap, ...], steps: int, theory: Theory, trace: Trace | None
 ) -> None:
-    """Raise MapError if maps do not have this many steps, or are not of the trace."""
+    """Raise MapError if a map does not have this many steps, or is not of the trace (if given)."""
     for i, ssh_map in enumerate(maps):
         if len(ssh_map.labels) != steps:
             raise MapError(
@@ -398,7 +426,7 @@ def _check_steps(
 
 
 def _table_of_maps(solution: Solution) -> str:
-    """A table with a row for each map: its cost, and its chi-square if it has poses."""
+    """An HTML table with a row for each map: its counts, and its chi-square if it has poses."""
     costs = solution.costs
     chi2 = [ssh_map.fit.chi2 if ssh_map.fit else None for ssh_map in solution.maps]
     columns: dict[str, list[object]] = {"map": [*range(1, solution.count + 1)]}

@@ -1,8 +1,8 @@
 """The search for the minimal maps of a trace: a stream of maps that ends with a `Solution`.
 
-A search makes a first map at once, finds the minimal cost in stages (`stages.py`), and lists the
-maps that have it (`map_list.py`). If it is stopped before, it falls back to some map of the whole
-trace (`fallback.py`). `prefixes.py` says why a prefix of the trace may stand for all of it.
+A search makes a first map at once. Then it finds the minimal cost in stages (`stages.py`), and
+lists the maps of that cost (`map_list.py`). If it is stopped earlier, it makes some map of the
+whole trace (`fallback.py`). `prefixes.py` proves why it is enough to solve the first steps.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.speedups import ALL, Speedups, checked_speedups
 from ssh_abduction.theory.theory import Theory
 
-# The search for the maps of a mended trace has at least this many seconds.
+# A search for the maps of a mended trace may take at least this many seconds.
 SHORTEST = 0.05
-# Without a time limit, finding out what all minimal maps share may take this many seconds, or as
+# Without a time limit, the proof of what all minimal maps share may take this many seconds, or as
 # long as the search if that is more.
 REASONING = 5.0
 _log = log_of(__name__)
@@ -49,7 +49,7 @@ _log = log_of(__name__)
 class Search:
     """A stream of the minimal maps of a trace, in constant memory.
 
-    Iterate once. `solution()` then says how the search ended.
+    Iterate over the search once to get the maps. Then `solution()` says how the search ended.
 
     Args:
         trace: The trace.
@@ -58,7 +58,7 @@ class Search:
 
     Attributes:
         trace: The trace.
-        theory: The theory, with its stars settled.
+        theory: The theory. Each `auto` in it is replaced by the value that is used.
         limits: The limits of the search.
     """
 
@@ -110,17 +110,17 @@ class Search:
         speedups: Speedups = ALL,
         minimal: SSHMap | None = None,
     ) -> Search:
-        """A search that goes on from one for the first steps of the trace, which has ended.
+        """Make a search for a trace that has grown, which goes on from an earlier search.
 
         Args:
-            after: The search for the first steps; None to begin anew.
+            after: The search for the first steps of the trace, which has ended; None to begin anew.
             trace: The trace that has grown.
             theory: The theory.
-            time_limit: Seconds of wall-clock time.
+            time_limit: Seconds of wall-clock time; None for no limit.
             max_maps: List at most this many maps; None lists all.
             speedups: The speed-ups that are on.
-            minimal: A map of the trace with the cost that `after` proved to be minimal. Only the
-                other maps remain to be found.
+            minimal: A map of the trace that costs what `after` proved to be minimal, if there is
+                one. Then the minimal cost is known, and the search only lists maps.
         """
         if after is not None:
             mend = "give the search of the steps before, or leave it out"
@@ -151,7 +151,7 @@ class Search:
 
     @property
     def best(self) -> SSHMap | None:
-        """The best map of the whole trace so far."""
+        """The best map of the whole trace so far; None before there is one."""
         return self._parts.known.best
 
     @property
@@ -166,41 +166,42 @@ class Search:
 
     @property
     def count(self) -> int:
-        """The number of maps given so far."""
+        """The number of maps given to the caller so far."""
         return self._parts.known.count
 
     @property
     def cost(self) -> Cost | None:
-        """The cost of the last map given."""
+        """The cost of the last map given to the caller; None before the first one."""
         return self._answer.cost
 
     @property
     def backbone(self) -> Backbone | None:
-        """What the minimal maps known so far share; None if none is known."""
+        """The backbone: what the minimal maps known so far share; None if none is known."""
         return self._parts.rivals.backbone
 
     @property
     def prefix(self) -> int:
-        """How many of the first steps were given to clingo."""
+        """The number of first steps of the trace that were given to clingo."""
         return self._parts.engine.size
 
     @property
     def grounding(self) -> Grounding:
-        """The size of the ground program that clingo solved last."""
+        """The numbers of rules and atoms of the ground program that clingo solved last."""
         return self._parts.engine.asker.grounding
 
     def __iter__(self) -> Iterator[SSHMap]:
         return self._given(Ranking(self.trace) if self.theory.displacement == "use" else None)
 
     def unranked(self) -> Iterator[SSHMap]:
-        """Iterate over the maps in the order in which they are found, without their fit.
+        """Iterate over the maps in the order in which they are found, instead of over the search.
 
-        This is faster than ranking maps by how well they close.
+        This is faster if the trace has displacements: the maps are not ranked by them and have no
+        poses.
         """
         return self._given(None)
 
     def _given(self, ranking: Ranking | None) -> Iterator[SSHMap]:
-        """Rank the maps of each level, and remember the maps given."""
+        """Yield the maps, those of one cost in the order of `ranking`; None keeps their order."""
         for cost, level in groupby(self._found(), key=lambda priced: priced[1]):
             maps = (ssh_map for ssh_map, _ in level)
             for ssh_map in ranking.ranked(maps, self.over) if ranking else maps:
@@ -208,7 +209,10 @@ class Search:
                 yield ssh_map
 
     def _found(self) -> Iterator[Priced]:
-        """The maps, level by level, in the order in which they are found; or the best one known."""
+        """Run the search, and yield each map with its preferred counts as it is found.
+
+        If no minimal map is found, yield the best map known.
+        """
         if self._begun:
             raise SolverError(
                 "search: expected to be iterated once, got a second time; make another Search"
@@ -251,17 +255,17 @@ class Search:
     def _solve_mended(
         self, mended: Trace, theory: Theory, most: int, seconds: float
     ) -> tuple[tuple[SSHMap, ...], bool]:
-        """Solve a mended trace, in the time and memory of this search.
+        """Solve a mended trace (one with its faults corrected) within the limits of this search.
 
         Args:
             mended: The mended trace.
             theory: A theory without faults.
             most: The number of maps to list at most; 0 for all.
-            seconds: The time it may take.
+            seconds: The time that this may take.
 
         Returns:
-            The minimal maps, or the best map known after that time; and whether the status is
-            proven.
+            The minimal maps (none if the trace has no map) and True; or the best map known after
+            that time and False.
         """
 
         def end_with_this_search(_: Progress) -> None:
@@ -282,7 +286,7 @@ class Search:
         return maps, search.status in (Status.OPTIMAL, Status.UNSATISFIABLE)
 
     def _reason(self) -> None:
-        """Find out what all minimal maps share, if not all are listed."""
+        """Prove what all minimal maps share, if not all of them are listed."""
         watch = self._parts.watch
         watch.use_reserve()
         watch.start()
@@ -297,14 +301,15 @@ class Search:
     def interrupt(self) -> None:
         """End the search soon, with the best answer so far.
 
-        It may be called by signal handlers and other threads.
+        Signal handlers and other threads may call this method.
         """
         self._parts.watch.interrupted = True
 
     def over(self) -> bool:
-        """Whether a limit is over or the search was interrupted.
+        """Whether a limit is reached or the search was interrupted.
 
-        The clock runs on for work that is still to be done with the maps.
+        If the clock stands still, restart it: the caller still works with the maps, within the
+        same time limit.
         """
         watch = self._parts.watch
         if not watch.running:
@@ -318,25 +323,26 @@ class Search:
         return False
 
     def solution(self, maps: tuple[SSHMap, ...] = ()) -> Solution:
-        """How the search ended.
+        """Make the answer from what the search has proven and from the maps that the caller kept.
 
         Args:
-            maps: The maps that the caller kept. If they are all that were given, and no minimal
-                map is missing, they are sorted into an order that is the same in each run.
+            maps: The maps that the answer holds. If all maps that were given are among them and no
+                minimal map is missing, they are sorted into an order that is the same in each run.
         """
         return self._answer.solution(self._answer.in_order(checked_maps(maps)))
 
     def snapshot(self, stopped: Stop) -> Solution:
-        """What is known while another thread still searches and cannot be stopped.
+        """Make an answer while another thread still searches and cannot be stopped.
 
-        The program ends then. The search cannot be used any more.
+        Call this only before the program ends: the search cannot be used any more.
 
         Args:
-            stopped: Why the search is to end.
+            stopped: The reason to name in the answer, such as "time limit".
         """
         one_of("stopped", stopped, get_args(Stop), SolverError)
         parts, known = self._parts, self._parts.known
-        # The other thread may change data that a sketch reads. Then the answer has no sketch.
+        # The other thread may change data while a sketch (a map without a search) reads them. If
+        # this raises, the answer has no sketch.
         with suppress(Exception):
             if known.status in (Status.UNKNOWN, Status.FEASIBLE):
                 parts.candidates.sketch(OVERTIME)

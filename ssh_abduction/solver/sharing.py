@@ -1,6 +1,7 @@
-"""What maps of one trace share: which steps are one in all, in some, or in none of them.
+"""Find what maps of one trace share: which steps are one in all, in some, or in none of them.
 
-Two steps are one if they are at one dstate, at one place, or along one path or course.
+Two steps are *one* if they are at one dstate, at one place, along one path, or along one course (a
+path in one direction). These are four *sorts*, and each sort is compared by itself.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
@@ -30,25 +31,25 @@ Pair: TypeAlias = tuple[int, int]
 Sort: TypeAlias = Literal["dstates", "places", "paths", "courses"]
 
 SORTS: tuple[Sort, ...] = ("dstates", "places", "paths", "courses")
-PRINTED = 1000  # pairs of steps that are printed at most; further ones add little
-NAMED = 6  # stretches of steps that a sentence names at most
-REMEMBERED = 10_000  # assignments of places, paths or courses that are not compared again
+PRINTED = 1000  # print at most this many pairs of steps; further ones add little
+NAMED = 6  # name at most this many stretches of steps in a sentence
+REMEMBERED = 10_000  # remember this many assignments of places, paths or courses that were compared
 
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """Which steps are one dstate, place, path or course (a path in one direction) in maps.
+    """Which steps are one dstate (or one place, path or course) in all, some or none of the maps.
 
-    Steps with two different numbers that are not in a pair are one in no map. If a dstate is along
-    no path, its steps have a number of their own. A pair of a step with itself means that the step
-    is along a path in some maps, and along none in others.
+    Two steps with the same number are one in all maps. Two steps with different numbers are one in
+    some maps if their numbers are a pair in `sometimes`, else in none. A dstate that is along no
+    path has a number of its own for paths. A pair of a step with itself means that the step is
+    along a path in some maps, and along none in others.
 
     Attributes:
-        always: A number for each step. Steps with one number are one in all maps. Numbers are
-            given in the order of the first steps that have them.
-        sometimes: Pairs of steps that are one in some maps and not in others. Each step is the
-            first with its number, and stands for all of them.
-        untold: The steps in which the maps differ, if a file has only some of the pairs (PRINTED).
+        always: A number for each step of the trace, counted from 0 in the order of first steps.
+        sometimes: Pairs of steps that are one in some maps only. Of all steps with one number, a
+            pair has the first.
+        untold: The steps in which the maps differ, if a file has only PRINTED of the pairs.
     """
 
     always: tuple[int, ...]
@@ -64,7 +65,7 @@ class Shared:
         )
 
     def one_in(self, i: int, j: int) -> Literal["all", "some", "none"]:
-        """Whether two steps are one in all maps, in some, or in none."""
+        """Say whether steps i and j are one in "all" maps, in "some", or in "none"."""
         if self.always[i] == self.always[j]:
             return "all"
         pair = tuple(sorted((self.always.index(self.always[i]), self.always.index(self.always[j]))))
@@ -72,10 +73,10 @@ class Shared:
 
     @property
     def differing(self) -> tuple[int, ...]:
-        """The steps in which the maps differ.
+        """The steps in which the maps differ, in order.
 
-        These are the steps that equal an earlier step in some maps only, and all other steps that
-        share a number with one of these.
+        Such a step is one with an earlier step in some maps only, or it is always one with such a
+        step.
         """
         if self.untold:
             return self.untold
@@ -83,9 +84,10 @@ class Shared:
         return tuple(t for t, number in enumerate(self.always) if number in numbers)
 
     def to_dict(self, steps: Iterable[int]) -> dict[str, Any]:
-        """The numbers of these steps, and the pairs.
+        """The numbers of these steps, and all pairs, as plain data.
 
-        If there are more than PRINTED pairs: that many, their count, and the steps that differ.
+        If there are more than PRINTED pairs, give only the first of them, their number, and the
+        steps in which the maps differ.
         """
         more = (
             {"pairs": len(self.sometimes), "differing": list(self.differing)}
@@ -105,9 +107,10 @@ class Backbone:
 
     Attributes:
         dstates: Which steps are one dstate, in all maps or in some.
-        places: Which steps are at one place; None for theories without places.
-        paths: Which steps are along one path; None likewise.
-        courses: Which steps are along one course; None likewise.
+        places: Which steps are at one place; None if the theory has no places.
+        paths: Which steps are along one path; None if the theory has no paths.
+        courses: Which steps are along one course (a path in one direction); None if the theory has
+            no paths.
         proven: Whether this holds for all minimal maps. If not, it holds only for the known ones,
             and further maps may differ more.
     """
@@ -123,12 +126,12 @@ class Backbone:
 
     @property
     def sorts(self) -> dict[Sort, Shared]:
-        """The sorts that are compared: dstates, and for most theories places, paths and courses."""
+        """What the maps share, by sort: "dstates", and with places "places", "paths", "courses"."""
         return {sort: shared for sort in SORTS if (shared := getattr(self, sort)) is not None}
 
     @property
     def sentence(self) -> str:
-        """What the maps share, and in which steps they differ."""
+        """A sentence that says what the maps share, and in which steps they differ."""
         differing = {sort: shared for sort, shared in self.sorts.items() if shared.sometimes}
         if "paths" in differing:  # a step along another path is along another course
             differing.pop("courses", None)
@@ -139,9 +142,10 @@ class Backbone:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As `solve --json` prints it (docs/reference/formats.md).
+        """The backbone as plain data, as `solve --json` prints it (docs/reference/formats.md).
 
-        Dstates are given by step, the rest by dstate, so that it is short for a long trace.
+        There is a number for each step in "dstates". To save space, the other sorts have a number
+        for each dstate only.
         """
         labels = self.dstates.always
         firsts = {number: t for t, number in reversed(list(enumerate(labels)))}
@@ -154,7 +158,12 @@ class Backbone:
 
     @classmethod
     def from_dict(cls, data: Any, steps: int, where: str = "backbone") -> Backbone:
-        """Read what `to_dict` wrote, for a trace of this many steps.
+        """Make a backbone from the plain data that `to_dict` returns.
+
+        Args:
+            data: The plain data.
+            steps: The number of steps of the trace.
+            where: The name of the data in error messages.
 
         Raises:
             MapError: A field is wrong. The message names it.
@@ -185,12 +194,13 @@ class Backbone:
 class Sharing:
     """Takes in maps of one trace, one by one, and keeps what they share, in constant memory.
 
-    Steps that are one dstate in all maps so far are a *class*. In all of these maps they are at one
-    place and along one course. So places and courses are compared by class.
+    Steps that are one dstate in all maps so far form a *class*. In each of these maps, the steps of
+    a class are at one place and along one course. So it is enough to compare the places and courses
+    of classes.
 
     Attributes:
-        maps: The number of maps.
-        classes: The class of each step.
+        maps: The number of maps so far.
+        classes: The number of the class of each step.
     """
 
     def __init__(self) -> None:
@@ -216,7 +226,7 @@ class Sharing:
         return self._kept
 
     def _split_by(self, labels: tuple[int, ...]) -> None:
-        """Split classes until the steps of each are at one dstate in this map too."""
+        """Split classes so that all steps of a class have the same label in this map, too."""
         both = list(zip(self.classes or [0] * len(labels), labels, strict=True))
         number = {pair: i for i, pair in enumerate(dict.fromkeys(both))}
         self.classes = tuple(map(number.__getitem__, both))
@@ -225,22 +235,26 @@ class Sharing:
             kept.split([before for before, _ in number])
 
     def firsts(self) -> list[int]:
-        """The first step of each class."""
+        """The first step of each class, by the number of the class."""
         first: dict[int, int] = {}
         for t, number in enumerate(self.classes):
             first.setdefault(number, t)
         return list(first.values())
 
     def sorts(self) -> Iterable[Sort]:
-        """What is compared."""
+        """The sorts that are compared, such as "dstates"; none before the first map."""
         return self._kept
 
     def kept(self, sort: Sort) -> Kept:
-        """What is known about one sort."""
+        """Which classes are one in all maps, and which in some, for one sort."""
         return self._kept[sort]
 
     def backbone(self, *, proven: bool) -> Backbone:
-        """What the maps so far share."""
+        """Make the backbone from the maps so far.
+
+        Args:
+            proven: Whether all minimal maps share it.
+        """
         found = {sort: self._shared(kept) for sort, kept in self._kept.items()}
         return Backbone(
             found["dstates"], found.get("places"), found.get("paths"), found.get("courses"), proven
@@ -261,13 +275,16 @@ class Sharing:
 
 
 class Kept:
-    """Which classes are one in all maps, and which in some.
+    """For one sort, which classes of steps are one in all maps so far, and which in some.
+
+    In each map, a class has a *name*: the number of its dstate, place or path, or its course.
+    Classes with the same name are one. A class along no path has no name.
 
     Attributes:
-        always: A number for each class. Classes with one number are one in all maps.
-        together: Pairs of classes that are one in some map, the smaller one first. It contains
-            each class with itself, unless it has no name in any map.
-        unnamed: Classes that have no name in some map.
+        always: A number for each class. Classes with the same number are one in all maps.
+        together: Pairs of classes that are one in some map, the smaller class first. A pair of a
+            class with itself means that the class has a name in some map.
+        unnamed: The classes that have no name in some map.
     """
 
     def __init__(self, classes: int) -> None:
@@ -277,7 +294,7 @@ class Kept:
         self._seen: set[tuple[Hashable, ...]] = set()
 
     def split(self, before: Sequence[int]) -> None:
-        """Replace the classes by parts of them. `before` has the old class of each new one."""
+        """Replace the classes by parts of them. `before` gives the old class of each new class."""
         parts: dict[int, list[int]] = {}
         for new, old in enumerate(before):
             parts.setdefault(old, []).append(new)
@@ -287,7 +304,7 @@ class Kept:
         self._seen.clear()
 
     def absorb(self, names: tuple[Hashable, ...]) -> None:
-        """Take in the names of the classes in a map. None is no name."""
+        """Take in the name of each class in a map; None if the class has no name there."""
         if names in self._seen:
             return
         if len(self._seen) == REMEMBERED:
@@ -311,9 +328,14 @@ class Kept:
 
 
 def _read_shared(data: Any, of_step: Sequence[int] | None, steps: int, where: str) -> Shared:
-    """What a file says about one sort.
+    """Read what a file says about one sort.
 
-    Its numbers are those of steps, or of dstates if `of_step` gives the dstate of each step.
+    Args:
+        data: The field of the file.
+        of_step: The dstate of each step, if the file has a number for each dstate. None if it has a
+            number for each step.
+        steps: The number of steps of the trace.
+        where: The name of the field in error messages.
     """
     expected = steps if of_step is None else len(set(of_step))
     always = data.get("always") if isinstance(data, Mapping) else None
@@ -387,7 +409,10 @@ def _told_differing(sort: Sort, shared: Shared) -> str:
 
 
 def stretches(steps: Sequence[int]) -> str:
-    """Words for steps, such as "12–15 and 40": at most NAMED stretches, and how many more steps."""
+    """Name steps in words, such as "12–15 and 40".
+
+    If they form more than NAMED stretches, only count the steps of the further ones.
+    """
     runs: list[list[int]] = []
     for step in steps:
         if runs and step == runs[-1][-1] + 1:
@@ -400,5 +425,5 @@ def stretches(steps: Sequence[int]) -> str:
 
 
 def _listed(words: Sequence[str]) -> str:
-    """Words with commas and "and" between them."""
+    """Join words by commas, and the last one by "and"."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -1,4 +1,4 @@
-"""Find the minimal cost of a trace: fast stages first, and a proof by prefixes at the end."""
+"""Find the minimal cost of a trace: try fast methods first, then prove it by prefixes."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ _log = log_of(__name__)
 
 
 class Stages:
-    """The stages in which one search finds the minimal cost.
+    """Runs the stages in which one search finds the minimal cost.
 
     Attributes:
-        mends: Whether mending the trace was tried.
-        mended_maps: The minimal maps, if mending the trace found them.
+        mends: Whether the search tried to mend the trace (guess its faults and correct them).
+        mended_maps: The minimal maps, if mending the trace found them all; else None.
     """
 
     def __init__(self, parts: Parts, solve_mended: Solver, *, goes_on: bool) -> None:
-        """No stage has begun.
+        """Begin no stage yet.
 
         Args:
-            parts: The parts of the search.
-            solve_mended: Solves a mended trace.
-            goes_on: Whether the search goes on from one for the first steps.
+            parts: The parts of the search. The results are added to `parts.known`.
+            solve_mended: A function that solves a mended trace, see `mending.Solver`.
+            goes_on: Whether the search goes on from an earlier one for the first steps.
         """
         self.mends = False
         self.mended_maps: tuple[SSHMap, ...] | None = None
         self._parts, self._solve_mended, self._goes_on = parts, solve_mended, goes_on
 
     def make_first_map(self) -> None:
-        """Make a causal map at once. clingo then has to find a better one."""
+        """Make a map quickly if the theory is causal. clingo then has to find a better one."""
         parts = self._parts
         if parts.known.status is not Status.OPTIMAL and (
             len(parts.task.trace) > choosing.FEW_STEPS
@@ -51,9 +51,13 @@ class Stages:
             parts.candidates.merge()
 
     def find_minimum(self) -> None:
-        """Find the minimal cost.
+        """Find the minimal cost, and set the status in `parts.known`.
 
         If this takes long, change to an engine that finds dstates before places and paths.
+
+        Raises:
+            LimitError: A limit is reached. Its reason is "no proof" if mending the trace found no
+                proof and the trace is too long for the readable encodings.
         """
         parts, task = self._parts, self._parts.task
         engine, steps = parts.prefixes.engine, len(task.trace)
@@ -92,7 +96,7 @@ class Stages:
         """Look for maps with faults by mending the trace.
 
         Returns:
-            Whether all minimal maps are known.
+            Whether minimal maps were found and proven.
         """
         from ssh_abduction.solver.mending import Mending  # loads numpy
 
@@ -106,7 +110,7 @@ class Stages:
                 parts.candidates.offer(found.map)
                 known.raise_bound(mending.bound)
                 parts.report()
-            # One map more shows whether the list is complete.
+            # Ask for one map more than wanted, to know whether the list is complete.
             self.mended_maps = mending.minimal_maps(most and most + 1)
         finally:
             known.raise_bound(mending.bound)
@@ -115,15 +119,18 @@ class Stages:
             first = self.mended_maps[0]
             known.status = Status.OPTIMAL
             known.keep(Found.of(first, parts.task.theory), first.labels)
-            parts.rivals.reasons = False  # its engines know nothing of mended traces
+            parts.rivals.reasons = False  # engines do not know mended traces
         return bool(self.mended_maps)
 
     def _find_minimum_soon(self, seconds: float) -> bool:
-        """Try to find the minimal cost step by step within a time.
+        """Try to find the minimal cost by growing prefixes, for a short time.
 
         Args:
-            seconds: The time limit, from the start of the search. The limit is a share of the
-                time left if that is less.
+            seconds: The time that this may take. If STEPWISE_SHARE of the time left is less, that
+                is the limit.
+
+        Returns:
+            Whether it ended in that time.
         """
         parts, watch = self._parts, self._parts.watch
         watch.end_stage_after(
@@ -139,7 +146,10 @@ class Stages:
         return True
 
     def _settle_dstates_first(self) -> None:
-        """If some map is known, go on with an engine that finds dstates first."""
+        """Go on with an engine that finds dstates before places and paths.
+
+        Such an engine begins with a map. If no map is known or can be made, change nothing.
+        """
         parts, best = self._parts, self._parts.known.best
         labels = best.labels if best else ()
         parts.candidates.sketch()

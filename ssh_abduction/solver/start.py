@@ -1,4 +1,4 @@
-"""The limits of a search, and where it begins: frozen values that its parts share."""
+"""The limits of a search and its starting point: frozen values that all parts of it read."""
 
 from __future__ import annotations
 
@@ -51,15 +51,17 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where a search begins, and whether it reasons at its end. For other packages here.
+    """The starting point of a search, and whether it proves the backbone at its end.
+
+    Users of the package do not need this class; its other modules do.
 
     Attributes:
-        reasons: Whether to find out at the end what all minimal maps share, if not all are
-            listed. A share of the time limit is kept for that.
-        after: The parts of an ended search for the first steps of the trace. Its grounding and
-            its proofs are taken over.
-        minimal: A map of the trace with the cost that `after` proved to be minimal. Only the other
-            maps remain to be found.
+        reasons: Whether to prove at the end what all minimal maps share, if not all are listed. A
+            share of the time limit is kept for that.
+        after: The parts of an ended search for the first steps of the trace, to take over its
+            grounding and its proofs; None to begin anew.
+        minimal: A map of the trace that costs what `after` proved to be minimal; None if there is
+            none. With such a map, the search only lists maps.
     """
 
     reasons: bool = False

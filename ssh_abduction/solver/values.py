@@ -1,4 +1,4 @@
-"""Counts, bounds and statuses: the plain values of a solution. Nothing here needs clingo."""
+"""The plain values of a solution: counts, bounds, statuses and times. Nothing here needs clingo."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Status(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """The counts that maps are compared by.
+    """The counts by which maps are compared.
 
     Attributes:
         dstates: Number of dstates.
         places: Number of places.
         paths: Number of paths.
-        excuses: Number of excused pairs of paths.
+        excuses: Number of pairs of paths that the axiom `side_of_branch` is not applied to.
         faults: The cost of all faults together, in dstates.
     """
 
@@ -41,7 +41,7 @@ class Cost:
 
     @staticmethod
     def of(ssh_map: SSHMap) -> Cost:
-        """Count what a map has."""
+        """Count the dstates, places, paths, excuses and faults of a map."""
         checked_map(ssh_map)
         faults = sum(round(10 * fault.cost) for fault in ssh_map.faults) / 10
         return Cost(
@@ -58,11 +58,11 @@ class Cost:
         return 10 * self.dstates + round(10 * self.faults)
 
     def preferred_by(self, theory: Theory) -> tuple[int, ...]:
-        """The counts that a theory minimises, the most important one first."""
+        """The counts that the theory minimises, the most important one first."""
         return tuple(getattr(self, name) for name in checked_theory(theory).priorities)
 
     def to_dict(self) -> dict[str, float]:
-        """The counts by name; excuses and faults only if there are any."""
+        """The counts by name. Excuses and faults are left out if there are none."""
         counts: dict[str, float] = {
             "dstates": self.dstates,
             "places": self.places,
@@ -73,14 +73,15 @@ class Cost:
 
 
 def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> Cost:
-    """The cost of a map, with the preferred counts as clingo counted them.
+    """The cost of a map, with the counts that the theory minimises taken from clingo.
 
-    If axioms are left out, clingo may count more than the map can show.
+    Without some axioms, a dstate may have several places or paths, but a map shows only one. Then
+    clingo counts more than the map shows.
 
     Args:
         ssh_map: The map.
-        cost: Its preferred counts by clingo, the most important one first.
-        theory: The theory that prefers them.
+        cost: The counts that clingo minimised, the most important one first.
+        theory: The theory that minimises them.
     """
     counted = {
         name: count for name, count in zip(theory.priorities, cost, strict=True) if name != "tenths"
@@ -90,17 +91,18 @@ def cost_as_counted(ssh_map: SSHMap, cost: tuple[int, ...], theory: Theory) -> C
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Proven lower bounds on the counts of every map of the trace; None if nothing is proven.
+    """Proven lower bounds on the counts of every map of a trace.
 
-    A search proves a bound on the count that the theory prefers first. The other counts are
-    bounded among the minimal maps only; see `Solution.cost` once the status is optimal.
+    A search proves a bound on the count that the theory minimises first. It proves none on the
+    other counts, as a map that is not minimal may have less of them. Each attribute is None if
+    nothing is proven.
 
     Attributes:
-        dstates: Lower bound on the dstates. A search that was stopped also takes it from the
-            steps that are pairwise distinct.
+        dstates: Lower bound on the dstates. For a search that was stopped, it is at least the
+            number of steps that are pairwise distinct.
         places: Lower bound on the places.
         paths: Lower bound on the paths.
-        excuses: Lower bound on the excused pairs of paths.
+        excuses: Lower bound on the pairs of paths that `side_of_branch` is not applied to.
         tenths: If faults are allowed, lower bound on the cost of dstates and faults together, in
             tenths of a dstate.
     """
@@ -115,7 +117,7 @@ class Bound:
         return shortly(self)
 
     def to_dict(self) -> dict[str, float]:
-        """The bounds that are proven, by name."""
+        """The bounds that are proven, by name. "cost" is `tenths` in dstates."""
         counts: dict[str, float | None] = {
             "dstates": self.dstates,
             "places": self.places,
@@ -128,7 +130,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class Seconds:
-    """Wall-clock time: in all, for grounding, and for solving."""
+    """Wall-clock seconds of a search: in all, for grounding, and for solving."""
 
     total: float
     ground: float
@@ -148,11 +150,11 @@ class Effort:
     """What a search did to find its answer.
 
     Attributes:
-        prefix: The number of first steps given to clingo.
-        seconds: The time it took.
-        grounding: The ground program that clingo solved last.
-        evidence: For each kind of evidence, the numbers of pairs of steps that it excluded and of
-            sets of equalities that it rejected.
+        prefix: The number of first steps of the trace that were given to clingo.
+        seconds: The time that the search took.
+        grounding: The size of the ground program that clingo solved last.
+        evidence: For each kind of evidence, by name, two numbers: "pairs" of steps that it
+            excluded, and sets of equalities that it rejected ("refused").
     """
 
     prefix: int
@@ -163,12 +165,13 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """The best maps with one number of dstates (of paths or places if these come first).
+    """How many maps have one cost: the minimal one, or the best one for more dstates.
 
     Attributes:
-        cost: The cost of the first map. All share the counts that the theory prefers.
-        count: The number of maps.
-        complete: Whether the level has no further map.
+        cost: The cost of the first of these maps. All of them share the counts that the theory
+            minimises.
+        count: The number of these maps.
+        complete: Whether no further map is minimal. All levels of a solution have the same value.
     """
 
     cost: Cost
@@ -176,7 +179,7 @@ class Level:
     complete: bool = field(default=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """The cost and the count."""
+        """The cost and the count as plain data."""
         return {"cost": self.cost.to_dict(), "count": self.count}
 
 
@@ -185,12 +188,12 @@ class Progress:
     """How far a search is.
 
     Attributes:
-        prefix: The number of first steps that it works on.
+        prefix: The number of first steps of the trace that clingo has.
         steps: The number of steps of the trace.
         cost: The cost of the best map so far; None before there is one.
         bound: The proven lower bounds so far.
-        maps: The number of maps given so far.
-        seconds: The time since the search began.
+        maps: The number of maps given to the caller so far.
+        seconds: The seconds since the search began.
     """
 
     prefix: int
@@ -202,7 +205,7 @@ class Progress:
 
     @property
     def sentence(self) -> str:
-        """All of it on one line."""
+        """All of these values on one line."""
         best = (
             f"best {self.cost.dstates} dstates, {self.cost.places} places, {self.cost.paths} paths"
             if self.cost

@@ -1,4 +1,4 @@
-"""Solutions as plain data and in words: the summary, and the JSON that `solve --json` prints."""
+"""Write solutions: the summary in words, and the JSON that `solve --json` prints."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str:
-    """Say in one sentence how many minimal maps there are, and where they differ.
+    """Say in one sentence how many minimal maps there are, and in which steps they differ.
 
     Args:
         solution: The solution.
-        count: The number of maps given. The solution need not hold them.
-        backbone: What the minimal maps share, as far as it is known.
+        count: The number of maps given. The solution need not hold the maps.
+        backbone: What the known minimal maps share; None if no minimal map is known.
     """
     if solution.status is Status.UNSATISFIABLE:
         return "no map satisfies the axioms"
@@ -46,7 +46,13 @@ def summary_of(solution: Solution, count: int, backbone: Backbone | None) -> str
 
 
 def opening(theory: Theory, steps: int, within: int) -> dict[str, Any]:
-    """The fields of a solution's JSON that come before its maps."""
+    """The fields of a solution's JSON that come before the maps, by name.
+
+    Args:
+        theory: The theory.
+        steps: The number of steps of the trace.
+        within: The number of dstates above the minimum that a listed map may have.
+    """
     head = {
         "format": SOLUTION_FORMAT,
         "version": VERSION,
@@ -57,22 +63,22 @@ def opening(theory: Theory, steps: int, within: int) -> dict[str, Any]:
 
 
 def written_map(ssh_map: SSHMap, cost: Cost | None = None) -> dict[str, Any]:
-    """A map in a solution's JSON.
+    """A map as it appears in a solution's JSON.
 
     Args:
         ssh_map: The map.
-        cost: The cost of the map, if maps differ in cost.
+        cost: The cost to write with the map; None for no cost.
     """
     return ssh_map.to_dict() | ({"cost": cost.to_dict()} if cost else {})
 
 
 def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[str, Any]:
-    """The fields of a solution's JSON that come after its maps.
+    """The fields of a solution's JSON that come after the maps, by name.
 
     Args:
         solution: The solution.
-        count: The number of maps that were written. The solution need not hold them.
-        backbone: What the minimal maps share, as far as it is known.
+        count: The number of maps that were written. The solution need not hold the maps.
+        backbone: What the known minimal maps share; None if no minimal map is known.
     """
     end: dict[str, Any] = {
         "status": solution.status.value,
@@ -87,7 +93,7 @@ def ending(solution: Solution, count: int, backbone: Backbone | None) -> dict[st
         },
     }
     end["summary"] = summary_of(solution, count, backbone)
-    # Fields that say nothing are left out.
+    # Leave out fields that would say nothing.
     if backbone and not (solution.minimal_listed and count == 1):
         end["backbone"] = backbone.to_dict()
     if solution.within:
