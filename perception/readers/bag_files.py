@@ -1,7 +1,7 @@
 """Finds and opens the files of a bag: one file or several parts of a drive, packed or not.
 
-rosbags reads complete files with an index. Other files are read record by record (`salvage`), up to
-the cut.
+The package rosbags reads complete files, which have an index. Files that were cut have none. They
+are read record by record up to the cut (`salvage`).
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Files:
 
     Attributes:
         format: `ros1`, `ros2` or `mcap`.
-        readers: Readers of rosbags, or salvages, one for each part, in order.
-        notes: Notes on the files.
+        readers: A reader for each part of the drive, in order: one of rosbags, or a `Salvage`.
+        notes: Sentences about the files that a user should know, such as that a part is missing.
     """
 
     format: str
@@ -50,7 +50,10 @@ class Files:
 
 
 def format_of(head: bytes) -> str | None:
-    """The format of a file with these first bytes; None if it is no bag."""
+    """Find the format (`ros1`, `ros2`, `mcap`) of a file with these first bytes.
+
+    None if the file is no bag.
+    """
     return next((name for magic, (name, _) in MAGICS.items() if head.startswith(magic)), None)
 
 
@@ -60,7 +63,7 @@ def opened(path: Path, format: str) -> Iterator[Files]:
 
     Args:
         path: The file or folder.
-        format: The format of the file.
+        format: Format of the file: `ros1`, `ros2` or `mcap`. It is ignored for a folder.
 
     Raises:
         LogError: The bag cannot be opened, or a disk is full.
@@ -80,7 +83,7 @@ def opened(path: Path, format: str) -> Iterator[Files]:
             else:
                 files = Files(format)
                 _open_part(path, files, folder, stack)
-                # The user may have meant the whole drive.
+                # Other parts of the drive may lie beside the file. The user may have meant all.
                 files.notes += _beside(path)
         except OSError as error:
             check_room(error, named(path))
@@ -91,7 +94,16 @@ def opened(path: Path, format: str) -> Iterator[Files]:
 
 
 def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
-    """Open a folder: by its metadata.yaml, or else all files by their numbers."""
+    """Open a folder by its metadata.yaml. Without a usable one, open all files in it.
+
+    Args:
+        path: The folder.
+        folder: Temporary folder.
+        stack: Closes the files.
+
+    Raises:
+        LogError: No file can be opened, or the files are of several drives.
+    """
     parts = sorted(
         (part for part in path.iterdir() if NAMES.search(part.name) and part.is_file()), key=_number
     )
@@ -161,7 +173,17 @@ def _of_folder(path: Path, folder: Path, stack: ExitStack) -> Files:
 
 
 def _open_part(path: Path, files: Files, folder: Path, stack: ExitStack) -> None:
-    """Open one file, and add its reader to those of the drive. Raises LogError."""
+    """Open one file, and add its reader to those of the drive.
+
+    Args:
+        path: The file.
+        files: Open files of the drive; receives the reader and notes.
+        folder: Temporary folder, for an unpacked copy or a link.
+        stack: Closes the reader.
+
+    Raises:
+        LogError: No message can be read.
+    """
     source = named(path)
     here = folder / f"{len(list(folder.iterdir()))}{dict(MAGICS.values())[files.format]}"
     with path.open("rb") as file:
@@ -189,7 +211,7 @@ def _open_part(path: Path, files: Files, folder: Path, stack: ExitStack) -> None
 
 
 def _by_rosbags(path: Path, format: str, stack: ExitStack) -> Any:
-    """An open reader of rosbags, which the stack closes."""
+    """Open a file or folder with rosbags, and return the reader, which the stack closes."""
     from rosbags import rosbag1, rosbag2
 
     reader: Any = rosbag1.Reader(path) if format == "ros1" else rosbag2.Reader(path)
@@ -199,7 +221,11 @@ def _by_rosbags(path: Path, format: str, stack: ExitStack) -> Any:
 
 
 def _copied(file: IO[bytes], here: Path, source: str) -> list[str]:
-    """Unpack a file as far as it is intact; return a note if it is not."""
+    """Unpack a file to the path `here`, as far as it is intact.
+
+    Returns:
+        One note if the file is cut or damaged; otherwise none.
+    """
     with here.open("wb") as copy:
         try:
             copied(unpacked(file, source), copy, source)
@@ -212,7 +238,7 @@ def _copied(file: IO[bytes], here: Path, source: str) -> list[str]:
 
 
 def _format(path: Path) -> str | None:
-    """The format of a file by its content; None if unknown."""
+    """The format of a file by its content; None if it is no bag or cannot be read."""
     try:
         with path.open("rb") as file:
             return format_of(unpacked(file, named(path)).read(HEAD))
@@ -221,20 +247,24 @@ def _format(path: Path) -> str | None:
 
 
 def _drive(part: Path) -> str:
-    """The name of a drive, without the number of the part and without endings."""
+    """The name of the drive that a part belongs to.
+
+    It is the name of the file without the number of the part and without the ending of a packed
+    file.
+    """
     stem, ending = NAMES.sub("", part.name), NAMES.search(part.name)
     found = PART.match(stem)
     return f"{found['drive'] if found else stem}.{ending[1] if ending else ''}"
 
 
 def _number(part: Path) -> tuple[int, str]:
-    """Key that sorts parts by number, then by name."""
+    """Key that sorts parts by number, then by name. The number is -1 if the name has none."""
     found = PART.match(NAMES.sub("", part.name))
     return int(found["number"]) if found else -1, part.name
 
 
 def _gaps(parts: list[Path]) -> list[str]:
-    """Notes on missing numbers of parts."""
+    """One note if numbers are missing among the sorted parts of a drive; otherwise none."""
     numbers = [number for number, _ in map(_number, parts) if number >= 0]
     missing = sorted(set(range(max(numbers, default=-1))) - set(numbers))
     if not missing:
@@ -249,7 +279,7 @@ def _gaps(parts: list[Path]) -> list[str]:
 
 
 def _beside(path: Path) -> list[str]:
-    """Notes if one of several parts is read alone."""
+    """One note if a file is only one of several parts of a drive; otherwise none."""
     number, _ = _number(path)
     if number < 0 or not NAMES.search(path.name):
         return []
@@ -276,11 +306,11 @@ def _beside(path: Path) -> list[str]:
 
 
 def check_room(error: Exception, source: str) -> None:
-    """Raise LogError if a disk is full, which is no fault of the bag."""
+    """Raise LogError if an error means that a disk is full. Then the bag itself is not damaged."""
     if is_full(error):
         raise no_room(source) from None
 
 
 def cause(error: Exception) -> str:
-    """The first line of the message of an error."""
+    """Return the first line of the message of an error, shortened; without a message, its type."""
     return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")[:200]

@@ -21,16 +21,16 @@ FIXED = (0.01, 0.01)
 
 @dataclass
 class Frame:
-    """The transform from a parent frame to a frame.
+    """The transform from a parent frame to a frame, which is the pose of the frame in its parent.
 
     Attributes:
         parent: Name of the parent frame.
-        translation: (3,) last translation.
-        rotation: (3, 3) last rotation.
-        first: First transform in the plane.
-        track: Transforms over time in the plane; None for a static one.
+        translation: (3,) translation in the last message, in metres.
+        rotation: (3, 3) rotation in the last message.
+        first: Pose in the plane in the first message.
+        track: Poses in the plane over time; None for a static transform.
         count: Number of messages.
-        off: Largest difference from `first`, in metres and radians.
+        off: Largest difference of a pose from `first`, in metres and radians.
     """
 
     parent: str
@@ -51,9 +51,18 @@ Frames = dict[str, dict[str, Frame]]
 
 
 def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
-    """Read the transforms. Only the ancestors of the scans' frames keep theirs over time.
+    """Read the transforms between the frames of a bag.
 
-    Transforms of the many joints are not needed.
+    Transforms over time are kept only for the frames of scans and their ancestors. Those of the
+    many joints of a robot are not needed.
+
+    Args:
+        bag: The open bag.
+        seen: Names of the frames of scans.
+        damaged: Receives the messages that cannot be read.
+
+    Returns:
+        For each frame, its transforms, by the name of the parent frame.
     """
     frames: Frames = {}
     topics = set(bag.topics(*TRANSFORMS))
@@ -86,7 +95,14 @@ def frames_of(bag: Bag, seen: set[str], damaged: list[Damage]) -> Frames:
 
 
 def _record(frames: Frames, child: str, parent: str, transform: Any, is_static: bool) -> Frame:
-    """Record a message of the transform to a frame. Raises Damaged."""
+    """Record a message with the transform from a parent frame to a child frame.
+
+    Returns:
+        All that is known of this transform.
+
+    Raises:
+        Damaged: The numbers are no pose.
+    """
     move, turn = transform.translation, transform.rotation
     flat = flat_pose(move, turn)
     parents = frames.setdefault(child, {})
@@ -105,16 +121,16 @@ def _record(frames: Frames, child: str, parent: str, transform: Any, is_static: 
 
 
 def parent_of(frames: Frames, child: str) -> Frame:
-    """The transform to a frame from its parent.
+    """Return the transform to a frame from its parent.
 
-    With several parents, it is a frame of the odometry, or else the last one.
+    If a frame has several parents, one with "odom" in its name is taken, otherwise the last one.
     """
     parents = list(frames[child].values())
     return next((one for one in parents if "odom" in one.parent.rpartition("/")[2]), parents[-1])
 
 
 def ancestors(frames: Frames, frame: str) -> list[str]:
-    """The frame, its parent and so on, as far as transforms lead."""
+    """List a frame, its parent, the parent of that, and so on, as far as transforms are known."""
     chain: list[str] = []
     while frame in frames and frame not in chain:
         chain.append(frame)
@@ -125,12 +141,25 @@ def ancestors(frames: Frames, frame: str) -> list[str]:
 def mount_of(
     frames: Frames, odom: str, base: str, frame: str, notes: list[str], assumed: dict[str, str]
 ) -> tuple[Pose, bool]:
-    """The pose of the laser in the frame of the robot, and whether it hangs upside down."""
+    """Compute how the laser is mounted on the robot.
+
+    Args:
+        frames: Transforms of the bag.
+        odom: Name of the frame of the odometry.
+        base: Name of the frame of the robot.
+        frame: Name of the frame of the scans.
+        notes: Receives notes on transforms that contradict each other.
+        assumed: Receives, by the key "mount", a note if no transform leads to the laser. Then the
+            laser is taken to be in the middle of the robot.
+
+    Returns:
+        The pose of the laser in the frame of the robot, and whether it hangs upside down.
+    """
     if base == frame:
         return (0.0, 0.0, 0.0), False
     chain = ancestors(frames, frame)
     parents = [parent_of(frames, child).parent for child in chain]
-    # If the robot's frame is unknown, the frame below the odometry's is the robot.
+    # If no transform leads to the robot's frame, the child of the odometry's frame is the robot.
     top = (
         parents.index(base)
         if base in parents
@@ -171,7 +200,11 @@ def mount_of(
 
 
 def flat_pose(position: Any, orientation: Any) -> Pose:
-    """The pose in the plane. Raises Damaged if the numbers are no pose."""
+    """Project a position (x, y, z) and a quaternion to a pose in the plane.
+
+    Raises:
+        Damaged: A number is not finite, or the quaternion is nearly 0.
+    """
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
     numbers = position.x, position.y, position.z, x, y, z, w
     if not all(map(math.isfinite, numbers)) or x * x + y * y + z * z + w * w < 0.5:
@@ -190,10 +223,10 @@ def _rotation(q: Any) -> NDArray[np.float64]:
 
 
 def stamp_of(header: Any) -> float:
-    """The time of a header in seconds; 0 if it is missing."""
+    """Return the time in a header in seconds; 0 means that the header has none."""
     return float(header.stamp.sec + header.stamp.nanosec * NANO)
 
 
 def frame_name(frame: str) -> str:
-    """The name of a frame, without the slash that it may begin with in ROS 1."""
+    """Return the name of a frame without the slash at the beginning that ROS 1 allows."""
     return frame.lstrip("/")

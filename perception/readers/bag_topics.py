@@ -21,11 +21,11 @@ class Bag:
     """An open bag.
 
     Attributes:
-        readers: Readers of rosbags, one for each part.
+        readers: A reader for each part: one of rosbags, or a `Salvage`.
         format: `ros1`, `ros2` or `mcap`.
-        notes: Notes on the files.
-        source: Name of the bag.
-        deserialize: Turns bytes of a message kind into a message.
+        notes: Sentences about the files that a user should know.
+        source: Name of the bag, for errors.
+        deserialize: Function from the bytes of a message and its kind to a message.
     """
 
     def __init__(self, files: bag_files.Files, store: Any, source: str) -> None:
@@ -44,7 +44,14 @@ class Bag:
         return [connection for reader in self.readers for connection in reader.connections]
 
     def topics(self, *kinds: str) -> dict[str, int]:
-        """The topics of these kinds, or all topics, with the number of messages."""
+        """Count the messages of each topic.
+
+        Args:
+            *kinds: Message kinds; without any, all topics are counted.
+
+        Returns:
+            Dict from the name of each topic of these kinds to its number of messages.
+        """
         counts: dict[str, int] = {}
         for connection in self.connections:
             if not kinds or connection.msgtype in kinds:
@@ -52,7 +59,7 @@ class Bag:
         return counts
 
     def listed(self) -> str:
-        """All topics with their kinds, for error messages."""
+        """Name the topics with their kinds, for error messages: at most 20, or "none"."""
         topics = dict.fromkeys(
             f"{c.topic} ({c.msgtype.rpartition('/')[2]})" for c in self.connections
         )
@@ -64,8 +71,9 @@ class Bag:
         """Read the messages of some topics.
 
         Yields:
-            The connection, the number within the topic, the time of recording, and the message or
-            its Damage.
+            For each message: its connection, its number within the topic (from 1), the time of
+            recording in seconds, and the message. Damage takes the place of a message that cannot
+            be read.
         """
         from rosbags.serde import SerdeError
 
@@ -107,7 +115,15 @@ class Bag:
 
 @contextmanager
 def opened(path: str | os.PathLike[str], format: str) -> Iterator[Bag]:
-    """Open a bag of a format. Raises LogError."""
+    """Open a bag.
+
+    Args:
+        path: The file or folder.
+        format: Format of the file: `ros1`, `ros2` or `mcap`. It is ignored for a folder.
+
+    Raises:
+        LogError: The bag cannot be opened.
+    """
     with bag_files.opened(Path(path), format) as files:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

@@ -1,19 +1,19 @@
 """Reads ROS bags: files of ROS 1, folders and files of ROS 2, and MCAP.
 
-It uses the package rosbags (extra `ros`); ROS itself need not be installed. It reads the laser's
-scans (sensor_msgs/LaserScan, or the first echoes of MultiEchoLaserScan), the odometer's poses
-(nav_msgs/Odometry) and the transforms between frames (tf2_msgs/TFMessage), with frames named as in
-REP 105:
+The package rosbags (extra `ros`) is needed; ROS itself need not be installed. Three kinds of
+messages are read: the laser's scans (sensor_msgs/LaserScan, or the first echoes of
+MultiEchoLaserScan), the odometer's poses (nav_msgs/Odometry), and the transforms between frames
+(tf2_msgs/TFMessage). Frames are named as in REP 105:
 
-- Odometry is the pose in Odometry messages. Without these, it is the transform from `odom` to the
-  robot. It is interpolated at the time of each scan.
+- Odometry is the pose in Odometry messages. If there are none, it is the transform from `odom` to
+  the robot. Odometry is interpolated at the time of each scan.
 - The mount of the laser is the transform from the frame of the robot to the frame that the scan
-  names. A laser that hangs upside down turns clockwise.
-- If the robot was localised, so that there are transforms from `map` to `odom`, the scans have
+  names. The beams of a laser that hangs upside down turn clockwise.
+- If there are transforms from `map` to `odom`, the robot was localised, and the scans have
   corrected poses.
 
-Times come from the headers of the messages. If these contradict themselves or each other, the times
-of recording are used (`poses`).
+Times come from the headers of the messages. If these times contradict themselves or each other, the
+times of recording are used (`poses`).
 """
 
 from __future__ import annotations
@@ -55,11 +55,12 @@ def read(bag: Bag, scan_topics: Sequence[str], odom_topic: str | None) -> Readin
 
     Args:
         bag: The open bag.
-        scan_topics: Topics of the scans; none for the only one.
-        odom_topic: Topic of the odometry; None for the only one, or for transforms.
+        scan_topics: Topics of the scans; if empty, the only topic with scans is read.
+        odom_topic: Topic of the odometry. If None, the only topic with odometry is read or, if
+            there is no such topic, the transforms.
 
     Returns:
-        The notes and the scans.
+        Notes on what was found, and the scans, which are read when they are iterated over.
 
     Raises:
         LogError: There are no scans or no odometry, or several topics and none is named.
@@ -129,7 +130,20 @@ def _scan_topics(bag: Bag, named: Sequence[str]) -> list[str]:
 
 
 def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> str | None:
-    """The topic of these kinds: the named one or the only one; None if there is none."""
+    """Choose a topic: the named one, or the only one with messages of some kinds.
+
+    Args:
+        bag: The open bag.
+        kinds: Message kinds.
+        name: Name of the topic; None for the only one.
+        option: Name of the option for the topic, for errors.
+
+    Returns:
+        The topic; None if no topic has such messages.
+
+    Raises:
+        LogError: The named topic does not exist, or several topics exist and none is named.
+    """
     counts = {topic: count for topic, count in bag.topics(*kinds).items() if count}
     short = kinds[0].rpartition("/")[2]
     listed = (
@@ -155,7 +169,15 @@ def _chosen(bag: Bag, kinds: Sequence[str], name: str | None, option: str) -> st
 
 
 def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float64]], Counter[str]]:
-    """The two times of the scans of each topic, (n, 2), and the number of scans of each frame."""
+    """Count the scans of a bag.
+
+    Returns:
+        For each topic, the time in the header and the time of recording of each scan, (n, 2), in
+        seconds; and the number of scans of each frame.
+
+    Raises:
+        LogError: No scan can be read.
+    """
     times: dict[str, list[tuple[float, float]]] = {}
     frames: Counter[str] = Counter()
     for connection, _, recorded, message in bag.messages(set(topics)):
@@ -172,7 +194,20 @@ def _survey(bag: Bag, topics: Sequence[str]) -> tuple[dict[str, NDArray[np.float
 def _odometer(
     bag: Bag, topic: str, damaged: list[Damage], notes: list[str]
 ) -> tuple[Track, str, str]:
-    """The poses of the odometer, their frame, and the frame of the robot. Raises LogError."""
+    """Read the poses of the odometer.
+
+    Args:
+        bag: The open bag.
+        topic: Topic of the odometry.
+        damaged: Receives the messages that cannot be read.
+        notes: Receives a note if several programs publish the topic.
+
+    Returns:
+        The poses, the name of their frame, and that of the frame of the robot.
+
+    Raises:
+        LogError: No message can be read.
+    """
     tracks: dict[tuple[str, str, str], Track] = {}
     for connection, number, recorded, message in bag.messages({topic}):
         if isinstance(message, Damage):
@@ -197,7 +232,7 @@ def _odometer(
     if len(tracks) > 1:
 
         def told(source: tuple[str, str, str]) -> str:
-            """A source as a note names it."""
+            """Name a source (frame, frame of the robot, sender) in a note."""
             odom, base, sender = source
             return f"from {odom} to {base}{f' by {sender}' if sender else ''}"
 
@@ -212,7 +247,19 @@ def _odometer(
 
 
 def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Track, str, str]:
-    """As `_odometer`, but by the transforms from `odom` to the robot. Raises LogError."""
+    """Take the poses of the odometer from the transforms from `odom` to the robot.
+
+    Args:
+        bag: The open bag.
+        frames: Transforms between frames.
+        frame: Frame of the scans.
+
+    Returns:
+        The poses, the name of their frame, and that of the frame of the robot.
+
+    Raises:
+        LogError: No transform changes over time.
+    """
     chain = [(child, parent_of(frames, child)) for child in ancestors(frames, frame)]
     moving = [(child, one) for child, one in chain if one.track is not None]
     found = next(
@@ -229,7 +276,13 @@ def _odometer_of_transforms(bag: Bag, frames: Frames, frame: str) -> tuple[Track
 
 
 def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
-    """The poses of the first source, if those of several sources alternate."""
+    """Keep the poses of the largest source if the poses of several sources alternate.
+
+    Args:
+        track: The poses.
+        called: What publishes the poses, for a note.
+        notes: Receives a note if there are several sources.
+    """
     sources = sources_of(track)
     if len(sources) == 1:
         return track
@@ -256,10 +309,11 @@ class _ScanPoses:
 
     Attributes:
         odometry: Poses by the odometer.
-        corrections: Transforms above the frame of the odometry, the nearest first.
+        corrections: Transforms to the frame of the odometry from its parent, from the parent of
+            that to the parent, and so on; empty if the robot was not localised.
         mounts: For each frame of scans, the pose of the laser in the frame of the robot, and
             whether it hangs upside down.
-        by_stamp: Whether to use the times of headers.
+        by_stamp: Whether times are those of headers, instead of those of recording.
     """
 
     odometry: Poses
@@ -268,7 +322,11 @@ class _ScanPoses:
     by_stamp: bool
 
     def at(self, time: float) -> tuple[Pose, Pose | None]:
-        """The pose by the odometer, and the corrected one. Raises Damaged."""
+        """The pose by the odometer at a time in seconds, and the corrected pose, if there is one.
+
+        Raises:
+            Damaged: There is no odometry at that time.
+        """
         if not self.odometry.covers(time):
             begin, end = self.odometry.times[[0, -1]]
             raise Damaged(
@@ -286,7 +344,7 @@ class _ScanPoses:
 def _scans(
     bag: Bag, topics: set[str], where: _ScanPoses, damaged: list[Damage]
 ) -> Iterator[Scan | Damage]:
-    """Read the scans, after the damage found so far."""
+    """Yield the damage that was found before, then the scans and damaged messages of topics."""
     yield from damaged
     for connection, number, recorded, message in bag.messages(topics):
         if isinstance(message, Damage):

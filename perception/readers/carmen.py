@@ -11,25 +11,25 @@ time]`, and R means remission:
     TRUEPOS true_x true_y true_theta odom_x odom_y odom_theta ...
     PARAM name value ...
 
-A g2o-style log also has, for each scan, the corrected pose (`VERTEX2 id x y theta`, or VERTEX_SE2,
-in the line before the scan's), and relative motions (`EDGE2 from to dx dy dtheta ...`, or
-EDGE_SE2).
+A log of g2o or TORO with scans also has corrected poses and relative motions. The corrected pose of
+a scan is in the line before the scan (`VERTEX2 id x y theta`, or VERTEX_SE2). Motions are edges
+between these vertices (`EDGE2 from to dx dy dtheta ...`, or EDGE_SE2).
 
 A log does not say what its poses mean. The reader therefore goes through it twice. The first pass
-(`carmen_survey`) finds the poses of the odometer, the mount of the laser, and the range that means
-"nothing near". The second pass yields the scans.
+(`carmen_survey`) finds out which poses are the odometer's, how the laser is mounted, and which
+range means "nothing near". The second pass yields the scans. There are four cases:
 
-- If the poses of the scans equal those of vertices, they are corrected. Odometry is the chain of
-  the edges from each vertex to the next.
-- If the first ODOM line after each scan repeats the pose of the scan, whatever the ODOM line before
-  the scan said, then the poses of the scans are corrected. GMapping writes such logs, with a NEFF
-  line after each scan. Its ODOM lines add the increments of the odometer to the corrected pose of
-  the last scan. Odometry is then the chain of these increments, from the line that repeats a pose
-  to the last line before the next scan, whose time is equal. The jump from that line to the scan's
-  pose is a correction. It is left out.
-- If the first pose of the scans wanders from the second, the first is corrected, and the second is
-  the odometer's.
-- Otherwise the second pose is the odometer's. The first is the laser's, or equals the second.
+- The poses of the scans equal those of vertices. Then they are corrected. Odometry is computed by
+  adding up the motions of the edges from each vertex to the next.
+- The first ODOM line after each scan repeats the pose of the scan, although the ODOM line before
+  the scan had another pose. Then the poses of the scans are corrected. GMapping writes such logs,
+  with a NEFF line after each scan. Its ODOM lines add the motions of the odometer to the corrected
+  pose of the last scan. Odometry is computed by adding up these motions, from the line that repeats
+  a pose to the last line before the next scan, which has the same time as that scan. The jump from
+  that line to the pose of the scan is a correction, and is left out.
+- The difference between the two poses of a scan varies widely. Then the first pose is corrected,
+  and the second is the odometer's.
+- Otherwise, the second pose is the odometer's. The first is the laser's, or equals the second.
 
 TRUEPOS lines, which CARMEN's simulator writes, give the true pose of the robot.
 """
@@ -86,7 +86,11 @@ MOST_WAITING = 100
 
 
 def looks_like(head: bytes) -> bool:
-    """Whether one of the first lines of a file is a message that this reader knows."""
+    """Check whether one of the first lines of a file is a message that this reader knows.
+
+    Args:
+        head: First bytes of the file.
+    """
     return LINE_OF_A_LOG.search(head) is not None
 
 
@@ -95,8 +99,12 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
 
     Args:
         file: The log.
-        source: Its name, for errors.
-        format: `carmen` ignores vertices and edges; `g2o` requires them; None reads what is there.
+        source: Name of the log, for errors.
+        format: `carmen` ignores vertices and edges; `g2o` requires vertices; None reads what is
+            there.
+
+    Returns:
+        Notes on what was found, and the scans, which are read when they are iterated over.
 
     Raises:
         LogError: The log holds no scan, or no odometry.
@@ -114,8 +122,8 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
             f"{source}: expected scans in lines {', '.join(KINDS)}, got none that can be read "
             f"(lines: {tags}); {why}"
         )
-    # Logs often hold each scan more than once: take the best kind that has at least half as many
-    # scans.
+    # Logs often hold each scan in lines of several kinds. Take the best kind of line, unless it has
+    # less than half the scans of the commonest kind.
     most = max(survey.scans for survey in found.kinds.values())
     kind = next(
         kind for kind in KINDS if kind in found.kinds and 2 * found.kinds[kind].scans >= most
@@ -151,10 +159,19 @@ def read(file: IO[bytes], source: str, format: str | None) -> Reading:
 def _scans(
     file: IO[bytes], source: str, odometer: _Odometer, kind: str, mount: Pose, reach: float
 ) -> Iterator[Scan | Damage]:
-    """Read the scans, and describe the lines that are skipped."""
+    """Yield the scans, and damage for lines that cannot be read.
+
+    Args:
+        file: The log.
+        source: Name of the log, for errors.
+        odometer: Gives the pose of each scan.
+        kind: Kind of the lines with scans.
+        mount: Pose of the laser in the frame of the robot.
+        reach: Reach of the laser in metres, if the lines of the scans do not give it.
+    """
     # Scans without poses wait here for the next ODOM line.
     waiting: list[Scan | Damage] = []
-    # Some logs give degrees.
+    # The field of view may be given in degrees. Without one, or with an invalid one, it is pi.
     fov = odometer.found.parameters.get("fov", math.pi)
     fov = math.radians(fov) if math.tau < fov <= 360 else fov if 0 < fov <= math.tau else math.pi
     for number, raw in lines(file, source):
@@ -187,20 +204,20 @@ def _scans(
 
 @dataclass(slots=True)
 class _Odometer:
-    """The pose of the odometer at each scan, from the lines of the log so far.
+    """Computes the pose of the odometer at each scan, from the lines of the log up to that scan.
 
     Attributes:
         found: Findings of the first pass.
         meaning: Meaning of the poses of the scans.
-        is_corrected: Whether the poses of vertices are corrected.
-        chain: Odometry, if it is chained from ODOM lines.
-        behind: The chain before the last ODOM line since the last scan.
+        is_corrected: Whether poses of vertices count as corrected.
+        chain: Pose by odometry, computed by adding up the motions between ODOM lines.
+        behind: Value of `chain` before the last ODOM line, or at the last scan if that came later.
         last: Pose and time of the last ODOM line.
-        before: Pose and time of the ODOM line before that.
+        before: Pose and time of the ODOM line before the last.
         restarts: Whether the next ODOM line starts from a corrected pose, and gives no motion.
         vertex: Index of the last vertex.
-        truth: A corrected pose, and the odometer's at that time.
-        news: A corrected pose that waits for the odometry of the next scan.
+        truth: The last corrected pose, and the pose by odometry at that time.
+        news: A corrected pose without odometry yet; the next scan gives it.
     """
 
     found: Found
@@ -224,8 +241,8 @@ class _Odometer:
                 self.chain = moved(self.chain, between(self.last[0], pose))
             self.before, self.last, self.restarts = self.last, (pose, time_at(tokens, 7)), False
         elif tag == b"NEFF":
-            # The ODOM line before repeated the pose of a scan, even if the line of that scan is
-            # missing.
+            # The last ODOM line repeated the pose of a scan, so it is no motion. The line of that
+            # scan may be missing.
             self.chain = self.behind
         elif tag == b"TRUEPOS":
             self.truth = pose_at(tokens, 1), pose_at(tokens, 4)
@@ -243,16 +260,20 @@ class _Odometer:
     def skip_line(self, tag: bytes) -> None:
         """Note that a line cannot be read.
 
-        The line may have been a scan, after which ODOM lines restart. Then the next ODOM line gives
-        no motion.
+        If ODOM lines restart after scans, the line may have been a scan. Then the next ODOM line
+        gives no motion.
         """
         self.restarts |= self.meaning == "restarts" and tag != b"ODOM"
 
     def pose_of(self, line: ScanLine) -> tuple[Pose, Pose | None]:
-        """The pose by the odometer, and the corrected one if it is known. Raises Damaged."""
+        """Compute the pose by the odometer at a scan, and the corrected pose, if it is known.
+
+        Raises:
+            Damaged: The pose should be that of a vertex, but there is none with this pose.
+        """
         first, second = line.first, line.second
         if first is None or second is None:
-            return self.chain, None  # This is replaced in `with_pose`.
+            return self.chain, None  # `with_pose` replaces this pose.
         if self.meaning == "edges":
             index = self.found.graph.index_at(second, self.vertex)
             if index is None:
@@ -271,7 +292,10 @@ class _Odometer:
         )
 
     def with_pose(self, item: Scan | Damage) -> Scan | Damage:
-        """Interpolate a missing pose of a scan from the last two ODOM lines."""
+        """If the lines of scans give no poses, interpolate the pose from the last two ODOM lines.
+
+        Damage, and scans in other logs, are returned unchanged.
+        """
         if self.meaning != "lines" or isinstance(item, Damage) or self.last is None:
             return item
         (start, began), (end, ended) = self.before or self.last, self.last
@@ -290,7 +314,10 @@ class _Odometer:
         return replace(item, odometry=odometry, corrected=self._corrected(odometry))
 
     def _corrected(self, odometry: Pose) -> Pose | None:
-        """The true pose, from the last corrected pose and the odometry since."""
+        """The true pose, from the last corrected pose and the odometry since then.
+
+        None if there was no corrected pose yet.
+        """
         return (
             moved(self.truth[0], between(self.truth[1], odometry))
             if self.truth is not None
@@ -301,7 +328,14 @@ class _Odometer:
 def _measured(
     line: ScanLine, mount: Pose, reach: float, fov: float
 ) -> tuple[NDArray[np.float64], Laser]:
-    """The ranges of a scan, and its laser."""
+    """The ranges of a scan in metres, and its laser.
+
+    Args:
+        line: The line of the scan.
+        mount: Pose of the laser in the frame of the robot.
+        reach: Reach of the laser in metres, if the line does not give it.
+        fov: Field of view in radians, if the line does not give the geometry of the laser.
+    """
     beams = len(line.ranges)
     if line.shape is None:
         laser = _conventional(beams, fov, without_codes(reach), mount)
@@ -313,9 +347,9 @@ def _measured(
 
 @lru_cache(maxsize=64)
 def _conventional(beams: int, fov: float, reach: float, mount: Pose) -> Laser:
-    """The laser of FLASER lines, whose first beam is at the right.
+    """The laser of FLASER lines, which do not give its geometry. Its first beam is on the right.
 
-    If the number of beams is even, the last beam of a SICK, at the left, is missing.
+    If the number of beams is even, the last beam of a SICK, on the left, is missing.
     """
     step = fov / max(1, beams - beams % 2)
     return Laser(-fov / 2, step, beams, reach, mount)

@@ -1,4 +1,7 @@
-"""Finds out what the poses and ranges of a log in lines mean: the first pass of `carmen`."""
+"""Finds out what the poses and ranges in a log of CARMEN, g2o or TORO mean.
+
+This is the first pass of `carmen`, where the possible meanings are listed.
+"""
 
 from __future__ import annotations
 
@@ -29,16 +32,16 @@ from perception.readers.messages import (
 )
 from ssh_abduction.data.odometry import Pose, between
 
-# Meaning of the poses of the scans, in the order of the docstring of `carmen`. `lines`: only ODOM
-# lines between scans give poses.
+# Meaning of the poses of the scans. The first four are the cases in the docstring of `carmen`, in
+# its order. `lines` means that scans have no poses, and ODOM lines between scans give them.
 Meaning: TypeAlias = Literal["edges", "restarts", "first corrected", "raw", "lines"]
-# Share of the scans that must follow a rule, since lines may be damaged.
+# A rule about scans holds if this share of the scans follows it, since lines may be damaged.
 MOST_SCANS = 0.9
 # The first pose is corrected if it is this far from the second, in metres or radians. Smaller
 # differences may come from a delay of milliseconds.
 WANDERED = (0.5, 0.25)
-# The mount of the laser is the same in all scans up to this difference, since some logs have two
-# decimals.
+# Mounts of the laser count as equal up to this difference, in metres and radians, since some logs
+# have two decimals.
 MOUNTED = 0.02
 # Ranges of a SICK LMS from here on, in metres, are codes such as "nothing came back" or "dazzled"
 # (SICK, Telegrams for LMS 200, values 8183 to 8191).
@@ -49,22 +52,26 @@ NO_RANGE = 1000.0
 
 @dataclass(slots=True)
 class Survey:
-    """Findings of the first pass about one kind of scans.
+    """Findings of the first pass about one kind of lines with scans.
+
+    A line has two poses. The mount is the first pose as seen from the second.
 
     Attributes:
         scans: Number of scans.
         beams: Number of beams of the first scan.
-        most: Largest range.
-        repeated: Number of times `most` occurs.
-        mount: First pose in the frame of the second, at the first scan.
+        most: Largest range in metres.
+        repeated: Number of times that `most` occurs.
+        mount: Mount at the first scan.
         mounted: Number of scans with about the same mount.
         wandered: Number of scans with a very different mount.
         same: Number of scans whose two poses are equal.
-        restarts: Number of scans whose pose the next ODOM line repeats, though the line before it
-            has the same time and another pose.
-        moves: Number of scans at which a restart could be seen.
-        unmoved: Lines of scans before which no ODOM line gives motion.
-        poses: Second poses, three numbers each.
+        restarts: Number of scans for which the next ODOM line repeats the pose of the scan, though
+            the previous ODOM line has another pose. The times of the lines exclude that the robot
+            simply moved.
+        moves: Number of scans for which the previous ODOM line has another pose, so that a restart
+            could be seen.
+        unmoved: Numbers of the lines of scans before which no ODOM line gives motion.
+        poses: Second poses of all scans: x, y, heading, x, …
     """
 
     scans: int = 0
@@ -86,11 +93,11 @@ class Found:
     """Findings of the first pass.
 
     Attributes:
-        kinds: Findings for each kind of scans.
-        parameters: Values of PARAM lines.
+        kinds: Findings for each kind of lines with scans.
+        parameters: Values of PARAM lines about the laser, by name: offset, side, angle, reach, fov.
         tags: Number of lines of each kind.
-        graph: Vertices and edges.
-        damage: Description of the first scan that cannot be read.
+        graph: Vertices and edges of the log.
+        damage: Description of the first scan that cannot be read; empty if there is none.
     """
 
     kinds: dict[str, Survey] = field(default_factory=dict)
@@ -101,7 +108,18 @@ class Found:
 
 
 def meaning_of(found: Found, survey: Survey, kind: str, source: str, notes: list[str]) -> Meaning:
-    """What the poses of the scans mean. Raises LogError if none are the odometer's."""
+    """Find out what the poses of the scans mean.
+
+    Args:
+        found: Findings of the first pass.
+        survey: Findings about the kind of lines that is read.
+        kind: That kind.
+        source: Name of the log, for errors.
+        notes: Receives notes for the user.
+
+    Raises:
+        LogError: No poses are the odometer's.
+    """
     is_same = survey.same >= MOST_SCANS * survey.scans
     if kind == "RAWLASER1":
         # Scans without poses take theirs from the ODOM lines.
@@ -143,7 +161,11 @@ def meaning_of(found: Found, survey: Survey, kind: str, source: str, notes: list
 def _meaning_beside_graph(
     graph: Graph, survey: Survey, kind: str, source: str, notes: list[str]
 ) -> Meaning:
-    """What the poses of the scans mean if there are vertices. Raises LogError."""
+    """Find out what the poses of the scans mean if the log has vertices.
+
+    Raises:
+        LogError: The poses are those of vertices, and there are no edges.
+    """
     if graph.share_at_vertices(survey.poses) < MOST_SCANS:
         notes.append(
             f"The poses in {kind} differ from those of VERTEX2: the former are used as "
@@ -169,14 +191,17 @@ def _meaning_beside_graph(
 
 
 def _listed(numbers: list[int] | tuple[int, ...]) -> str:
-    """The first five numbers, and how many more there are."""
+    """List the first five numbers for a note, and say how many more there are."""
     return ", ".join(map(str, numbers[:5])) + (
         f" and {len(numbers) - 5} more" if len(numbers) > 5 else ""
     )
 
 
 def mount_of(found: Found, survey: Survey, meaning: Meaning, kind: str) -> Pose:
-    """The pose of the laser in the frame of the robot, by its poses or else by the parameters."""
+    """Find the pose of the laser in the frame of the robot.
+
+    It is the difference of the two poses of a scan, or else is given by PARAM lines.
+    """
     own = survey.mount
     if (
         own is not None
@@ -193,7 +218,17 @@ def mount_of(found: Found, survey: Survey, meaning: Meaning, kind: str) -> Pose:
 
 
 def reach_of(found: Found, survey: Survey, kind: str, assumed: dict[str, str]) -> float:
-    """The range that means that nothing is near; infinite if the lines of the scans give it."""
+    """Find the range in metres from which nothing came back.
+
+    Args:
+        found: Findings of the first pass.
+        survey: Findings about the kind of lines that is read.
+        kind: That kind.
+        assumed: Receives, by the key "no_return", a note if the log does not say the range.
+
+    Returns:
+        The range; infinite if each line with a scan gives its own.
+    """
     if kind != "FLASER":
         return math.inf
     if (reach := found.parameters.get("reach", 0.0)) > 0:
@@ -209,7 +244,13 @@ def reach_of(found: Found, survey: Survey, kind: str, assumed: dict[str, str]) -
 
 
 def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Found:
-    """Go through a log, and find what its poses and ranges mean."""
+    """Go through a log, and count what shows the meaning of its poses and ranges.
+
+    Args:
+        file: The log.
+        source: Name of the log, for errors.
+        with_graph: Whether to read vertices and edges.
+    """
     found = Found()
     odometer: tuple[Pose, float | None] | None = None  # Pose and time of the last ODOM line.
     since: dict[str, int] = {}  # Number of ODOM lines since the last scan of each kind.
@@ -240,7 +281,7 @@ def survey_of(file: IO[bytes], source: str, with_graph: bool) -> Found:
                 _count(survey, line)
                 if (
                     since.get(line.kind, 2) < 2
-                ):  # The first one only repeats the pose of the scan before.
+                ):  # The first ODOM line after a scan only repeats the pose of the scan.
                     survey.unmoved.append(number)
                 since[line.kind] = 0
                 waiting = survey, line, odometer
@@ -260,7 +301,15 @@ def _count_restart(
     pose: Pose,
     time: float | None,
 ) -> None:
-    """Count whether an ODOM line that follows a scan repeats its pose."""
+    """Count whether the ODOM line after a scan repeats the pose of the scan.
+
+    Args:
+        survey: Receives the counts.
+        line: Line of the scan.
+        before: Pose and time of the ODOM line before the scan.
+        pose: Pose of the ODOM line after the scan.
+        time: Time of the ODOM line after the scan, in seconds.
+    """
     if line.second is None or before is None or before[0] == line.second:
         return
     survey.moves += 1
@@ -269,7 +318,7 @@ def _count_restart(
 
 
 def _count(survey: Survey, line: ScanLine) -> None:
-    """Count a scan: its ranges, and how its two poses compare."""
+    """Count a scan: its ranges, and how its two poses differ."""
     survey.scans += 1
     survey.beams = survey.beams or len(line.ranges)
     ranges = line.ranges[line.ranges <= NO_RANGE]
@@ -291,5 +340,5 @@ def _count(survey: Survey, line: ScanLine) -> None:
 
 
 def without_codes(reach: float) -> float:
-    """The reach of a laser, without the ranges that a SICK uses as codes."""
+    """Lower the reach of a laser, in metres, to exclude the ranges that a SICK uses as codes."""
     return SICK_REACH if SICK_REACH <= reach <= SICK_MOST else reach

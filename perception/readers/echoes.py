@@ -3,12 +3,12 @@
 Drivers encode "nothing came back" in many ways: infinity, the largest range of the laser, a
 constant below it, 0, or NaN. A log rarely says which. So the whole log is surveyed:
 
-- A range that repeats at many poses, with hardly anything beyond it, is no wall. It means that
+- If a range repeats at many poses, and hardly any range is longer, it is no wall. It means that
   nothing came back.
-- Beams of 0 or NaN mean that nothing came back if their neighbours are long. If their neighbours
-  have usual lengths, the laser failed there, and nothing is known.
+- If the neighbours of beams with 0 or NaN are long, such a beam means that nothing came back. If
+  the neighbours have usual lengths, the laser failed there, and nothing is known.
 
-Notes say what was found. `Told` holds the user's corrections.
+Notes say what was found. `Told` holds what the user says instead.
 """
 
 from __future__ import annotations
@@ -42,12 +42,13 @@ APART, TURNED, MOST_SURVEYED = 0.3, math.radians(20), 500
 # A repeated range that means "nothing" occurs in this share of surveyed scans, at least
 # LEAST_SCANS, and in this share of their beams. A wall has the same distance from few poses only.
 SCANS, LEAST_SCANS, BEAMS = 0.1, 5, 0.005
-# Noise of the repeated range, as shares of it, to try in turn.
+# Noise of the repeated range, relative to that range. These values are tried in turn.
 NOISES = (1e-5, 0.001, 0.004, 0.016)
-# The repeated range is a spike at the end of all ranges: it holds this share of the ranges that are
-# as long, and SPIKE times the ranges of an equal band just below.
+# The repeated range is a spike at the end of the histogram of ranges. It has the share NEARLY_ALL
+# of the ranges that are at least as long, and SPIKE times the ranges in an equally wide band just
+# below.
 NEARLY_ALL, SPIKE = 0.9, 10
-# Share of all beams from which a kind of beam without a measurement is worth a note.
+# A kind of beam without a measurement is worth a note if it has at least this share of all beams.
 WORTH_A_NOTE = 0.01
 # Neighbours of beams that met nothing are longer than this share of all beams. Neighbours of beams
 # that failed at random have usual lengths (0.5).
@@ -56,11 +57,12 @@ LONG = 0.8
 
 @dataclass(frozen=True)
 class Told:
-    """What the user says about the laser. None leaves it to the log and the survey.
+    """What the user says about the laser. None means that the log and the survey decide.
 
     Attributes:
-        fov: Degrees from the first beam to the last, counterclockwise, around the same middle as in
-            the log. Negative for clockwise beams, as of a laser that hangs upside down.
+        fov: Degrees from the first beam to the last, counterclockwise. The middle of the field of
+            view stays as in the log. Negative if the beams turn clockwise, as those of a laser that
+            hangs upside down.
         mount: Position of the laser on the robot: metres ahead, metres to the left, degrees to the
             left.
         no_return: Metres from which a range means that nothing came back.
@@ -106,7 +108,7 @@ class Told:
             )
 
     def placed(self, scan: Scan) -> Scan:
-        """The scan with a laser that points as the user says."""
+        """Copy a scan, with the field of view and mount of the laser that the user gives."""
         laser = scan.laser
         if self.fov is not None:
             middle, fov = laser.first + laser.step * laser.steps / 2, math.radians(self.fov)
@@ -117,23 +119,27 @@ class Told:
         return scan if laser is scan.laser else replace(scan, laser=laser)
 
     def reach(self, reach: float) -> float:
-        """The reach of a laser in metres, by the user or else by the log."""
+        """Return the reach of a laser in metres that the user gives, or else that of the log.
+
+        Args:
+            reach: Reach according to the log, in metres.
+        """
         # The ranges may have been rounded to single precision.
         return reach if self.no_return is None else self.no_return * (1 - 1e-6)
 
     @property
     def free(self) -> frozenset[str]:
-        """The kinds of beams that met nothing, according to the user."""
+        """The kinds of beams that met nothing, according to the user: all of KINDS, or none."""
         return frozenset(KINDS if self.zero_is == "free" else ())
 
 
 @dataclass(frozen=True)
 class Meaning:
-    """Meaning of the ranges of a laser.
+    """Which ranges of a laser mean that nothing came back.
 
     Attributes:
         reach: Metres from which a range means that nothing came back.
-        free: Which of KINDS (beams without a measurement) also mean this.
+        free: Kinds of beams without a measurement that also mean this, a subset of KINDS.
     """
 
     reach: float
@@ -145,10 +151,11 @@ def interpret_log(scans: Sequence[Scan], told: Told) -> tuple[tuple[Scan, ...], 
 
     Args:
         scans: The scans, with ranges as the driver wrote them.
-        told: What the user says. The survey finds the rest.
+        told: What the user says about the laser. The survey finds the rest.
 
     Returns:
-        The scans with ranges as `Scan` describes them, and notes on what was found.
+        The scans, in which ranges are infinite if nothing came back and NaN if nothing is known;
+        and notes on what was found.
 
     Raises:
         LogError: The user gives one mount, but the scans come from several lasers.
@@ -182,17 +189,21 @@ def interpret_scan(scan: Scan, told: Told) -> Scan:
 
     Args:
         scan: The scan, with ranges as the driver wrote them.
-        told: What the user says.
+        told: What the user says about the laser.
 
     Returns:
-        The scan with ranges as `Scan` describes them.
+        The scan, in which ranges are infinite if nothing came back and NaN if nothing is known.
     """
     placed = told.placed(scan)
     return _measured(placed, Meaning(told.reach(placed.laser.reach), told.free))
 
 
 def moving(scans: Iterable[Scan]) -> list[Scan]:
-    """The scans before which the robot moved, by odometry."""
+    """Choose scans between which the robot moved, by odometry.
+
+    Returns:
+        The first scan, and each scan at least APART metres or TURNED radians from the last chosen.
+    """
     kept: list[Scan] = []
     for scan in scans:
         dx, dy, turned = between(kept[-1].odometry, scan.odometry) if kept else (APART, 0.0, 0.0)
@@ -202,7 +213,7 @@ def moving(scans: Iterable[Scan]) -> list[Scan]:
 
 
 def _measured(scan: Scan, meaning: Meaning) -> Scan:
-    """The scan with infinite ranges if nothing came back, and NaN if nothing is known."""
+    """Copy a scan, with infinite ranges if nothing came back and NaN if nothing is known."""
     ranges, kinds = scan.ranges.copy(), _kinds(scan)
     with np.errstate(invalid="ignore"):
         ranges[scan.ranges >= meaning.reach] = np.inf
@@ -218,7 +229,7 @@ def _measured(scan: Scan, meaning: Meaning) -> Scan:
 
 
 def _kinds(scan: Scan) -> dict[str, Bools]:
-    """Masks of the beams of each of KINDS."""
+    """For each of KINDS, the mask of its beams in a scan, (beams,)."""
     ranges = scan.ranges
     with np.errstate(invalid="ignore"):
         near = (ranges > 0) & (ranges <= scan.laser.nearest)
@@ -227,7 +238,15 @@ def _kinds(scan: Scan) -> dict[str, Bools]:
 
 
 def _survey(scans: Sequence[Scan], told: Told) -> tuple[Meaning, list[str]]:
-    """The meaning of the ranges of one laser, and notes on it."""
+    """Find out what the ranges of one laser mean.
+
+    Args:
+        scans: Scans of one laser.
+        told: What the user says about the laser.
+
+    Returns:
+        The meaning, and notes on it.
+    """
     laser, notes = scans[0].laser, list[str]()
     reach = told.reach(laser.reach)
     if told.no_return is None and (repeated := _repeated(scans)) is not None:
@@ -266,7 +285,7 @@ def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
     """Find the range that means "nothing came back".
 
     Returns:
-        The range, and its share of all beams; None if there is no such range.
+        The range in metres, and its share of all beams; None if there is no such range.
     """
     laser = scans[0].laser
     with np.errstate(invalid="ignore"):
@@ -280,7 +299,7 @@ def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
     if len(ranges) < few:
         return None
     for noise in NOISES:
-        # A few stray ranges may be longer, so the middle of the spike is found from below them.
+        # A few stray ranges may be longer than the spike. Skip them to find its middle.
         middle = float(ranges[-few])
         width = noise * middle
         for _ in range(5):
@@ -299,7 +318,15 @@ def _repeated(scans: Sequence[Scan]) -> tuple[float, float] | None:
 
 
 def _without_measurement(scans: Sequence[Scan], reach: float) -> tuple[frozenset[str], list[str]]:
-    """Find the kinds of beams that met nothing, and describe beams without a measurement."""
+    """Find out which kinds of beams without a measurement mean that nothing came back.
+
+    Args:
+        scans: Scans of one laser.
+        reach: Reach of the laser in metres.
+
+    Returns:
+        These kinds, a subset of KINDS; and notes on beams without a measurement.
+    """
     counts = dict.fromkeys(KINDS, 0)
     beside: dict[str, list[Array]] = {kind: [] for kind in KINDS}
     lengths: list[Array] = []

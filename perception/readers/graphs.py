@@ -32,11 +32,12 @@ MOST_BETWEEN = 100
 
 @dataclass(frozen=True)
 class Chain:
-    """Odometry at each vertex, in the order of the file, chained from the edges.
+    """Poses by odometry at the vertices, computed by adding up the motions along the edges.
 
     Attributes:
-        poses: Pose at each vertex.
-        gaps: Vertices before which no edge gives motion; the robot seems to have stood still.
+        poses: Pose at each vertex, in the order of the file. The first is (0, 0, 0).
+        gaps: Numbers of the vertices to which no edge leads from the vertex before. There, the
+            robot is taken to have stood still.
     """
 
     poses: tuple[Pose, ...]
@@ -45,13 +46,13 @@ class Chain:
 
 @dataclass
 class Graph:
-    """Vertices in the order of the file, and edges by the numbers of their ends.
+    """A pose graph: vertices with poses, and edges with motions.
 
     Add all vertices and edges before using the methods, which cache their results.
 
     Attributes:
-        vertices: Number and pose of each vertex.
-        edges: Motion along each edge.
+        vertices: Number and pose of each vertex, in the order of the file.
+        edges: Dict from the numbers of two vertices to the motion from the first to the second.
     """
 
     vertices: list[tuple[int, Pose]] = field(default_factory=list)
@@ -59,7 +60,7 @@ class Graph:
 
     @cached_property
     def chain(self) -> Chain:
-        """Odometry at each vertex, chained from the edges."""
+        """Pose by odometry at each vertex, computed by adding up the motions along the edges."""
         poses: list[Pose] = [(0.0, 0.0, 0.0)]
         gaps: list[int] = []
         for (start, _), (end, _) in zip(self.vertices, self.vertices[1:], strict=False):
@@ -70,7 +71,11 @@ class Graph:
         return Chain(tuple(poses), tuple(gaps))
 
     def _motion(self, start: int, end: int) -> Pose | None:
-        """The motion between vertices, over the vertices between if there is no edge."""
+        """The motion from one vertex to another, by their edge; None if it is unknown.
+
+        If there is no edge between the two, the motions along the vertices between them, by
+        number, are added up.
+        """
         if (motion := self.edges.get((start, end))) is not None:
             return motion
         if (back := self.edges.get((end, start))) is not None:
@@ -85,7 +90,12 @@ class Graph:
         return motion
 
     def is_corrected(self, farthest: float) -> bool:
-        """Whether a vertex differs from odometry by more than this many metres."""
+        """Check whether the poses of vertices were corrected.
+
+        Args:
+            farthest: Poses were corrected if one is farther than this from its pose by odometry, in
+                metres.
+        """
         first = self.vertices[0][1]
         return any(
             math.dist(between(first, pose)[:2], odometry[:2]) > farthest
@@ -93,14 +103,26 @@ class Graph:
         )
 
     def index_at(self, pose: Pose, guess: int | None = None) -> int | None:
-        """The index of the vertex with this pose, trying the guess first; None if there is none."""
+        """Find the index in `vertices` of a vertex with this pose; None if there is none.
+
+        Args:
+            pose: The pose, up to rounding.
+            guess: Index of a vertex to try first.
+        """
         if guess is not None and same_pose(self.vertices[guess][1], pose):
             return guess
         near: list[int] = self._tree.query_ball_point(pose[:2], 2 * ROUNDED)
         return next((i for i in sorted(near) if same_pose(self.vertices[i][1], pose)), None)
 
     def share_at_vertices(self, poses: Sequence[float]) -> float:
-        """Share of poses (flat: x, y, heading, x, …) that are poses of vertices."""
+        """Compute the share of poses that equal the pose of a vertex, up to rounding.
+
+        Args:
+            poses: Flat list of poses: x, y, heading, x, …
+
+        Returns:
+            A number from 0 to 1.
+        """
         table: NDArray[np.float64] = np.reshape(poses, (-1, 3))
         last = len(self.vertices) - 1
         at = sum(

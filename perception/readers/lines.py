@@ -1,7 +1,7 @@
 """Reads the lines of a log, plain or packed, one at a time.
 
-Neither a log of hours nor a line without an end is ever in memory as a whole. A packed file is
-recognised by its first bytes: gzip, bzip2, xz or zstd.
+So long logs do not fill the memory, and neither does a very long line, which is skipped. A packed
+file is recognised by its first bytes: gzip, bzip2, xz or zstd.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def copied(file: IO[bytes], copy: IO[bytes], source: str) -> None:
         source: Name of the file, for errors.
 
     Raises:
-        LogError: The disk of temporary files is full.
+        LogError: The disk with the temporary folder is full.
     """
     try:
         shutil.copyfileobj(file, copy, 2**20)
@@ -85,7 +85,11 @@ def copied(file: IO[bytes], copy: IO[bytes], source: str) -> None:
 
 
 def no_room(source: str) -> LogError:
-    """The error that there is no room for temporary files."""
+    """Make the error that there is no room for temporary files.
+
+    Args:
+        source: Name of the file that was copied.
+    """
     where = tempfile.gettempdir()
     return LogError(
         f"{source}: expected room for a temporary copy in {where}, got a full disk; free "
@@ -94,7 +98,7 @@ def no_room(source: str) -> LogError:
 
 
 def is_full(error: BaseException) -> bool:
-    """Whether an error, also of SQLite, means that a disk is full."""
+    """Check whether an error means that a disk is full. The error may be one of SQLite."""
     return (
         getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
         or type(error).__name__ == "FullError"
@@ -102,7 +106,11 @@ def is_full(error: BaseException) -> bool:
 
 
 def packer(file: IO[bytes]) -> str | None:
-    """The packer of a file (gzip, bzip2, xz, zstd), by its first bytes; None for a plain file."""
+    """Recognise the packer of a file by its first bytes.
+
+    Returns:
+        "gzip", "bzip2", "xz" or "zstd"; None for a file that is not packed.
+    """
     file.seek(0)
     head = file.read(max(map(len, PACKERS)))
     return next((name for magic, (name, _) in PACKERS.items() if head.startswith(magic)), None)
@@ -113,10 +121,10 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
 
     Args:
         file: The file.
-        source: Its name, for errors.
+        source: Name of the file, for errors.
 
     Returns:
-        A stream that raises one of `damages()` if packed data are cut or damaged.
+        A stream of unpacked bytes. It raises one of `damages()` if packed data are cut or damaged.
 
     Raises:
         LogError: The package that unpacks zstd is missing.
@@ -142,7 +150,11 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
 
 
 def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
-    """The errors of the streams of `unpacked` for cut (EOFError) and damaged data, and others."""
+    """List the errors that a stream of `unpacked` raises for cut (EOFError) or damaged data.
+
+    Args:
+        *others: Errors to add to these.
+    """
     zstd = zstd_module()
     return (
         EOFError,
@@ -155,7 +167,7 @@ def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
 
 
 def zstd_module() -> Any:
-    """Python's zstd module, or its backport for Python before 3.14; None if there is neither."""
+    """Return Python's zstd module, or its backport for Python before 3.14; None without both."""
     for name in ("compression.zstd", "backports.zstd"):
         try:
             return importlib.import_module(name)
@@ -169,10 +181,11 @@ def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
 
     Args:
         file: The file.
-        source: Its name, for errors.
+        source: Name of the file, for errors.
 
     Yields:
-        The number of the line, from 1, and the line; None for one longer than LONGEST_LINE bytes.
+        The number of each line, from 1, and the line. A line of more than LONGEST_LINE bytes is
+        None.
 
     Raises:
         LogError: Packed data are cut or damaged; the message says up to which line they can be

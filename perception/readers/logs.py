@@ -49,20 +49,21 @@ def read_log(
 
     Args:
         path: The file, or the folder of a ROS 2 bag.
-        format: One of FORMATS; None finds it by the content of the file, not by its name.
+        format: "carmen", "g2o", "ros1", "ros2" or "mcap". None finds it by the content of the file,
+            not by its name.
         scan_topic: Topic of the scans in a bag, or a sequence of topics; needed if there are
             several.
         odom_topic: Topic of the odometry in a bag; needed if there are several.
-        fov: Degrees from the first beam to the last, counterclockwise, if the log lacks it or is
-            wrong. See `perception.readers.echoes.Told` for this and the following arguments.
+        fov: Degrees from the first beam to the last, counterclockwise, if the log does not say it
+            or is wrong. `perception.readers.echoes.Told` explains this and the following arguments.
         mount: Position of the laser on the robot: metres ahead, metres to the left, degrees to the
             left.
         no_return: Metres from which a range means that nothing came back.
         zero_is: Meaning of ranges that are no measurement: "free" or "unknown".
 
     Returns:
-        The log. Its `notes` say what the reader assumed or found out, and its `damaged` lists
-        skipped parts.
+        The log. Its `notes` say what the reader assumed or found out. Its `damaged` are the parts
+        that were skipped.
 
     Raises:
         LogError: The file cannot be read, has no known format, or holds no scan or no odometry.
@@ -82,7 +83,7 @@ def read_log(
             f"damaged, first: {damaged[0].what if damaged else 'none'}"
         )
     meant, found_out = interpret_log(scans, told)
-    # The user's settings need no assumption.
+    # If the user gave a setting, nothing was assumed for it.
     assumed = (note for option, note in reading.assumed.items() if getattr(told, option) is None)
     log = RobotLog(
         meant,
@@ -109,12 +110,12 @@ def stream_log(
 ) -> Iterator[Scan | Damage]:
     """Read the scans of a robot's log one at a time, in the order of the file.
 
-    Arguments and errors are those of `read_log`. The log is not surveyed as a whole: a repeated
-    range is a wall unless `no_return` says otherwise, and zeros are unknown unless `zero_is` says
-    otherwise.
+    Arguments and errors are those of `read_log`. Unlike there, ranges are interpreted without the
+    rest of the log. So a range that often repeats counts as a wall unless `no_return` is given, and
+    ranges of 0 are unknown unless `zero_is` is given.
 
     Yields:
-        Scans, and the parts that were skipped.
+        Scans, and `Damage` for the parts that were skipped.
     """
     told = Told(fov, mount, no_return, zero_is)
     with _reading(path, format, scan_topic, odom_topic) as reading:
@@ -129,7 +130,7 @@ def _reading(
     scan_topic: str | Sequence[str] | None,
     odom_topic: str | None,
 ) -> Iterator[Reading]:
-    """Open a log of any format."""
+    """Open and survey a log of any format. Raises LogError."""
     topics = [scan_topic] if isinstance(scan_topic, str) else list(scan_topic or ())
     if format is not None and format not in FORMATS:
         raise LogError(f"format: expected one of {', '.join(FORMATS)}, got {brief(format)}")
@@ -173,7 +174,7 @@ def _format(file: IO[bytes], source: str) -> str:
         longest = LONGEST_LINE if line is None else longest
         if len(head) > HEAD:
             break
-    # Nothing but lines that are too long, or nothing at all.
+    # All lines are too long, or the file is empty.
     if not head:
         got = f"lines of more than {longest // 2**20} MiB" if longest else "an empty file"
         raise LogError(f"{source}: expected a robot's log, got {got}; formats: {formats}")

@@ -13,8 +13,9 @@ from perception.readers.lines import LONGEST_LINE
 from ssh_abduction.data.errors import brief
 from ssh_abduction.data.odometry import Pose
 
-# Kinds of scans. Many logs hold each scan several times, so the most informative kind comes first:
-# with the geometry of the laser and a pose, without the geometry, without a pose.
+# Kinds of lines with scans. Many logs hold each scan in several kinds of lines, so the most
+# informative kind comes first: with the geometry of the laser and poses, without the geometry,
+# without poses.
 KINDS = ("ROBOTLASER1", "FLASER", "RAWLASER1")
 # The lines of a pose graph.
 VERTICES, EDGES = (b"VERTEX2", b"VERTEX_SE2"), (b"EDGE2", b"EDGE_SE2")
@@ -41,12 +42,13 @@ class ScanLine:
     """A line that holds a scan.
 
     Attributes:
-        kind: One of KINDS.
-        ranges: (n,) metres.
-        shape: First bearing, step and reach of the laser, if the line has them.
-        first: First pose: that of the laser, or a corrected one, if the line has poses.
-        second: Second pose: that of the robot.
-        time: Seconds.
+        kind: First word of the line, one of KINDS.
+        ranges: (n,) ranges in metres.
+        shape: Bearing of the first beam and step between beams in radians, and reach in metres;
+            None if the line does not have them.
+        first: First pose, which is that of the laser or a corrected one; None without poses.
+        second: Second pose, which is that of the robot; None without poses.
+        time: Seconds; None if missing.
     """
 
     kind: str
@@ -58,7 +60,17 @@ class ScanLine:
 
 
 def words(raw: bytes | None) -> list[bytes]:
-    """The words of a line; none for a comment. Raises Damaged if it is no message."""
+    """Split a line into words.
+
+    Args:
+        raw: The line; None for one that was too long to be read.
+
+    Returns:
+        The words; an empty list for an empty line or a comment.
+
+    Raises:
+        Damaged: The line is too long, or does not begin with the name of a message.
+    """
     if raw is None:
         raise Damaged(f"expected a line of at most {LONGEST_LINE // 2**20} MiB, got a longer one")
     tokens = raw.split()
@@ -70,11 +82,18 @@ def words(raw: bytes | None) -> list[bytes]:
 
 
 def scan_line(tokens: list[bytes]) -> ScanLine | None:
-    """The scan in a line; None for another kind of line. Raises Damaged."""
+    """Parse a line with a scan; None for another kind of line.
+
+    Args:
+        tokens: Words of the line.
+
+    Raises:
+        Damaged: Words are missing or are no valid numbers.
+    """
     kind = tokens[0].decode("ascii")
     if kind not in KINDS:
         return None
-    # FLASER has ranges and poses only. The others begin with the geometry of the laser.
+    # A FLASER line has only ranges and poses. Lines of other kinds begin with the geometry.
     if kind == "FLASER":
         beams, after = _ranges(tokens, 1)
         poses = after
@@ -108,7 +127,15 @@ def scan_line(tokens: list[bytes]) -> ScanLine | None:
 
 
 def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
-    """The ranges whose number is at this position, and the position after them."""
+    """Parse ranges that come after their number.
+
+    Args:
+        tokens: Words of the line.
+        at: Index of the word with the number of ranges.
+
+    Returns:
+        (n,) metres, and the index of the word after the ranges.
+    """
     count = _whole(tokens[at] if at < len(tokens) else b"", "beams")
     if count == 0:
         raise Damaged("expected at least one beam, got none")
@@ -124,7 +151,11 @@ def _ranges(tokens: list[bytes], at: int) -> tuple[NDArray[np.float64], int]:
 
 
 def pose_at(tokens: list[bytes], at: int) -> Pose:
-    """The pose at a position. Raises Damaged."""
+    """Parse the pose that begins at word `at`: x and y in metres, heading in radians.
+
+    Raises:
+        Damaged: There are no three numbers, or they are too large.
+    """
     if len(tokens) < at + 3:
         raise Damaged(
             f"expected a pose of three numbers after word {at}, got {max(0, len(tokens) - at)}"
@@ -136,26 +167,36 @@ def pose_at(tokens: list[bytes], at: int) -> Pose:
 
 
 def vertex_of(tokens: list[bytes]) -> tuple[int, Pose]:
-    """The number and pose of a vertex. Raises Damaged."""
+    """Parse the line of a vertex: its number and its pose. Raises Damaged."""
     return _whole(tokens[1] if len(tokens) > 1 else b"", "vertex"), pose_at(tokens, 2)
 
 
 def edge_of(tokens: list[bytes]) -> tuple[tuple[int, int], Pose]:
-    """The ends and the motion of an edge. Raises Damaged."""
+    """Parse the line of an edge: the numbers of its vertices, and the motion. Raises Damaged."""
     if len(tokens) < 3:
         raise Damaged("expected an edge between two vertices, got fewer words")
     return (_whole(tokens[1], "vertex"), _whole(tokens[2], "vertex")), pose_at(tokens, 3)
 
 
 def parameters_of(tokens: list[bytes]) -> dict[str, float]:
-    """The parameter of the laser in a PARAM line, if there is one."""
+    """Parse a PARAM line.
+
+    Returns:
+        The parameter of the laser in the line, by its short name; empty for other parameters.
+
+    Raises:
+        Damaged: The value is no number.
+    """
     if len(tokens) < 2 or tokens[1] not in _PARAMETERS:
         return {}
     return {_PARAMETERS[tokens[1]]: number_of(tokens[2] if len(tokens) > 2 else b"")}
 
 
 def time_at(tokens: list[bytes], at: int) -> float | None:
-    """The time at a position; None if it is missing or unreadable, as nothing depends on it."""
+    """Parse the time in seconds in word `at`.
+
+    None if the time is missing or unreadable. That is no error, since times are not essential.
+    """
     if at >= len(tokens) or not _is_number(tokens[at]):
         return None
     time = float(tokens[at])
@@ -163,14 +204,14 @@ def time_at(tokens: list[bytes], at: int) -> float | None:
 
 
 def number_of(word: bytes, may_be_infinite: bool = False) -> float:
-    """A number, finite unless `may_be_infinite`. Raises Damaged."""
+    """Parse a number. Raises Damaged if it is no number, or not finite unless `may_be_infinite`."""
     if not _is_number(word) or not (math.isfinite(value := float(word)) or may_be_infinite):
         raise Damaged(f"expected a finite number, got {_quoted(word)}")
     return value
 
 
 def _whole(word: bytes, what: str) -> int:
-    """A whole number that is not negative. Raises Damaged."""
+    """Parse a whole number that is not negative and not too large. Raises Damaged."""
     if not (word.isdigit() and len(word) < 10) or (value := int(word)) > MOST_BEAMS * 1000:
         raise Damaged(f"expected a number ({what}), got {_quoted(word)}")
     return value

@@ -1,6 +1,7 @@
-"""Poses over time with two clocks: the time in the header, and the time of recording.
+"""Poses over time in a bag.
 
-The messages show which clock is usable, and whether two programs published at once.
+A message has two times: a stamp in its header, and the time of recording. This module chooses the
+clock that is usable. It also finds out if two programs published different poses at once.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ SOURCES = 4
 
 @dataclass
 class Track:
-    """Poses over time, in the order of arrival.
+    """Poses over time, in the order of their messages.
 
     Attributes:
-        numbers: Five numbers for each pose: stamp (0 if the header has none), time of recording, x,
-            y, heading.
+        numbers: Flat list of five numbers for each pose: stamp in the header (0 if it has none) and
+            time of recording in seconds; x and y in metres; heading in radians.
     """
 
     numbers: array[float] = field(default_factory=lambda: array("d"))
@@ -47,17 +48,17 @@ class Track:
         self.numbers.extend((stamp, recorded, *pose))
 
     def table(self) -> Array:
-        """(n, 5): stamp, time of recording, and the pose."""
+        """Return the numbers as a table, (n, 5): stamp, time of recording, x, y, heading."""
         return np.frombuffer(self.numbers, dtype=np.float64).reshape(-1, 5)
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses in the order of time, with continuous headings.
+    """Poses sorted by time.
 
     Attributes:
-        times: (n,) seconds.
-        poses: (n, 3) metres and radians.
+        times: (n,) seconds, ascending.
+        poses: (n, 3) x and y in metres, heading in radians. Headings do not jump by a full turn.
     """
 
     times: Array
@@ -65,7 +66,7 @@ class Poses:
 
     @classmethod
     def of(cls, track: Track, by_stamp: bool) -> Poses:
-        """Sort a track by one of its two clocks."""
+        """Sort the poses of a track: by the stamps in headers, or by the times of recording."""
         table = track.table()
         times = table[:, 0 if by_stamp else 1]
         order = np.argsort(times, kind="stable")
@@ -74,26 +75,27 @@ class Poses:
         return cls(times[order], poses)
 
     def at(self, time: float) -> Pose:
-        """The interpolated pose at a time."""
+        """Interpolate the pose at a time in seconds."""
         x, y, heading = (float(np.interp(time, self.times, self.poses[:, i])) for i in range(3))
         return x, y, math.remainder(heading, math.tau)
 
     def covers(self, time: float) -> bool:
-        """Whether the poses cover a time, or nearly do."""
+        """Check whether a time is between the first and last pose, or at most BESIDE s outside."""
         return bool(self.times[0] - BESIDE <= time <= self.times[-1] + BESIDE)
 
 
 def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
-    """Choose a clock: the headers, unless they contradict themselves or each other.
+    """Choose between the stamps in headers and the times of recording.
 
-    If both clocks are bad, the time of recording is used.
+    Stamps are used if those of each topic are consistent and those of all topics agree. Otherwise,
+    the times of recording are used, even if they are wrong, too.
 
     Args:
         topics: For each topic, (n, 2) stamps and times of recording in seconds, in the order of the
             bag.
 
     Returns:
-        Whether to use the times of the headers, and notes on the clocks.
+        Whether to use the stamps, and notes on what is wrong with the clocks.
     """
     wrong = [text for name, times in topics.items() if (text := _wrong_stamps(name, times[:, 0]))]
     held = [
@@ -125,7 +127,7 @@ def clock_of(topics: Mapping[str, Array]) -> tuple[bool, tuple[str, ...]]:
 
 
 def _wrong_stamps(name: str, stamps: Array) -> str | None:
-    """The fault of the stamps of one topic; None if there is none."""
+    """Describe what is wrong with the stamps of one topic; None if nothing is wrong."""
     none = int((stamps == 0).sum())
     if none == len(stamps) or none > 2:  # A simulated clock may begin at 0.
         return f"{none} of {len(stamps)} messages of {name} have none"
@@ -141,9 +143,14 @@ def _wrong_stamps(name: str, stamps: Array) -> str | None:
 
 
 def _wrong_recording(name: str, times: Array, stamps_are_wrong: bool) -> str | None:
-    """The fault of the times of recording of one topic; None if there is none.
+    """Describe what is wrong with the times of recording of a topic; None if nothing is wrong.
 
-    They are wrong if they stand still while the times of the headers go on.
+    They are wrong if they stand still while the stamps in the headers go on.
+
+    Args:
+        name: Name of the topic.
+        times: (n, 2) stamps and times of recording in seconds.
+        stamps_are_wrong: Whether the stamps cannot be compared with.
     """
     stamps, recorded = times.T
     if len(times) < 3:
@@ -164,7 +171,7 @@ def _wrong_recording(name: str, times: Array, stamps_are_wrong: bool) -> str | N
 
 
 def _apart(topics: Mapping[str, Array]) -> list[str]:
-    """Describe topics whose clock differs from that of the first topic."""
+    """Describe topics whose stamps differ from those of the first topic; empty if all agree."""
     begin = min(times[:, 1].min() for times in topics.values())
     every = max(COMPARED, (max(times[:, 1].max() for times in topics.values()) - begin) / TIMES)
     (first, reference), *others = (
@@ -186,10 +193,16 @@ def _apart(topics: Mapping[str, Array]) -> list[str]:
 
 
 def _ahead(times: Array, begin: float, every: float) -> tuple[Array, Array]:
-    """By how many seconds stamps are ahead of recording, in intervals of `every` seconds.
+    """Compute by how many seconds the stamps of a topic are ahead of its times of recording.
+
+    Args:
+        times: (n, 2) stamps and times of recording in seconds.
+        begin: Time of recording from which intervals are counted.
+        every: Length of an interval in seconds.
 
     Returns:
-        Mean time, (k,), and median lead, (k,), of each interval.
+        For each interval with messages: mean time of recording since `begin`, (k,), and median
+        lead of the stamps, (k,).
     """
     recorded = times[:, 1] - begin
     ahead = times[:, 0] - times[:, 1]
@@ -201,19 +214,21 @@ def _ahead(times: Array, begin: float, every: float) -> tuple[Array, Array]:
 
 
 def sources_of(track: Track) -> list[NDArray[np.intp]]:
-    """Separate the messages of alternating sources, as of two programs with one transform.
+    """Separate the poses of sources that alternate, such as two programs with the same transform.
 
-    Each message is appended to the source whose last pose is nearest. If none is near, it starts
-    another source.
+    Each pose is given to the source whose last pose is nearest. If no source is near, the pose
+    starts a new source.
 
     Returns:
-        Indices of the messages of each source, the largest first; one source if none alternate.
+        Indices of the poses of each source, the largest source first. If the poses do not
+        alternate, all belong to one source.
     """
     poses = track.table()[:, 2:]
     if len(poses) < 10:
         return [np.arange(len(poses))]
     over = np.abs(poses[2:] - poses[:-2])
-    # At least a quarter of these steps stays within one source, even if two come in random order.
+    # At least a quarter of these steps over two poses stay within one source, even if the poses of
+    # two sources come in random order.
     near = 0.05 + 4 * float(np.percentile(np.hypot(over[:, 0], over[:, 1]), 25))
     heads: list[list[float]] = []
     of: list[int] = []

@@ -1,7 +1,7 @@
-"""Reads the intact part of a bag without an index, which rosbags cannot open.
+"""Reads the intact part of a bag that was cut or never closed.
 
-Such a bag was cut or never closed. Records are read from the beginning up to the first damaged one.
-Messages before a cut within a chunk are also read.
+Such a bag has no index, so the package rosbags cannot open it. Records are read from the beginning
+up to the first damaged one. If the cut is within a chunk of messages, those before it are read.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ ROS1_MESSAGE, ROS1_CHUNK, CONNECTION = 2, 5, 7
 
 
 class Message(NamedTuple):
-    """A message.
+    """A message of a bag.
 
     Attributes:
-        connection: Number of its connection.
-        topic: Its topic.
-        msgtype: Its kind.
-        sender: Its sender.
+        connection: Number of the connection, which is one sender's messages to one topic.
+        topic: Name of the topic.
+        msgtype: Message kind, such as sensor_msgs/msg/LaserScan.
+        sender: Name of the sender; empty if the format does not store it.
         time: Time of recording in nanoseconds.
-        data: Its bytes.
+        data: The serialised message.
     """
 
     connection: int
@@ -67,7 +67,7 @@ class Connection:
 
 
 class Salvage:
-    """The intact messages of a bag, with the interface of a reader of rosbags.
+    """The intact messages of a file of a bag, with the interface of a reader of rosbags.
 
     Args:
         path: The file.
@@ -76,7 +76,7 @@ class Salvage:
     Attributes:
         connections: The connections with intact messages.
         count: Number of intact messages.
-        seconds: Time from the first to the last.
+        seconds: Time from the first to the last intact message, in seconds.
     """
 
     def __init__(self, path: Path, format: str) -> None:
@@ -98,14 +98,19 @@ class Salvage:
     def messages(
         self, connections: Collection[Connection]
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Read the messages of some connections: connection, nanoseconds, bytes."""
+        """Read the messages of some connections.
+
+        Yields:
+            For each message: its connection, the time of recording in nanoseconds, and the
+            serialised message.
+        """
         asked = {connection.id: connection for connection in connections}
         for message in self._messages():
             if message.connection in asked:
                 yield asked[message.connection], message.time, message.data
 
     def close(self) -> None:
-        """Do nothing, as no file is open between two calls."""
+        """Do nothing: no file is open between two calls. Readers of rosbags have this method."""
 
     def _messages(self) -> Iterator[Message]:
         try:
@@ -136,7 +141,11 @@ def _mcap(path: Path) -> Iterator[Message]:
 
 
 def _mcap_records(stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
-    """The intact records of a stream of `size` bytes, also those in chunks: kind and content."""
+    """Read the intact records of an MCAP stream of `size` bytes, including those in chunks.
+
+    Yields:
+        The kind and the content of each record.
+    """
     while len(head := stream.read(9)) == 9:
         kind, length = struct.unpack("<BQ", head)
         data = stream.read(min(length, size))
@@ -175,10 +184,14 @@ def _ros1(path: Path) -> Iterator[Message]:
 
 
 def _ros1_records(stream: IO[bytes], size: int) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
-    """The intact records of a stream of `size` bytes, also those in chunks: header and content."""
+    """Read the intact records of a ROS 1 stream of `size` bytes, including those in chunks.
+
+    Yields:
+        The fields of the header and the content of each record.
+    """
 
     def part() -> tuple[bytes, bool]:
-        """The next part of a record, and whether it is complete."""
+        """Read the next header or content of a record; return it, and whether it is complete."""
         length = int.from_bytes(head, "little") if len(head := stream.read(4)) == 4 else size + 1
         data = stream.read(min(length, size))
         return data, len(data) == length
@@ -224,7 +237,7 @@ READERS: dict[str, Callable[[Path], Iterator[Message]]] = {
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
-    """A text that follows its length, and the position after it."""
+    """Read a text that is stored after its length; return it, and the position after it."""
     (length,) = struct.unpack_from("<I", data, at)
     end = at + 4 + length
     return data[at + 4 : end].decode(), end
@@ -242,7 +255,15 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
 
 
 def _unpacked(packed: str, data: bytes) -> bytes:
-    """The content of a chunk as far as it exists. Raises KeyError for an unknown packer."""
+    """Unpack the content of a chunk, as far as it exists.
+
+    Args:
+        packed: Name of the compression.
+        data: The packed bytes.
+
+    Raises:
+        KeyError: The compression is unknown.
+    """
     if packed in ("", "none"):
         return data
     from lz4.frame import LZ4FrameDecompressor

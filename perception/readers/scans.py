@@ -33,9 +33,10 @@ class Laser:
         first: Bearing of the first beam, in radians counterclockwise from straight ahead.
         step: Angle from each beam to the next, in radians.
         beams: Number of beams of a scan.
-        reach: Metres from which a range only means that nothing is nearer.
+        reach: Largest range in metres that is measured. A range from here on means that nothing
+            came back.
         mount: Pose of the scanner in the frame of the robot.
-        nearest: Metres up to which a range is no measurement.
+        nearest: Largest range in metres that is too short to be a measurement.
     """
 
     first: float
@@ -47,16 +48,16 @@ class Laser:
 
     @property
     def steps(self) -> int:
-        """Number of steps between beams in the field of view.
+        """The number of angular steps in the field of view.
 
-        If the number of beams is even, the last beam is missing, as for a SICK and for scanners of
-        a full circle.
+        If the number of beams is even, a last beam is missing after them, as for a SICK and for
+        scanners of a full circle. The step to that beam is counted.
         """
         return max(1, self.beams - self.beams % 2)
 
     @cached_property
     def bearings(self) -> NDArray[np.float64]:
-        """(beams,) bearing of each beam in the frame of the scanner, in radians."""
+        """The bearing of each beam in the frame of the scanner: (beams,), radians."""
         return self.first + self.step * np.arange(self.beams, dtype=np.float64)
 
 
@@ -70,9 +71,11 @@ class Scan:
         laser: The scanner.
         odometry: Pose by the odometer, which starts anywhere and drifts. Only its increments
             matter.
-        corrected: Pose by later correction, for pictures and evaluation. No inference reads it.
-        time: Seconds by the clock of the log, which may be cut, wrapped or missing.
-        line: Line of the scan in the log, or number of its message, from 1.
+        corrected: Pose by a later correction, or the true one; None if unknown. It is for pictures
+            and evaluation, and no inference reads it.
+        time: Seconds by the clock of the log; None if missing. The clock may be rounded, or start
+            again.
+        line: Line of the scan in the log, or number of its message in a bag, from 1.
     """
 
     ranges: NDArray[np.float64]
@@ -88,8 +91,8 @@ class Damage:
     """A part of a log that cannot be read and was skipped.
 
     Attributes:
-        line: Its line, or the number of its message, from 1.
-        what: What was expected there, and what came.
+        line: Line in the log, or number of the message in a bag, from 1.
+        what: Text that says what was expected there, and what came.
     """
 
     line: int
@@ -104,8 +107,8 @@ class RobotLog:
         scans: Scans in the order of the file.
         damaged: Skipped parts in the order of the file.
         format: Name of the format.
-        source: The file.
-        notes: Sentences about the log that a user should know, such as that its odometry was
+        source: Path of the file or folder.
+        notes: Sentences about the log that a user should know, for example that its odometry was
             reconstructed.
     """
 
@@ -120,7 +123,7 @@ class RobotLog:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The notes, and a sentence on the skipped parts."""
+        """The notes and, if parts were skipped, a sentence on them."""
         if not self.damaged:
             return self.notes
         first, were = self.damaged[0], "was" if len(self.damaged) == 1 else "were"
@@ -135,15 +138,15 @@ class RobotLog:
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """A log whose format and meaning are known; its scans can be read once.
+    """A log that was surveyed. Its scans can be read once.
 
     Attributes:
         format: Name of the format.
-        notes: Sentences about the log.
-        items: Scans with ranges as the driver wrote them, and skipped parts, in the order of the
-            file.
-        assumed: Notes on what the reader assumed, by the field of `perception.readers.echoes.Told`
-            that replaces it.
+        notes: Sentences about the log that a user should know.
+        items: Iterator over scans, with ranges as the driver wrote them, and skipped parts, in the
+            order of the file.
+        assumed: Notes on what the reader assumed. The key of a note is the field of
+            `perception.readers.echoes.Told` by which a user can say otherwise.
     """
 
     format: str

@@ -14,8 +14,9 @@
 >>> read.ranges.tolist(), read.odometry, read.corrected
 ([1.0, inf, 2.5], (1.0, 0.0, 0.0), (1.1, 0.0, 0.0))
 
-Lengths are metres and angles radians in all formats. The true pose, `corrected`, is written where
-readers do not take it for odometry. A scan without a time gets its index in seconds.
+Lengths are metres and angles radians in all formats. The true pose, `corrected`, is written in
+lines or transforms of its own, so that readers do not take it for odometry. A scan without a time
+gets its index as time in seconds.
 """
 
 from __future__ import annotations
@@ -60,15 +61,15 @@ def write_carmen(
 ) -> None:
     """Write scans as a log of CARMEN, completely or not at all.
 
-    Each scan is a ROBOTLASER1 line, with the geometry and mount of the laser, after an ODOM line
-    and, if the true pose is known, a TRUEPOS line, as CARMEN's simulator writes. Ranges beyond the
-    reach are written as the reach, ranges that are no measurement as 0.
+    Each scan has up to three lines, as CARMEN's simulator writes them: a TRUEPOS line if the true
+    pose is known, an ODOM line, and a ROBOTLASER1 line with ranges, geometry and mount of the
+    laser. Ranges beyond the reach are written as the reach, ranges that are no measurement as 0.
 
     Args:
         path: The file; it is gzipped if its name ends in .gz.
         scans: Scans to write.
-        parameters: Numbers by name, such as the noise of the odometry, for PARAM lines at the
-            beginning.
+        parameters: Numbers by name, such as the noise of the odometry. They are written in PARAM
+            lines at the beginning.
 
     Raises:
         LogError: There is no scan, or the file cannot be written.
@@ -98,11 +99,11 @@ def write_bag(
     poses are known, from map to odom) and /tf_static (from base_link to laser).
 
     Args:
-        path: A name in .bag makes a file of ROS 1, one in .mcap a file of MCAP, and any other a
-            folder of ROS 2.
+        path: File or folder to write. A name that ends in .bag makes a file of ROS 1, one in .mcap
+            a file of MCAP, and any other a folder of ROS 2.
         scans: Scans to write.
-        covariances: (n, 3, 3) covariance of the odometry of each scan: x, y, heading. None writes
-            zeros, which mean unknown.
+        covariances: (n, 3, 3) covariance of the pose by odometry (x, y, heading) at each scan. None
+            writes zeros, which mean unknown.
 
     Raises:
         LogError: There is no scan, the folder exists, the bag cannot be written, or the extra `ros`
@@ -138,7 +139,7 @@ def write_bag(
 
 
 def _numbered(scans: Iterable[Scan]) -> tuple[list[Scan], list[float]]:
-    """The scans, and the time of each. Raises LogError if there are none."""
+    """List the scans, and the time of each in seconds. Raises LogError if there are no scans."""
     listed = list(scans)
     if not listed:
         raise LogError("scans: expected at least one to write, got none")
@@ -146,7 +147,7 @@ def _numbered(scans: Iterable[Scan]) -> tuple[list[Scan], list[float]]:
 
 
 def _carmen_lines(scan: Scan, time: float) -> str:
-    """The lines of a scan."""
+    """The lines of a scan in a log of CARMEN."""
     stamp = f"{time:.6f} localhost {time:.6f}\n"
     odometry = _numbers(scan.odometry)
     laser = scan.laser
@@ -175,7 +176,7 @@ def _numbers(pose: Pose) -> str:
 
 
 def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float64] | None) -> Path:
-    """Write a bag; return the file or folder of it to keep."""
+    """Write a bag to a new path; return the file or folder that is the result."""
     try:
         from rosbags import rosbag1, rosbag2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -215,7 +216,14 @@ def _write_bag(path: Path, scans: Iterable[Scan], covariances: NDArray[np.float6
 def _messages(
     store: Any, scans: Iterable[Scan], covariances: NDArray[np.float64] | None, is_ros1: bool
 ) -> Iterator[tuple[str, int, Any]]:
-    """The messages of all scans: topic, time in nanoseconds, and message."""
+    """Make the messages of all scans.
+
+    Yields:
+        For each message: its topic, its time in nanoseconds, and the message.
+
+    Raises:
+        LogError: There is no scan, a time is negative, or the laser is not always mounted equally.
+    """
     types = store.types
     mounted: set[Pose] = set()
     for number, (scan, seconds) in enumerate(zip(*_numbered(scans), strict=True)):
@@ -260,23 +268,24 @@ def _messages(
 
 
 class _Maker:
-    """Makes messages of one time.
+    """Makes messages with one time.
 
     Args:
         types: Message classes by name.
-        stamp: The time.
-        numbering: Sequence number of the header, for ROS 1.
+        stamp: Message with the time.
+        numbering: Keyword argument with the sequence number of the header, for ROS 1; empty for
+            ROS 2.
     """
 
     def __init__(self, types: Any, stamp: Any, numbering: dict[str, int]) -> None:
         self.types, self.stamp, self.numbering = types, stamp, numbering
 
     def header(self, frame: str) -> Any:
-        """A header with the time."""
+        """Make the header of a message in a frame."""
         return self.types["std_msgs/msg/Header"](stamp=self.stamp, frame_id=frame, **self.numbering)
 
     def transform(self, parent: str, child: str, pose: Pose) -> Any:
-        """A TFMessage with one transform."""
+        """Make a TFMessage with one transform, which is the pose of the child in its parent."""
         geometry = "geometry_msgs/msg/"
         move = self.types[geometry + "Transform"](
             translation=self.vector(pose[0], pose[1]), rotation=self.turned(pose[2])
@@ -287,7 +296,12 @@ class _Maker:
         return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
 
     def odometry(self, pose: Pose, covariance: NDArray[np.float64]) -> Any:
-        """An Odometry message with a covariance in the plane."""
+        """Make an Odometry message.
+
+        Args:
+            pose: x and y in metres, heading in radians.
+            covariance: (3, 3) covariance of the pose.
+        """
         geometry, unknown = "geometry_msgs/msg/", np.zeros(36)
         # ROS has six dimensions; only three (plane) are known.
         known = np.zeros((6, 6))
@@ -307,7 +321,7 @@ class _Maker:
         )
 
     def scan(self, ranges: NDArray[np.float64], laser: Laser) -> Any:
-        """A LaserScan message."""
+        """Make a LaserScan message with ranges in metres."""
         return self.types["sensor_msgs/msg/LaserScan"](
             header=self.header(LASER),
             angle_min=laser.first,
@@ -322,11 +336,11 @@ class _Maker:
         )
 
     def vector(self, x: float, y: float) -> Any:
-        """A vector in the plane."""
+        """Make a vector in the plane."""
         return self.types["geometry_msgs/msg/Vector3"](x=x, y=y, z=0.0)
 
     def turned(self, angle: float) -> Any:
-        """The quaternion of a rotation about z."""
+        """Make the quaternion of a rotation about z by an angle in radians."""
         return self.types["geometry_msgs/msg/Quaternion"](
             x=0.0, y=0.0, z=math.sin(angle / 2), w=math.cos(angle / 2)
         )
