@@ -1,1 +1,1 @@
-"""clingo under limits, and what passes between it and Python."""
+"""Run clingo under limits, give it facts, and read its answers."""

@@ -1,4 +1,4 @@
-"""Runs clingo under limits, for all engines and searches."""
+"""Run clingo under limits of time and memory, for all engines and searches."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from ssh_abduction.solver.values import Grounding
 from ssh_abduction.theory import encodings
 from ssh_abduction.theory.speedups import Speedups
 
-# After grounding, clasp prepares the program and cannot be stopped. It takes about this share of
-# the time and memory of grounding. So no search begins if a limit would be reached meanwhile.
+# After grounding, clasp prepares the program and cannot be stopped. This takes about these shares
+# of the time and of the memory that grounding took. So begin no search if a limit would be reached
+# during the preparation.
 PREPARING = 0.6, 1.0
 
-SLOW = 0.05  # the log mentions grounding that takes more seconds
+SLOW = 0.05  # log the grounding if it takes more seconds than this
 _log = log_of(__name__)
 _ONE = clingo.Number(1)
 _grounding = threading.Lock()
@@ -31,9 +32,9 @@ _under_way: set[clingo.SolveHandle] = set()  # the running searches of clingo, e
 
 @atexit.register
 def _end_all() -> None:
-    """End the searches of unfinished streams when Python exits.
+    """End all running searches of clingo when Python exits.
 
-    Their threads would abort Python.
+    A search that nobody iterates to its end still has a thread, which would abort Python.
     """
     for handle in list(_under_way):
         handle.cancel()
@@ -41,9 +42,9 @@ def _end_all() -> None:
 
 @contextmanager
 def _held_back_interrupts() -> Iterator[None]:
-    """Hold back Ctrl-C and SIGTERM until this context ends.
+    """Hold back Ctrl-C and SIGTERM until this context ends, then handle the first that came.
 
-    If they came while clingo starts a thread, the thread would have no owner.
+    A signal that came while clingo starts a thread would leave a thread that nothing ends.
     """
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     held = {number: handler for number, handler in handlers.items() if callable(handler)}
@@ -67,15 +68,16 @@ Made = TypeVar("Made")
 
 
 class Control(clingo.Control):
-    """A clingo control without warnings.
+    """A clingo control without warnings, which grounds under limits.
 
-    Only one control at a time reads or grounds. Two threads at once would wait for each other at
-    each symbol and take three times as long.
+    Of all controls in this process, only one at a time reads or grounds. Two threads that ground at
+    once would wait for each other at each symbol and take three times as long.
 
     Attributes:
-        preparing: As PREPARING.
-        seconds: How long clingo has grounded since it last began to solve.
-        mebibytes: How much memory that grounding added.
+        preparing: The shares of the time and of the memory of grounding that clasp needs to
+            prepare the program, as PREPARING.
+        seconds: The seconds that clingo has grounded since it last began to solve.
+        mebibytes: The memory in MiB that this grounding added.
     """
 
     def __init__(
@@ -84,13 +86,14 @@ class Control(clingo.Control):
         check: Callable[[], None] = lambda: None,
         preparing: tuple[float, float] = PREPARING,
     ) -> None:
-        """A control without a program.
+        """Make a control without a program.
 
         Args:
-            options: Of clingo.
-            check: Called now and then while clingo grounds, if an encoding has `@go_on`. An
-                exception ends the grounding and makes the control unusable.
-            preparing: As PREPARING.
+            options: Command-line options of clingo.
+            check: A function that is called now and then while clingo grounds an encoding with
+                `@go_on`. If it raises an exception, the grounding ends and the control is unusable.
+            preparing: The shares of the time and of the memory of grounding that clasp needs to
+                prepare the program.
         """
         super().__init__(["--warn=none", *options])
         self.preparing = preparing
@@ -99,7 +102,7 @@ class Control(clingo.Control):
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Be the only control that reads or grounds; wait for others, under the limits."""
+        """Let only this control read or ground in this context. First wait for other controls."""
         while not _grounding.acquire(timeout=POLL):
             self._check()
         try:
@@ -112,7 +115,7 @@ class Control(clingo.Control):
             super().load(path)
 
     def load_encodings(self, *names: str) -> None:
-        """Load these encodings, and the files that they include."""
+        """Load encodings by their names, each after the files that it shares with others."""
         for name in names:
             for path in encodings.paths(name):
                 self.load(path)
@@ -138,7 +141,8 @@ class Control(clingo.Control):
             super().ground(parts, context or asked)
         except BaseException:
             if asked.raised is not None:
-                # Clingo raises a copy of this exception, which lacks its attributes.
+                # Clingo raises a copy of the exception that lacks its attributes. Raise the
+                # exception itself.
                 raise asked.raised from None
             raise
         finally:
@@ -155,7 +159,7 @@ class Control(clingo.Control):
 
 
 class _Asked:
-    """Answers `@go_on`: clingo asks while it grounds whether to go on."""
+    """Evaluates `@go_on(...)` of encodings, by which clingo asks whether to go on grounding."""
 
     def __init__(self, check: Callable[[], None]) -> None:
         self.raised: BaseException | None = None
@@ -165,7 +169,7 @@ class _Asked:
     def go_on(self, *_: clingo.Symbol) -> clingo.Symbol:
         """Return 1, unless `check` raises.
 
-        `check` is called only now and then, as clingo may ask this millions of times.
+        `check` is called only every POLL seconds, as clingo may call this method millions of times.
         """
         try:
             if time.perf_counter() > self._next:
@@ -178,13 +182,13 @@ class _Asked:
 
 
 class Asker:
-    """One clingo control, and the questions to it under limits.
+    """Lets a clingo control search for answers, under limits.
 
     Attributes:
-        control: The control that is asked; it may be replaced.
-        watch: The limits; they may be replaced.
-        ground_seconds: How long clingo has grounded so far.
-        solve_seconds: How long clingo has solved so far.
+        control: The control. It may be replaced.
+        watch: The limits. They may be replaced.
+        ground_seconds: The seconds that clingo has grounded so far.
+        solve_seconds: The seconds that clingo has solved so far.
     """
 
     def __init__(self, watch: Watch) -> None:
@@ -204,13 +208,13 @@ class Asker:
 
     @property
     def grounding(self) -> Grounding:
-        """The size of the program in the last call of clingo that ended.
+        """The numbers of rules and atoms in the last search of clingo that ended; 0 before it.
 
-        This takes a millisecond, as clingo returns all its statistics.
+        To get them takes a millisecond, as clingo returns all its statistics.
         """
         try:
             program = self.control.statistics["problem"]["lp"]
-        except (RuntimeError, KeyError):  # no call came to an end
+        except (RuntimeError, KeyError):  # no search has ended
             return Grounding(0, 0)
         return Grounding(int(program["rules"]), int(program["atoms"]))
 
@@ -227,21 +231,25 @@ class Asker:
         until: Callable[[], bool] = lambda: False,
         ahead: bool = False,
     ) -> Generator[Answer, None, bool]:
-        """Yield the answers of clingo, each read as soon as it comes.
+        """Yield what `read` makes of each answer of clingo, as soon as the answer comes.
 
         Args:
-            read: Reads a value from an answer, which clingo may change afterwards.
-            mode: Clingo's opt-mode.
-            models: How many answers to ask for; 0 for all.
-            assumptions: These hold in each answer.
-            conflicts: The limit; -1 for none.
-            on_bound: Called with each bound that clingo proves.
-            control: Another control than this one's own.
-            until: Called now and then; the search ends once it is true.
-            ahead: Let clingo search for the next answer while the caller uses this one.
+            read: Makes a value from an answer at once, as clingo changes the answer afterwards.
+            mode: The value of clingo's option --opt-mode, such as "opt" or "optN".
+            models: The number of answers to ask for; 0 for all.
+            assumptions: Literals that hold in each answer.
+            conflicts: The number of conflicts after which the search ends; -1 for no limit.
+            on_bound: Called with each lower bound that clingo proves.
+            control: The control to use instead of `self.control`; None for that one.
+            until: Called now and then; the search ends once it returns True.
+            ahead: Whether clingo searches for the next answer while the caller uses this one.
 
         Returns:
-            Whether the answers are complete: neither `conflicts` nor `until` ended the search.
+            Whether the list of answers is complete: neither `conflicts` nor `until` ended the
+            search, and there is no further answer.
+
+        Raises:
+            LimitError: A limit is reached.
         """
         project = "no" if mode.partition(",")[0] == "opt" else "project"
         with self._solving(
@@ -269,16 +277,21 @@ class Asker:
         mode: str = "ignore",
         until: Callable[[], bool] = lambda: False,
     ) -> tuple[Answer | None, list[int] | None]:
-        """An answer in which these literals are true, or an unsat core of them.
-
-        Both are None if the limit of conflicts or `until` ended the search.
+        """Find an answer in which some literals are true, or an unsat core of these literals.
 
         Args:
-            read: Makes a value of an answer.
+            read: Makes a value from an answer.
             assumed: The literals.
-            conflicts: The limit; -1 for none.
-            mode: Clingo's opt-mode.
-            until: Asked now and then; the search ends once it is true.
+            conflicts: The number of conflicts after which the search ends; -1 for no limit.
+            mode: The value of clingo's option --opt-mode.
+            until: Called now and then; the search ends once it returns True.
+
+        Returns:
+            The value and None; or None and the core, a list of literals that cannot all be true.
+            Both are None if `conflicts` or `until` ended the search.
+
+        Raises:
+            LimitError: A limit is reached.
         """
         with self._solving(self.control, assumed, mode, 1, "no", conflicts) as handle:
             if not self._has_come(handle, until):
@@ -289,7 +302,7 @@ class Asker:
             if not _result(handle, conflicts).unsatisfiable:
                 return None, None
             known = set(assumed)
-            # A core may also have external atoms, which clingo assumes.
+            # A core may also have external atoms, as clingo assumes these, too.
             return None, [literal for literal in handle.core() if literal in known]
 
     @contextmanager
@@ -303,7 +316,7 @@ class Asker:
         conflicts: int,
         on_bound: Callable[[Sequence[int]], None] | None = None,
     ) -> Iterator[clingo.SolveHandle]:
-        """A search of clingo in a thread of its own, which ends with this context."""
+        """Run a search of clingo in a thread of its own. The search ends with this context."""
         configuration: Any = control.configuration.solve
         configuration.opt_mode, configuration.models, configuration.project = mode, models, project
         configuration.solve_limit = f"{conflicts},-1"
@@ -327,10 +340,13 @@ class Asker:
                 handle.cancel()
 
     def _has_come(self, handle: clingo.SolveHandle, until: Callable[[], bool]) -> bool:
-        """Wait until clingo has an answer or ends, or until `until` holds.
+        """Wait until clingo has an answer or ends, or until `until` returns True.
 
         Returns:
-            Whether clingo has an answer or ended.
+            Whether clingo has an answer or ended; False if `until` ended the wait.
+
+        Raises:
+            LimitError: A limit is reached.
         """
         began = time.perf_counter()
         try:
@@ -347,10 +363,10 @@ class Asker:
 def mapped(
     function: Callable[[Answer], Made], answers: Generator[Answer, None, bool]
 ) -> Generator[Made, None, bool]:
-    """The results of a function for each answer.
+    """Yield the result of a function for each answer.
 
     Returns:
-        What the generator of the answers returns.
+        What the generator `answers` returns: whether the answers are complete.
     """
     with closing(answers):
         while True:
@@ -362,10 +378,10 @@ def mapped(
 
 
 def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
-    """How a search ended.
+    """The result of a search that has ended.
 
     Raises:
-        LimitError: It was interrupted from outside, not ended by the limit of conflicts.
+        LimitError: The search was interrupted, although it had no limit of conflicts.
     """
     result = handle.get()
     if result.interrupted and conflicts < 0:
@@ -374,7 +390,13 @@ def _result(handle: clingo.SolveHandle, conflicts: int) -> clingo.SolveResult:
 
 
 def new_control(encoding: str, base: str, options: Sequence[str]) -> Control:
-    """A control with an encoding, and these facts in its base."""
+    """Make a control and ground an encoding with some facts.
+
+    Args:
+        encoding: The name of the encoding.
+        base: The facts, which are added to the program part base.
+        options: Command-line options of clingo.
+    """
     control = Control(options)
     control.load_encodings(encoding)
     control.add("base", [], base)
@@ -383,13 +405,13 @@ def new_control(encoding: str, base: str, options: Sequence[str]) -> Control:
 
 
 def give_threads(control: clingo.Control, *, two: bool) -> None:
-    """Let clasp search with two threads, which exchange what they learn, or with one."""
+    """Let clasp search with one thread, or with two that exchange what they learn."""
     configuration: Any = control.configuration.solve
     configuration.parallel_mode = "2,compete" if two else "1"
 
 
 def has_processors(speedups: Speedups) -> bool:
-    """Whether a search may have two threads."""
+    """Whether a search may use two threads: the speed-up is on, and there are two processors."""
     if not speedups.threads:
         return False
     from joblib import cpu_count  # loads slowly

@@ -11,23 +11,29 @@ from typing import Literal, TypeAlias
 
 from ssh_abduction.data.errors import SolverError, brief, is_finite
 
-# The search for minimal maps of prefixes ends when this share of the time limit is left. That
-# share is for finding any map of the whole trace, minimal or not.
+# The search for minimal maps of prefixes ends when this share of the time limit is left. It is
+# reserved for finding any map of the whole trace, minimal or not.
 RESERVE = 0.2
-# A search of the whole trace that has found no map ends when this share of the time limit is left.
-# That share is for making a map without a search.
+# If a search of the whole trace has found no map, it ends when this share of the time limit is
+# left. It is reserved for making a map without a search.
 LAST = 0.05
 # Seconds between two checks of the clock and of Ctrl-C while clingo is busy. A limit may be overrun
 # by a second, and a check takes far less than this.
 POLL = 0.05
-# Seconds between two reports of progress: as often as a person can read them.
+# Seconds between two reports of progress. A person cannot read them faster.
 TICK = 0.5
 
 Stop: TypeAlias = Literal["time limit", "memory limit", "interrupted", "maps limit", "no proof"]
 
 
 def check_limit(name: str, unit: str, limit: object) -> None:
-    """Raise SolverError if a limit of a caller is neither None nor a number above 0."""
+    """Raise SolverError if a limit is neither None nor a number above 0.
+
+    Args:
+        name: The name of the limit in the error message.
+        unit: Its unit in the error message.
+        limit: The limit.
+    """
     if (
         limit is not None
         and not (is_finite(limit) and limit > 0)
@@ -40,20 +46,21 @@ def check_limit(name: str, unit: str, limit: object) -> None:
 
 
 class LimitError(Exception):
-    """A search reached a limit or was interrupted. The incumbent is the answer."""
+    """A search reached a limit or was interrupted. Its best map so far is the answer."""
 
     def __init__(self, reason: Stop) -> None:
         self.reason = reason
 
 
 class StageTimeError(Exception):
-    """The time of a stage is over. The next stage begins."""
+    """The time of a stage of a search is over. The search goes on with its next stage."""
 
 
 class Watch:
-    """The limits of a search: `check` raises when one is reached.
+    """The clock and the limits of a search. `check` raises when a limit is reached.
 
-    Time that the caller of a stream spends between two maps does not count.
+    The clock counts only between `start` and `stop`. So the time that a caller spends with a map
+    does not count.
     """
 
     def __init__(
@@ -64,14 +71,15 @@ class Watch:
         *,
         beside: Watch | None = None,
     ) -> None:
-        """Set the limits. `start` begins to count time.
+        """Set the limits. The clock stands still until `start`.
 
         Args:
             limit: Seconds; None for no limit.
-            memory: MiB that the process may use; None for no limit.
-            on_tick: Called now and then, to report progress.
-            beside: The watch of the main search, if this is one beside it. The main search ends
-                this one. Its time limit only rejects work that would outlast it.
+            memory: MiB that the process may use at its peak; None for no limit.
+            on_tick: Called by `check` every TICK seconds, to report progress.
+            beside: The watch of a main search, if this one is for work that runs beside it; else
+                None. This watch then allows no uninterruptible work that would outlast the main
+                search.
         """
         self._beside = beside
         self._on_tick = on_tick
@@ -88,7 +96,7 @@ class Watch:
         self._started = time.perf_counter()
 
     def begin_anew(self) -> None:
-        """Restart the clock at 0, with the whole time limit."""
+        """Restart the clock at 0, without a reserve and without a limit for a stage."""
         self._spent, self._next_tick, self._stage_ends, self.interrupted = (
             0.0,
             TICK,
@@ -100,7 +108,7 @@ class Watch:
 
     @property
     def has_reserve(self) -> bool:
-        """Whether the last share of the time limit is still reserved for any map."""
+        """Whether the last part of the time limit is still reserved for finding any map."""
         return self._allowed is not None and self._allowed <= self.reserve_begins
 
     @property
@@ -108,10 +116,10 @@ class Watch:
         return self._started is not None
 
     def use_reserve(self, last: float = 0.0) -> None:
-        """Allow the search to use the whole time limit.
+        """Allow the search to use the reserved part of the time limit, too.
 
         Args:
-            last: A share of the limit to keep reserved, unless it is in use already.
+            last: The share of the limit that stays reserved; no effect if it is already in use.
         """
         if self._limit is not None and self._allowed is not None:
             self._allowed = max(self._allowed, self._limit * (1 - last))
@@ -121,33 +129,33 @@ class Watch:
 
     @property
     def reserve_begins(self) -> float:
-        """Seconds after which only the share for finding any map is left."""
+        """The seconds after which only the reserved part of the time limit is left."""
         return math.inf if self._limit is None else self._limit * (1 - RESERVE)
 
     def part(self, seconds: float) -> Watch:
-        """A watch that ends after this many seconds, or when this one does."""
+        """Start a new watch whose limit is this many seconds. Limits of this watch also end it."""
         part = Watch(seconds, self._memory, self.check)
         part.use_reserve()
         part.start()
         return part
 
     def shorten(self, seconds: float) -> None:
-        """Lower the time limit to this many seconds."""
+        """Lower the time limit to this many seconds since the start, without a reserve."""
         self._limit = self._allowed = seconds if self._limit is None else min(seconds, self._limit)
 
     def end_stage_after(self, seconds: float) -> None:
-        """Let `check` raise StageTimeError once, after this many seconds of search."""
+        """Let `check` raise StageTimeError once, when the clock shows this many seconds."""
         self._stage_ends = seconds
 
     def elapsed(self) -> float:
         return self._spent + (0 if self._started is None else time.perf_counter() - self._started)
 
     def check(self, ahead: float = 0.0, mebibytes: float = 0.0) -> None:
-        """Raise if a limit is reached, or coming work that cannot be interrupted would reach it.
+        """Raise if a limit is reached, or would be reached during the next work.
 
         Args:
-            ahead: Seconds that the work takes.
-            mebibytes: Memory that the work takes.
+            ahead: Seconds that the next work takes; it cannot be interrupted.
+            mebibytes: MiB of memory that the next work takes.
 
         Raises:
             LimitError: A limit is reached, or the search was interrupted.
@@ -167,33 +175,33 @@ class Watch:
             raise StageTimeError
 
     def allows(self, seconds: float) -> bool:
-        """Whether there is time for work of this length that cannot be interrupted."""
+        """Whether there is time for work that takes this many seconds and cannot be interrupted."""
         if self._allowed is not None and self.elapsed() + seconds > self._allowed:
             return False
         return not seconds or self._beside is None or self._beside.left() >= seconds
 
     def memory_left(self) -> float | None:
-        """MiB until the memory limit, for other processes to use; None for no limit."""
+        """The MiB that are left until the memory limit; None for no limit."""
         if self._memory is None:
             return self._beside.memory_left() if self._beside else None
         return self._memory - peak_memory()
 
     def left(self) -> float:
-        """Seconds until the time limit."""
+        """The seconds that are left until the time limit; infinity for no limit."""
         return math.inf if self._limit is None else self._limit - self.elapsed()
 
 
 def resident_memory() -> float:
-    """The memory that this process uses now, in MiB; its peak if the system lacks that number."""
+    """The memory in MiB that this process uses now; its peak if the system does not tell."""
     with suppress(OSError, StopIteration), open("/proc/self/status", "rb") as status:
         return next(int(line.split()[1]) for line in status if line.startswith(b"VmRSS:")) / 2**10
     return peak_memory()
 
 
 def peak_memory() -> float:
-    """The most memory that this process has used, in MiB.
+    """The largest memory in MiB that this process has used.
 
-    On Linux getrusage counts what the parent process used, so /proc is read there.
+    On Linux this reads /proc, as getrusage there also counts what the parent process used.
     """
     with suppress(OSError, StopIteration), open("/proc/self/status", "rb") as status:
         return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) / 2**10

@@ -1,8 +1,8 @@
-"""Checks whether a map keeps a user's own rules.
+"""Check whether a map satisfies a user's own rules.
 
-The checker does not know such rules. They are grounded with the content of the map as facts. If a
-rule reads only what a map shows, clingo chooses only what the rules themselves leave open. So the
-check takes hardly longer than grounding.
+The checker does not know such rules, but clingo does: it grounds them with the content of the map
+as facts. If the rules read only what a map shows, clingo has no choices except those in the rules
+themselves. So the check takes hardly longer than grounding.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.solver.asp.own import keeps_own_rules
@@ -31,7 +31,8 @@ from ssh_abduction.solver.asp.rules import read_by
 from ssh_abduction.theory.settle import Problem
 from ssh_abduction.theory.theory import Theory
 
-# What rules may read of a map and a trace, so that the map alone shows whether they hold.
+# The predicates that rules may read. SHOWN are those of a map, OF_TRACE those of a trace and its
+# theory.
 SHOWN = frozenset(
     {
         "is",
@@ -64,7 +65,10 @@ FRAME = """
 
 
 def can_be_asked(theory: Theory) -> bool:
-    """Whether a map alone shows if the rules of a settled theory hold."""
+    """Whether `keeps_own_rules` can check the rules of a theory.
+
+    It can if the rules read only what a map and a trace show. The theory must not have `auto`.
+    """
     if not theory.rules:
         return True
     settled = not theory.has_faults and (theory.level == "causal" or theory.path_order == "total")
@@ -74,11 +78,11 @@ def can_be_asked(theory: Theory) -> bool:
 
 
 def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
-    """Whether a map of a whole trace keeps the user's own rules. Ask `can_be_asked` first.
+    """Whether a map satisfies the user's own rules. First make sure that `can_be_asked` is true.
 
     Args:
-        problem: The trace and its settled theory.
-        ssh_map: A map of all steps that satisfies all other axioms.
+        problem: The trace, and its theory with the rules.
+        ssh_map: A map of all steps of the trace that satisfies all other axioms.
     """
     trace, theory = problem.trace, problem.theory
     if not theory.rules:
@@ -102,9 +106,9 @@ def keeps_own_rules(problem: Problem, ssh_map: SSHMap) -> bool:
 
 
 def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
-    """The atoms of the encodings for each step of this map.
+    """Yield the atoms that describe a map, as the readable encodings have them.
 
-    Dstates and places have the names of their first steps; paths are numbered from 1.
+    The name of a dstate or place is the number of the first step there. Paths are numbered from 1.
     """
     first: dict[int, int] = {}
     place: dict[int, int] = {}

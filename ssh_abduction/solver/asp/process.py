@@ -1,8 +1,7 @@
-"""Runs Python work in a process of its own, so that it can use a second processor.
+"""Run a Python function in a process of its own, so that it can use a second processor.
 
-Guesses and the search beside them are mostly Python. As two threads, both would take three times
-as long, as only one thread at a time runs Python. Only one thread at a time grounds
-(`asp/control.py`).
+Guesses run beside the main search. Both are mostly Python, and only one thread at a time runs
+Python or grounds (`asp/control.py`). So as two threads both would take three times as long.
 """
 
 from __future__ import annotations
@@ -27,12 +26,13 @@ _under_way: set[subprocess.Popen[bytes]] = set()
 
 
 def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) -> Result:
-    """Call `work` in another process, or in this one if there can be no other.
+    """Call `work` in another process, or in this one if no other process can be started.
 
     Args:
-        work: What to call; it, its arguments, its result and its errors can be pickled.
-        arguments: The first arguments.
-        watch: The last argument. Its limits end the other process.
+        work: The function to call. It, its arguments, its result and its errors can be pickled.
+        arguments: The first arguments of `work`.
+        watch: The limits, which end the other process. `work` gets a watch as its last argument.
+            In the other process, that watch only limits the memory.
 
     Returns:
         The result of `work`.
@@ -48,7 +48,7 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
             raise error
         return result
     if code < 0:
-        # A signal ended it, as when the system is short of memory.
+        # A signal ended the process. Most likely the system is short of memory.
         raise LimitError("memory limit")
     return work(*arguments, watch)
 
@@ -56,9 +56,9 @@ def in_process(work: Callable[..., Result], *arguments: object, watch: Watch) ->
 def _run(
     work: Callable[..., object], arguments: tuple[object, ...], watch: Watch
 ) -> tuple[int, bytes]:
-    """The exit code and the output of a child process that does this work.
+    """Start a child process that does the work, and return its exit code and its output.
 
-    If this process exits first, the child's stdin closes and the child exits.
+    If this process exits first, the stdin of the child closes, and then the child exits, too.
     """
     # A program that embeds Python cannot be run as Python.
     if "python" not in os.path.basename(sys.executable or "").lower():
@@ -90,13 +90,13 @@ def _run(
 
 
 def end_all() -> None:
-    """End all processes that this one waits for, before it ends itself."""
+    """Kill all processes that `in_process` waits for. Call this before this process exits."""
     for process in list(_under_way):
         process.kill()
 
 
 def serve() -> None:
-    """Do the work that comes in, and write its result or error to the output."""
+    """Run in the child: read the work from stdin, do it, and write its result or error."""
     # The parent process handles Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     work, arguments, memory = pickle.load(sys.stdin.buffer)
@@ -115,7 +115,7 @@ def serve() -> None:
 
 
 def _end_with_input() -> None:
-    """Exit when stdin closes: the parent process has exited."""
+    """Exit when stdin closes, as the parent process has exited then."""
     while os.read(0, 1):
         pass
     os._exit(1)

@@ -1,6 +1,6 @@
-"""Checks whether clingo can read a user's own rules, and would ever ground them.
+"""Check that clingo can read a user's own rules, and that it would ground them.
 
-The errors say how to write them.
+Errors say how to write the rules.
 
 >>> from ssh_abduction import Theory
 >>> from ssh_abduction.solver.asp.rules import check_rules
@@ -23,12 +23,12 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.rules import Rules
 from ssh_abduction.theory.theory import Theory
 
-# The predicates of a trace's facts, which come step by step.
+# The predicates of the facts of a trace, which are added step by step.
 OF_STEPS = {"view", "act", "kind", "turns", "open", "excluded", "elsewhere", "one"}
 READABLE = {"axiom", "path", "prefer", "defeasible"}  # the predicates of a theory's facts
 # The program parts that are grounded, with the number of their parameters.
 PARTS = {"base": 0, "step": 1, "check": 1}
-TEXT = "<string>"  # what clingo calls a text that is no file
+TEXT = "<string>"  # clingo's name for a text that is not in a file
 ALLOWED = {
     ast.ASTType.Rule,
     ast.ASTType.Program,
@@ -43,10 +43,10 @@ EXAMPLE = (
 
 
 def check_rules(theory: Theory) -> None:
-    """Check the rules of a settled theory.
+    """Check the user's own rules in a theory without `auto`.
 
     Raises:
-        TheoryError: Rules cannot be read, or would never be grounded.
+        TheoryError: Clingo cannot read some rules, or would never ground them.
     """
     for rules in theory.rules:
         others = tuple(other for other in theory.rules if other is not rules)
@@ -57,7 +57,13 @@ def check_rules(theory: Theory) -> None:
 
 @lru_cache(maxsize=64)
 def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> None:
-    """Check a file of rules. It may use what the others and these encodings define."""
+    """Check a file of rules. Raises TheoryError if a rule is not allowed.
+
+    Args:
+        rules: The file.
+        others: Other files of rules. The file may read the predicates that they define.
+        files: The names of the encodings. The file may read the predicates that they define.
+    """
     of_steps, known, numbers = _predicates(files)
     statements = _statements(rules)
     own = {
@@ -147,10 +153,10 @@ def _check(rules: Rules, others: tuple[Rules, ...], files: tuple[str, ...]) -> N
 
 
 def read_by(rules: Rules, every: Iterable[Rules]) -> frozenset[str]:
-    """The predicates that rules read and that none of these files defines.
+    """The names of the predicates that a file of rules reads but no file of rules defines.
 
     Args:
-        rules: The rules, which passed `check_rules`.
+        rules: The file, which passed `check_rules`.
         every: All files of rules.
     """
     own = {
@@ -170,10 +176,14 @@ def read_by(rules: Rules, every: Iterable[Rules]) -> frozenset[str]:
 
 
 def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
-    """The statements of rules, each with its program part and the parameter of the part.
+    """Parse a file of rules.
+
+    Returns:
+        Each statement, with the name of its program part and the parameter of that part ("" for
+        none).
 
     Raises:
-        TheoryError: Clingo cannot read the rules, or a part is never grounded.
+        TheoryError: Clingo cannot read the rules, or a program part is never grounded.
     """
     found: list[tuple[ast.AST, str, str]] = []
     messages: list[str] = []
@@ -198,12 +208,12 @@ def _statements(rules: Rules) -> list[tuple[ast.AST, str, str]]:
         ast.parse_string(rules.text, take, logger=lambda _, message: messages.append(message))
     except RuntimeError:
         raise TheoryError(_said(rules, messages)) from None
-    # The first one opens base.
+    # Leave out the first statement, which opens the part base.
     return [entry for entry in found[1:] if entry[0].ast_type is not ast.ASTType.Comment]
 
 
 def _said(rules: Rules, messages: list[str]) -> str:
-    """Clingo's messages about rules, on one line."""
+    """The message of an error: what clingo says about rules, and an example, on one line."""
     said = " ".join(messages[0].split()) if messages else "clingo cannot read them"
     said = re.sub(r"^<[^>]*>", lambda _: rules.name, said)
     said = said if said.startswith(rules.name) else f"{rules.name}: {said}"
@@ -211,9 +221,9 @@ def _said(rules: Rules, messages: list[str]) -> str:
 
 
 def _check_safety(*files: Rules) -> None:
-    """Let clingo look for unsafe variables, as it does before it grounds rules.
+    """Let clingo look for unsafe variables. Raises TheoryError if it finds one.
 
-    Nothing is grounded, as that may take long.
+    Clingo looks for them before it grounds a program. Ground nothing here, as that may take long.
     """
     messages: list[str] = []
     control = clingo.Control(logger=lambda _, message: messages.append(message))
@@ -231,11 +241,11 @@ def _check_safety(*files: Rules) -> None:
 def _predicates(
     files: tuple[str, ...],
 ) -> tuple[frozenset[str], frozenset[str], dict[str, frozenset[int]]]:
-    """The predicates of these encodings.
+    """The predicates of some encodings.
 
     Returns:
-        The predicates about steps, all predicates that the encodings define, and the possible
-        numbers of arguments of each that they define or read.
+        The names of the predicates about steps; the names of all predicates that the encodings
+        define; and for each predicate that they define or read, its possible numbers of arguments.
     """
     of_steps = set(OF_STEPS)
     defined, numbers = set[str](), dict[str, set[int]]()
@@ -255,7 +265,7 @@ def _predicates(
 
 
 def _heads(statement: ast.AST) -> Iterator[str]:
-    """The predicates that a rule derives, or lets clingo choose."""
+    """Yield the names of the predicates that a statement derives or lets clingo choose."""
     if statement.ast_type is ast.ASTType.Rule:
         yield from (atom.name for atom in _derived(statement.head))
     elif statement.ast_type is ast.ASTType.External:
@@ -263,7 +273,7 @@ def _heads(statement: ast.AST) -> Iterator[str]:
 
 
 def _violations(statement: ast.AST) -> Iterator[str]:
-    """The axioms of which a rule derives violations."""
+    """Yield the names of the axioms whose violations a rule derives."""
     for atom in _derived(statement.head):
         if (
             atom.name == "violation"
@@ -274,7 +284,7 @@ def _violations(statement: ast.AST) -> Iterator[str]:
 
 
 def _derived(head: ast.AST) -> Iterator[ast.AST]:
-    """The atoms of a head, without those of its conditions."""
+    """Yield the atoms that the head of a rule derives, without the atoms of its conditions."""
     if head.ast_type is ast.ASTType.ConditionalLiteral:
         yield from (atom for atom, _ in _atoms_in(head.literal))
     elif head.ast_type is ast.ASTType.Literal:
@@ -284,9 +294,9 @@ def _derived(head: ast.AST) -> Iterator[ast.AST]:
 
 
 def _atoms(statement: ast.AST) -> Iterator[tuple[ast.AST, bool]]:
-    """The atoms in a rule's body and in the conditions of its head.
+    """Yield the atoms that a rule reads: those in its body and in the conditions of its head.
 
-    Each comes with whether the rule reads that it holds.
+    Each atom comes with a flag that is False if `not` stands before the atom.
     """
     derived = list(_derived(statement.head))
     for literal in statement.body:
@@ -299,7 +309,7 @@ def _atoms(statement: ast.AST) -> Iterator[tuple[ast.AST, bool]]:
 
 
 def _atoms_in(node: ast.AST, positive: bool = True) -> Iterator[tuple[ast.AST, bool]]:
-    """All atoms below a node, and whether no `not` stands before them."""
+    """Yield all atoms in a syntax tree, each with a flag: False if `not` stands before it."""
     if node.ast_type is ast.ASTType.SymbolicAtom:
         term = node.symbol
         while term.ast_type is ast.ASTType.UnaryOperation:  # classical negation
@@ -323,7 +333,7 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _functions_of_python(node: ast.AST) -> Iterator[ast.AST]:
-    """All terms below a node that call Python functions."""
+    """Yield all terms in a syntax tree that call Python functions."""
     if node.ast_type is ast.ASTType.Function and node.external:
         yield node
     for child in _children(node):
@@ -335,7 +345,7 @@ def _counted(numbers: frozenset[int]) -> str:
 
 
 def _is_settled(term: ast.AST, parameter: str) -> bool:
-    """Whether a term has neither a variable nor the parameter of its program part."""
+    """Whether a term contains no variable and not the parameter of its program part."""
     if term.ast_type is ast.ASTType.Variable or str(term) == parameter:
         return False
     return all(_is_settled(child, parameter) for child in _children(term))

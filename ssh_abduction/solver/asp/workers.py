@@ -1,9 +1,9 @@
-"""Processes that do one piece of work after another.
+"""Run tasks in several processes. Each process does one task after another.
 
-Processes are started anew, not forked: a process forked while a thread grounds may hang. They exit
-when their stdin closes, which happens when the parent process exits. A process that is killed loses
-only its current piece of work. Their temporary files lie in one folder, which is deleted with
-them.
+The processes are started, not forked, as a process that is forked while a thread grounds may hang.
+When the parent process exits, the stdin of each process closes, and then the process exits, too. A
+process that is killed loses only its current task. All temporary files of the processes lie in one
+folder, which is deleted at the end.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from ssh_abduction.runtime.program import command, search_path
 
-# A process may take at most this many seconds to begin, on a machine that has much else to do.
+# A process may take this many seconds to start, even on a busy machine.
 STARTING = 10.0
 # Seconds between two checks whether to stop. Ctrl-C has to take effect within two seconds.
 POLL = 0.05
@@ -33,21 +33,24 @@ _BEGIN = b"\0ssh-abduction answers\n"  # whatever Python prints before this is n
 
 
 class Lost(NamedTuple):
-    """A piece of work without an answer: its process was killed, or did not answer in time."""
+    """Says that a task has no answer, as its process ended, or was killed because it was late.
+
+    `number` is the number of the task. `late` says whether it took too long.
+    """
 
     number: int
     late: bool
 
 
 class Worker:
-    """A process that does one piece of work at a time, until `end`.
+    """A process that does one task at a time, until `end` is called.
 
     Attributes:
-        deadline: When the process is killed if it has not answered, on the monotonic clock.
+        deadline: The time of the monotonic clock at which the process is late; None for no limit.
     """
 
     def __init__(self, folder: str) -> None:
-        """Begin a process, which makes its temporary files in this folder."""
+        """Start a process, which makes its temporary files in this folder."""
         self.deadline: float | None = None
         self._late = False
         self._process = subprocess.Popen(
@@ -74,13 +77,13 @@ class Worker:
         return self._process.poll() is None
 
     def done(self, number: int, work: Callable[..., Any], arguments: tuple[object, ...]) -> Any:
-        """What `work` returns; Lost if the process ends before.
+        """Let the process call `work`, and wait for what it returns; Lost if the process ends.
 
         Args:
-            number: Of the piece of work.
-            work: A function that can be pickled. Its last argument is called to ask whether to
-                stop.
-            arguments: Its other arguments.
+            number: The number of the task, for Lost.
+            work: A function that can be pickled. Its last argument is a function that returns
+                whether to stop early.
+            arguments: The other arguments of `work`.
         """
         self._send((work, arguments))
         output = self._process.stdout
@@ -103,11 +106,11 @@ class Worker:
         return Lost(number, self._late)
 
     def give_up(self) -> None:
-        """End the current work soon, and begin no other."""
+        """Ask the process to end its current task soon. It must get no further task."""
         self._send(None)
 
     def end_if_late(self) -> None:
-        """Kill the process if its answer is overdue."""
+        """Kill the process if its deadline is over."""
         if self.deadline is not None and time.monotonic() > self.deadline:
             self._late = True
             self.kill()
@@ -130,20 +133,21 @@ def answers(
     seconds: float | None,
     patience: float,
 ) -> Iterator[Any]:
-    """What `work` returns for each task, as soon as it is ready; Lost if there is no answer.
+    """Yield what `work` returns for each task, as soon as it is ready; Lost if it has no answer.
 
     Args:
-        work: As in `Worker.done`.
-        tasks: Arguments, of which the first is the number of the task.
-        processes: How many processes work at once.
-        stopped: Whether to end: no task begins any more, and those under way are given up.
-        seconds: How long a task may take until its process is killed; None for no limit.
-        patience: How many seconds a task may take once it is given up.
+        work: The function to call, as in `Worker.done`.
+        tasks: The arguments of `work` for each task. The first one is the number of the task.
+        processes: The number of processes that work at once.
+        stopped: Returns whether to end. Once it does, no task begins, and running tasks are asked
+            to end soon.
+        seconds: The time for a task. After it the process is killed. None for no limit.
+        patience: The seconds that a running task may take after it was asked to end.
     """
     waiting = queue.SimpleQueue[tuple[Any, ...]]()
     for task in tasks:
         waiting.put(task)
-    ready = queue.SimpleQueue[Any]()  # answers, and a None for each thread that ends
+    ready = queue.SimpleQueue[Any]()  # answers, and None for each thread that ends
     workers: list[Worker | None] = [None] * processes
     over = threading.Event()  # nobody waits for answers any more
     folder = tempfile.TemporaryDirectory(prefix="ssh-abduction-", ignore_cleanup_errors=True)
@@ -198,7 +202,7 @@ def answers(
 
 
 def _living(worker: Worker | None, folder: str) -> Worker:
-    """This process, or a new one if there is none or it has ended."""
+    """Return this worker if it is alive, else start a new one."""
     if worker is not None and worker.is_alive:
         return worker
     if worker is not None:
@@ -217,7 +221,7 @@ def _end(workers: Sequence[Worker], threads: Sequence[threading.Thread]) -> None
 
 
 class _Work:
-    """The pieces of work that a process is sent, and the folder for its temporary files."""
+    """The tasks that a worker process receives. When stdin closes, deletes the folder and exits."""
 
     def __init__(self, folder: str) -> None:
         self._folder = folder
@@ -248,7 +252,10 @@ _outputs: list[BinaryIO] = []  # the stream for answers, in a worker process
 
 
 def reply(answer: object) -> None:
-    """Send the answer of the current work. Another thread has to end the process then."""
+    """Send the answer of the current task to the parent process.
+
+    A task that calls this itself has to end the process afterwards.
+    """
     pickle.dump(answer, _outputs[0])
     _outputs[0].flush()
 
@@ -259,7 +266,7 @@ def serves() -> bool:
 
 
 def serve() -> None:
-    """Do the work that comes in, and send the answers, until the input ends."""
+    """Run in a worker process: do the tasks that stdin brings, and write the answers to stdout."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(
             number, signal.SIG_IGN

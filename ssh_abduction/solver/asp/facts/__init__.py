@@ -1,11 +1,11 @@
-"""Between Python and clingo: a trace becomes facts, and an answer set becomes a map.
+"""Turn a trace into facts for clingo, and an answer set of clingo into a map.
 
-No module outside this package knows the name of a predicate. Each family of encodings has a module
-here. Other packages import the functions for the readable encodings, which are listed below.
+Only this package knows the names of predicates. Each family of encodings has a module here. Other
+packages import the functions for the readable encodings (`encodings/*.lp`), which are listed below.
 
-In the fast encodings a step is an argument of a fact, so that one call grounds the rules for many
-steps. A program part for each step would take about thirty times as long. Only the readable
-encodings have such parts. They are mostly grounded for short prefixes.
+The fast encodings (`encodings/fast/*.lp`) have a step as an argument of a fact. So one call grounds
+the rules for many steps. The readable encodings have a program part for each step. To ground them
+takes about thirty times as long, but mostly they are grounded only for short prefixes of a trace.
 """
 
 from ssh_abduction.solver.asp.facts.answer_maps import read_map, read_steps

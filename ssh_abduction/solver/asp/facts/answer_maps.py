@@ -1,4 +1,4 @@
-"""Maps made of answer sets and of labels, whichever encoding gave them."""
+"""Make maps from answer sets of any encoding, and from labels (the dstate of each step)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,13 @@ from ssh_abduction.theory.theory import Theory
 
 
 def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
-    """The map that an answer set describes, for the steps in it."""
+    """Make the map that an answer set of the readable encodings describes.
+
+    Args:
+        model: The answer set. It may have only the first steps of the trace.
+        trace: The trace.
+        theory: The theory, without `auto`.
+    """
     is_at: dict[int, int] = {}
     place: dict[int, int] = {}
     course: dict[int, tuple[int, int]] = {}
@@ -52,9 +58,10 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
 
 
 def read_steps(model: Model) -> tuple[tuple[int, ...], tuple[int | None, ...]]:
-    """The dstate and the place of each step in an answer set, which may break axioms.
+    """Read the dstate and the place of each step from an answer set, which may break axioms.
 
-    In a causal theory no step has a place.
+    Returns:
+        The dstate of each step; and the place of each step, or None in a causal theory.
     """
     found: dict[str, dict[int, int]] = {"is": {}, "at": {}}
     for name, args in map(read_atom, model.symbols(shown=True)):
@@ -75,7 +82,19 @@ def _map(
     faults: Sequence[tuple[int, str]] = (),
     theory: Theory | None = None,
 ) -> SSHMap:
-    """The map of these steps. A dstate or place is named by the first step at it."""
+    """Make a map from the atoms of an answer. Steps name dstates and places: the first step there.
+
+    Args:
+        trace: The trace.
+        is_at: The dstate of each step.
+        place: The place of each step; empty for a causal map.
+        course: The path and the direction of each step that is along a path.
+        heading: The heading of each step, if places have frames or gateways.
+        before: Triples of a path and two places on it, the earlier one first.
+        excused: Pairs of paths that side_of_branch is not applied to.
+        faults: Steps and kinds of faults.
+        theory: The theory, for the costs of faults; None for a map without faults.
+    """
     views = views_of(is_at, trace, faults)
     names = sorted(set(is_at.values()))
     dstate_of = {name: i for i, name in enumerate(names)}
@@ -116,7 +135,7 @@ def _map(
 def views_of(
     labels: Mapping[int, int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
 ) -> dict[int, View | None]:
-    """The view of each dstate: the first view there that is known and not misread.
+    """The view of each dstate: the first view there that is known and not treated as wrong.
 
     Args:
         labels: The dstate of each step.
@@ -124,7 +143,7 @@ def views_of(
         faults: Steps and kinds of faults.
 
     Returns:
-        The views by dstate; None for a dstate without such a view.
+        For each dstate its view, or None if it has no such view.
     """
     misread = {t for t, kind in faults if kind == "misread"}
     views: dict[int, View | None] = dict.fromkeys(labels.values())
@@ -141,7 +160,15 @@ def faults_of(
     trace: Trace,
     theory: Theory,
 ) -> tuple[Fault, ...]:
-    """The faults in the form that maps use."""
+    """Make the faults of a map.
+
+    Args:
+        faults: Steps and kinds of faults.
+        labels: The dstate of each step.
+        views: The view of each dstate.
+        trace: The trace.
+        theory: The theory, for the costs of faults.
+    """
     found = []
     for t, kind in sorted(faults):
         cost = theory.fault_tenths(kind, trace.steps[t]) / 10
@@ -161,7 +188,12 @@ def faults_of(
 
 
 def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
-    """The causal map that these labels make. Dstates are numbered by first visit."""
+    """Make a causal map (without places) from labels. Dstates are numbered by first visit.
+
+    Args:
+        labels: The dstate of each step, under any number.
+        trace: The trace.
+    """
     number: dict[int, int] = {}
     first: list[int] = []
     for t, label in enumerate(labels):
@@ -178,7 +210,14 @@ def causal_map(labels: Sequence[int], trace: Trace) -> SSHMap:
 def faulty_map(
     labels: Sequence[int], trace: Trace, faults: Sequence[tuple[int, str]], theory: Theory
 ) -> SSHMap:
-    """The causal map that these labels make, with faults. Dstates are numbered by first visit."""
+    """Make a causal map with faults from labels. Dstates are numbered by first visit.
+
+    Args:
+        labels: The dstate of each step, under any number.
+        trace: The trace.
+        faults: Steps and kinds of faults.
+        theory: The theory, for the costs of faults.
+    """
     number: dict[int, int] = {}
     found = tuple(number.setdefault(label, len(number)) for label in labels)
     is_at = dict(enumerate(found))
@@ -195,7 +234,13 @@ def faulty_map(
 def links_of(
     labels: Sequence[int], trace: Trace, faults: Iterable[tuple[int, str]] = ()
 ) -> tuple[tuple[int, str, int], ...]:
-    """The distinct links that these labels make, sorted, without actions that slipped."""
+    """The distinct links (dstate, action, dstate) of labels, sorted.
+
+    Args:
+        labels: The dstate of each step.
+        trace: The trace.
+        faults: Steps and kinds of faults. An action that slipped makes no link.
+    """
     slipped = {t for t, kind in faults if kind == "slipped"}
     links = enumerate(zip(pairwise(labels), trace.actions, strict=False))
     return tuple(sorted({(s, action.name, x) for t, ((s, x), action) in links if t not in slipped}))
@@ -210,7 +255,13 @@ def view_at(trace: Trace, step: int) -> str | int:
 def _paths(
     count: int, dstates: Iterable[DState], before: Iterable[tuple[int, int, int]]
 ) -> tuple[MapPath, ...]:
-    """Paths with their places in order."""
+    """Make the paths of a map, each with its places in order.
+
+    Args:
+        count: The number of paths.
+        dstates: The dstates, with their places and paths.
+        before: Triples of a path and two places, the earlier one first.
+    """
     on: list[set[int]] = [set() for _ in range(count)]
     for s in dstates:
         if s.path is not None and s.place is not None:
@@ -225,7 +276,12 @@ def _paths(
 
 
 def in_order(places: Iterable[int], before: Iterable[tuple[int, int]]) -> list[int]:
-    """The places sorted by the strict order `before`: by the number of places before each."""
+    """Sort places by how many places come before each.
+
+    Args:
+        places: The places.
+        before: All pairs of places, the earlier one first. It is a strict order.
+    """
     behind = dict.fromkeys(places, 0)
     for _, q in before:
         behind[q] += 1

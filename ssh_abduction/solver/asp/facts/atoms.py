@@ -1,4 +1,4 @@
-"""Numbers, constants and atoms as clingo has them."""
+"""Turn numbers, constants and atoms from Python to clingo, and back."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ def constant(value: str | int) -> str:
 
 @lru_cache(maxsize=2**14)
 def read_atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
-    """The name and the arguments of an atom of a map.
+    """The name of an atom and its arguments as numbers; pos is 1 and neg is -1.
 
-    Results are cached, as maps share most atoms and each part takes a call to clingo.
+    Results are cached: answers share most atoms, and each part of an atom takes a call to clingo.
     """
     return symbol.name, tuple(
         arg.number if arg.type is SymbolType.Number else COURSE[arg.name]
@@ -25,9 +25,9 @@ def read_atom(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
     )
 
 
-_number = cache(Number)  # takes half the time of making a number anew
+_number = cache(Number)  # takes half the time of making a new number
 
 
 def numbers(*arguments: int) -> list[Symbol]:
-    """Numbers as the arguments of a program part, or of an atom."""
+    """Numbers as clingo's symbols, for the arguments of a program part or of an atom."""
     return [_number(argument) for argument in arguments]

@@ -1,4 +1,8 @@
-"""Conclusions of `derivation.lp`, for explanations: how to ask for them, and how to read them."""
+"""Ask for and read the conclusions of `derivation.lp`, from which explanations are made.
+
+A conclusion is a statement about steps, such as that two steps are one dstate. The axioms imply it
+if it holds in all maps.
+"""
 
 from __future__ import annotations
 
@@ -10,37 +14,37 @@ from ssh_abduction.solver.asp.facts.atoms import numbers
 
 
 def active(axiom: str, t: int) -> Symbol:
-    """The atom of an explanation that makes an axiom hold at step t."""
+    """The atom that says that an axiom must hold at step t (explain.lp)."""
     return Function("active", [Function(axiom), *numbers(t)])
 
 
 def told_of(steps: Iterable[int]) -> str:
-    """The steps that conclusions are about (derivation.lp), as facts."""
+    """The facts that name the steps that conclusions may be about."""
     return " ".join(f"told_of({t})." for t in sorted(set(steps)))
 
 
 def conclusion(name: str, *steps: int) -> Symbol:
-    """A conclusion of derivation.lp."""
+    """The atom of a conclusion, such as `one_dstate`, about some steps."""
     return Function("so", [Function(name, numbers(*steps))])
 
 
 def read_conclusion(symbol: Symbol) -> tuple[str, tuple[int, ...]]:
-    """The name of a conclusion, and its steps."""
+    """The name and the steps of a conclusion, from its atom."""
     said = symbol.arguments[0]
     return said.name, tuple(argument.number for argument in said.arguments)
 
 
 def conclusions_of(control: Control) -> list[Symbol]:
-    """All conclusions that an answer may have."""
+    """The atoms of all conclusions that are possible in a ground control."""
     return [atom.symbol for atom in control.symbolic_atoms.by_signature("so", 1)]
 
 
 def read_argument(model: Model) -> tuple[frozenset[Symbol], frozenset[Symbol], frozenset[Symbol]]:
-    """Read an answer of an explanation.
+    """Read an answer in which axioms may be broken.
 
     Returns:
-        The conclusions that hold, the `active` atoms of the broken axioms, and the atoms of
-        steps that are one dstate.
+        Three sets of atoms: the conclusions that hold; `active(N,T)` for each axiom N that is
+        broken at step T; and `same(I,T)` for each pair of steps at one dstate.
     """
     conclusions, broken, one = set[Symbol](), set[Symbol](), set[Symbol]()
     for symbol in model.symbols(atoms=True):
@@ -54,17 +58,17 @@ def read_argument(model: Model) -> tuple[frozenset[Symbol], frozenset[Symbol], f
 
 
 def picked(symbol: Symbol) -> Symbol:
-    """The external atom that picks a conclusion; some picked one is to fail."""
+    """The external atom that picks a conclusion. At least one picked conclusion is to fail."""
     return Function("picked", [symbol])
 
 
 def some_fail() -> Symbol:
-    """The atom that some picked conclusion does not hold."""
+    """The atom that says that some picked conclusion does not hold."""
     return Function("some_fail")
 
 
 def may_fail(conclusions: Iterable[Symbol]) -> str:
-    """The rules that let these conclusions fail."""
+    """The rules that define `some_fail` and `picked` for some conclusions."""
     return "\n".join(
         f"#external {picked(c)}. {some_fail()} :- {picked(c)}, not {c}. "
         f"#heuristic {c} : {picked(c)}. [1,false]"

@@ -1,4 +1,9 @@
-"""Facts for `fast/faulty.lp`, where views may be misread and actions may slip, and its answers."""
+"""Write facts for `fast/faulty.lp`, and read its answers.
+
+In that encoding views may be misread and actions may slip. It has several names (numbers of
+possible dstates) for each view. The last name of a view is its *rest*: one name for all dstates of
+the view that have no name of their own.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +18,10 @@ from ssh_abduction.theory.evidence import Equality, Pairs
 
 
 def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
-    """The name and view of each dstate.
+    """Yield all names, each with its view. The last one of each view is its rest.
 
     Args:
-        names: The number of names of each view, besides its rest.
+        names: For each view, the number of its names without the rest.
     """
     first = 0
     for view, count in names.items():
@@ -25,19 +30,19 @@ def faulty_names(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
 
 
 def faulty_rests(names: Mapping[int, int]) -> Iterator[tuple[int, int]]:
-    """The rest of each view, and the view."""
+    """Yield the rest of each view, with the view. `names` is as for `faulty_names`."""
     named = dict(names)
     last = {view: name for name, view in faulty_names(named)}
     return ((name, view) for view, name in last.items())
 
 
 def at_most_faults(most: int) -> str:
-    """A rule for faulty.lp: the steps given so far have at most this many faults."""
+    """The rule that the steps given so far have at most this many faults."""
     return f":- #count {{ T,misread : misreads(T); T,slipped : slips(T) }} > {most}."
 
 
 def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
-    """Rules for faulty.lp: at most this many dstates, and faults of at most this cost."""
+    """The rules that limit the number of dstates, and the cost of faults in tenths of a dstate."""
     faults = (
         "W,T,misread : misreads(T), price(misread,T,W); W,T,slipped : slips(T), price(slipped,T,W)"
     )
@@ -48,12 +53,12 @@ def dstates_and_faults_up_to(dstates: int, tenths: int) -> str:
 
 
 def faulty_base(actions: Iterable[int], names: Mapping[int, int], kinds: Iterable[str]) -> str:
-    """The names, the actions and the allowed kinds of faults, as facts for faulty.lp.
+    """The facts for the names, the actions and the allowed kinds of faults.
 
     Args:
         actions: The actions as numbers.
-        names: The number of names of each view, besides its rest.
-        kinds: The kinds of faults that are allowed.
+        names: For each view, the number of its names without the rest.
+        kinds: The kinds of faults that are allowed: "misread", "slipped".
     """
     found = [f"action({action})." for action in sorted(set(actions))]
     found += [f"allowed({kind})." for kind in kinds]
@@ -75,17 +80,17 @@ def faulty_batch(
     price: Mapping[str, Sequence[int]],
     full: Collection[int] = (),
 ) -> str:
-    """These steps of a trace as a batch of facts for faulty.lp.
+    """The facts for a batch: some further steps of a trace.
 
     Args:
         batch: The number of the batch.
         seen: The view of each step of the trace, as a number.
         actions: The action after each step, as a number.
-        steps: The new steps, in the order in which they are given.
-        known: The steps given before, in their order.
+        steps: The steps of this batch, in the order in which they are given.
+        known: The steps of earlier batches, in their order.
         pairs: Evidence about pairs of steps.
-        price: Tenths of dstates for each kind of fault, at each step.
-        full: The steps that may be at any dstate, even if misread.
+        price: For each kind of fault, its cost at each step, in tenths of a dstate.
+        full: Steps for which an answer says at which dstate they are, even if they are misread.
     """
     given = {*known, *steps}
     new = set(steps)
@@ -114,7 +119,7 @@ def faulty_batch(
 
 
 def not_all_one(equalities: Collection[Equality]) -> str:
-    """A rule for faulty.lp: these equalities of given steps do not all hold."""
+    """The rule that some equalities of steps do not all hold. All of the steps must be given."""
     body = (f"is({e.first},S{k}), is({e.second},S{k})" for k, e in enumerate(equalities))
     return f":- {', '.join(body)}."
 
@@ -123,8 +128,8 @@ def read_faulty(model: Model) -> tuple[dict[int, int], frozenset[int], frozenset
     """Read an answer of faulty.lp.
 
     Returns:
-        The dstate of each step that the program holds; the steps whose action slipped; and the
-        steps whose dstate is not known.
+        A dict from steps to the names of their dstates; the steps whose action slipped; and the
+        misread steps whose dstate is left open.
     """
     where: dict[int, int] = {}
     steps: dict[str, set[int]] = {"slips": set(), "lost": set()}

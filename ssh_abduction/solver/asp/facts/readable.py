@@ -1,4 +1,7 @@
-"""Facts for the readable encodings (`encodings/*.lp`): a theory, and the steps of a trace."""
+"""Write a theory and the steps of a trace as facts for the readable encodings (`encodings/*.lp`).
+
+Facts and rules are text in the language of clingo.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +21,17 @@ from ssh_abduction.theory.theory import Theory
 
 
 def encoding_names(theory: Theory) -> tuple[str, ...]:
-    """The encodings that a theory needs, in the order to load them."""
+    """The names of the encodings that a theory needs, in the order to load them."""
     return (*encodings.needed_by(vars(theory)), "preference", "show")
 
 
 def theory_facts(theory: Theory, paths: int) -> str:
-    """The axioms and the preference of a theory, and names for paths, as facts."""
+    """The facts for a theory: its axioms, its preference, and names for paths.
+
+    Args:
+        theory: The theory, without `auto`.
+        paths: The number of names for paths.
+    """
     facts = [f"axiom({name})." for name in theory.axioms]
     facts += [f"path(1..{paths})."] if theory.level == "topological" else []
     facts += preferred(theory)
@@ -33,7 +41,7 @@ def theory_facts(theory: Theory, paths: int) -> str:
 
 
 def preferred(theory: Theory) -> list[str]:
-    """The counts that a theory minimises, the first one at the highest level."""
+    """The facts for the counts that a theory minimises: the first one has the highest level."""
     return [
         f"prefer({count},{len(theory.priorities) - i})."
         for i, count in enumerate(theory.priorities)
@@ -41,19 +49,25 @@ def preferred(theory: Theory) -> list[str]:
 
 
 def own_rules(theory: Theory) -> str:
-    """The user's own rules. Their axioms hold like those of the encodings."""
+    """The text of all of the user's own rules. Their axioms hold like those of the encodings."""
     return "\n".join(rules.text for rules in theory.rules)
 
 
 def run_by_steps() -> Symbol:
-    """The external atom that allows answers: parts of steps are grounded."""
+    """The external atom that allows answers. It says that the parts of all steps are grounded."""
     return Function("run_by_steps")
 
 
 def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
-    """The most paths of a map of the first steps.
+    """The greatest number of paths that a map of the first steps can have.
 
-    A path begins at the start, or where a turn right or left ends.
+    A path can begin only at the first step, and where a turn right or left (or an action that
+    slipped) ends.
+
+    Args:
+        trace: The trace.
+        theory: The theory. If it lacks some axioms, there may be a path for each step.
+        steps: The number of first steps.
     """
     if TRAVELS_AND_TURNS & theory.given_up:
         return steps
@@ -63,7 +77,7 @@ def most_paths(trace: Trace, theory: Theory, steps: int) -> int:
 
 
 def trace_facts(problem: Problem, start: int, stop: int) -> str:
-    """Steps `start` to `stop - 1`, and the links to them, as facts."""
+    """The facts for steps `start` to `stop - 1`, and for the actions that lead to these steps."""
     trace, theory = problem.trace, problem.theory
     facts = []
     for t in range(start, stop):
@@ -101,7 +115,7 @@ def trace_facts(problem: Problem, start: int, stop: int) -> str:
 
 
 def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
-    """The gateways that these steps see, and how they fit earlier ones, for gateways.lp."""
+    """Yield facts for gateways.lp: what steps see, and how that fits what earlier steps see."""
     found = frames.Frames(trace, stop)
     known = len(frames.Frames(trace, start).frames)
     yield from (f"star({t},{found.stars[t]})." for t in range(start, stop))
@@ -145,7 +159,7 @@ def _gateway_facts(trace: Trace, start: int, stop: int) -> Iterator[str]:
 
 
 def _evidence_facts(problem: Problem, start: int, stop: int) -> Iterator[str]:
-    """Evidence about these steps, and about their pairs with earlier steps."""
+    """Yield facts for the evidence about steps, and about their pairs with earlier steps."""
     trace, theory = problem.trace, problem.theory
     for evidence in problem.evidence:
         pairs = evidence.pairs(trace)
@@ -160,7 +174,7 @@ def _evidence_facts(problem: Problem, start: int, stop: int) -> Iterator[str]:
 
 
 def program(problem: Problem) -> str:
-    """A trace and its settled theory as the facts that `encodings/run.py` solves."""
+    """The text of a file that `encodings/run.py` solves: the facts of a trace and its theory."""
     trace, theory = problem.trace, problem.theory
     files = " ".join(f"{name}.lp" for name in encoding_names(theory))
     return "\n".join(
@@ -177,7 +191,7 @@ def program(problem: Problem) -> str:
 
 
 def query(t: int) -> Symbol:
-    """The external atom that makes t the last step."""
+    """The external atom that says that step t is the last step."""
     return Function("query", numbers(t))
 
 
