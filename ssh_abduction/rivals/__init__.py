@@ -1,4 +1,4 @@
-"""Compare the minimal maps of a trace, and find the next experiment that distinguishes them."""
+"""Compare rivals (minimal maps of one trace), and find an experiment that distinguishes them."""
 
 from ssh_abduction import lazy_names
 

@@ -13,10 +13,11 @@ the paths of steps 18–22 differ
 >>> print(found.deciding[0])
 steps 17–18 and 21 are at the place of step 14
 
-Maps are distinguished by questions (`rivals/questions.py`). Some of these decide
-(`rivals/factors.py`): the answers to all others follow from them. They are asked in the order of
-causes: faults, dstates, places, paths, directions. Questions that do not depend on each other
-belong to different choices, and each combination of options of the choices is a map.
+Questions distinguish maps, for example: are steps 3 and 7 one dstate? (`rivals/questions.py`). A
+few questions decide: their answers fix the answers to all others (`rivals/factors.py`). Deciding
+questions are asked in the order of causes: faults, dstates, places, paths, directions. A choice is
+a set of deciding questions that depend on each other. Its options are the ways to answer them. Each
+combination of one option per choice is a map.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class Option:
     """One way to answer the questions of a choice.
 
     Attributes:
-        answers: The answers, in the order of the questions.
+        answers: The answers, in the order of the questions of the choice.
         maps: The numbers of the maps with these answers, counted from 1.
     """
 
@@ -59,7 +60,7 @@ class Option:
     maps: tuple[int, ...] = field(repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `compare --json` prints it."""
+        """Return the option as plain data, as `compare --json` prints it."""
         return {"answers": list(self.answers), "count": len(self.maps), "maps": list(self.maps)}
 
 
@@ -68,9 +69,10 @@ class Choice:
     """Questions that depend on each other, but on no question of another choice.
 
     Attributes:
-        questions: The deciding questions, as in `Comparison.deciding`.
-        options: The ways to answer them, that of map 1 first.
-        differing: For each sort the steps that depend only on this choice.
+        questions: Some of the questions in `Comparison.deciding`.
+        options: The ways in which maps answer these questions, the way of map 1 first.
+        differing: For each sort (faults, dstates, places, paths, courses) the steps whose group
+            depends only on this choice.
     """
 
     questions: tuple[Question, ...]
@@ -78,7 +80,7 @@ class Choice:
     differing: dict[Matter, tuple[int, ...]] = field(hash=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `compare --json` prints it."""
+        """Return the choice as plain data, as `compare --json` prints it."""
         return {
             "questions": [question.to_dict() for question in self.questions],
             "options": [option.to_dict() for option in self.options],
@@ -88,15 +90,16 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Others:
-    """How the maps compare with those of another list.
+    """A comparison of one list of maps with another list. Maps are numbered from 1.
 
     Attributes:
         count: The number of maps in the other list.
-        both: The maps in both lists, up to renaming: their numbers here and there, from 1.
-        here: The numbers of the maps that are only here.
-        there: The numbers of the maps that are only there.
-        best: What differs between the first map here and the first map there.
-        source: Where the other list is from.
+        both: The maps that both lists have, up to renaming: pairs of the number in this list and
+            the number in the other list.
+        here: The numbers of the maps that only this list has.
+        there: The numbers of the maps that only the other list has.
+        best: The difference between the first maps of both lists.
+        source: The name of the other list, for messages.
     """
 
     count: int
@@ -108,7 +111,7 @@ class Others:
 
     @property
     def sentence(self) -> str:
-        """How many maps are in both lists."""
+        """A sentence: the number of maps in both lists, and in only one of them."""
         if not self.here and not self.there:
             return (
                 f"the {self.count} maps are the same in both"
@@ -123,7 +126,7 @@ class Others:
         return "of the maps, " + ", ".join(told[:-1]) + " and " + told[-1]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `compare --json` prints it."""
+        """Return the comparison as plain data, as `compare --json` prints it."""
         return {
             "count": self.count,
             "sentence": self.sentence,
@@ -136,26 +139,29 @@ class Others:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What maps of one trace share, and where they differ.
+    """The result of `compare`: what maps of one trace share, and where they differ.
+
+    A sort is one of faults, dstates, places, paths and courses.
 
     Attributes:
         ids: The ids of the maps.
         steps: The number of steps of the trace.
-        minimal: The number of maps, from the first one on, that are proven minimal; None if
+        minimal: The number of maps at the start of the list that are proven minimal; None if
             unknown.
         complete: Whether these are all minimal maps; None if unknown.
-        stopped: Why listing ended, if it was not complete and the reason is known.
-        shared: What all minimal maps share. If `shared.proven` is False, only listed maps count.
+        stopped: Why listing ended early; None if it was complete or the reason is unknown.
+        shared: What all minimal maps share. If `shared.proven` is False, this is known only of the
+            listed maps.
         listed: What the listed maps share.
-        variants: For each sort the number of different labelings, placings, … in the listed maps.
-        choices: The independent choices that make the listed maps: each combination of their
-            options is a map.
-        together: For each sort the steps that depend on several choices together.
+        variants: For each sort, the number of different ways in which the listed maps group steps.
+        choices: The independent choices. Each combination of their options is one listed map.
+        together: For each sort, the steps whose group depends on several choices together.
         deciding: Questions that distinguish all listed maps, in the order in which to ask them. The
             first ones distinguish all labelings. None is superfluous, but a smaller set may exist.
-        sizes: For each triple of numbers of dstates, places and paths, how many maps have it.
-        fits: The least and the greatest chi-square, if maps have fits.
-        others: How the maps compare with another list.
+        sizes: Pairs of a size (numbers of dstates, places and paths) and the number of maps with
+            this size.
+        fits: The least and the greatest chi-square; None if the maps have no fits.
+        others: The comparison with another list; None if there is no other list.
     """
 
     ids: tuple[str, ...] = field(repr=False)
@@ -216,7 +222,7 @@ class Comparison:
 
     @property
     def unlisted(self) -> dict[Matter, tuple[int, ...]]:
-        """For each sort the steps in which listed maps agree, but other minimal maps differ."""
+        """For each sort, the steps in which listed maps agree but other minimal maps differ."""
         found: dict[Matter, tuple[int, ...]] = {}
         for sort, shared in self.shared.sorts.items():
             shown = self.listed.sorts.get(sort)
@@ -226,7 +232,7 @@ class Comparison:
         return found
 
     def to_dict(self) -> dict[str, Any]:
-        """As `compare --json` prints it (docs/reference/formats.md)."""
+        """Return plain data, as `compare --json` prints it (docs/reference/formats.md)."""
         data: dict[str, Any] = {
             "summary": self.sentence,
             "count": len(self.ids),
@@ -259,12 +265,15 @@ class Comparison:
 def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     """Compare maps of one trace: what they share, where they differ, and which steps decide.
 
-    If a solution does not list all minimal maps, its backbone says what all of them share. To find
-    the backbone may take as long as the search was allowed to.
+    If a solution does not list all minimal maps, its backbone (what all minimal maps share) is
+    used. It may take as long to find as the time limit of the search.
 
     Args:
         maps: A Solution, a Listing (`Listing.load` reads a file), or maps of one trace.
-        other: Maps of the same trace to compare them with.
+        other: Other maps of the same trace, for `Comparison.others`; None for no such comparison.
+
+    Returns:
+        The comparison of `maps` with each other, and with `other`.
 
     Raises:
         MapError: There are no maps, or they are maps of several traces.
@@ -274,7 +283,7 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
     if listing_there:
         listing.check_same_trace(listing_there)
     table = Table(listing.maps)
-    # the backbone says more than the listed maps only if the list is not complete
+    # the backbone has more information than the listed maps only if the list is not complete
     listed = replace(table.shared(), proven=listing.complete is True)
     shared = listing.backbone if listing.backbone and listing.complete is False else listed
     _check_backbone(shared, listed, listing)
@@ -312,7 +321,17 @@ def compare(maps: Maps, other: Maps | None = None) -> Comparison:
 def _depending(
     asked: Sequence[Asked], options: Sequence[NDArray[np.intp]], table: Table
 ) -> tuple[list[dict[Matter, tuple[int, ...]]], dict[Matter, tuple[int, ...]]]:
-    """The steps that depend only on each choice, and the steps that depend on several."""
+    """Find the steps that depend on one choice alone, and those that depend on several.
+
+    Args:
+        asked: All questions, with the answers of the maps.
+        options: For each choice, the option of each map.
+        table: The maps as arrays.
+
+    Returns:
+        For each choice, the steps of each sort that depend on it alone, and the steps of each sort
+        that depend on several choices.
+    """
     of_choice: list[dict[Matter, set[int]]] = [{} for _ in options]
     together: dict[Matter, set[int]] = {}
     sizes = [np.bincount(option) for option in options]
@@ -345,7 +364,7 @@ def _choice(
 
 
 def _variants(table: Table, maps: Sequence[SSHMap]) -> dict[Matter, int]:
-    """The numbers of different labelings, placings, …"""
+    """For each sort, count the different ways in which maps group steps."""
     faults: dict[Matter, int] = (
         {"faults": len({m.faults for m in maps})} if any(m.faults for m in maps) else {}
     )
@@ -399,13 +418,13 @@ def _contradiction(told: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[i
     """Find two steps about which the backbone is wrong.
 
     Args:
-        told: The backbone: steps that are one dstate in all maps, or in some.
-        seen: The same for the listed maps.
-        in_one: A number for each step. Steps with the same number are skipped.
+        told: The backbone for one sort: the steps that are one in all maps, or in some.
+        seen: The same, for the listed maps only.
+        in_one: A number for each step. Pairs of steps with the same number are skipped.
 
     Returns:
-        Two steps that the backbone calls one in all maps although they differ in a listed one, or
-        one in no map although they are one in a listed one; None if there are none.
+        Two steps that are one in all maps by the backbone, but differ in a listed map; or that are
+        one in no map by the backbone, but one in a listed map. None if there are no such steps.
     """
     first_of: dict[int, int] = {}
     for t, number in enumerate(told.always):

@@ -1,14 +1,17 @@
-"""What a map predicts for an action: its known end, or what the axioms or a path imply for it.
+"""Predict with a map where an action leads, and what is seen there.
 
-The axioms, or the order of a path, may imply the end of an action that was never tried in a dstate:
+If the action was tried at a dstate, its link is known. Otherwise the axioms, or the order of a
+path, may still tell where the action leads:
 
-- a turn, if places have frames: it leads to the slot that many quarters on (turn_rotates). Its
-dstate
-  is known (one_dstate_per_heading), or at least its star, which is that of the place, turned;
-- a turn around along a path: it leads back along the path (turn_around_reverses), and at most one
-  dstate is there (one_dstate_per_course);
-- a travel along a path: it leads to the next place in the order of the path. This is only expected,
-  as the order of a map is one of several, and there may be an unseen place between.
+- A turn, if places have frames (numbered directions): it leads to the slot that lies one, two or
+  three quarters on (axiom turn_rotates). If the map has a dstate there, it is the only one
+  (one_dstate_per_heading). If not, the star there is still known: the star of the place, turned.
+- A turn around at a dstate along a path: it leads back along the path (turn_around_reverses), and
+  at most one dstate is there (one_dstate_per_course).
+- A travel along a path: it leads to the next place in the order of the path. This is only expected,
+  because the order of a map is one of several, and an unseen place may lie between.
+
+A star is all openings or gateways that are seen at a step.
 """
 
 from __future__ import annotations
@@ -31,13 +34,13 @@ _OF_COURSES = frozenset({"turn_around_reverses", "one_dstate_per_course"})
 
 @dataclass(frozen=True, slots=True)
 class Consequence:
-    """What a map predicts for an action in a dstate.
+    """The prediction of a map for an action at a dstate.
 
     Attributes:
-        how: link if the action was tried; implied if the axioms imply the end; expected if the
-            order of a path suggests it; open if nothing is known.
-        dstate: Where the action leads; None if unknown.
-        seen: What is seen there, as far as it is known.
+        how: "link" if the action was tried; "implied" if the axioms imply where it leads;
+            "expected" if the order of a path suggests it; "open" if nothing is known.
+        dstate: The dstate that the action leads to; None if unknown.
+        seen: The view and star there, as far as they are known; None if nothing is known.
     """
 
     how: How
@@ -46,11 +49,11 @@ class Consequence:
 
     @property
     def is_sure(self) -> bool:
-        """Whether any other outcome refutes the map."""
+        """Whether any other outcome of the action refutes the map."""
         return self.how in ("link", "implied")
 
     def clashes(self, other: Consequence) -> bool:
-        """Whether each outcome refutes one of the two maps."""
+        """Tell whether any outcome refutes this map or the map of the other prediction."""
         if not (self.is_sure and other.is_sure and self.seen and other.seen):
             return False
         one, two = self.seen, other.seen
@@ -60,7 +63,7 @@ class Consequence:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `next --json` prints it."""
+        """Return the prediction as plain data, as `next --json` prints it."""
         return {"how": self.how, "dstate": self.dstate} | (
             self.seen.to_dict() if self.seen else {"view": None}
         )
@@ -70,13 +73,13 @@ OPEN = Consequence("open")
 
 
 class Consequences:
-    """What one map predicts for actions.
+    """The predictions of one map.
 
     Args:
         ssh_map: The map.
-        links: For each dstate the actions that were tried there, and where they lead.
-        looks: What each dstate looks like.
-        theory: The theory, whose axioms may imply ends; None if all axioms hold.
+        links: For each dstate, a dict from each action tried there to the dstate it leads to.
+        looks: The view and star of each dstate.
+        theory: The theory, whose axioms may imply where actions lead; None to use all axioms.
     """
 
     def __init__(
@@ -105,7 +108,7 @@ class Consequences:
         self._orders = {path.id: path.order for path in ssh_map.paths}
 
     def of(self, dstate: int, action: Action) -> Consequence:
-        """What the map predicts for an action in a dstate."""
+        """Predict where an action leads from a dstate, and what is seen there."""
         there = self._links[dstate].get(action.name)
         if there is not None:
             return self._to(there, "link")
@@ -117,7 +120,14 @@ class Consequences:
         return OPEN
 
     def sure_ends(self, actions: Sequence[Action]) -> tuple[tuple[int, str, int], ...]:
-        """Untried actions with implied ends, as triples of dstate, action and end."""
+        """List the untried actions whose ends the axioms imply.
+
+        Args:
+            actions: The actions of the robot.
+
+        Returns:
+            Triples of a dstate, the name of an action, and the dstate that the action leads to.
+        """
         turns = [action for action in actions if action.kind == "turn"]
         if not (self._framed or (self._turns_back and self._at)):
             return ()
@@ -164,7 +174,7 @@ class Consequences:
 
 
 def _is_four(seen: Seen) -> bool:
-    """Whether a star is read as four openings."""
+    """Tell whether a star is given as four openings: ahead, right, back and left."""
     return (
         seen.star is not None
         and len(seen.star) == 4
@@ -173,9 +183,9 @@ def _is_four(seen: Seen) -> bool:
 
 
 def is_possible(action: Action, seen: Seen) -> bool:
-    """Whether the star allows an action.
+    """Tell whether the star that is seen allows an action. Without a star, any action is allowed.
 
-    A travel needs a gateway ahead, and a turn to a gateway needs that gateway.
+    A travel needs an opening ahead. A turn to a numbered gateway needs that gateway.
     """
     if seen.star is None:
         return True

@@ -1,4 +1,4 @@
-"""What differs between two maps of one trace.
+"""Find what differs between two maps of one trace.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
@@ -6,9 +6,10 @@
 >>> print(found)
 dstates: the first map groups steps 0–1 | 2; the other one groups steps 0 | 1–2
 
-The steps of one dstate in a map may be at several dstates in the other map. Dstates of both maps
-that share steps are connected. Each connected part that differs is one `Change`; all else is the
-same in both maps. Places, paths and courses are compared in the same way.
+The steps of one dstate in a map may be at several dstates in the other map. Dstates of the two maps
+that share a step are connected. If the two maps group the steps of a connected part differently,
+the part is one `Change`. The other parts are the same in both maps. Places, paths and courses are
+compared in the same way.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ SORTED_BY = {
     "paths": "paths",
     "courses": "directions along paths",
 }
-# At most this many changes of a sort, and links, are put into words.
+# At most this many changes of one sort, and at most this many links, are put into words.
 TOLD = 12
 
 
@@ -43,11 +44,11 @@ class Change:
     """Steps that two maps group differently, by dstate, place, path or course.
 
     Attributes:
-        sort: What they are grouped by.
-        first: The groups of the first map, by their first steps.
-        other: The groups of the other map.
-        first_none: Steps that are at no place, or along no path, in the first map.
-        other_none: The same for the other map.
+        sort: What the steps are grouped by: "dstates", "places", "paths" or "courses".
+        first: The groups of steps in the first map, sorted by first step.
+        other: The groups of the same steps in the other map.
+        first_none: The steps that are at no place, or along no path, in the first map.
+        other_none: The steps that are at no place, or along no path, in the other map.
     """
 
     sort: Sort
@@ -57,12 +58,12 @@ class Change:
     other_none: Steps = ()
 
     def told(self, names: tuple[str, str]) -> str:
-        """The change in words, with these names for the two maps."""
+        """Put the change into words, with these names for the two maps."""
         sides = ((self.first, self.first_none), (self.other, self.other_none))
         return "; ".join(f"{name} {_told(*side)}" for name, side in zip(names, sides, strict=True))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `compare --diff --json` prints it."""
+        """Return the change as plain data, as `compare --diff --json` prints it."""
         data: dict[str, Any] = {
             "sort": self.sort,
             "first": [list(g) for g in self.first],
@@ -75,18 +76,20 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """What differs between two maps of one trace.
+    """The difference between two maps of one trace.
+
+    Each pair has a value for the first map and a value for the other map.
 
     Attributes:
         ids: The ids of both maps.
         names: The names of both maps in words.
-        sizes: For both maps the numbers of dstates, places, paths and links.
-        changes: Steps that are grouped differently.
-        links: For both maps the links that only it has, among dstates that are the same in both. A
-            dstate is named by its first step.
-        faults: For both maps the faults that only it has.
-        chi2: The chi-square of both maps, if both have a fit.
-        has_places: For both maps whether it has places.
+        sizes: For each map, the numbers of dstates, places, paths and links.
+        changes: The steps that the maps group differently.
+        links: For each map, the links that the other map lacks, between dstates that have the same
+            steps in both maps. A dstate is named by its first step.
+        faults: For each map, the faults that the other map lacks.
+        chi2: The chi-square of each map; None if one of them has no fit.
+        has_places: For each map, whether it has places.
     """
 
     ids: tuple[str, str]
@@ -105,7 +108,7 @@ class Difference:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The difference in words, cause first."""
+        """The difference in words, line by line; causes come before effects."""
         told = []
         counts = zip(("dstates", "places", "paths", "links"), *self.sizes, strict=True)
         if unequal := [f"{a} {name} against {b}" for name, a, b in counts if a != b]:
@@ -137,7 +140,7 @@ class Difference:
         return "\n".join(self.lines) or "the maps are the same"
 
     def to_dict(self) -> dict[str, Any]:
-        """As `compare --diff --json` prints it (docs/reference/formats.md)."""
+        """Return plain data, as `compare --diff --json` prints it (docs/reference/formats.md)."""
         sizes = [
             dict(zip(("dstates", "places", "paths", "links"), size, strict=True))
             for size in self.sizes
@@ -168,7 +171,10 @@ def difference(
     Args:
         first: A map.
         other: Another map.
-        names: The names of the maps in words.
+        names: What to call the two maps in words.
+
+    Returns:
+        The difference. Its `same` is True if the maps are the same up to renaming.
 
     Raises:
         MapError: The maps have different numbers of steps.
@@ -228,7 +234,7 @@ def difference(
 
 
 def _changes(table: Table, sort: Sort) -> Iterable[Change]:
-    """The classes of steps that two maps group differently, by their first steps."""
+    """Yield the changes of one sort between the two maps of a table, sorted by first step."""
     ones = table.ones[sort]
     linked: nx.Graph[int] = nx.Graph()
     linked.add_nodes_from(range(ones.shape[1]))
@@ -253,7 +259,7 @@ def _groups(classes: Sequence[int], ones: Sequence[int]) -> list[list[int]]:
 
 
 def _named_links(ssh_map: SSHMap) -> set[Link]:
-    """The links, each dstate named by its first step."""
+    """Return the links of a map. Each dstate is named by its first step."""
     first: dict[int, int] = {}
     for t, label in enumerate(ssh_map.labels):
         first.setdefault(label, t)
@@ -263,7 +269,7 @@ def _named_links(ssh_map: SSHMap) -> set[Link]:
 
 
 def _unmoved(first: SSHMap, other: SSHMap) -> set[int]:
-    """The first steps of the dstates that have the same steps in both maps."""
+    """Find the dstates that have the same steps in both maps, each named by its first step."""
     sets: list[set[Steps]] = []
     for ssh_map in (first, other):
         steps: dict[int, list[int]] = {}
@@ -278,7 +284,7 @@ def _size(ssh_map: SSHMap) -> tuple[int, int, int, int]:
 
 
 def _told(groups: Sequence[Steps], none: Steps) -> str:
-    """How one map treats the steps: groups steps 0–1 | 2 and leaves out step 5."""
+    """Put into words how one map groups steps: "groups steps 0–1 | 2 and leaves out step 5"."""
     grouped = f"groups {_steps(sum(map(len, groups)))} {' | '.join(map(stretches, groups))}"
     left = f"leaves out {_steps(len(none))} {stretches(none)}"
     return " and ".join(([grouped] if groups else []) + ([left] if none else []))

@@ -1,4 +1,4 @@
-"""Experiments that distinguish rival maps, as values."""
+"""Experiments that distinguish rival maps (minimal maps of one trace), as plain values."""
 
 from __future__ import annotations
 
@@ -14,26 +14,31 @@ from ssh_abduction.solver import Stop, stretches
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """What some rivals, by number from 1, expect of an untried action."""
+    """The prediction of some rivals for an untried action.
+
+    Attributes:
+        rivals: The rivals with this prediction, numbered from 1.
+        says: The prediction.
+    """
 
     rivals: tuple[int, ...]
     says: Consequence
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `next --json` prints it."""
+        """Return the prediction as plain data, as `next --json` prints it."""
         return {"rivals": list(self.rivals), **self.says.to_dict()}
 
 
 @dataclass(frozen=True, slots=True)
 class Untried:
-    """An action that not all rivals have tried, and the way to it.
+    """An action for which at least one rival has no link, and the way to it.
 
     Attributes:
-        way: Actions along links that all rivals know.
-        action: The action after them.
-        expects: What the rivals expect of it.
-        worst: The greatest number of rivals that it may leave; it surely refutes the others.
-        pairs: The number of pairs of rivals that expect something different.
+        way: The actions that lead there, along links that all rivals have.
+        action: The untried action, to be done after these.
+        expects: The different predictions of the rivals.
+        worst: The number of rivals that are left in the worst case. All others are refuted.
+        pairs: The number of pairs of rivals with different predictions.
     """
 
     way: tuple[str, ...]
@@ -43,7 +48,7 @@ class Untried:
     pairs: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `next --json` prints it."""
+        """Return the action as plain data, as `next --json` prints it."""
         expects = [expectation.to_dict() for expectation in self.expects]
         return {
             "way": list(self.way),
@@ -56,28 +61,33 @@ class Untried:
 
 @dataclass(frozen=True, slots=True)
 class Branch:
-    """The rest of a plan after an observation."""
+    """The rest of a plan after an observation.
+
+    Attributes:
+        seen: The observation.
+        plan: The plan for the rivals that predict this observation.
+    """
 
     seen: Seen
     plan: Plan
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `next --json` prints it."""
+        """Return the branch as plain data, as `next --json` prints it."""
         return {"seen": self.seen.to_dict(), **self.plan.to_dict()}
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """An experiment as a tree: actions, and the next plan for each view after the last.
+    """An experiment as a tree: actions, and a further plan for each observation after them.
 
     Attributes:
-        rivals: The rivals that are left, by number from 1.
-        actions: Actions along links that all of these know; empty if known links do not
-            distinguish them.
+        rivals: The rivals that are left, numbered from 1.
+        actions: Actions along links that all these rivals have. Empty if no such links distinguish
+            the rivals.
         branches: For each predicted observation after the last action, the plan for the rivals that
-            are left.
-        untried: The most informative untried action, if no known link distinguishes the rivals or
-            one rival is left; None if there is none.
+            are then left.
+        untried: The most informative untried action. Only at the ends of the tree, where one rival
+            is left or known links do not distinguish the rivals. None if there is no such action.
     """
 
     rivals: tuple[int, ...]
@@ -87,24 +97,24 @@ class Plan:
 
     @property
     def worst(self) -> int:
-        """The number of rivals that are left in the worst case."""
+        """The number of rivals that the whole plan leaves in the worst case."""
         return max((branch.plan.worst for branch in self.branches), default=len(self.rivals))
 
     @property
     def longest(self) -> int:
-        """The greatest number of actions."""
+        """The greatest number of actions along any branch of the plan, without untried actions."""
         return len(self.actions) + max((branch.plan.longest for branch in self.branches), default=0)
 
     @property
     def leaves(self) -> Iterator[Plan]:
-        """The ends of the plan."""
+        """The plans without branches at the ends of the tree, one after the other."""
         if not self.branches:
             yield self
         for branch in self.branches:
             yield from branch.plan.leaves
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `next --json` prints it."""
+        """Return the plan as plain data, as `next --json` prints it."""
         told: dict[str, Any] = {"rivals": list(self.rivals)}
         if self.branches:
             told |= {
@@ -116,28 +126,34 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """What some rivals, by number from 1, predict after each action of the experiment."""
+    """The predictions of some rivals for the actions of an experiment.
+
+    Attributes:
+        rivals: The rivals with these predictions, numbered from 1.
+        seen: The predicted observation after each action.
+    """
 
     rivals: tuple[int, ...]
     seen: tuple[Seen, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `next --json` prints it."""
+        """Return the predictions as plain data, as `next --json` prints it."""
         return {"rivals": list(self.rivals), "seen": [seen.to_dict() for seen in self.seen]}
 
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """What to do next to find out which of some rival maps is true.
+    """A plan of actions to find out which of some rival maps is true. Rivals have numbers from 1.
 
     Attributes:
         count: The number of rivals.
-        alike: The rivals, by number from 1, in groups that predict the same along all their links.
-        predictions: What they predict after each of `plan.actions`, up to the first difference.
+        alike: Groups of rivals. All rivals of a group predict the same along all their links.
+        predictions: The different predictions of the rivals after each of `plan.actions`.
         plan: The experiment as a tree.
         sharing: What all rivals share: "dstates and places", "dstates", or "".
-        complete: Whether these are all minimal maps.
-        stopped: The limit that ended the search, if one did; then there may be a better plan.
+        complete: Whether the rivals are all minimal maps.
+        stopped: The limit that ended the search; None if it ended by itself. After a limit there
+            may be a better plan.
     """
 
     count: int
@@ -150,9 +166,10 @@ class Experiment:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The actions up to the first difference in predictions.
+        """The actions to do next, up to the first difference in predictions.
 
-        If no known link distinguishes the rivals, the way to the untried action, then the action.
+        If no known links distinguish the rivals, these are the way to the untried action, and then
+        that action. Empty if there is nothing to do.
         """
         untried = self.plan.untried
         return self.plan.actions or ((*untried.way, untried.action) if untried else ())
@@ -166,7 +183,8 @@ class Experiment:
     def is_settled(self) -> bool:
         """Whether there is nothing left to try.
 
-        No known link distinguishes rivals, and the robot cannot reach an untried action.
+        This is so if no known links distinguish the rivals, the robot cannot reach any untried
+        action, and no limit ended the search.
         """
         return not self.actions and self.stopped is None
 
@@ -177,7 +195,7 @@ class Experiment:
 
     @property
     def warning(self) -> str | None:
-        """A warning if there may be more maps, or if a limit ended the search."""
+        """A warning if there may be more maps, or if a limit ended the search; otherwise None."""
         told = []
         if not self.complete:
             known = (
@@ -194,7 +212,7 @@ class Experiment:
         return "; ".join(told) or None
 
     def to_dict(self) -> dict[str, Any]:
-        """As `ssh-abduction next --json` prints it (docs/reference/formats.md)."""
+        """Return plain data, as `next --json` prints it (docs/reference/formats.md)."""
         return {
             "count": self.count,
             "complete": self.complete,
@@ -252,5 +270,5 @@ def _acts(actions: Sequence[str]) -> str:
 
 
 def told_rivals(rivals: Sequence[int]) -> str:
-    """Numbers of rivals in words: map 1, or maps 1–3 and 7."""
+    """Put the numbers of rivals into words: "map 1", or "maps 1–3 and 7"."""
     return f"{'map' if len(rivals) == 1 else 'maps'} {stretches(rivals)}"

@@ -11,32 +11,34 @@
 
 Kuipers & Beeson (2002): "it may be necessary to search actively for the relevant experience, using
 homing sequences (Rivest & Schapire 1989) or the rehearsal procedure (Kuipers & Byun 1991)". Here
-each rival knows where the robot is: at the dstate of the last step. So the task is to find a
-distinguishing sequence of machines with known first states, not a homing sequence.
+each rival says where the robot is: at the dstate of the last step. So the first states of all
+machines are known, and the task is to find a distinguishing sequence, not a homing sequence.
 
 Known links
 -----------
-Each map predicts what is seen along the links that it knows. With `implied` it also predicts along
-links that the axioms imply: if places have frames, four right turns lead back
-(`rivals/consequences.py`). A sequence of actions is followed while all rivals that are left know
-each link. Once their predictions differ, the observation leaves some of them.
+Each map predicts what is seen along its links. With `implied` it also predicts along links that the
+axioms imply: if places have frames, four right turns lead back (`rivals/consequences.py`). A
+sequence of actions is followed while all rivals that are left have each link. Once their
+predictions differ, the observation refutes some of them.
 
-*Two rivals.* The two maps move from joint state to joint state. Breadth-first search finds the
-fewest actions after which the predictions differ, or proves that they never do.
+*Two rivals.* The robot is at one dstate in each map. The two dstates are a joint state. A
+breadth-first search over joint states finds the fewest actions after which the predictions differ,
+or proves that they never differ.
 
-*Many rivals.* The experiment that leaves the fewest rivals in the worst case is PSPACE-complete
-(Lee & Yannakakis 1994, "Testing finite-state machines: state identification and verification"). The
-plan is greedy: it takes the sequence up to a first difference that gains most per action. Leaving
-at worst m of n rivals gains log(n / m). Then it plans for each part. So it may leave more than the
-best plan.
+*Many rivals.* Finding the experiment that leaves the fewest rivals in the worst case is
+PSPACE-complete (Lee & Yannakakis 1994, "Testing finite-state machines: state identification and
+verification"). So the plan is greedy. Each sequence of actions up to a first difference has a gain:
+log(n / m) if it leaves m of n rivals in the worst case. The plan takes the sequence with the
+greatest gain per action. Then it plans for the rivals that are left after each observation. So it
+may leave more rivals than the best plan.
 
 Untried actions
 ---------------
-Rivals that known links do not distinguish see the same forever along the links that all of them
-know, for example rivals that differ only in paths. An action that some of them have not tried may
-distinguish them: if two rivals are sure of different outcomes, one is refuted. The most informative
-action leaves the fewest rivals in the worst case. Ties go to the action for which most pairs of
-rivals expect different outcomes, then to the nearest.
+Some rivals predict the same along all links that they have in common, for example rivals that
+differ only in paths. An action that some of them have not tried may distinguish them: if two rivals
+are sure of different outcomes, one is refuted. The most informative action leaves the fewest rivals
+in the worst case. Ties go to the action for which most pairs of rivals expect different outcomes,
+then to the nearest action.
 """
 
 from __future__ import annotations
@@ -95,19 +97,23 @@ def next_experiment(
     """Find the actions after which rival maps predict different observations.
 
     Args:
-        maps: Maps of one trace. A Solution also says its theory, and whether it is complete.
-        trace: The trace of the maps. If given, its stars are predicted beside views, and it says
-            the kinds of actions.
-        theory: The theory of the maps. It says how stars are read and which axioms imply the ends
-            of untried actions. If None, stars are read unless some map has a dstate with two.
+        maps: Maps of one trace. A Solution also gives `theory` and `complete`.
+        trace: The trace of the maps. If given, stars (the openings or gateways seen) are predicted
+            in addition to views, and the kinds of actions are read from it.
+        theory: The theory of the maps. It sets how stars are compared, and which axioms imply where
+            untried actions lead. If None, stars are used unless a map has a dstate with two stars.
         complete: Whether these are all minimal maps.
-        actions: Actions that the robot can do, beside those that some map has a link for.
-        can: Names of the actions that the robot can do when it sees this; if None, any action that
-            the star allows.
-        implied: Whether the experiment may follow links that no rival has but the axioms imply.
-        time_limit: Seconds. When a limit ends the search, the answer is the plan so far.
-        memory_limit: MiB that the process may use.
-        watch: Limits of a caller that may interrupt, instead of these two.
+        actions: Actions that the robot can do, in addition to those that some map has a link for.
+        can: A function from what the robot sees to the names of the actions that it can do there.
+            If None, the robot can do any action that the star allows.
+        implied: Whether the experiment may use links that no rival has but that the axioms imply.
+        time_limit: Seconds; None for no limit. At a limit the answer is the plan so far.
+        memory_limit: MiB that the process may use; None for no limit.
+        watch: Limits to use instead of `time_limit` and `memory_limit`. The caller can interrupt
+            the search with it.
+
+    Returns:
+        The experiment.
 
     Raises:
         MapError: The maps are not maps of one trace, or not of this trace.
@@ -152,9 +158,11 @@ def next_experiment(
 
 
 class Laboratory:
-    """Makes the plan for some rivals.
+    """The search for a plan that distinguishes some rivals.
 
-    Rivals with equal machines are one group; machines are numbered in the order of the groups.
+    A machine is a map as seen from the current dstate (`rivals/machines.py`). Rivals with equal
+    machines are one group. Machines have the numbers of their groups, from 0. Parameters as in
+    `next_experiment`.
     """
 
     def __init__(
@@ -206,16 +214,23 @@ class Laboratory:
 
     @property
     def alike(self) -> tuple[tuple[int, ...], ...]:
-        """The groups of rivals with equal machines, by number from 1."""
+        """The groups of rivals with equal machines. Rivals are numbered from 1."""
         return tuple(_numbers(group) for group in self._groups)
 
     def plan(self) -> Plan:
-        """The whole plan, found greedily."""
+        """Find the whole plan, greedily."""
         everything = list(range(len(self._groups)))
         return self._plan_for(everything, (0,) * len(everything))
 
     def predictions(self, actions: Sequence[str]) -> tuple[Prediction, ...]:
-        """What the rivals predict after each of these actions; they know all links."""
+        """List the predictions of the rivals after each of these actions.
+
+        Args:
+            actions: Names of actions. All rivals must have the links for them.
+
+        Returns:
+            A prediction for each group of rivals that predict the same; empty without actions.
+        """
         names = [action.name for action in self._actions]
         found: dict[tuple[int, ...], list[int]] = {}
         for machine, group in enumerate(self._groups):
@@ -235,7 +250,7 @@ class Laboratory:
         )
 
     def _plan_for(self, machines: Sequence[int], start: Row) -> Plan:
-        """The plan for some machines, each in a state."""
+        """Find the plan for some machines, each in the state that `start` has for it."""
         rivals = _numbers(i for m in machines for i in self._groups[m])
         try:
             split = self._split(machines, start) if len(machines) > 1 else None
@@ -256,13 +271,14 @@ class Laboratory:
     def _split(
         self, machines: Sequence[int], start: Row
     ) -> tuple[list[int], dict[int, tuple[list[int], list[int]]]] | None:
-        """The sequence of actions up to a difference that gains most per action.
+        """Find the sequence of actions up to a difference with the greatest gain per action.
 
-        Leaving at worst m of n rivals gains log(n / m).
+        The gain is log(n / m) if m of n rivals are left in the worst case.
 
         Returns:
-            The actions, and for each observation after them the machines that predict it (as
-            indices of `machines`) with their states; None if known links do not distinguish them.
+            The actions, and a dict from each observation after them to the machines that predict it
+            (as indices of `machines`) and their states. None if no known links distinguish the
+            machines.
         """
         weights = np.array([len(self._groups[m]) for m in machines])
         total, least = int(weights.sum()), int(weights.max())
@@ -292,7 +308,10 @@ class Laboratory:
         return [*walk.way(best[1]), best[2]], parts
 
     def _untried(self, machines: Sequence[int], start: Row) -> Untried | None:
-        """The most informative action that some have not tried, along links that all know."""
+        """Find the most informative action that at least one of the machines has no link for.
+
+        The way to the action uses links that all machines have. None if there is no such action.
+        """
         walk = Walk(self._table, machines, start, self._watch)
         best: tuple[tuple[int, int], int, int, dict[Consequence, list[int]]] | None = None
         for layer in walk.layers():
@@ -321,9 +340,11 @@ class Laboratory:
     def _say(
         self, machines: Sequence[int], states: Sequence[int], action: int
     ) -> dict[Consequence, list[int]] | None:
-        """What rivals expect of an action at a joint state.
+        """Find what rivals predict for an action at a joint state (a state of each machine).
 
-        None if the action is impossible there, or if all rivals are sure of the same outcome.
+        Returns:
+            A dict from each prediction to the rivals that make it. None if the action is impossible
+            there, or if all rivals are sure of the same outcome.
         """
         here = int(self._table.sights[machines[0], states[0]])
         done = self._actions[action]
@@ -352,10 +373,10 @@ class Laboratory:
 
 
 def _informs(said: dict[Consequence, list[int]]) -> tuple[int, int]:
-    """A sort key of untried actions: the most informative has the least.
+    """Compute a sort key of untried actions. The most informative action has the least key.
 
-    It is the number of rivals left in the worst case, and minus the number of pairs of rivals that
-    expect something different.
+    The key is the number of rivals left in the worst case, and then minus the number of pairs of
+    rivals that expect different outcomes.
     """
     counts = {consequence: len(group) for consequence, group in said.items()}
     total = sum(counts.values())
@@ -368,14 +389,14 @@ def _informs(said: dict[Consequence, list[int]]) -> tuple[int, int]:
 
 
 def _numbers(rivals: Iterable[int]) -> tuple[int, ...]:
-    """Rivals by number from 1."""
+    """Convert indices of rivals, from 0, to sorted numbers, from 1."""
     return tuple(sorted(i + 1 for i in rivals))
 
 
 def _to_known_views(
     links: Mapping[int, Mapping[str, int]], ssh_map: SSHMap
 ) -> dict[int, dict[str, int]]:
-    """The links to dstates with known views. No map predicts what is seen at the others."""
+    """Keep the links to dstates with known views, as a map predicts nothing about the others."""
     return {
         s: {action: x for action, x in tried.items() if ssh_map.dstates[x].view is not None}
         for s, tried in links.items()
@@ -383,7 +404,7 @@ def _to_known_views(
 
 
 def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
-    """Raise MapError unless these are maps of one trace, and of this one."""
+    """Raise MapError unless these are maps of one trace, and of `trace` if it is given."""
     if not maps:
         raise MapError(
             "maps: expected at least one to seek an experiment for, got none; "
@@ -430,7 +451,7 @@ def _check(maps: Sequence[SSHMap], trace: Trace | None) -> None:
 
 
 def _sharing(maps: Sequence[SSHMap]) -> str:
-    """What all maps share: dstates, or dstates and places, or nothing."""
+    """Tell what all maps share: "dstates and places", "dstates", or "" for neither."""
     if len({(ssh_map.labels, ssh_map.links) for ssh_map in maps}) > 1:
         return ""
     places = {tuple(s.place for s in ssh_map.dstates) for ssh_map in maps}

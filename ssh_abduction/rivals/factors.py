@@ -1,17 +1,20 @@
-"""Which questions decide between maps, and which of them are independent of each other.
+"""Find questions that decide between maps, and divide them into independent choices.
 
-A question is a column of truth values, one for each map. Some questions *decide* if no two maps
-give the same answers to all of them. They are chosen greedily: the next one splits most pairs of
-maps not distinguished yet, and ties go to the earliest. Then superfluous ones are dropped. A
-smaller set may exist: to find the smallest is NP-hard (minimum test set, Garey & Johnson 1979,
-SP6).
+A question is a column of truth values: the answer of each map. A set of questions *decides* if no
+two maps give the same answers to all of them. Questions are chosen greedily: the next one
+distinguishes the most pairs of maps that are not distinguished yet, and ties go to the earliest.
+Then superfluous questions are dropped. A smaller set may exist, but to find the smallest one is
+NP-hard (minimum test set, Garey & Johnson 1979, SP6).
 
-A *choice* is a set of questions, and its *options* are the different answers to them. Choices are
-*independent* if each combination of their options is a map, so that the product of the numbers of
-options is the number of maps. There is one finest division into independent choices. It is found by
-merging: a minimal set of dependent choices lies within one choice of that division (if two
-independent choices shared it, its parts would be independent, and so the whole). So the members of
-such a set are merged until all choices are independent.
+A *choice* is a set of questions, and its *options* are the different answers that maps give to
+them. Choices are *independent* if each combination of their options is a map. Then the number of
+maps is the product of the numbers of options. There is exactly one finest division of questions
+into independent choices.
+
+The finest division is found by merging. Start with small choices. If they are not all independent,
+find a minimal set of dependent choices, merge its members, and repeat. The merged members belong to
+one choice of the finest division. Otherwise two independent choices would split the set into two
+parts. Each part is independent, as the set is minimal, so the whole set would be independent.
 
 >>> import numpy as np
 >>> rows = np.array([[0, 0, 0], [0, 1, 1], [1, 0, 0], [1, 1, 1]], dtype=bool)
@@ -37,17 +40,17 @@ def deciding(columns: Sequence[Bools] | Bools, maps: int, tiers: Sequence[int] =
     """Choose questions that distinguish all maps that can be distinguished.
 
     Args:
-        columns: For each question the answers of the maps. Earlier questions win ties.
+        columns: For each question, the answers of all maps. Earlier questions win ties.
         maps: The number of maps.
-        tiers: The tier of each question. Questions of a higher tier are asked only once those of
-            lower tiers split nothing more. One tier by default.
+        tiers: The tier of each question. A question is chosen only if no question of a lower tier
+            distinguishes any more maps. By default all questions have one tier.
 
     Returns:
         The indices of the questions, in the order of choice. None is superfluous.
     """
     groups = np.zeros(maps, dtype=np.intp)
-    # The split of a question only shrinks as others are chosen. So it is counted again only when it
-    # is at the top of the heap.
+    # A question distinguishes ever fewer new pairs as others are chosen. So its pairs are counted
+    # again only when it is at the top of the heap.
     waiting = [
         (tier, -_split(column, groups), i)
         for i, (column, tier) in enumerate(zip(columns, tiers or [0] * len(columns), strict=True))
@@ -75,7 +78,7 @@ def independent(columns: Sequence[Bools] | Bools) -> list[list[int]]:
     """Divide questions into the finest independent choices.
 
     Args:
-        columns: For each question the answers of the maps. Equal maps count once.
+        columns: For each question, the answers of all maps. Maps with equal answers count once.
 
     Returns:
         The choices as lists of indices, in the order of their first questions.
@@ -95,14 +98,15 @@ def independent(columns: Sequence[Bools] | Bools) -> list[list[int]]:
 
 
 def options_of(columns: Sequence[Bools] | Bools, maps: int) -> NDArray[np.intp]:
-    """Number the answers of each map to some questions.
+    """Number the options: the different combinations of answers to some questions.
 
     Args:
-        columns: For each question the answers of the maps.
+        columns: For each question, the answers of all maps.
         maps: The number of maps.
 
     Returns:
-        A number for each map, from 0 in the order of the maps. Equal numbers mean equal answers.
+        The option of each map, shape (maps,). Options are numbered from 0 in the order of the maps.
+        Maps with the same answers have the same option.
     """
     if not len(columns):
         return np.zeros(maps, dtype=np.intp)
@@ -114,17 +118,17 @@ def options_of(columns: Sequence[Bools] | Bools, maps: int) -> NDArray[np.intp]:
 
 
 def _split(column: Bools, groups: NDArray[np.intp]) -> int:
-    """The number of pairs of maps in one group that give different answers."""
+    """Count the pairs of maps of the same group that give different answers."""
     sizes = np.bincount(groups)
     yes = np.bincount(groups, weights=column).astype(np.int64)
     return int((yes * (sizes - yes)).sum())
 
 
 def _linked(table: Bools) -> list[list[int]]:
-    """Group questions that are pairwise dependent, directly or through others.
+    """Group questions that depend on each other, directly or through others.
 
-    Two questions depend on each other if their joint answers are not as frequent as the product of
-    the frequencies of each.
+    Two questions are independent if the share of maps that answer yes to both is the product of the
+    shares that answer yes to each.
     """
     counts = table.astype(np.int64)
     yes, maps = counts.sum(axis=1), table.shape[1]
@@ -143,7 +147,7 @@ def _linked(table: Bools) -> list[list[int]]:
 
 
 def _dependent(options: Sequence[NDArray[np.intp]]) -> set[int] | None:
-    """A minimal set of dependent choices; None if all are independent."""
+    """Find a minimal set of dependent choices, as indices; None if all are independent."""
 
     def are_independent(which: Sequence[int]) -> bool:
         together = np.unique(np.stack([options[k] for k in which]), axis=1).shape[1] if which else 1

@@ -1,4 +1,8 @@
-"""Shortest walks through required moves and stances."""
+"""Find shortest walks that make required moves and visit required stances.
+
+A stance is a place and a heading where the robot may stand. A move is an action that leads from one
+stance to another.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +18,30 @@ from scipy.sparse import coo_array
 from ssh_abduction.rivals.stances import Move
 
 T = TypeVar("T")
-# Seconds for a flow. If they are over, the robot goes to the nearest untried move.
+# Seconds for the search for one flow. If it takes longer, the robot goes to the nearest untried
+# move instead.
 PATIENCE = 2.0
-# The greatest number of flows to seek. Later plans do what is cut off in the last one.
+# The greatest number of flows to seek. Later plans visit the parts that the last flow cuts off.
 ROUNDS = 8
 
 
 def shortest_walk(
     moves: Sequence[Move], start: int, due: set[int], unseen: set[int]
 ) -> tuple[str, ...]:
-    """The shortest walk that makes these moves and visits these stances, up to an unknown move.
+    """Find the shortest walk that makes required moves and visits required stances.
 
-    Empty if there is no such walk, or if none is found in time. The order of the moves is Fleury's:
-    of the moves that do not cut off the rest, one with an unknown end goes first: it says most.
+    The order of the moves is found by Fleury's algorithm: each move must not cut off the rest of
+    the walk. Among such moves, one with an unknown end comes first, as it is most informative.
+
+    Args:
+        moves: All moves.
+        start: The number of the stance where the robot is.
+        due: Indices of the moves that the walk has to make.
+        unseen: Numbers of the stances that the walk has to visit.
+
+    Returns:
+        The names of the actions up to the first move with an unknown end. Empty if there is no such
+        walk, or if none is found in time.
     """
     times = shortest_flow(moves, start, due, unseen)
     if times is None:
@@ -66,18 +81,19 @@ def shortest_flow(
     """Count how often the shortest walk makes each move.
 
     A walk is a flow on the graph of moves: each stance is entered as often as it is left, except
-    for the first and the last one. `milp` of scipy finds a flow of least cost. If a part of it is
-    not connected to the start, a constraint forbids that and the flow is solved again, as Dantzig,
-    Fulkerson & Johnson (1954) did for the travelling salesman.
+    for the first and the last one. `milp` of scipy finds a flow of least cost. A part of the flow
+    may not be connected to the start. Then a constraint that the part is entered is added, and the
+    flow is solved again, as Dantzig, Fulkerson & Johnson (1954) did for the travelling salesman.
 
     Args:
         moves: All moves.
-        start: The stance where the robot is.
+        start: The number of the stance where the robot is.
         due: Indices of the moves that the walk has to make.
-        unseen: Stances that the walk has to visit.
+        unseen: Numbers of the stances that the walk has to visit.
         rounds: The greatest number of flows to seek. After the last one, the result is the part of
             the flow that is connected to the start.
-        patience: Seconds for each flow. If they are over, the walk may not be the shortest.
+        patience: Seconds for each flow. At the limit the best flow so far is used. It may not be
+            the shortest.
 
     Returns:
         A count for each move; None if there is no walk, or none was found in time.
@@ -88,7 +104,7 @@ def shortest_flow(
         np.array([number[n] for n in ends])
         for ends in ([x.source for x in moves], [x.target for x in moves])
     )
-    # columns: each move, and whether a stance is the last one
+    # variables: the count of each move, and for each stance whether it is the last one
     kinds = [np.arange(m), np.arange(m), m + np.arange(size)]
     balance = coo_array(
         (
@@ -143,7 +159,12 @@ def shortest_flow(
 
 
 def _parts_cut_off(used: Sequence[Move], start: int) -> list[set[int]]:
-    """The connected parts of a flow that are not connected to the start, as sets of stances."""
+    """Find the connected parts of a flow without the start, as sets of stances.
+
+    Args:
+        used: The moves of the flow.
+        start: The number of the stance where the robot is.
+    """
     near = reached_from(used, start)
     left = [move for move in used if move.source not in near]
     parts: list[set[int]] = []
@@ -160,7 +181,13 @@ def _parts_cut_off(used: Sequence[Move], start: int) -> list[set[int]]:
 def nearest_of(
     moves: Sequence[Move], start: int, due: set[int], unseen: set[int]
 ) -> tuple[str, ...]:
-    """The way to the nearest of these moves and stances; empty if none can be reached."""
+    """Find the shortest way to make one required move or to visit one required stance.
+
+    Parameters as in `shortest_walk`.
+
+    Returns:
+        The names of the actions; empty if no such move or stance can be reached.
+    """
     after: dict[int, list[int]] = {}
     for k, move in sorted(enumerate(moves), key=lambda pair: pair[0] not in due):
         after.setdefault(move.source, []).append(k)
@@ -179,12 +206,12 @@ def nearest_of(
 
 
 def reached_from(moves: Iterable[Move], start: int) -> set[int]:
-    """The stances that moves lead to."""
+    """Find all stances that moves lead to from `start`, including `start`."""
     return followed_from(((move.source, move.target) for move in moves), start)
 
 
 def followed_from(links: Iterable[tuple[T, T]], start: T) -> set[T]:
-    """All stances that links reach from `start`, with `start`."""
+    """Find all nodes that links (pairs of source and target) reach, including `start`."""
     after: dict[T, list[T]] = {}
     for source, target in links:
         after.setdefault(source, []).append(target)

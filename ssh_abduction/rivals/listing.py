@@ -1,4 +1,4 @@
-"""Maps of one trace from a solution, a file or a list, and what is known about unlisted maps.
+"""A list of maps of one trace, from a solution, a file or Python, with what is known about others.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> one = SSHMap((0, 0), (DState(0, "hall"),), ())
@@ -31,12 +31,13 @@ class Listing:
 
     Attributes:
         maps: The maps.
-        minimal: The number of maps, from the first one on, that are proven minimal; None if
+        minimal: The number of maps at the start of the list that are proven minimal; None if
             unknown.
-        complete: Whether there is no further minimal map; None if unknown.
-        stopped: Why listing ended before it was complete, if known.
-        backbone: What all minimal maps share, by reasoning or from all maps; None if unknown.
-        source: Where the maps are from, for messages.
+        complete: Whether all minimal maps are listed; None if unknown.
+        stopped: Why listing ended before it was complete; None if it did not, or if this is
+            unknown.
+        backbone: What all minimal maps share, listed or not; None if unknown.
+        source: The name of the list, for messages.
     """
 
     maps: tuple[SSHMap, ...]
@@ -53,7 +54,10 @@ class Listing:
 
     @classmethod
     def of(cls, source: Maps) -> Listing:
-        """The listing of a solution, or of maps.
+        """Make a listing of a solution, of a map or of several maps.
+
+        Args:
+            source: A Solution, an SSHMap, or maps. A Listing is returned as it is.
 
         Raises:
             MapError: There are no maps, or they are maps of several traces.
@@ -89,7 +93,7 @@ class Listing:
         """Read what `solve --json` printed, or the one map that `SSHMap.save` wrote.
 
         Args:
-            path: The file; - for standard input.
+            path: The file, or "-" for standard input.
 
         Raises:
             MapError: The file cannot be read, or does not hold maps of one trace.
@@ -98,14 +102,14 @@ class Listing:
 
     @classmethod
     def from_dict(cls, data: Any, where: str = "maps") -> Listing:
-        """The listing of what `solve --json` printed (docs/reference/formats.md).
+        """Make a listing from what `solve --json` printed (docs/reference/formats.md).
 
         Args:
-            data: The JSON value.
-            where: What messages call it.
+            data: The value that was read from JSON.
+            where: The name of the data, for messages.
 
         Raises:
-            MapError: A field is wrong; the message names it.
+            MapError: A field is wrong. The message names the field.
         """
         a_text("where", where, MapError)
         maps = tuple(ssh_map.renumbered() for ssh_map in maps_of(data, where))
@@ -174,7 +178,8 @@ class Listing:
         """Return the listing if its maps can be those of one trace.
 
         Args:
-            one_view: Whether each dstate has one view, so that maps say what was seen at each step.
+            one_view: Whether each dstate has one view. Then a map shows the view of each step, and
+                these views are compared.
 
         Raises:
             MapError: There are no maps, or they are maps of several traces.
@@ -222,7 +227,7 @@ class Listing:
                 )
 
     def number(self, name: str) -> int:
-        """The index of a map.
+        """Find the index of a map, counted from 0.
 
         Args:
             name: The number of the map, counted from 1, or its id.
@@ -268,7 +273,7 @@ def _has_one_view(theory: Theory) -> bool:
 
 
 def _seen(ssh_map: SSHMap) -> tuple[View | None, ...]:
-    """The view at each step, by a map whose dstates have one view each."""
+    """List the view at each step, from a map whose dstates have one view each."""
     views = [s.view for s in ssh_map.dstates]
     seen = [views[label] for label in ssh_map.labels]
     for fault in ssh_map.faults:

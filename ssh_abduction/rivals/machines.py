@@ -1,10 +1,10 @@
-"""Maps as machines: what each predicts from the current dstate on, along the links that it knows.
+"""Maps as finite-state machines: the predictions of each map from the current dstate on.
 
-Maps with equal machines predict the same forever, so they are merged: 780 rivals that differ only
-in paths have one machine.
+Rivals are minimal maps of one trace. Rivals with equal machines predict the same for all actions,
+so they share one machine. For example, 780 rivals that differ only in paths have one machine.
 
-A robot that follows links which all rivals know is at one dstate in each rival. These dstates are a
-*joint state*: a row of numbers, one for each machine. numpy moves all rows of one depth at once.
+A robot that follows links of all rivals is at one dstate in each of them. These dstates are a
+*joint state*: a row of numbers, one for each machine. numpy moves many rows at once.
 """
 
 from __future__ import annotations
@@ -28,25 +28,26 @@ from ssh_abduction.theory.theory import Theory
 
 Array: TypeAlias = NDArray[np.int32]
 Row: TypeAlias = tuple[int, ...]
-UNKNOWN = -1  # the end of a link that a machine does not have
-# The greatest number of entries in the rows that are moved at once: some ten megabytes.
+UNKNOWN = -1  # the state after an action for which a machine has no link
+# The greatest number of entries in the rows that are moved at once. They take about ten megabytes.
 CHUNK = 2**21
 
 
 class Limits(Protocol):
-    """Limits of a search. `check` raises an exception if one is over."""
+    """Limits of a search. `check` raises an exception once a limit is reached."""
 
     def check(self) -> None:
-        """Raise an exception if a limit is over."""
+        """Raise an exception if a limit is reached."""
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What is seen at a dstate.
+    """The observation at a dstate.
 
     Attributes:
         view: The view; None if unknown.
-        star: The openings as a trace has them; None if stars are not used.
+        star: All openings that are seen there, in the format of the trace; None if stars are not
+            used.
     """
 
     view: View | None
@@ -57,13 +58,13 @@ class Seen:
         return view if self.star is None else f"{view} {_star_text(self.star)}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `next --json` prints it."""
+        """Return the observation as plain data, as `next --json` prints it."""
         return {"view": self.view} | (
             {} if self.star is None else {"star": [_entry(entry) for entry in self.star]}
         )
 
 
-# Names of the actions that a robot can do when it sees this.
+# A function from what a robot sees to the names of the actions that it can do there.
 Can: TypeAlias = Callable[[Seen], Iterable[str]]
 
 
@@ -89,17 +90,23 @@ def _star_text(star: Sequence[Any]) -> str:
 
 
 class Sights:
-    """What the dstates of rival maps look like.
+    """The observations at the dstates of rival maps, numbered.
 
-    Two dstates have the same number if and only if one look cannot distinguish them. Without a
-    trace only views count. Stars are read as in the theory: as four openings; or turned in any
-    way, if the theory does not say how stars are turned. If stars agree in tolerance only, stars
-    that could be equal, directly or through others, count as equal: the robot can see each
-    predicted difference. Without a theory, stars are read unless a map has a dstate with two stars.
+    Two dstates have the same number if and only if the robot cannot distinguish them by what it
+    sees there. Without a trace only views count. With a trace stars (the openings seen) count, too.
+    The theory sets how they are compared: as four openings, up to rotation, or with a tolerance of
+    angles. With a tolerance, stars that could be equal, directly or through other stars, count as
+    equal. So the robot can see each predicted difference. Without a theory, stars are used unless a
+    map has a dstate with two different stars.
+
+    Args:
+        maps: The rival maps.
+        trace: The trace of the maps; None to compare views only.
+        theory: The theory of the maps; None if unknown.
 
     Attributes:
-        seen: What is seen, by number.
-        of: For each map, the number of each dstate.
+        seen: The observation of each number.
+        of: For each map, the number of the observation at each dstate.
     """
 
     def __init__(self, maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> None:
@@ -130,9 +137,9 @@ class Sights:
 
 
 class _Reading:
-    """Reads the star of a step.
+    """A function that reads the star of a step.
 
-    A call gives the star and its key. Stars that are not distinguished have the same key.
+    A call returns a key and the star. Stars that cannot be distinguished have the same key.
     """
 
     def __init__(self, trace: Trace, theory: Theory, steps: Sequence[int] = ()) -> None:
@@ -147,7 +154,7 @@ class _Reading:
 
 
 def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None) -> _Reading | None:
-    """How stars are read; None if they are not used."""
+    """Make the function that reads stars; None if stars are not used."""
     if trace is None or not trace.has_stars:
         return None
     if theory is not None:
@@ -180,13 +187,13 @@ def _reading(maps: Sequence[SSHMap], trace: Trace | None, theory: Theory | None)
 
 
 def _sound(ssh_map: SSHMap) -> list[tuple[int, int]]:
-    """The steps whose observation the map accepts, each with its dstate."""
+    """List the steps whose observation the map does not treat as wrong, each with its dstate."""
     wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
     return [(t, label) for t, label in enumerate(ssh_map.labels) if t not in wrong]
 
 
 def _first_steps(ssh_map: SSHMap) -> dict[int, int]:
-    """For each dstate, the first step whose observation the map believes."""
+    """For each dstate, find the first step whose observation the map does not treat as wrong."""
     first: dict[int, int] = {}
     for t, label in _sound(ssh_map):
         first.setdefault(label, t)
@@ -194,9 +201,10 @@ def _first_steps(ssh_map: SSHMap) -> dict[int, int]:
 
 
 def _classes(trace: Trace, steps: Sequence[int]) -> dict[int, int]:
-    """A number for each of these steps.
+    """Number these steps by what is seen.
 
-    Steps with one view share a number if their stars could be one, directly or through others.
+    Steps with the same view have the same number if their stars could be equal, directly or through
+    the stars of other steps.
     """
     stars = {t: trace.steps[t].gateways or Star(()) for t in steps}
     groups: dict[object, list[list[int]]] = {}  # for each view
@@ -212,13 +220,13 @@ def _classes(trace: Trace, steps: Sequence[int]) -> dict[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """What a map predicts from the current dstate on.
+    """The predictions of a map from the current dstate on, as a finite-state machine.
 
-    States are numbered by how they are reached; the current one is 0.
+    States are the dstates that links reach, numbered breadth first. The current dstate is 0.
 
     Attributes:
-        sights: The number (of Sights) of what is seen in each state.
-        ends: For each state, the actions with the states that they lead to.
+        sights: For each state, the number that `Sights` gives to what is seen there.
+        ends: For each state, pairs of an action and the state that it leads to.
     """
 
     sights: tuple[int, ...]
@@ -226,14 +234,17 @@ class Machine:
 
 
 def links_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
-    """For each dstate the actions that were tried there, by name, and where they lead.
+    """For each dstate, find the actions that were tried there and where they lead.
 
     Args:
         ssh_map: The map.
         number: The index of the map, for messages.
 
+    Returns:
+        For each dstate, a dict from the names of actions to the dstates that they lead to.
+
     Raises:
-        MapError: An action leads to two dstates.
+        MapError: An action leads from one dstate to two dstates.
     """
     found: dict[int, dict[str, int]] = {s.id: {} for s in ssh_map.dstates}
     for source, action, target in sorted(ssh_map.links):
@@ -250,7 +261,7 @@ def links_of(ssh_map: SSHMap, number: int) -> dict[int, dict[str, int]]:
 def with_ends(
     links: Mapping[int, Mapping[str, int]], ends: Sequence[tuple[int, str, int]]
 ) -> dict[int, dict[str, int]]:
-    """Add links to others, in the order of the names of actions."""
+    """Copy links and add others (dstate, action, end). Actions are sorted by name."""
     found: dict[int, dict[str, int]] = {s: dict(tried) for s, tried in links.items()}
     for source, action, target in ends:
         found[source][action] = target
@@ -260,7 +271,16 @@ def with_ends(
 def machine_of(
     start: int, links: Mapping[int, Mapping[str, int]], sights: Sequence[int]
 ) -> tuple[Machine, tuple[int, ...]]:
-    """The machine of a map, and the dstate of each of its states."""
+    """Make the machine of a map.
+
+    Args:
+        start: The current dstate.
+        links: For each dstate, a dict from actions to the dstates that they lead to.
+        sights: For each dstate, the number of what is seen there.
+
+    Returns:
+        The machine, and the dstate of each of its states.
+    """
     number, reached = {start: 0}, [start]
     ends: list[tuple[tuple[str, int], ...]] = []
     for s in reached:
@@ -276,8 +296,8 @@ class Table:
     """Machines as arrays, so that an action is followed in all of them at once.
 
     Attributes:
-        ends: (machines, states, actions): the state that an action leads to, or UNKNOWN.
-        sights: (machines, states): the number of what is seen there.
+        ends: The state that an action leads to, or UNKNOWN. Shape (machines, states, actions).
+        sights: The number of what is seen in a state. Shape (machines, states).
     """
 
     def __init__(self, machines: Sequence[Machine], actions: Sequence[str]) -> None:
@@ -295,12 +315,13 @@ class Table:
         """Follow an action from joint states.
 
         Args:
-            group: The machines, shape (m,).
-            rows: The joint states, shape (n, m).
-            action: The number of the action.
+            group: The indices of the machines, shape (m,).
+            rows: The joint states, shape (n, m): the state of each machine.
+            action: The index of the action.
 
         Returns:
-            The joint states after it, and what is seen there; UNKNOWN if a machine lacks the link.
+            The joint states after the action, and the numbers of what is seen there, both of shape
+            (n, m). Entries are UNKNOWN if the machine lacks the link.
         """
         there = self.ends[group, rows, action]
         return there, np.where(there < 0, UNKNOWN, self.sights[group, there])
@@ -308,12 +329,14 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """The joint states that are first reached after `depth` actions, without a visible difference.
+    """The joint states that are reached first after `depth` actions.
+
+    On the way there all machines predict the same observations.
 
     Attributes:
         depth: The number of actions.
         first: The number of the first row, counted over all layers.
-        rows: The joint states, shape (n, m).
+        rows: The joint states, shape (n, m): the state of each machine.
     """
 
     depth: int
@@ -322,7 +345,15 @@ class Layer:
 
 
 class Walk:
-    """Follows links that all machines of a group know, breadth first, while they see the same.
+    """A breadth-first search over joint states.
+
+    It follows links that all machines have, as long as all predict the same observations.
+
+    Args:
+        table: All machines.
+        group: The indices of the machines to follow.
+        start: The state of each of these machines at first.
+        limits: Limits of the search; None for none.
 
     >>> blind = Machine((0, 0), ((("a", 1),), (("a", 0),)))
     >>> walk = Walk(Table([blind, blind], ["a"]), [0, 1], (0, 0), None)
@@ -335,11 +366,11 @@ class Walk:
     ) -> None:
         self.table, self.group, self._limits = table, np.array(group, np.int32), limits
         self._start = start
-        # for each row the row before it, and the action
+        # for each row, the row before it and the action between them
         self._came: list[tuple[int, int]] = [(0, 0)]
 
     def layers(self) -> Iterator[Layer]:
-        """The joint states, the nearest first."""
+        """Yield the joint states layer by layer, the nearest first."""
         known = {np.array(self._start, np.int32).tobytes()}
         layer = Layer(0, 0, np.array([self._start], np.int32))
         while len(layer.rows):
@@ -364,8 +395,8 @@ class Walk:
         """Follow each action from the joint states of a layer, part by part.
 
         Yields:
-            The number of the part's first row, the action, the joint states after it, and what is
-            seen there.
+            The number of the first row of the part, the index of the action, the joint states after
+            the action, and the numbers of what is seen there.
         """
         size = max(CHUNK // len(self.group), 1)
         for start in range(0, len(layer.rows), size):
@@ -376,7 +407,7 @@ class Walk:
                 yield layer.first + start, action, *self.table.follow(self.group, part, action)
 
     def way(self, row: int) -> list[int]:
-        """The actions that lead to a row."""
+        """List the indices of the actions that lead from the start to a row, by its number."""
         found: list[int] = []
         while row:
             row, action = self._came[row]

@@ -1,8 +1,9 @@
 """Questions that distinguish maps of one trace.
 
 A question asks whether two steps are one dstate, at one place, along one path, or along one path in
-one direction. Questions to which all maps give the same answers, or opposite ones, are one
-question, which the earliest steps stand for.
+one direction. It can also ask whether a step is treated as wrong. If two questions get the same
+answers from all maps, or opposite answers from all maps, only the one about the earliest steps is
+kept.
 """
 
 from __future__ import annotations
@@ -28,20 +29,19 @@ class Question:
     """A question that distinguishes maps.
 
     It asks whether two steps are one dstate, at one place, along one path, or along one path in one
-    direction; or whether the map ignores a step.
+    direction; or whether a map has a fault (treats a step as wrong).
 
     Attributes:
-        sort: What the question is about.
-        first: The earlier of the earliest two steps that it can be asked about. If both are the
-            same step, it asks whether the step is along a path (at a place) at all. For a fault
-            both are its step.
-        later: The later step.
-        yes: The number of maps that say yes.
-        here: The steps that are one with `first` in all maps.
-        there: The steps that are one with `later` in all maps.
-        places: For questions about paths, if all maps have the same places: the places of the steps
-            of `here` and of `there`.
-        fault: For questions about faults: the fault in the maps that say yes.
+        sort: The subject: "faults", "dstates", "places", "paths" or "courses".
+        first: The earlier of the two steps. If `first` and `later` are equal, the question asks
+            whether the step is at a place, or along a path, at all. For a fault, both are its step.
+        later: The later of the two steps.
+        yes: The number of maps that answer yes.
+        here: The steps that all maps group with `first`, by this sort.
+        there: The steps that all maps group with `later`, by this sort.
+        places: The places of the steps in `here`, and of the steps in `there`. Only for questions
+            about paths or courses, if all maps have the same places; otherwise None.
+        fault: The fault of the maps that answer yes; None if the question is not about faults.
     """
 
     sort: Matter
@@ -78,7 +78,7 @@ class Question:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, as `compare --json` prints it."""
+        """Return the question as plain data, as `compare --json` prints it."""
         data: dict[str, Any] = {
             "sort": self.sort,
             "first": self.first,
@@ -100,7 +100,7 @@ class Asked:
     Attributes:
         question: The question.
         column: The answer of each map.
-        steps: For each sort, the steps about which this question, or its opposite, asks.
+        steps: For each sort, the later steps of all questions with the same or opposite answers.
     """
 
     question: Question
@@ -109,7 +109,7 @@ class Asked:
 
 
 def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> list[Asked]:
-    """All questions that distinguish maps, each once.
+    """List all questions that distinguish maps, each once.
 
     Args:
         table: The maps as arrays.
@@ -117,7 +117,8 @@ def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> 
         same_places: Whether all maps have the same places.
 
     Returns:
-        The questions in the order of causes; those about the earliest steps come first.
+        The questions with their answers, in the order of causes (faults, dstates, places, paths,
+        courses). Among questions of one sort, those about earlier steps come first.
     """
     found: dict[bytes, Asked] = {}
     faults = {fault for ssh_map in maps for fault in ssh_map.faults}
@@ -136,7 +137,7 @@ def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> 
         together = members_of(heads)
         for c, d, column in table.questions(sort):
             key = _key(column)
-            # equal and opposite answers are one question, which the earliest steps stand for
+            # of questions with equal or opposite answers, keep the one about the earliest steps
             if key not in found:
                 sides = [
                     sorted(t for k in together[heads[side]] for t in steps_by_class[k])
@@ -168,12 +169,12 @@ def questions_of(table: Table, maps: Sequence[SSHMap], *, same_places: bool) -> 
 
 
 def _key(column: Bools) -> bytes:
-    """A key that equal and opposite columns share. They belong to one question."""
+    """Compute a key of answers. Equal columns and opposite columns have the same key."""
     return np.packbits(column ^ column[0]).tobytes()
 
 
 def members_of(numbers: Sequence[int]) -> dict[int, list[int]]:
-    """The positions of each number."""
+    """Return a dict from each number to the list of its positions, from 0."""
     members: dict[int, list[int]] = {}
     for i, number in enumerate(numbers):
         members.setdefault(number, []).append(i)

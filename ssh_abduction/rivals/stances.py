@@ -1,4 +1,4 @@
-"""Stances: where a robot may stand and what it faces there, and the moves between them."""
+"""Stances (places and headings where a robot may stand) and the moves between them."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from ssh_abduction.rivals.machines import Can, Seen, links_of
 from ssh_abduction.theory.theory import Theory
 
 How: TypeAlias = Literal["known", "implied", "expected", "unknown"]
-# The cost of an unknown move in actions: there, a turn, and back.
+# The cost of an unknown move in actions: go there, turn around, and come back.
 THERE_AND_BACK = 3
 AROUND = Action.of("around")
 
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """An action from one stance to another, both by number.
+    """An action that leads from one stance to another.
 
-    `how` says how its end is known:
-
-    - known: the action was tried;
-    - implied: a turn whose end the axioms imply, as places have frames;
-    - expected: a turn, if turns go as far as stars say; or a travel back the way that the robot
-    came; - unknown: anything else. The plan needs an end: a travel is taken to come back through
-    the same
-      gateway, and another action to do nothing.
+    Attributes:
+        source: The number of the stance before the action.
+        action: The action.
+        target: The number of the stance after the action. If `how` is "unknown", this is a guess: a
+            travel comes back through the same gateway, and any other action does nothing.
+        how: How the target is known. "known": the action was tried. "implied": the axioms imply it,
+            for a turn at a place with a frame. "expected": a turn by the angle that the star shows,
+            or a travel back the way that the robot came. "unknown": anything else.
     """
 
     source: int
@@ -40,20 +40,28 @@ class Move:
 
     @property
     def cost(self) -> int:
-        """The cost in actions."""
+        """The cost as a number of actions."""
         return THERE_AND_BACK if self.how == "unknown" else 1
 
     @property
     def is_untried(self) -> bool:
-        """Whether a tour has to make it: an unknown move, or a travel expected to lead back."""
+        """Whether a tour has to make the move: it is unknown, or a travel expected to lead back."""
         return self.how == "unknown" or (self.how == "expected" and self.action.kind != "turn")
 
 
 class Stances:
-    """Where a robot may stand, and what it faces there.
+    """The stances of a map: places and headings where a robot may stand.
 
-    The first stances are the dstates of the map, by number. The others are a turn away from these
-    and were never seen.
+    The first stances are the dstates of the map, with the same numbers. The others were never seen:
+    turns lead there from seen ones.
+
+    Args:
+        ssh_map: The map.
+        trace: The trace of the map.
+        theory: The theory of the map.
+        actions: Actions that the robot can do, in addition to those of the trace.
+        can: A function from what the robot sees to the names of the actions that it can do there.
+            If None, the robot can do any action that the star (the openings seen) allows.
     """
 
     def __init__(
@@ -77,7 +85,7 @@ class Stances:
             for step in self._looks
         ]
         self._frames = [_frame(star) for star in self._stars]
-        # room, and degrees clockwise in it
+        # for each stance its room, and the heading in the room in degrees clockwise
         self._at: list[tuple[int, float]] = [
             (s.place or 0, 90.0 * (s.heading or 0)) for s in ssh_map.dstates
         ]
@@ -89,7 +97,7 @@ class Stances:
         self._back: dict[int, int] = {}  # where a travel from a stance leads if it leads back
 
     def moves(self) -> list[Move]:
-        """All moves from all stances. This adds stances that were never seen."""
+        """List all moves from all stances. The call adds stances that were never seen."""
         for source, tried in self._links.items():
             for name, target in tried.items():
                 if (
@@ -106,9 +114,11 @@ class Stances:
         return found
 
     def _rooms(self) -> list[tuple[int, float]]:
-        """The room of each dstate, and its degrees in the room.
+        """Group dstates that turns link into rooms.
 
-        Dstates that turns link are in one room. A turn says the degrees from one to the next.
+        Returns:
+            For each dstate the number of its room, and the heading in the room in degrees
+            clockwise. The headings of two dstates differ by the angle of the turn between them.
         """
         turns: dict[int, list[tuple[int, float]]] = {n: [] for n in self._links}
         for n, tried in self._links.items():
@@ -136,7 +146,10 @@ class Stances:
         return [at[n] for n in sorted(at)]
 
     def _possible(self, n: int) -> list[Action]:
-        """What the robot can do in a stance; what the star allows if the stance was never seen."""
+        """List the actions that the robot can do in stance n.
+
+        In a stance that was never seen, these are the actions that the turned star allows.
+        """
         if n < len(self._looks):
             step = self._looks[n]
             seen = Seen(step.view, step.star if self._stars[n] else None)
@@ -161,7 +174,7 @@ class Stances:
         ]
 
     def _move(self, n: int, action: Action) -> Move:
-        """The move that an action makes from a stance."""
+        """Make the move for an action in stance n."""
         if n < len(self._links) and action.name in self._links[n]:
             return Move(n, action, self._links[n][action.name], "known")
         frame = self._frames[n]
@@ -182,15 +195,16 @@ class Stances:
         )
 
     def _around(self, n: int) -> int:
-        """The stance that a turn around leads to."""
+        """Find the stance that a turn around leads to from stance n."""
         degrees = _degrees(AROUND, self._frames[n])
         assert degrees is not None
         return self._turned(n, degrees)
 
     def _turned(self, n: int, degrees: float) -> int:
-        """The stance after a clockwise turn.
+        """Find the stance after a clockwise turn of this many degrees from stance n.
 
-        It is a new one if no known stance is within the spread of the star's bearings.
+        If no stance of the room is as close to that heading as the spread of bearings in the star,
+        a new stance is added.
         """
         (room, before), star, frame = self._at[n], self._stars[n], self._frames[n]
         assert star is not None
@@ -217,12 +231,12 @@ def _frame(star: Star | None) -> Frame | None:
 
 
 def _faces(frame: Frame) -> int | None:
-    """The slot that the robot faces."""
+    """Find the slot of a frame that the robot faces; None if it faces none."""
     return next((slot for slot in range(frame.slots) if frame.faces(slot)), None)
 
 
 def _degrees(action: Action, frame: Frame | None) -> float | None:
-    """How many degrees a turn goes clockwise, by the star; None if the star does not say."""
+    """Find by how many degrees clockwise a turn goes; None if the star does not show it."""
     if frame is None or action.bearing is not None:
         return action.bearing
     if action.gateway is not None:
@@ -237,5 +251,5 @@ def _degrees(action: Action, frame: Frame | None) -> float | None:
 
 
 def _apart(one: float, other: float) -> float:
-    """Degrees between two directions."""
+    """Compute the angle between two directions in degrees, 0 to 180."""
     return abs((one - other + 180) % 360 - 180)

@@ -1,8 +1,10 @@
 """Maps of one trace as arrays, so that thousands of them are compared in seconds.
 
-Steps that are one dstate in all maps are a *class*, named by its first step. For each sort
-(dstates, places, paths, courses) the table has, for each map and class, the first class that is one
-with it. So the numbers that maps give to their dstates, places and paths do not matter.
+Steps that are one dstate in all maps are a *class*. Classes are numbered from 0 by their first
+steps. Two classes are *one* in a map if they are at one dstate of it (or at one place, along one
+path, or along one course, for these sorts). For each sort, map and class, the table has the first
+class that is one with this class. So the numbers that maps give to their dstates, places and paths
+do not matter.
 
 >>> from ssh_abduction.data.maps import DState, SSHMap
 >>> a, b = DState(0, "hall"), DState(1, "hall")
@@ -33,10 +35,10 @@ class Table:
     """Maps of one trace as arrays.
 
     Attributes:
-        firsts: The first step of each class.
-        classes: The class of each step.
-        ones: For each sort that all maps have, an array (maps, classes) with the first class that
-            is one with each class; NONE if it has no place, path or course.
+        firsts: The first step of each class, shape (classes,).
+        classes: The class of each step, shape (steps,).
+        ones: For each sort that all maps have, an array of shape (maps, classes): the first class
+            that is one with each class in each map; NONE if the class has no place, path or course.
     """
 
     def __init__(self, maps: Sequence[SSHMap]) -> None:
@@ -59,21 +61,25 @@ class Table:
             self.ones[sort] = np.array(rows, dtype=np.int32)
 
     def __len__(self) -> int:
-        """The number of maps."""
+        """Return the number of maps."""
         return len(self.ones["dstates"])
 
     def steps_of(self, classes: Sequence[int]) -> tuple[int, ...]:
-        """The steps of some classes."""
+        """List the steps of some classes, ascending."""
         return tuple(np.flatnonzero(np.isin(self.classes, classes)).tolist())
 
     def variants(self, sort: Sort) -> int:
-        """The number of different labelings, placings, … of a sort."""
+        """Count the different ways in which maps group classes by this sort."""
         return len(np.unique(self.ones[sort], axis=0))
 
     def heads(self, sort: Sort) -> Ints:
-        """For each class the first class that goes with it in every map.
+        """For each class, find the first class that all maps treat in the same way.
 
-        Two classes go together if in all maps they are one, or both have no place, path or course.
+        Two classes are treated in the same way if in each map they are one, or both have no place,
+        path or course.
+
+        Returns:
+            That first class of each class, shape (classes,).
         """
         _, first, inverse = np.unique(
             self.ones[sort], axis=1, return_index=True, return_inverse=True
@@ -81,14 +87,15 @@ class Table:
         return first[inverse.reshape(-1)].astype(np.int32)
 
     def questions(self, sort: Sort) -> Iterator[tuple[int, int, Bools]]:
-        """Questions that distinguish maps.
+        """Yield questions that distinguish maps: are two classes one?
 
-        The earlier class of each pair is the first of its kind in some map. That is enough: if two
-        maps group a class differently, they also differ in the first class of its group.
+        It is enough to pair each class with the first class of its group in each map: two maps in
+        which every class has the same first class group all classes in the same way.
 
         Yields:
-            Two classes, the earlier first, and for each map whether they are one in it. If both are
-            the same class, whether it is along a path (at a place) at all.
+            Two classes, the earlier first, and for each map whether the two are one in it. If both
+            are the same class: for each map, whether the class is at a place, or along a path, at
+            all.
         """
         ones = self.ones[sort]
         for c in np.flatnonzero((ones != ones[0]).any(axis=0)).tolist():
@@ -99,7 +106,7 @@ class Table:
                     yield h, c, same
 
     def shared(self) -> Backbone:
-        """What these maps share."""
+        """Find what these maps share: which steps are one in all of them, in some, or in none."""
         found = {sort: self._shared(ones) for sort, ones in self.ones.items()}
         return Backbone(
             found["dstates"],
@@ -132,7 +139,11 @@ class Table:
 
 
 def _common_classes(labelings: Sequence[Ints]) -> Ints:
-    """The classes of steps that have one label in each labeling, numbered by first visit."""
+    """Find the class of each step, shape (steps,).
+
+    Steps are in one class if they have equal labels in each labeling. Classes are numbered from 0
+    by first step.
+    """
     classes = labelings[0].astype(np.int64)
     for labels in labelings[1:]:
         _, classes = np.unique(classes * (int(labels.max()) + 1) + labels, return_inverse=True)
@@ -143,7 +154,7 @@ def _common_classes(labelings: Sequence[Ints]) -> Ints:
 
 
 def _firsts_of(names: Sequence[Hashable]) -> Ints:
-    """For each name the index where it comes first; NONE for no name."""
+    """For each name, find the index at which it comes first; NONE if the name is None."""
     first: dict[Hashable, int] = {}
     return np.array(
         [NONE if name is None else first.setdefault(name, i) for i, name in enumerate(names)],

@@ -1,4 +1,4 @@
-"""The shortest tour through all that is untried in a map.
+"""Plan the shortest tour through everything that is untried in a map.
 
 >>> from ssh_abduction import Trace, solve
 >>> from ssh_abduction.rivals.tour import next_tour
@@ -7,19 +7,19 @@
 >>> next_tour(solve(corridor).maps[0], corridor, actions=["around"])
 ('around', 'travel', 'travel')
 
-An explorer that always does the nearest untried action looks around at each place, although it
-comes back to most places and would see the same then. So it plans ahead, in a graph of stances and
-moves (`rivals/stances.py`). The tour is the shortest walk that makes each unknown move and each
-expected travel, and visits each stance. Only then are expected turns tried one by one. Expected
-ends are guesses for the plan only: nothing is concluded from them, and each surprise leads to a new
-plan.
+A robot that always does the nearest untried action looks around at each place, although it comes
+back to most places later and could do so then. So the tour plans ahead, in a graph of stances
+(places and headings) and moves (`rivals/stances.py`). The tour is the shortest walk that makes each
+unknown move and each expected travel, and visits each stance. Only after that are expected turns
+tried one by one. Expected ends of moves are guesses for the plan only. No conclusion is drawn from
+them, and the robot plans again after each surprise.
 
-A map with the fewest dstates may merge places that only look alike. So the tour is planned in a map
-in which each return to a place is doubted until enough is seen there. If the robot comes by an
-unknown move to what the map takes for a known place, the plan treats it as a place of its own,
-until it and the doubted places beside it have more than `margin` dstates. What the robot does there
-is new if they are two places, and confirms the return if they are one. The way back to where the
-robot came from is believed at once.
+A map with the fewest dstates may merge places that only look alike. So the tour doubts each return
+to a place until enough is seen there. Suppose that an unknown move leads to a place that the map
+takes for a known one. Then the plan treats it as a new place, until this place and the doubted
+places beside it have more than `margin` dstates. Meanwhile the robot explores it. If they are two
+places, the robot sees something new. If they are one, it confirms the return. A travel back to
+where the robot came from is not doubted.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from ssh_abduction.rivals.stances import Stances
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import Theory
 
-# A place, and 0 or the step of a return to it that is not believed.
+# A place, and 0, or the step of a doubted return to the place, which gets a copy of the place.
 Copy: TypeAlias = tuple[int, int]
-# With more moves than these a flow takes about a second. Then the robot goes to the nearest untried
-# move.
+# With more moves than this a flow takes about a second or more. Then the robot goes to the nearest
+# untried move instead.
 MOST_MOVES = 1500
 
 
@@ -53,17 +53,17 @@ def next_tour(
     can: Can | None = None,
     margin: int = 0,
 ) -> tuple[str, ...]:
-    """Plan the shortest tour through all that is untried, and return its first actions.
+    """Plan the shortest tour through everything that is untried, and return its first actions.
 
     Args:
         ssh_map: A minimal map of the trace.
         trace: The trace.
         theory: The theory of the map; Theory.topological() if None.
-        actions: Actions that the robot can do, beside those of the trace.
-        can: Names of the actions that the robot can do when it sees this; if None, any action that
-            the star allows.
-        margin: A return to a place is believed once more dstates than this are seen there; 0
-            believes each return at once. Only returns in maps with places are doubted.
+        actions: Actions that the robot can do, in addition to those of the trace.
+        can: A function from what the robot sees to the names of the actions that it can do there.
+            If None, the robot can do any action that the star (the openings seen) allows.
+        margin: A return to a place is doubted until more than this many dstates are seen there. 0
+            doubts no return. Only returns in maps with places are doubted.
 
     Returns:
         The actions up to the first one with an unknown end; empty if nothing is untried.
@@ -91,9 +91,15 @@ def next_tour(
 
 
 def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
-    """The map with a separate place for each return that is not believed yet, without paths."""
+    """Copy a map, with a new place for each doubted return and without paths.
+
+    Args:
+        ssh_map: A map with places.
+        trace: The trace of the map.
+        margin: A return is doubted until more than this many dstates are seen there.
+    """
     believed: set[int] = set()
-    # believing a return gives more dstates to the places beside it, so repeat until nothing changes
+    # believing a return may add dstates to doubted places beside it: repeat until nothing changes
     while True:
         at = _copies(ssh_map, trace, believed)
         dstates: dict[Copy, set[int]] = {}
@@ -140,7 +146,7 @@ def with_doubted_returns(ssh_map: SSHMap, trace: Trace, margin: int) -> SSHMap:
 
 
 def _copies(ssh_map: SSHMap, trace: Trace, believed: Collection[int]) -> list[Copy]:
-    """The place of each step, if only the returns at these steps are believed."""
+    """Find the place of each step, if all returns but those at the steps `believed` are doubted."""
     places = [ssh_map.dstates[label].place or 0 for label in ssh_map.labels]
     at: list[Copy] = [(places[0], 0)]
     known = {places[0]}
