@@ -1,9 +1,9 @@
 """Makes a world with walls from a floor plan, in which a robot with a body can drive.
 
 A plan draws each room as a polygon and each door as a point on its outline. So the walls are the
-outlines of all rooms. A door is an opening of DOOR metres in the outlines of both of its rooms,
-moved along the wall if a corner would narrow it. If thick walls separate the outlines, jambs
-connect them.
+outlines of all rooms. A door is an opening of DOOR metres in the outlines of both of its rooms. If
+a corner would narrow the opening, it is moved along the wall. If the outlines of the two rooms are
+apart, because the wall is thick, the sides of the opening (its jambs) are walls, too.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Opening:
     Attributes:
         middle: (x, y) in metres.
         along: Direction of the wall in radians.
-        width: Metres.
-        depth: Metres from the outline of one room to that of the other.
+        width: Width of the opening in metres.
+        depth: Thickness of the wall: metres from the outline of one room to that of the other.
     """
 
     middle: tuple[float, float]
@@ -42,7 +42,14 @@ class Opening:
     depth: float
 
     def frame(self, points: Array) -> Array:
-        """Coordinates of points, (n, 2), along and across the wall, in metres from the middle."""
+        """Convert points to coordinates along and across the wall, from the middle.
+
+        Args:
+            points: (n, 2) x and y in metres.
+
+        Returns:
+            (n, 2) metres along the wall, and across it to the left.
+        """
         cos, sin = math.cos(self.along), math.sin(self.along)
         off = points - np.array(self.middle)
         return np.column_stack(
@@ -50,7 +57,12 @@ class Opening:
         )
 
     def point(self, along: float, across: float) -> tuple[float, float]:
-        """The point at this distance along the wall, and across it to the left."""
+        """Compute the point (x, y) at a distance in metres along the wall, and across it.
+
+        Args:
+            along: Metres along the wall from the middle.
+            across: Metres to the left of the direction of the wall.
+        """
         cos, sin = math.cos(self.along), math.sin(self.along)
         return self.middle[0] + cos * along - sin * across, self.middle[
             1
@@ -58,7 +70,7 @@ class Opening:
 
     @property
     def threshold(self) -> Array:
-        """The segment from jamb to jamb, (1, 4)."""
+        """The segment across the opening, from side to side: (1, 4), metres."""
         return np.array([[*self.point(-self.width / 2, 0.0), *self.point(self.width / 2, 0.0)]])
 
 
@@ -69,7 +81,7 @@ class Building:
     Attributes:
         plan: The plan.
         segments: (n, 4) walls in metres.
-        openings: Openings of the doors, in the order of the plan.
+        openings: The opening of each door, in the order of the plan.
     """
 
     plan: Plan
@@ -93,12 +105,12 @@ class Building:
         return cls(plan, np.vstack([walls, *jambs]), openings)
 
     def world(self) -> World:
-        """The building as a world."""
+        """Make a world with the walls of the building."""
         return World(self.plan.name, self.segments, angles="any")
 
 
 def _outline(room: Room) -> Array:
-    """The walls of a room, (n, 4)."""
+    """The walls of a room: (n, 4), metres."""
     corners = np.array(room.polygon)
     walls = np.hstack([corners, np.roll(corners, -1, axis=0)])
     drawn: Array = walls[np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1]) > 1e-6]
@@ -106,7 +118,7 @@ def _outline(room: Room) -> Array:
 
 
 def _opening(plan: Plan, door: Door) -> Opening:
-    """The opening of a door in the nearest walls of its rooms."""
+    """Make the opening of a door in the nearest walls of its two rooms."""
     outlines = [_outline(plan.rooms[room]) for room in door.rooms]
     walls = [walls[int(distances_to(walls, door.position).argmin())] for walls in outlines]
     longest = max(walls, key=lambda wall: float(np.hypot(*(wall[2:] - wall[:2]))))
@@ -127,9 +139,13 @@ def _opening(plan: Plan, door: Door) -> Opening:
 
 
 def _span(flat: Opening, walls: Array) -> tuple[float, float]:
-    """First and last position of the wall of a room along a door, in metres from the door.
+    """Where the wall with a door begins and ends, in metres along the wall from the door.
 
     An outline may have corners within a straight wall, so connected stretches are joined.
+
+    Args:
+        flat: The door, as an opening without depth.
+        walls: (n, 4) walls of a room of the door.
     """
     # (n, 2 ends, along and across)
     ends = np.stack([flat.frame(walls[:, :2]), flat.frame(walls[:, 2:])], axis=1)
@@ -145,17 +161,17 @@ def _span(flat: Opening, walls: Array) -> tuple[float, float]:
 
 
 def _across(flat: Opening, wall: Array, along: float) -> float:
-    """Position of a wall across a door, at a position along it."""
+    """How many metres a wall is to the left of a door's middle, at a position along the door."""
     ends = flat.frame(wall.reshape(2, 2))
     return float(np.interp(along, *ends[np.argsort(ends[:, 0])].T))
 
 
 def _cut(walls: Array, opening: Opening) -> Array:
-    """Remove the parts of walls in an opening, clipped to a rectangle (Liang and Barsky)."""
+    """Remove the parts of walls within the rectangle of an opening (Liang and Barsky)."""
     starts, ends = opening.frame(walls[:, :2]), opening.frame(walls[:, 2:])
     half = np.array([opening.width / 2, opening.depth / 2 + DEPTH])
     way = ends - starts
-    # Shares of each wall's length at its entry and exit of each axis' slab.
+    # For each axis: the shares of a wall's length at which it enters and leaves the rectangle.
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half - starts) / way, (half - starts) / way
     still = way == 0
@@ -174,7 +190,7 @@ def _cut(walls: Array, opening: Opening) -> Array:
 
 
 def _jambs(opening: Opening) -> Array:
-    """The two sides of an opening in a thick wall, (2, 4); none in a thin one."""
+    """The two sides of an opening in a thick wall, (2, 4); none, (0, 4), in a thin wall."""
     if opening.depth < 0.02:
         return np.empty((0, 4))
     half, deep = opening.width / 2, opening.depth / 2

@@ -1,10 +1,11 @@
-"""Control laws: from laser images to motions. They do not know the true pose.
+"""Control laws, which compute the motions of the robot from laser images alone.
 
-Trajectory-following leads the robot along the midline between two walls, or along one wall at a
-fixed distance. Hill-climbing leads it to a fixed point. Along its path, this is half a corridor's
-width before the wall ahead, or the middle of a street that opens to a side. Across its path, it is
-midway between the walls, or half a corridor's width from the only wall. The heading is along the
-walls. The robot corrects only what the image shows.
+They do not know the true pose. Trajectory-following leads the robot along the midline between two
+walls, or along one wall at a fixed distance. Hill-climbing then leads it to a dstate (distinctive
+state), a fixed position and heading at a place. Along the path, the fixed point is half a
+corridor's width before the wall ahead, or in the middle of a street that opens to a side. Across
+the path, it is midway between the walls, or half a corridor's width from the only wall. The heading
+is along the walls. The robot corrects only the errors that the image shows.
 
 Reference:
     Kuipers & Beeson 2002, section on distinctive states; Kuipers 2000, the control level.
@@ -27,31 +28,32 @@ from simulator.sight import Sight, sight
 from simulator.world import World
 
 Array = NDArray[np.float64]
-# Quarter turns clockwise from the heading before an action to after.
+# Number of quarter turns clockwise that an action turns the robot by.
 QUARTERS = {"travel": 0, "right": 1, "around": 2, "left": 3}
 TURNS = {"left": math.pi / 2, "right": -math.pi / 2, "around": math.pi}
 # Metres between two images while the robot travels.
 STRIDE = 0.15
-# Images at rest, whose median, beam by beam, reduces noise and ignores lost beams.
+# Number of images that a standing robot takes. Their median, beam by beam, reduces noise and
+# ignores lost beams.
 STILL = 9
 # Largest number of corrections while hill-climbing, since noise may keep the robot out of
 # tolerance.
 TRIES = 12
-# Metres after which a travel has failed, since walls in a circle would never end it.
+# A travel has failed after this many metres, since it would never end between walls in a circle.
 LONGEST_TRAVEL = 300.0
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Distance from the fixed point at which hill-climbing ends.
+    """Largest errors with which hill-climbing ends.
 
-    The defaults are the best precision of such a robot.
+    The defaults are the best precision that such a robot reaches.
 
     Attributes:
-        close: Metres along the path.
-        straight: Radians of heading.
-        aside: Metres across the path. If the robot is farther off, it backs off and approaches
-            again.
+        close: Distance from the fixed point along the path, in metres.
+        straight: Error of the heading, in radians.
+        aside: Distance from the fixed point across the path, in metres. If it is larger, the robot
+            drives back and approaches again.
     """
 
     close: float = 0.015
@@ -64,13 +66,13 @@ class Driver:
     """A robot in a world, with its laser, as control laws use it.
 
     Attributes:
-        world: World with this tour's clutter.
+        world: The world, with the clutter as it is on this tour.
         robot: The robot.
-        laser: Its laser.
-        rng: Source of noise.
-        tolerance: Errors at which hill-climbing ends, in metres and radians.
-        on_travel: Called with the driver after each motion in `travel`.
-        recorder: Records the pose after each motion, for a log.
+        laser: The robot's laser.
+        rng: Source of the noise of the laser.
+        tolerance: Largest errors with which hill-climbing ends.
+        on_travel: Function that is called with the driver after each motion of a travel.
+        recorder: Records the pose after each motion, for a log; None without a log.
     """
 
     world: World
@@ -82,16 +84,31 @@ class Driver:
     recorder: Recorder | None = None
 
     def look(self, images: int = 1) -> Array:
-        """An image, (180,) metres: the median of this many scans, beam by beam."""
+        """Take an image: the median of some scans, beam by beam.
+
+        Args:
+            images: Number of scans.
+
+        Returns:
+            (180,) ranges in metres, from right to left.
+        """
         scans = self.laser.scan(self.world, np.repeat([self.robot.pose], images, axis=0), self.rng)
         return np.median(scans, axis=0) if images > 1 else scans[0]
 
     def see(self, images: int = 1) -> Sight:
-        """The walls in the median of this many scans."""
+        """Find the walls in the median of this many scans."""
         return sight(self.look(images), self.world.reach, self.laser.reach)
 
     def go(self, forward: float, turn: float = 0.0) -> None:
-        """Move the robot. Raises SimulatorError if it leaves the world or hits a wall."""
+        """Move the robot.
+
+        Args:
+            forward: Metres forward; negative for back.
+            turn: Radians to turn on the way, counterclockwise.
+
+        Raises:
+            SimulatorError: The robot leaves the world or hits a wall.
+        """
         self.robot.move(forward, turn)
         x, y, _ = self.robot.pose
         if not self.world.holds(x, y):
@@ -109,7 +126,12 @@ class Driver:
 
 
 def act(driver: Driver, action: str) -> None:
-    """Do an action of a route, then climb to the dstate where it ends."""
+    """Do an action of a route, and climb to the dstate at its end.
+
+    Args:
+        driver: The robot.
+        action: "travel", "left", "right" or "around".
+    """
     if action == "travel":
         travel(driver)
         climb(driver)
@@ -119,7 +141,12 @@ def act(driver: Driver, action: str) -> None:
 
 
 def travel(driver: Driver) -> None:
-    """Follow the midline or the wall to the next distinctive place."""
+    """Follow the midline or the wall to the next distinctive place.
+
+    Raises:
+        SimulatorError: A wall is ahead, there is no place within LONGEST_TRAVEL metres, or the
+            robot hits a wall.
+    """
     reach = driver.world.reach
     # A side street counts only after leaving the place where the robot started.
     began = driver.robot.driven
@@ -147,25 +174,25 @@ def travel(driver: Driver) -> None:
 
 
 def _steer(seen: Sight, reach: float, stride: float) -> float:
-    """Radians to turn on the next stride, to reach the line and then follow it."""
+    """How far to turn on the next stride, to reach the line and then follow it, in radians."""
     offset = seen.offset(reach)
     wanted = 0.0 if offset is None else -math.atan(1.5 * float(np.clip(offset, -0.5, 0.5)))
     return (wanted - seen.tilt) * min(1.0, abs(stride) / 0.12)
 
 
 def climb(driver: Driver, turned: bool = False) -> None:
-    """Hill-climb to the fixed point: along the path, across it, and in heading.
+    """Climb to the fixed point: correct the position along and across the path, and the heading.
 
     Args:
         driver: The robot.
-        turned: Whether the action was a turn; then the robot does not back off to correct its
-            distance from the line.
+        turned: Whether the action was a turn. Then the position across the path is not corrected,
+            as the robot would have to drive back and approach again.
     """
     reach, tolerance = driver.world.reach, driver.tolerance
     for attempt in range(TRIES):
         seen = driver.see(STILL)
         to_go, offset = seen.to_go(reach), seen.offset(reach)
-        # Turning cannot correct a distance from the line: back off and approach again.
+        # Turning on the spot cannot correct a distance from the line: drive back, and come again.
         aside = abs(offset) if offset is not None else 0.0
         if (
             aside > tolerance.aside
@@ -185,7 +212,7 @@ def climb(driver: Driver, turned: bool = False) -> None:
 
 
 def _come_again(driver: Driver) -> None:
-    """Back off a little, and approach the fixed point again along the line."""
+    """Drive back a little, and approach the fixed point again along the line."""
     reach = driver.world.reach
     back = 0.0
     while back < 0.5 * reach:
@@ -201,14 +228,14 @@ def _come_again(driver: Driver) -> None:
 
 
 class Corridors:
-    """Does the actions of a route with the control laws for right angles.
+    """Does the actions of a route in a world whose streets meet at right angles.
 
-    It collects the openings of the current place, numbered by quarter turns (slots) clockwise from
-    the direction of arrival.
+    It also collects the openings of the current place, for stars.
 
     Args:
         driver: The robot.
-        looks_behind: Whether to look behind at the start, as no path led there.
+        looks_behind: Whether the robot looks behind itself at the start. Elsewhere, it knows that
+            the path by which it came is behind.
     """
 
     def __init__(self, driver: Driver, looks_behind: bool = False) -> None:
@@ -217,7 +244,7 @@ class Corridors:
         self._facing = 0
 
     def begin(self) -> None:
-        """Climb to the dstate near the start."""
+        """Climb to the dstate near the start, and look behind if required."""
         climb(self.driver)
         if self.looks_behind:
             self.driver.go(0.0, math.pi)
@@ -228,17 +255,22 @@ class Corridors:
             climb(self.driver)
 
     def act(self, action: str) -> None:
-        """Do an action of a route."""
+        """Do an action of a route: "travel", "left", "right" or "around"."""
         act(self.driver, action)
         self._facing = (self._facing + QUARTERS[action]) % 4
         if action == "travel":
-            # The robot came through the opening behind it.
+            # The robot is at a new place, where only the opening behind it is known.
             self._openings, self._facing = {2: True}, 0
 
     def star(self, image: Array) -> tuple[float, ...]:
-        """The star: openings ahead, right, behind and left, if known.
+        """Find the star: which directions are open at this place, as seen since arrival.
 
-        A direction is open if its wall is far. The image does not show what is behind the robot.
+        Args:
+            image: (180,) ranges in metres. A direction is open if its wall is far.
+
+        Returns:
+            Four numbers, for ahead, right, behind and left: 1 if open, 0 if closed or unknown. The
+            image does not show what is behind; an earlier image may.
         """
         for slot, beams in ((0, image[82:98]), (1, image[:10]), (3, image[-10:])):
             is_far = bool(np.median(beams) > 1.8 * self.driver.world.reach)

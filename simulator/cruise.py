@@ -1,8 +1,7 @@
 """Drives along a planned route and around unknown obstacles.
 
-The driver knows the building and sees what the laser sees. The robot aims at a point AIM metres
-ahead on its route. If the laser shows an obstacle that is no known wall, the robot plans a
-route around this obstacle.
+The walls of the building are known. The robot aims at a point AIM metres ahead on its route. If the
+laser shows an obstacle on the route that is no known wall, the robot plans a route around it.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ STRIDE = 0.1
 AIM, CLOSE, WIDE = 0.5, 0.2, 0.6
 # Largest turn in a stride, and the turn from which the robot turns on the spot, in radians.
 BEND, SHARP = math.radians(20), math.radians(50)
-# Metres within which obstacles matter, and distance from known walls at which a point is an
-# obstacle.
+# Obstacles within WATCH metres of the robot matter. A point is an obstacle if it is more than KNOWN
+# metres from known walls.
 WATCH, KNOWN = 3.0, 0.25
 # The robot is stuck after this many motions without progress.
 PATIENCE = 100
@@ -39,14 +38,14 @@ def follow(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
 
     Args:
         driver: The robot.
-        space: Known walls; obstacles that the laser sees are added.
+        space: Free space between known walls. Obstacles that the laser sees are marked in it.
         way: (n, 2) route in metres.
 
     Yields:
-        After each motion, the index of the point of the route that the robot has reached.
+        After each motion, the index in `way` of the point that the robot has reached.
 
     Raises:
-        SimulatorError: An obstacle closes the route, or the robot hits a wall.
+        SimulatorError: An obstacle blocks the route, or the robot is stuck or hits a wall.
     """
     # Index in the given route of each point of the current route, which changes around obstacles.
     numbers = np.arange(len(way))
@@ -66,14 +65,28 @@ def follow(driver: Driver, space: FreeSpace, way: Array) -> Iterator[int]:
 
 
 def _come_to(way: Array, at: int, driver: Driver) -> int:
-    """The nearest upcoming waypoint. Ties go to the last one, so that doubling back works."""
+    """The index of the nearest upcoming point of the route.
+
+    If several points are equally near, it is the last of them, so that a route may turn back.
+
+    Args:
+        way: (n, 2) route in metres.
+        at: Index of the last point that was reached.
+        driver: The robot.
+    """
     off = np.hypot(*(way[at : at + round(1.5 * AIM / CELL)] - np.array(driver.robot.pose[:2])).T)
     nearest = len(off) - 1 - int((off[::-1]).argmin())
     return len(way) - 1 if at + len(off) == len(way) and off[-1] < 2 * STRIDE else at + nearest
 
 
 def _stride(driver: Driver, way: Array, aim: float) -> None:
-    """Turn to the aim on the route, and drive if it is roughly ahead."""
+    """Turn towards the aim, a point on the route, and drive if the aim is roughly ahead.
+
+    Args:
+        driver: The robot.
+        way: (n, 2) rest of the route in metres.
+        aim: Metres along the route to the aim.
+    """
     x, y, heading = driver.robot.pose
     goal = way[: 2 + round(aim / CELL)][-1]
     turn = math.remainder(math.atan2(goal[1] - y, goal[0] - x) - heading, math.tau)
@@ -89,7 +102,22 @@ def _stride(driver: Driver, way: Array, aim: float) -> None:
 def _around_obstacles(
     driver: Driver, space: FreeSpace, image: Array, way: Array, numbers: Cells, at: int
 ) -> tuple[Array, Cells]:
-    """Plan the route again if the laser shows something new on it."""
+    """Plan the route again if the laser shows a new obstacle on it.
+
+    Args:
+        driver: The robot.
+        space: Free space, in which new obstacles are marked.
+        image: (180,) ranges in metres.
+        way: (n, 2) current route in metres.
+        numbers: (n,) index in the given route of each point of the current route.
+        at: Index in the current route of the last point that was reached.
+
+    Returns:
+        The new route, and its `numbers`.
+
+    Raises:
+        SimulatorError: There is no way around the obstacle.
+    """
     seen = _obstacles(driver, space, image)
     ahead = slice(at, at + round(WATCH / CELL))
     if (
@@ -116,7 +144,11 @@ def _around_obstacles(
 
 
 def _obstacles(driver: Driver, space: FreeSpace, image: Array) -> Array:
-    """Find points, (n, 2) metres, that are neither known walls nor marked yet, and mark them."""
+    """Find new obstacles in an image, and mark them in the free space.
+
+    Returns:
+        (n, 2) points in metres that are neither known walls nor obstacles that were marked before.
+    """
     x, y, heading = driver.robot.pose
     near = image < WATCH
     angles = heading + BEARINGS[near]
@@ -128,7 +160,7 @@ def _obstacles(driver: Driver, space: FreeSpace, image: Array) -> Array:
 
 
 def _apart(points: Array, others: Array) -> Array:
-    """Distance from each point, (n, 2), to the nearest of others, (m, 2); (n,) metres."""
+    """The distance from each point to the nearest of other points, (n,)."""
     off: Array = np.hypot(*(points[:, None] - others).transpose(2, 0, 1)).min(1)
     return off
 

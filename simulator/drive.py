@@ -1,7 +1,7 @@
 """A drive as a robot logs it: scans and odometry, and the true poses for evaluation.
 
-While the robot drives, a Recorder records its pose after each motion. At the end, all scans are
-computed at once, and the odometer reads the trajectory.
+While the robot drives, a Recorder records its pose after each motion. After the drive, all scans
+are computed at once, and the odometry is computed from the poses.
 """
 
 from __future__ import annotations
@@ -38,14 +38,15 @@ class Drive:
     Attributes:
         name: Name of the drive.
         ranges: (n, beams) metres; infinite if the laser saw nothing within its reach.
-        odometry: (n, 3) x, y, heading by the odometer, which begins at (0, 0, 0); metres and
-            radians.
-        poses: (n, 3) true poses.
+        odometry: (n, 3) pose by the odometer at each scan: x and y in metres, heading in radians.
+            It begins at (0, 0, 0).
+        poses: (n, 3) true pose at each scan.
         times: (n,) seconds since the beginning.
-        metres: Driven distance.
+        metres: Length of the drive.
         odometer: Noise of the odometry.
         laser: The scanner.
-        truth: True places as plain data, for evaluation only.
+        truth: True places and poses, as JSON-like data for evaluation only; empty until `judged`
+            adds it.
     """
 
     name: str
@@ -64,11 +65,11 @@ class Drive:
     def judged(
         self, places: Mapping[str, Sequence[float]], scans: Sequence[str | None], **more: object
     ) -> Drive:
-        """Add the truth by which maps of this drive are judged.
+        """Copy the drive, with the truth by which its maps are evaluated.
 
         Args:
-            places: (x, y) of each place in metres.
-            scans: Place of each scan; None between places.
+            places: (x, y) in metres of each place, by name.
+            scans: Name of the place of each scan; None between places.
             more: Other fields of `truth`.
         """
         visits: list[dict[str, Any]] = []
@@ -99,9 +100,10 @@ class Recorder:
 
     Attributes:
         every: Metres between scans.
-        turn: Radians between scans.
-        poses: Poses after each motion.
-        scans: For each arrangement of the clutter, indices of poses with a scan.
+        turn: Radians between scans if the robot turns.
+        poses: Pose after each motion, or after each part of a long motion.
+        scans: For each world (each arrangement of the clutter), the indices of poses at which a
+            scan is taken.
         metres: Distance driven so far.
     """
 
@@ -123,13 +125,13 @@ class Recorder:
 
     @property
     def taken(self) -> int:
-        """Number of scans so far."""
+        """The number of scans so far."""
         return sum(len(numbers) for _, numbers in self.scans)
 
     def note(self, world: World, pose: Pose) -> None:
         """Record the pose after a motion in this world.
 
-        A long motion is cut into parts, so that scans are taken on its way.
+        A long motion is divided into parts, so that scans are also taken during the motion.
         """
         if not self.poses:
             self._add(world, pose, 0.0, 0.0)
@@ -165,19 +167,20 @@ class Recorder:
             self._way = self._turned = 0.0
 
     def drive(self, name: str, laser: Laser, odometer: Odometer, seed: int) -> Drive:
-        """Make the drive, with a scan also at its end.
+        """Make the drive from the recorded poses. A last scan is taken at its end.
 
-        Scans and odometer have their own noise, which does not change the drive.
+        Scans and odometry have random generators of their own, so their noise does not change the
+        trajectory.
 
         Args:
             name: Name of the drive.
             laser: The scanner.
             odometer: Noise of the odometry.
-            seed: Seed of both noises.
+            seed: Seed of the noise of scans and odometry.
         """
         if self.scans[-1][1][-1:] != [len(self.poses) - 1]:
             self.scans[-1][1].append(len(self.poses) - 1)
-        # Generators 2 and 3 of this seed; others are used for the drive itself.
+        # Use generators 2 and 3 of this seed. The drive itself uses others.
         sight, wheels = (np.random.default_rng([seed, k]) for k in (2, 3))
         poses = np.array(self.poses)
         numbers = [number for _, part in self.scans for number in part]

@@ -30,9 +30,11 @@ Point = tuple[float, float]
 CELL = 0.1
 # Largest area to plan on, in square metres.
 LARGEST = 200_000
-# Metres around start and goal, and around the part that is searched.
+# The grid reaches this many metres beyond the walls. A part of it reaches this far beyond the
+# points around which it is cut out.
 MARGIN = 2.0
-# More than ROOM metres from walls is not better. A metre along a wall costs NARROW metres.
+# A route prefers to stay ROOM metres from walls; more is not better. A metre at a wall costs as
+# much as NARROW metres in the open.
 ROOM, NARROW = 1.0, 4.0
 # Cells around start and goal in which a route may be nearer to walls than elsewhere.
 LEEWAY = 2
@@ -42,13 +44,14 @@ SMOOTH = 0.3
 
 @dataclass
 class FreeSpace:
-    """A grid of cells with walls and seen obstacles. Row 0 is at the bottom.
+    """A grid of cells with walls and obstacles. Row 0 is at the bottom.
 
     Attributes:
         corner: (x, y) of the lower left corner in metres.
-        occupied: (rows, columns) cells with walls or obstacles.
-        radius: Radius of the robot in metres. Its middle stays this far and one more cell away.
-        off: (rows, columns) metres to the nearest wall, without obstacles.
+        occupied: (rows, columns) mask of the cells with walls or obstacles.
+        radius: Radius of the robot in metres.
+        off: (rows, columns) distance in metres to the nearest wall. Obstacles that are marked later
+            do not count.
     """
 
     corner: Point
@@ -61,7 +64,15 @@ class FreeSpace:
 
     @classmethod
     def of(cls, segments: Array, radius: float) -> FreeSpace:
-        """Make the free space between walls, (n, 4) metres. Raises SimulatorError."""
+        """Make the free space between walls.
+
+        Args:
+            segments: (n, 4) walls in metres.
+            radius: Radius of the robot in metres.
+
+        Raises:
+            SimulatorError: The area is too large.
+        """
         ends = segments.reshape(-1, 2)
         corner = ends.min(0) - MARGIN
         width, height = ends.max(0) + MARGIN - corner
@@ -76,11 +87,11 @@ class FreeSpace:
 
     @property
     def least(self) -> float:
-        """Metres that the middle of the robot keeps from occupied cells."""
+        """Smallest distance of the robot's middle from occupied cells, in metres."""
         return self.radius + CELL
 
     def drawn(self, segments: Array) -> Mask:
-        """Mask of the cells that segments cross."""
+        """Make the mask, (rows, columns), of the cells that segments, (n, 4), cross."""
         cells = np.zeros_like(self.occupied)
         for x1, y1, x2, y2 in segments:
             count = 2 + math.ceil(math.hypot(x2 - x1, y2 - y1) / (CELL / 2))
@@ -91,19 +102,31 @@ class FreeSpace:
         return cells
 
     def cells(self, points: Array) -> tuple[Cells, Cells]:
-        """Rows and columns of the cells of points, (n, 2), or of the nearest cells."""
+        """Find the cells of points.
+
+        Args:
+            points: (n, 2) metres. A point outside the grid has the nearest cell.
+
+        Returns:
+            Rows, (n,), and columns, (n,).
+        """
         columns, rows = np.floor((points - np.array(self.corner)) / CELL).astype(np.intp).T
         return rows.clip(0, self.occupied.shape[0] - 1), columns.clip(0, self.occupied.shape[1] - 1)
 
     def middles(self, points: Array) -> Array:
-        """Centres of the cells of points, (n, 2)."""
+        """Move points, (n, 2) in metres, to the centres of their cells."""
         found: Array = (np.column_stack(self.cells(points)[::-1]) + 0.5) * CELL + np.array(
             self.corner
         )
         return found
 
     def part(self, points: Array, closed: Mask | None = None) -> Part:
-        """The part of the grid around points, (n, 2), with additional closed cells."""
+        """Cut out the part of the grid around some points.
+
+        Args:
+            points: (n, 2) metres.
+            closed: (rows, columns) mask of further cells that count as occupied.
+        """
         rows, columns = self.cells(np.vstack([points.min(0) - MARGIN, points.max(0) + MARGIN]))
         window = slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1)
         occupied = (
@@ -113,18 +136,27 @@ class FreeSpace:
         return Part(corner, _clearance(occupied), self.least)
 
     def way(self, start: Point, goal: Point, closed: Mask | None = None) -> Array | None:
-        """The best route between two points within the part around both; see Part.way."""
+        """Find the best route between two points, within the part of the grid around both.
+
+        Args:
+            start: (x, y) in metres.
+            goal: (x, y) in metres.
+            closed: (rows, columns) mask of further cells that count as occupied.
+
+        Returns:
+            (n, 2) metres; None if there is no route. `Part.way` says which route is best.
+        """
         return self.part(np.array([start, goal]), closed).way(start, goal)
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of free space.
+    """A rectangular part of free space.
 
     Attributes:
         corner: (x, y) of the lower left corner in metres.
-        clearance: (rows, columns) metres to the nearest occupied cell.
-        least: Metres that the robot has to keep.
+        clearance: (rows, columns) distance in metres to the nearest occupied cell.
+        least: Smallest distance of the robot's middle from occupied cells, in metres.
     """
 
     corner: Point
@@ -134,8 +166,12 @@ class Part:
     def way(self, start: Point, goal: Point) -> Array | None:
         """Find the best route between two points: short, and ROOM metres from walls if possible.
 
+        Args:
+            start: (x, y) in metres.
+            goal: (x, y) in metres.
+
         Returns:
-            (n, 2) metres, one point a cell; None if there is no route.
+            (n, 2) metres, with a point in each cell; None if there is no route.
         """
         (row, other_row), (column, other_column) = self._cells(np.array([start, goal]))
         cells = _shortest(
@@ -152,23 +188,33 @@ class Part:
         return np.where(safe[:, None], smooth, way)
 
     def off(self, points: Array) -> Array:
-        """Distance of points, (n, 2), from occupied cells, in metres."""
+        """Measure how far points, (n, 2), are from occupied cells: (n,), metres."""
         found: Array = self.clearance[self._cells(points)]
         return found
 
     @cached_property
     def regions(self) -> Cells:
-        """Connected region of each cell as a number; 0 if the robot cannot be there."""
+        """The number of the connected region of each cell; 0 if the robot cannot be there."""
         numbered: Cells = label(self.clearance >= self.least, structure=np.ones((3, 3)))[0]
         return numbered
 
     def region(self, points: Array) -> Cells:
-        """Numbers of the regions of points, (n, 2)."""
+        """Look up the number of the region of each point, (n, 2) metres; see `regions`."""
         found: Cells = self.regions[self._cells(points)]
         return found
 
     def nearest(self, region: int, goal: Point, room: float) -> Point:
-        """The point of a region nearest to a goal, `room` metres from walls if possible."""
+        """Find the point of a region that is nearest to a goal.
+
+        Args:
+            region: Number of the region.
+            goal: (x, y) in metres.
+            room: Smallest distance of the point from walls in metres, if the region has such
+                points. Otherwise, points as far from walls as possible are considered.
+
+        Returns:
+            (x, y) in metres.
+        """
         cells = np.argwhere(self.regions == region)
         clearance = self.clearance[tuple(cells.T)]
         cells = cells[clearance >= min(room, float(clearance.max()))]
@@ -188,7 +234,10 @@ class Part:
 
 
 def _clearance(occupied: Mask) -> Array:
-    """Metres from each cell to the nearest occupied one. Outside counts as occupied."""
+    """The distance from each cell to the nearest occupied cell, in metres.
+
+    Cells outside the grid count as occupied.
+    """
     clearance: Array = (
         distance_transform_edt(np.pad(~occupied, 1, constant_values=False))[1:-1, 1:-1] * CELL
     )
@@ -198,10 +247,18 @@ def _clearance(occupied: Mask) -> Array:
 def _shortest(
     clearance: Array, least: float, start: tuple[int, int], goal: tuple[int, int]
 ) -> Cells | None:
-    """Cells of the cheapest route, (n, 2) rows and columns, at least this far from walls.
+    """The cells of the cheapest route.
 
-    The robot may be closer to obstacles than planned at start and goal. There, a cell is free if it
-    touches no occupied one.
+    Args:
+        clearance: (rows, columns) distance in metres to the nearest occupied cell.
+        least: Smallest distance of the route from occupied cells, in metres. Near start and goal,
+            where the robot may be closer to obstacles than planned, a cell need only not touch an
+            occupied one.
+        start: Row and column of the first cell.
+        goal: Row and column of the last cell.
+
+    Returns:
+        (n, 2) rows and columns; None if there is no route.
     """
     rows, columns = clearance.shape
     free = clearance >= least

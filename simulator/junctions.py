@@ -1,10 +1,11 @@
 """Control laws for streets that meet at any angles, by laser images and odometry.
 
 The robot follows the midline of a street until a wall is ahead or a side is open. There it looks
-around and climbs to the fixed point of the place, where the midlines of its streets meet. The
-panorama there is its model of the place, whose gateways are the streets that lead away. A turn goes
-to the next gateway at its side, and a turn around to the opposite heading. The robot finds its
-heading by comparing images with the panorama. It does not know its true pose.
+around and climbs to the fixed point of the place, where the midlines of its streets meet. It keeps
+the panorama at that point as its model of the place. The gateways of the place are the streets that
+lead away. A turn to the left or right ends at the next gateway on that side. A turn around ends at
+the opposite heading. The robot finds its heading by comparing images with the panorama. It does not
+know its true pose.
 """
 
 from __future__ import annotations
@@ -34,8 +35,9 @@ from ssh_abduction.data.trace import Action
 
 # Radians between two images of a turn.
 TURN = math.radians(15)
-# In multiples of the reach: distance driven before a place is expected, distance at which a wall
-# ahead stops the robot, and distance of a side wall at which the side is open.
+# Distances in multiples of the reach. LEAVE: a place is expected only after driving this far.
+# AHEAD: a wall ahead within this distance stops the robot. OPEN: a side is open if its wall is
+# farther.
 LEAVE, AHEAD, OPEN = 2.2, 1.6, 1.35
 SIDES = {"left": 1, "right": -1}
 ACTIONS = {
@@ -53,9 +55,9 @@ class Here:
     """The place where the robot is.
 
     Attributes:
-        ranges: (360,) panorama in metres.
-        place: Streets in the panorama.
-        heading: Heading of the robot in the panorama, in radians.
+        ranges: (360,) panorama: the range at each degree, in metres.
+        place: Streets and fixed point that the panorama shows.
+        heading: Heading of the robot relative to the panorama, in radians counterclockwise.
     """
 
     ranges: Array
@@ -64,13 +66,13 @@ class Here:
 
 
 class Pilot:
-    """Does the actions of a route with the control laws for any angles.
+    """Does the actions of a route in a world whose streets meet at any angles.
 
     Args:
         driver: The robot.
 
     Attributes:
-        here: The place where the robot is, once it has begun.
+        here: The place where the robot is; set by `begin`.
     """
 
     here: Here
@@ -80,7 +82,11 @@ class Pilot:
         self.reach = driver.world.reach
 
     def begin(self) -> None:
-        """Climb to the dstate near the start. Raises SimulatorError if there is no place."""
+        """Climb to the dstate (fixed position and heading) near the start.
+
+        Raises:
+            SimulatorError: There is no place near the start.
+        """
         if not self._climb():
             raise self._error(
                 "start",
@@ -90,7 +96,11 @@ class Pilot:
             )
 
     def act(self, action: str) -> None:
-        """Do an action of a route. Raises SimulatorError if it cannot be done."""
+        """Do an action of a route: "travel", "left", "right" or "around".
+
+        Raises:
+            SimulatorError: The action cannot be done.
+        """
         if action == "travel":
             self._travel()
         elif action == "around":
@@ -107,7 +117,14 @@ class Pilot:
             self._face(self.here.heading + turn)
 
     def star(self, image: Array | None = None) -> tuple[float, ...]:
-        """Bearings of the gateways in the panorama, in degrees clockwise from straight ahead."""
+        """Find the star: the bearings of the gateways of this place.
+
+        Args:
+            image: Ignored, as the panorama shows the gateways.
+
+        Returns:
+            Degrees clockwise from straight ahead, ascending.
+        """
         bearings = (
             round(math.degrees(self.here.heading - street.bearing) % 360, 1) % 360
             for street in self.here.place.streets
@@ -131,18 +148,18 @@ class Pilot:
             heed = self.driver.robot.driven + self.reach
 
     def _follow(self, began: float, heed: float) -> float:
-        """Follow the midline until a wall is ahead, or to the end of an open side.
+        """Follow the midline until a wall is ahead, or until a side was open and is closed again.
 
         Args:
-            began: Odometer reading in metres at the beginning.
-            heed: Odometer reading up to which walls and open sides are ignored.
+            began: Distance driven at the beginning of the travel, in metres.
+            heed: Distance driven up to which walls ahead and open sides are ignored.
 
         Returns:
-            Metres for which a side was open; 0 for a wall ahead.
+            Metres for which a side was open; 0 if a wall is ahead.
         """
         robot, reach = self.driver.robot, self.reach
         course = robot.odometry[2]  # Direction of the street by odometry.
-        # Whether walls were on both sides, and their end positions.
+        # Whether both sides were closed after `heed`, and the distance driven when one opened.
         closed, opened = False, None
         while robot.driven - began <= LONGEST_TRAVEL:
             image = self.driver.look()
@@ -174,13 +191,17 @@ class Pilot:
         )
 
     def _straight(self, way: float) -> None:
-        """Drive straight ahead, or back if negative."""
+        """Drive straight ahead, in metres; back if negative."""
         strides = math.ceil(abs(way) / STRIDE)
         for _ in range(strides):
             self.driver.go(way / strides)
 
     def _climb(self) -> bool:
-        """Climb to the fixed point of the place, keeping the heading. False if this is no place."""
+        """Climb to the fixed point of the place, and turn to the dstate nearest to the old heading.
+
+        Returns:
+            Whether this is a place, which has a fixed point.
+        """
         came = self.driver.robot.odometry[2]
         for _ in range(TRIES):
             straight_on = came - self.driver.robot.odometry[2]
@@ -201,13 +222,17 @@ class Pilot:
         return place.fixed is not None
 
     def _go(self, goal: complex) -> None:
-        """Go to a point of the panorama, forward or back, but at most `reach` metres."""
+        """Drive towards a point of the panorama, forward or back, at most `reach` metres.
+
+        Args:
+            goal: Complex number: metres ahead of the panorama's frame, and metres to its left.
+        """
         forward = cmath.phase(goal) if abs(cmath.phase(goal)) <= math.pi / 2 else cmath.phase(-goal)
         self._face(forward)
         self._straight(min(abs(goal), self.reach) * (1 if forward == cmath.phase(goal) else -1))
 
     def _look_around(self) -> Here:
-        """Turn once around. The panorama is in the frame of the robot at the end."""
+        """Turn once around, and find the place in the panorama."""
         driver = self.driver
         panorama = Panorama(driver.look())
         for _ in range(round(math.tau / TURN)):
@@ -217,7 +242,7 @@ class Pilot:
         return Here(ranges, Place.of(ranges, self.reach, driver.laser.reach), panorama.headings[-1])
 
     def _face(self, heading: float) -> None:
-        """Turn on the spot to a heading in the panorama."""
+        """Turn on the spot to a heading, in radians relative to the panorama."""
         for _ in range(TRIES):
             turn = math.remainder(heading - self.here.heading, math.tau)
             if abs(turn) <= self.driver.tolerance.straight:
@@ -229,7 +254,7 @@ class Pilot:
             )
 
     def _turn(self, turn: float) -> float:
-        """Turn once; return the angle by odometry."""
+        """Turn on the spot by an angle in radians; return the angle by odometry."""
         before = self.driver.robot.odometry[2]
         self.driver.go(0.0, turn)
         return math.remainder(self.driver.robot.odometry[2] - before, math.tau)
@@ -243,7 +268,13 @@ class Pilot:
 
 
 def _is_open(image: Array, side: int, reach: float) -> bool:
-    """Whether the wall at a side (1 left, -1 right) has ended, between 75 and 90 degrees."""
+    """Whether a side is open: there is no near wall between 75 and 90 degrees.
+
+    Args:
+        image: (180,) ranges in metres.
+        side: 1 for the left, -1 for the right.
+        reach: Half the width of a street in metres.
+    """
     beams = (
         image[-15:] * np.sin(BEARINGS[-15:]) if side > 0 else image[:15] * np.sin(-BEARINGS[:15])
     )
@@ -251,5 +282,5 @@ def _is_open(image: Array, side: int, reach: float) -> bool:
 
 
 def _steer(street: Street) -> float:
-    """Radians to turn on the next stride, to reach the midline and then follow it."""
+    """How far to turn on the next stride, to reach the midline and follow it, in radians."""
     return street.bearing - math.atan(1.5 * float(np.clip(street.offset, -0.5, 0.5)))

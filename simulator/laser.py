@@ -1,4 +1,7 @@
-"""A laser range finder: 180 beams, one a degree over the half circle ahead, from the right."""
+"""A laser range finder with 180 beams, one for each degree of the half circle ahead.
+
+The first beam is on the right, the last on the left.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,8 @@ class Laser:
 
     Attributes:
         noise: Standard deviation of a range in metres.
-        reach: Largest range in metres; anything farther reads as this.
-        dropouts: Probability that a beam is lost and reads as the largest range.
+        reach: Largest range in metres. A beam that meets nothing nearer reads this range.
+        dropouts: Probability that a beam is lost and reads the largest range.
     """
 
     noise: float = 0.005
@@ -33,9 +36,16 @@ class Laser:
     dropouts: float = 0.001
 
     def exact(self, world: World, poses: Array) -> Array:
-        """Ranges without noise from m poses (x, y, heading), (m, 180) metres.
+        """Compute the ranges without noise at some poses.
 
         One call for many poses is faster than many calls.
+
+        Args:
+            world: The world.
+            poses: (m, 3) x and y in metres, heading in radians.
+
+        Returns:
+            (m, 180) metres, from right to left.
         """
         poses = np.atleast_2d(poses)
         rows = max(1, _BLOCK // (BEAMS * len(world.segments)))
@@ -44,14 +54,23 @@ class Laser:
         )
 
     def scan(self, world: World, poses: Array, rng: np.random.Generator) -> Array:
-        """Ranges with noise, (m, 180) metres."""
+        """Compute the ranges with noise at some poses.
+
+        Args:
+            world: The world.
+            poses: (m, 3) x and y in metres, heading in radians.
+            rng: Source of the noise.
+
+        Returns:
+            (m, 180) metres, from right to left.
+        """
         ranges = self.exact(world, poses)
         ranges = ranges + rng.normal(0, self.noise, ranges.shape) * (ranges < self.reach)
         ranges[rng.random(ranges.shape) < self.dropouts] = self.reach
         return np.clip(ranges, 0.01, self.reach)
 
     def _cast(self, segments: Array, poses: Array) -> Array:
-        """Distance from each pose to the nearest wall along each beam, (m, 180) metres."""
+        """The distance from each pose to the nearest wall along each beam: (m, 180), metres."""
         near = _near(segments, poses, self.reach)
         nearest: Array = np.minimum(
             meetings(near, poses, BEARINGS).min(axis=2, initial=np.inf), self.reach
@@ -60,7 +79,7 @@ class Laser:
 
 
 def _near(segments: Array, poses: Array, reach: float) -> Array:
-    """The walls whose boxes are within `reach` of the box of the poses."""
+    """The walls whose bounding box is within `reach` of the bounding box of the poses."""
     low, high = poses[:, :2].min(0) - reach, poses[:, :2].max(0) + reach
     ends, others = segments[:, :2], segments[:, 2:]
     near: Array = segments[
@@ -70,15 +89,15 @@ def _near(segments: Array, poses: Array, reach: float) -> Array:
 
 
 def meetings(segments: Array, poses: Array, bearings: Array) -> Array:
-    """Distances from m poses along b bearings to w walls; infinite if a ray misses the wall.
+    """Compute the distances from poses to walls along rays.
 
     Args:
         segments: (w, 4) walls in metres.
-        poses: (m, 3) x, y, heading.
-        bearings: (b,) radians.
+        poses: (m, 3) x and y in metres, heading in radians.
+        bearings: (b,) directions of the rays relative to the heading, in radians.
 
     Returns:
-        (m, b, w) metres.
+        (m, b, w) metres; infinite if the ray misses the wall.
     """
     angles = poses[:, 2, None] + bearings
     dx, dy = np.cos(angles)[:, :, None], np.sin(angles)[:, :, None]

@@ -29,14 +29,17 @@ def reported(
     scale: float = 0.0,
     bend: float = 0.0,
 ) -> Displacement:
-    """A displacement as odometry reports it, with systematic errors and random noise.
+    """Add systematic errors and random noise to a displacement, as odometry reports it.
 
     Args:
-        displacement: The true displacement.
-        odometry: The noise, whose covariance is sampled.
+        displacement: The true displacement: metres ahead and to the left, and radians turned.
+        odometry: Model of the noise. The noise is drawn with its covariance.
         rng: Source of the noise.
         scale: Share by which reported distances are too long.
         bend: Radians a metre by which the reported heading drifts to the left.
+
+    Returns:
+        The reported displacement, rounded.
     """
     dx, dy, turned = displacement
     drift = bend * math.hypot(dx, dy)

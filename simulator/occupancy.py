@@ -1,8 +1,8 @@
-"""Reads occupancy maps of ROS, a YAML file and an image, and turns them into walls.
+"""Reads occupancy maps of ROS, and turns them into walls.
 
-The rules are those of map_server and nav2_map_server. Each pixel becomes a cell: occupied (100),
-free (0), unknown (-1), or in between. Walls are the borders of cells of 100, since costmaps and
-particle filters do not treat other cells as obstacles.
+Such a map is a YAML file and an image. The rules are those of map_server and nav2_map_server: each
+pixel becomes a cell that is occupied (100), free (0), unknown (-1), or in between. Walls are the
+borders of cells of 100, since costmaps and particle filters do not treat other cells as obstacles.
 """
 
 from __future__ import annotations
@@ -59,10 +59,11 @@ class MapFile:
         resolution: Metres a pixel.
         origin: (x, y) of the lower left corner of the image in metres, and its counterclockwise
             rotation in radians.
-        negate: Whether white is occupied instead of black.
-        occupied_thresh: A pixel above this is occupied, from 0 (free) to 1.
-        free_thresh: A pixel below this is free.
-        mode: Rule that turns pixels into cells.
+        negate: Whether white pixels are occupied, instead of black ones.
+        occupied_thresh: A pixel is occupied if it is darker than this, from 0 (white) to 1 (black);
+            with `negate`, if it is brighter.
+        free_thresh: A pixel is free if it is brighter than this, on the same scale.
+        mode: Rule that turns pixels into cells: "trinary", "scale" or "raw".
     """
 
     image: Path
@@ -81,7 +82,7 @@ def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
         path: The YAML file.
 
     Returns:
-        The name of the map, and its walls as segments, (n, 4) in metres.
+        The name of the map, which is that of the file, and its walls, (n, 4) in metres.
 
     Raises:
         SimulatorError: The map cannot be read, or has no walls. The text names the file and the
@@ -115,7 +116,7 @@ def read_occupancy(path: Path) -> tuple[str, NDArray[np.float64]]:
 
 
 def read_map_file(path: Path) -> MapFile:
-    """Read the YAML file of an occupancy map without its image.
+    """Read the YAML file of an occupancy map. Its image is not read.
 
     Raises:
         SimulatorError: The file is unreadable or no YAML, or a field is missing or invalid.
@@ -132,10 +133,16 @@ def read_map_file(path: Path) -> MapFile:
 
 
 def _fields(data: bytes) -> dict[str, str | list[str]]:
-    """The fields of a YAML file, each a text or a list of texts. Raises ValueError.
+    """Parse the fields of a YAML file.
 
     Scalars stay texts, as in the parser of map_server. PyYAML would read 5e-2 as a text and 1:30 as
     a number.
+
+    Returns:
+        For each field a text or a list of texts.
+
+    Raises:
+        ValueError: The file is no YAML, or a field has another form.
     """
     import yaml  # Imported here because it loads slowly.
 
@@ -169,7 +176,7 @@ def _fields(data: bytes) -> dict[str, str | list[str]]:
 
 
 class _Reader:
-    """Checks the fields of a map file; errors name the field.
+    """Checks the fields of a map file. Errors name the field that is wrong.
 
     Args:
         fields: Fields by name.
@@ -180,7 +187,7 @@ class _Reader:
         self.fields, self.path = fields, path
 
     def map_file(self) -> MapFile:
-        """Check all fields."""
+        """Check all fields, and warn of unknown ones. Raises SimulatorError."""
         if strange := sorted(set(self.fields) - FIELDS):
             warnings.warn(
                 f"{named(self.path)}: expected the fields {', '.join(sorted(FIELDS))}, got others, "
@@ -245,7 +252,7 @@ class _Reader:
 
     @staticmethod
     def _number(value: str | list[str] | None) -> float:
-        """A finite number; NaN for anything else."""
+        """Convert a text to a finite number; NaN for anything else."""
         try:
             number = float(value) if isinstance(value, str) else math.nan
         except ValueError:
@@ -277,10 +284,11 @@ class _Reader:
 
 
 def _cells(fields: MapFile, path: Path) -> Cells:
-    """The cells of a map, (rows, columns) with the top row first.
+    """Read the image of a map, and turn its pixels into cells.
 
     Returns:
-        100 occupied, 0 free, -1 unknown, or in between.
+        (rows, columns) with the top row first: 100 is occupied, 0 free, -1 unknown, and 1 to 99 in
+        between.
 
     Raises:
         SimulatorError: The image cannot be read. The text names the YAML file and the image.
@@ -343,12 +351,16 @@ def _cells(fields: MapFile, path: Path) -> Cells:
 def _shades(
     image: Image.Image, with_alpha: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | bool]:
-    """Brightness of the pixels of an image, from 0 (black) to 1, and the mask of opaque ones.
+    """Measure the brightness of the pixels of an image.
 
     Args:
         image: An image in grey, colours or a palette.
         with_alpha: Whether opacity counts as a fourth colour, as in mode trinary. Then all pixels
-            are opaque.
+            count as opaque.
+
+    Returns:
+        (rows, columns) brightness from 0 (black) to 1, and the mask of opaque pixels; True if all
+        are opaque.
     """
     if image.mode == "F":
         raise ValueError("pixels that are floating-point numbers, for which map_server has no rule")
@@ -364,9 +376,12 @@ def _shades(
 def _edges(
     occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float, float]
 ) -> NDArray[np.float64]:
-    """The borders between occupied and other cells, as long segments, (n, 4) in metres.
+    """The borders between occupied and other cells, joined to long segments: (n, 4), metres.
 
-    Row 0 of the cells is at the bottom.
+    Args:
+        occupied: (rows, columns) mask, with the bottom row first.
+        resolution: Side of a cell in metres.
+        origin: (x, y) of the lower left corner in metres, and rotation in radians.
     """
     found: list[tuple[float, float, float, float]] = []
     # Find borders between rows, then between columns by transposing.

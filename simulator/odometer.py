@@ -1,4 +1,4 @@
-"""An odometer with random errors that grow along the way, and with systematic errors.
+"""An odometer with systematic errors, and with random errors that grow with the distance.
 
 >>> from simulator.odometer import Odometer
 >>> exact = Odometer(along=0, across=0, heading=0, turning=0)
@@ -27,15 +27,15 @@ class Odometer:
     """Noise and systematic errors of an odometer.
 
     The errors of two motions are independent, so the standard deviation of the noise grows with the
-    square root of the distance. The defaults agree with the recorded logs of ACES, Belgioioso,
-    CSAIL and Seattle, compared between two scans with their corrected poses: `along` 0.02 to 0.08,
-    `across` 0.015 to 0.05, `heading` 0.008 to 0.07, `turning` 0.1 (corrected there).
+    square root of the distance. The defaults are near those of recorded logs (ACES, Belgioioso,
+    CSAIL and Seattle), in which the motion between two scans was compared with the corrected poses:
+    `along` 0.02 to 0.08, `across` 0.015 to 0.05, `heading` 0.008 to 0.07, `turning` 0.1.
 
     Attributes:
-        along: Standard deviation along the motion, metres after one metre.
-        across: Standard deviation across the motion, metres after one metre.
-        heading: Standard deviation of the heading, radians after one metre.
-        turning: Standard deviation of the heading, radians after a turn of one radian.
+        along: Standard deviation along the motion after one metre, in metres.
+        across: Standard deviation across the motion after one metre, in metres.
+        heading: Standard deviation of the heading after one metre, in radians.
+        turning: Standard deviation of the heading after a turn of one radian, in radians.
         scale: Share by which reported distances are too long, as with worn wheels.
         bend: Radians a metre by which the reported heading drifts to the left, as with wheels of
             unequal size.
@@ -65,7 +65,14 @@ class Odometer:
                 )
 
     def as_noisy_as(self, along: float) -> Odometer:
-        """Scale the noise to `along`, keeping its proportions. Raises SimulatorError."""
+        """Copy the odometer, with noise of the default proportions, scaled to a value of `along`.
+
+        Args:
+            along: Standard deviation along the motion after one metre, in metres.
+
+        Raises:
+            SimulatorError: The value is not from 0 to 1.
+        """
         if not is_finite(along) or not 0 <= along <= WORST:
             raise SimulatorError(
                 f"odometry_noise: expected a number from 0 to {WORST:g}, got "
@@ -82,13 +89,18 @@ class Odometer:
         )
 
     def parameters(self) -> dict[str, float]:
-        """The noise model by name, for logs."""
+        """Return all attributes as a dict from name to value, for logs."""
         return asdict(self)
 
     def reading(self, poses: Array, rng: np.random.Generator) -> Array:
-        """Odometry at each of the true poses (x, y, heading), (n, 3) in metres and radians.
+        """Compute what the odometer reads along a trajectory.
 
-        It begins at (0, 0, 0).
+        Args:
+            poses: (n, 3) true poses: x and y in metres, heading in radians.
+            rng: Source of the noise.
+
+        Returns:
+            (n, 3) poses by odometry. The first is (0, 0, 0).
         """
         ahead, left, turned = _motions(poses)
         way = np.hypot(ahead, left)
@@ -109,9 +121,16 @@ class Odometer:
         return np.column_stack([x, y, np.remainder(heading + np.pi, 2 * np.pi) - np.pi])
 
     def covariances(self, readings: Array) -> Array:
-        """Covariance, (n, 3, 3), of the noise of each reading, (n, 3), relative to the first one.
+        """Estimate the covariance of the noise of each reading, relative to the first one.
 
-        It is a first-order estimate without systematic errors, which a robot cannot know.
+        The estimate is of first order. It does not include systematic errors, which a robot cannot
+        know.
+
+        Args:
+            readings: (n, 3) poses by odometry.
+
+        Returns:
+            (n, 3, 3) covariances of x, y and heading.
         """
         found = np.zeros((len(readings), 3, 3))
         for number, (start, ahead, left, turned) in enumerate(
@@ -141,7 +160,10 @@ class Odometer:
 
 
 def _motions(poses: Array) -> tuple[Array, Array, Array]:
-    """Motion from each pose to the next: metres ahead, metres to the left, radians turned."""
+    """The motion from each pose to the next: metres ahead, metres to the left, radians turned.
+
+    Each is an array, (n - 1,).
+    """
     steps = np.diff(poses, axis=0)
     cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     turned = np.remainder(steps[:, 2] + np.pi, 2 * np.pi) - np.pi
