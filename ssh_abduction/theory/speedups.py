@@ -1,9 +1,10 @@
 """The table of speed-ups: what each one does, and for which theories it holds.
 
-Users may add axioms and evidence, but a speed-up is made for certain axioms. So each speed-up names
-the axioms that it rests on, which the theory must not give up, and the axioms that it keeps. It is
-on for a theory only if it keeps all that the theory demands. An axiom that it does not know
-switches it off. So axioms that users add are always obeyed.
+A speed-up makes solving faster and changes no answer. It is made for certain axioms, but users may
+add others. So each speed-up lists the axioms that it rests on: the theory must enforce them. It
+also lists the axioms that it keeps: for these it is exact. A speed-up is used for a theory only if
+it keeps all axioms of the theory. So an axiom that it does not know switches it off, and axioms
+that users add are always obeyed.
 
 >>> from ssh_abduction import Theory
 >>> from ssh_abduction.theory.speedups import Speedups
@@ -28,7 +29,7 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 
 @dataclass(frozen=True, slots=True)
 class Speedups:
-    """Which speed-ups are on.
+    """Which speed-ups are on, as flags.
 
     No speed-up changes an answer. `TABLE` says what each one does, and for which theories it holds.
     """
@@ -59,7 +60,14 @@ class Speedups:
 
     @classmethod
     def without(cls, names: str | Iterable[str]) -> Speedups:
-        """All speed-ups except these. Raises SolverError."""
+        """Return Speedups that are all on except these.
+
+        Args:
+            names: Names of fields, in a list or separated by commas.
+
+        Raises:
+            SolverError: A name is unknown.
+        """
         if not isinstance(names, Iterable):
             raise SolverError(
                 f"speedups: expected names out of {', '.join(SPEEDUPS)}, got {brief(names)}"
@@ -73,14 +81,18 @@ class Speedups:
         return cls(**dict.fromkeys(off, False))
 
     def that_hold_for(self, theory: Theory) -> Speedups:
-        """The speed-ups that hold for a theory; `star` must not be auto."""
+        """Return these speed-ups without those that might change an answer for a theory.
+
+        Args:
+            theory: The theory. Its `star` must not be auto.
+        """
         theory = checked_theory(theory)
         valid = {speedup.switch for speedup in TABLE if speedup.holds_for(theory)}
         return replace(self, **{name: False for name in SPEEDUPS if name not in valid})
 
 
 def checked_speedups(value: object) -> Speedups:
-    """The speed-ups that a caller gives. Raises SolverError."""
+    """Return a value if it is Speedups, or raise SolverError."""
     if not isinstance(value, Speedups):
         raise SolverError(
             f"speedups: expected Speedups, got {brief(value)}; take Speedups() or "
@@ -94,18 +106,18 @@ SPEEDUPS = tuple(f.name for f in fields(Speedups))
 
 @dataclass(frozen=True)
 class Speedup:
-    """One row of the table.
+    """A row of the table of speed-ups.
 
     Attributes:
-        name: Its own name.
+        name: The name of the row.
         switch: The field of `Speedups` that turns it on. Several rows may share a switch.
         sentence: What it does.
-        suits: Whether it is made for a theory.
-        rests_on: Axioms that it needs. The theory must enforce each of them that it has a subject
-            for.
-        keeps: The axioms for which it is exact: it loses no map that satisfies them, and lets no
-            other map pass. EVERY if any further axiom only removes maps, or if every map is
-            checked anyway.
+        suits: Returns whether the row is made for a theory.
+        rests_on: Axioms that it needs. If an axiom is about something that a theory has, such as
+            paths, the theory must enforce it.
+        keeps: Returns the axioms for which it is exact: it loses no map that satisfies them, and
+            finds no other map. EVERY if it is exact for all axioms, because further axioms only
+            remove maps, or because every map is checked anyway.
     """
 
     name: str
@@ -116,7 +128,7 @@ class Speedup:
     keeps: Callable[[], frozenset[str]] | None
 
     def holds_for(self, theory: Theory) -> bool:
-        """Whether it changes no answer for a theory (without star=auto)."""
+        """Whether it changes no answer for a theory. `star` must not be auto."""
         return (
             self.suits(theory)
             and not self.rests_on & theory.given_up
@@ -137,7 +149,7 @@ def _knows_views(theory: Theory) -> bool:
 
 
 def _keeps_headings(theory: Theory) -> bool:
-    """Whether a dstate has at most one heading."""
+    """Whether a dstate (a place and a direction) has at most one heading."""
     return theory.star != "frame" or "one_heading" in theory.hard
 
 
@@ -166,7 +178,12 @@ def _has_bare_places(theory: Theory) -> bool:
 
 
 def _kept_by(*names: str, and_also: Iterable[str] = ()) -> Callable[[], frozenset[str]]:
-    """The axioms that these fast encodings and the Python code around them keep."""
+    """Make a function that returns the axioms that some fast encodings keep.
+
+    Args:
+        names: The names of the encodings.
+        and_also: Axioms that the Python code around the encodings keeps.
+    """
     return lambda: encodings.keeps(*names) | frozenset(and_also)
 
 
@@ -213,8 +230,8 @@ GATEWAYS = frozenset(
     }
 )
 NOTHING: frozenset[str] = frozenset()
-# Axioms about links, observations and pairs of steps only. A map that satisfies them still does so
-# when it is cut to its first steps.
+# Axioms about links, observations and pairs of steps only. If a map satisfies them, so does the map
+# of its first steps.
 SURVIVE_A_CUT = FRAMES | {
     "next_place",
     "all_on_paths",
@@ -230,8 +247,8 @@ SURVIVE_A_CUT = FRAMES | {
     "one_star",
     "one_pose",
 }
-# Kinds of evidence that only say which steps are different dstates or at different places, and
-# which labels contradict each other.
+# Kinds of evidence about steps only: they say which steps are different dstates or at different
+# places, and which labels contradict each other.
 PAIRS_OF_STEPS = ("asserted", "one_star", "one_pose", "planar")
 
 TABLE = (
@@ -409,7 +426,7 @@ TABLE = (
 
 
 def row(name: str) -> Speedup:
-    """The row with this name."""
+    """Return the row of the table with this name."""
     return next(speedup for speedup in TABLE if speedup.name == name)
 
 

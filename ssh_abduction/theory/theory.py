@@ -41,12 +41,12 @@ from ssh_abduction.theory.fields import (
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.rules import Rules
 
-# Ignoring a step costs at least LEAST_SURE times the price, and at most MOST_SURE times: even a
-# very confident view may be wrong.
+# Treating a view or a star as wrong costs LEAST_SURE to MOST_SURE times the price: even a very
+# confident view may be wrong.
 LEAST_SURE, MOST_SURE = 0.1, 5.0
 LARGEST_TOML = 2**20  # bytes
-# The fields that speed-ups know through the axioms. For any other field, such as one that is added
-# later, speed-ups must say that they respect it.
+# The fields that are covered by the axioms of a theory. Speed-ups must name any other field that
+# they respect, such as one that is added later.
 SPOKEN_FOR = {
     "level",
     *CHOICES,
@@ -68,8 +68,9 @@ SETTLED = ("returns", "unknown_views")
 
 @dataclass(frozen=True)
 class Theory:
-    """A frozen choice of axioms and of what is minimised: a preset, `replace`, or field by field.
+    """An immutable choice of axioms and of what to minimise.
 
+    Take a preset such as `causal`, change it with `replace`, or set the fields by name.
     docs/explanation/theory.md explains the axioms and their sources. `ssh-abduction theory` prints
     them.
 
@@ -78,36 +79,36 @@ class Theory:
             and paths).
         boundary: Whether the axioms about left and right of a path hold. none: they do not. strict:
             without exception. defeasible: with exceptions for pairs of paths, each at a cost.
-        symmetric_sides: Whether paths cross at a turn, so that a turn gives four relations of
-            sides, not one.
+        symmetric_sides: Whether two paths cross at a turn from one to the other. If they do, a
+            branch on the right in one direction is on the left in the other.
         path_order: Whether the places of a path have a partial or a total order.
-        next_place: Whether a travel leads to the next place of its path.
+        next_place: Whether a travel leads to the next place of its path, and passes none.
         all_on_paths: Whether every dstate is on a path, even one where no travel starts or ends.
-        star: How to read the gateways seen at a place. none: not at all. alike: a dstate has one
-            star, within tolerance. pattern: stars of a place agree up to a rotation. frame: they
-            agree when turned by the heading, and paths go straight on. gateways: like frame, in
-            any directions within tolerance. auto: frame if the trace has stars, else none. frame
-            becomes gateways if stars or turns do not fit right angles.
+        star: How to use stars (the gateways seen at a place). none: not at all. alike: a dstate has
+            one star, within tolerance. pattern: the stars of a place are one star, rotated. frame:
+            the stars of a place agree when rotated by the headings, and paths go straight on.
+            gateways: like frame, in any directions, within tolerance. auto: frame if the trace has
+            stars, else none. If stars or turns do not fit right angles, frame becomes gateways.
         displacement: Whether displacements are evidence; auto uses them if the trace has any.
         reject: Significance level: the largest probability of rejecting the true map because of
             its displacements.
-        joint: The number of returns to places that are tested together: 1 or 2.
-        returns: The number of returns of the trace that may be true, among which `reject` is
-            shared; 0 counts them in the trace.
-        misread: Cost in dstates, in tenths, of treating a view or a star (the openings seen at a
-            place) as wrong; 0 forbids it.
-        slipped: Cost in dstates of an action that did not do what its name says; with 0, no action
-            may slip.
+        joint: How many returns (visits that come back to a place) are tested together. 1: each
+            alone. 2: also pairs of them.
+        returns: How many returns to a place or a dstate may be true, so that `reject` is divided
+            among them; 0 counts them in the trace.
+        misread: Cost in dstates, with one decimal, of treating a view or a star (the gateways seen
+            at a place) as wrong; 0 forbids it.
+        slipped: Cost in dstates of an action that did not do what its name says; 0 forbids it.
         jumped: Cost in dstates of ignoring a displacement, for example because the robot was
             carried; 0 forbids it.
-        planar: Whether paths meet at places only, so that the map can be drawn in the plane
-            without a crossing, with right turns to the right.
+        planar: Whether paths meet only at places. Then the map can be drawn in the plane without a
+            crossing, with right turns to the right.
         prefer: What to minimise, most important first, out of dstates, paths, places and excuses.
             Counts that are not named are not minimised. auto is dstates,places,paths if
             displacements are used, else dstates,paths,places.
         without: Names of axioms to leave out, to see what they do.
         rules: Your own rules: paths of files that use the predicates of the encodings, or Rules.
-        unknown_views: Whether the view of some step is unknown. The trace decides it.
+        unknown_views: Whether the view of some step is unknown. It is set from the trace.
         same: Pairs of steps known to be one dstate.
         different: Pairs of steps known to be different dstates.
         elsewhere: Pairs of steps known to be at different places.
@@ -144,21 +145,34 @@ class Theory:
 
     @classmethod
     def causal(cls) -> Theory:
-        """The causal axioms alone, fewest dstates: the smallest Moore machine of the trace."""
+        """Return the preset with the causal axioms only and the fewest dstates.
+
+        Its maps are the smallest Moore machines that explain the trace.
+        """
         return cls(level="causal", boundary="none", star="none", prefer=("dstates",))
 
     @classmethod
     def topological(cls) -> Theory:
-        """All levels, fewest dstates first, as in Kuipers & Beeson (2002). The default."""
+        """Return the default preset: all axioms, fewest dstates first.
+
+        Reference: Kuipers & Beeson (2002).
+        """
         return cls()
 
     @classmethod
     def circumscriptive(cls) -> Theory:
-        """All levels; fewest paths, then places, then dstates, as in Remolina & Kuipers (2004)."""
+        """Return the preset with all axioms and the fewest paths, then places, then dstates.
+
+        Reference: Remolina & Kuipers (2004).
+        """
         return cls(prefer=("paths", "places", "dstates"))
 
     def replace(self, **choices: Any) -> Theory:
-        """This theory with other choices. Raises TheoryError."""
+        """Return this theory with other values of some fields.
+
+        Raises:
+            TheoryError: A field is unknown or has a wrong value.
+        """
         unknown = set(choices) - {f.name for f in fields(self)}
         if unknown:
             raise TheoryError(
@@ -169,9 +183,11 @@ class Theory:
 
     @property
     def priorities(self) -> tuple[Count, ...]:
-        """What is minimised, most important first, with excuses if boundary=defeasible.
+        """The counts to minimise, most important first.
 
-        With displacement=auto, the order is that for a trace without displacements.
+        With boundary=defeasible, they include "excuses". With faults, "tenths" comes first: the
+        cost in tenths of a dstate. With displacement=auto, the order is that for a trace without
+        displacements.
         """
         prefer = self.prefer
         if self.has_faults:
@@ -193,22 +209,22 @@ class Theory:
 
     @property
     def has_faults(self) -> bool:
-        """Whether a map may ignore parts of the trace."""
+        """Whether a map may treat parts of the trace as wrong, at a cost."""
         return any(getattr(self, kind) > 0 for kind in EXCUSED)
 
     def without_faults(self) -> Theory:
-        """This theory without faults: a map may ignore nothing."""
+        """Return this theory without faults: a map may treat nothing as wrong."""
         return replace(self, **dict.fromkeys(EXCUSED, 0.0))  # type: ignore[arg-type]
 
     def fault_tenths(self, kind: str, step: Step) -> int:
-        """The cost of ignoring a step, in tenths of dstates; 0 if the theory forbids it.
+        """Return the cost of a fault at a step, in tenths of a dstate; 0 if the theory forbids it.
 
-        The cost of a view or star grows with the log odds of the step's confidence. A confidence of
-        0.99, or none, costs the full price.
+        The cost of a wrong view or star grows with the log odds of the step's confidence. If the
+        confidence is 0.99 or None, the cost is the field `misread`.
 
         Args:
-            kind: misread (the view), misseen (the star), slipped (the action done there), or jumped
-                (the displacement that led there).
+            kind: misread (the view is wrong), misseen (the star), slipped (the action done there),
+                or jumped (the displacement that led there).
             step: The step.
         """
         if not isinstance(kind, str) or kind not in FAULTS:
@@ -223,9 +239,10 @@ class Theory:
 
     @cached_property
     def axioms(self) -> tuple[str, ...]:
-        """The names of the axioms that hold; the user's own rules come last.
+        """The names of the axioms that hold. Those of the user's own rules come last.
 
-        With star=auto and displacement=auto, neither counts as present.
+        With star=auto, axioms about stars are left out; with displacement=auto, those about
+        displacements.
         """
         own = [axiom.name for rules in self.rules for axiom in rules.axioms]
         return (
@@ -239,7 +256,7 @@ class Theory:
 
     @cached_property
     def hard(self) -> frozenset[str]:
-        """The axioms that nothing may break, neither an excuse nor a fault."""
+        """The names of the axioms that no excuse and no fault may break."""
         excused = set().union(*(axioms for name, axioms in EXCUSED.items() if getattr(self, name)))
         return (
             frozenset(self.axioms)
@@ -249,7 +266,7 @@ class Theory:
 
     @cached_property
     def given_up(self) -> frozenset[str]:
-        """Axioms relevant to this theory that it does not enforce.
+        """The names of axioms relevant to this theory that it does not enforce.
 
         They are not chosen, are left out, or may be excused.
         """
@@ -260,10 +277,11 @@ class Theory:
 
     @cached_property
     def demands(self) -> frozenset[str]:
-        """All that a speed-up must respect.
+        """The names of all that a speed-up must respect.
 
-        These are the hard axioms and, under names of their own, axioms that may be excused,
-        asserted equalities of steps, the user's own rules, and fields that no axiom covers.
+        These are the hard axioms, "NAME, excusable" for each other axiom, "asserted same" if the
+        user asserts that steps are one dstate, "the rules of FILE" for the user's own rules, and
+        "the field NAME" for each changed field that no axiom covers.
         """
         excusable = {f"{name}, excusable" for name in set(self.axioms) - self.hard}
         asserted = {"asserted same"} if self.same else set()
@@ -277,15 +295,15 @@ class Theory:
 
     @cached_property
     def asserted(self) -> Pairs:
-        """The pairs of steps that the user asserts. Computed once, as there may be many."""
+        """Pairs of steps that the user asserts to be one dstate, different dstates or places."""
         return Pairs.of(self.different, self.elsewhere, self.same)
 
     def with_frames(self) -> Theory:
-        """The theory in which places have frames and fewest dstates come first.
+        """Return a theory with star=frame and fewest dstates first, for a theory with star=pattern.
 
-        For star=pattern. Its maps, without their headings, are also maps of this theory: paths are
-        totally ordered, the axioms of sides hold without excuses, and stars that agree in a frame
-        are one pattern.
+        The maps of the new theory, without their headings, are also maps of this theory. The new
+        theory has paths with a total order and axioms of sides without excuses. Stars that agree in
+        a frame are one pattern.
         """
         boundary = "none" if self.boundary == "none" else "strict"
         rest = [count for count in self.priorities if count in ("paths", "places")]
@@ -298,7 +316,7 @@ class Theory:
 
         Args:
             step: The step.
-            where: What messages call the step.
+            where: The name of the step in messages.
 
         Raises:
             TraceError: The step lacks a star, or the kind of its action.
@@ -340,7 +358,7 @@ class Theory:
             raise TraceError(f"{where}: {error}, or take {choice('star', 'none')}") from None
 
     def check_steps(self, trace: Trace) -> None:
-        """Check that the trace has all steps that the pairs name.
+        """Check that the trace has all steps in the fields `same`, `different` and `elsewhere`.
 
         Raises:
             TheoryError: A step is missing.
@@ -355,11 +373,14 @@ class Theory:
                     )
 
     def of_steps(self, first: int, length: int) -> Theory:
-        """This theory for a part of the trace. Pairs with steps outside of it are dropped.
+        """Return this theory for a part of the trace.
+
+        The pairs of steps in `same`, `different` and `elsewhere` are renumbered. Pairs with a step
+        outside of the part are dropped.
 
         Args:
-            first: The first step, which becomes step 0.
-            length: The number of steps.
+            first: The first step of the part, which becomes step 0.
+            length: The number of steps of the part.
         """
         first, length = (
             a_whole_number(name, value, TheoryError)
@@ -376,7 +397,7 @@ class Theory:
         return replace(self, **kept)  # type: ignore[arg-type]
 
     def to_dict(self) -> dict[str, Any]:
-        """The theory as plain data."""
+        """Return the fields as a dict of plain data."""
         return {
             k: [list(e) if isinstance(e, tuple) else e for e in v] if isinstance(v, tuple) else v
             for k, v in asdict(self).items()
@@ -384,7 +405,10 @@ class Theory:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Theory:
-        """The theory that `to_dict` wrote. Missing fields are those of the level's preset.
+        """Make a theory of the data that `to_dict` wrote.
+
+        Missing fields get their values in the preset: `causal` if level is causal, else
+        `topological`.
 
         Raises:
             TheoryError: A field is wrong.
@@ -401,8 +425,8 @@ class Theory:
         """Read a theory from a TOML file with one field a line, such as `star = "frame"`.
 
         Args:
-            path: The file. Its line `preset = "causal"` names the preset that the other fields
-                change. Files of `rules` are relative to its folder.
+            path: The file. A line such as `preset = "causal"` names the preset that the other
+                fields change. Paths in the field `rules` are relative to the folder of this file.
 
         Raises:
             TheoryError: The file cannot be read, or a field is wrong.
@@ -428,7 +452,7 @@ class Theory:
 
 
 def _read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The fields in a TOML file. Raises TheoryError."""
+    """Return the fields in a TOML file as a dict, or raise TheoryError."""
     try:
         return tomllib.loads(read_at_most(path, LARGEST_TOML).decode("utf-8"))
     except OSError as error:
@@ -450,7 +474,7 @@ PRESETS: dict[str, Callable[[], Theory]] = {
 
 
 def checked_theory(value: object) -> Theory:
-    """The theory that a caller gives; Theory.topological() for None. Raises TheoryError."""
+    """Return a theory; Theory.topological() for None. Raise TheoryError for other values."""
     if not isinstance(value, Theory | None):
         raise TheoryError(
             f"theory: expected a Theory, got {brief(value)}; take Theory.topological(), "

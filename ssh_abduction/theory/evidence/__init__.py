@@ -1,16 +1,16 @@
 """Kinds of evidence: what is known besides views and actions.
 
-A kind of evidence is a module of this folder and an encoding of the same name.
-
+Each kind of evidence is a module of this folder, with an encoding of the same name.
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.theory.evidence import pairs_of
 >>> trace = Trace.from_steps("aaa", ["travel", "travel"])
 >>> pairs_of(trace, Theory(different=[(0, 2)])).apart
 {2: frozenset({0})}
 
-`KINDS` lists the kinds. No other code knows them by name. What a kind knows about pairs of steps
-(`Pairs`) prunes the domains of all engines, so evidence makes solving faster. What a kind can check
-only on a whole map (`refuse`) is asked after each answer.
+`KINDS` lists the kinds. A kind gives pairs of steps that are known to be equal or different
+(`pairs`). They prune the domains of all engines, which ask clingo for maps. So evidence makes
+solving faster. Some knowledge is about whole maps only. A kind uses it to check each map that
+clingo finds (`refuse`).
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ __all__ = [
 
 
 def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidence, ...]:
-    """Make the kinds of evidence that a theory uses.
+    """Make an object for each kind of evidence that a theory uses.
 
     Args:
         theory: The theory without `auto`.
-        known: Evidence that was made before. What it remembers about traces is kept.
+        known: Evidence that was made before. What it has computed about traces is reused.
     """
     made = [kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms]
     before = {type(evidence): evidence for evidence in known}
@@ -62,7 +62,7 @@ def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidenc
 def said_by(
     kinds: Iterable[Evidence], trace: Trace, refused: Mapping[str, int]
 ) -> dict[str, dict[str, int]]:
-    """What each kind of evidence excluded.
+    """Count what each kind of evidence excluded.
 
     Args:
         kinds: The evidence.
@@ -70,7 +70,8 @@ def said_by(
         refused: The number of rejected sets of equalities, by the name of the kind.
 
     Returns:
-        By the name of the kind, the number of excluded pairs of steps and of rejected sets.
+        For the name of each kind, a dict: "pairs" is the number of pairs of steps that are
+        different dstates, and "refused" the number of rejected sets.
     """
     return {
         kind.name: {
@@ -82,12 +83,14 @@ def said_by(
 
 
 def pairs_of(trace: Trace, theory: Theory, evidence: Iterable[Evidence] | None = None) -> Pairs:
-    """What the evidence that cannot be excused says about pairs of steps of a trace.
+    """Return which pairs of steps the evidence shows to be equal or different.
+
+    Evidence that a fault may excuse is left out.
 
     Args:
         trace: The trace.
         theory: The theory, without `auto`.
-        evidence: The evidence that this theory uses; made for it by default.
+        evidence: The evidence that this theory uses; by default it is made.
     """
     kinds = evidence_of(theory) if evidence is None else evidence
     return Pairs.joined([e.pairs(trace) for e in kinds if e.axiom in theory.hard])

@@ -1,6 +1,6 @@
-"""Stars (the openings seen at places) as evidence: steps with other stars are other dstates.
+"""Stars as evidence: steps with different stars are different dstates.
 
-This needs neither places nor right angles.
+A star is all openings seen at a step. This evidence needs neither places nor right angles.
 """
 
 from __future__ import annotations
@@ -18,14 +18,16 @@ from ssh_abduction.theory.pairs import Pairs
 if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
-_Seen = tuple[str | None, Star]  # a star, and its view; None if views say nothing about dstates
+_Seen = tuple[str | None, Star]  # a view (None if a dstate may have several views), and a star
 
 
 @dataclass(frozen=True)
 class Alike:
-    """Stars that are compared without being turned.
+    """Evidence from stars (openings seen), compared without rotating them.
 
-    Steps with different views are different dstates anyway, so they give no pairs.
+    Attributes:
+        has_one_view: Whether a dstate has only one view. Then steps with different views are
+            different dstates anyway, so they give no pairs.
     """
 
     name: ClassVar[str] = "alike"
@@ -56,7 +58,7 @@ class Alike:
 
 @lru_cache(maxsize=8)
 def _pairs(seen: tuple[_Seen, ...]) -> Pairs:
-    """The pairs of steps with the same view, but stars that are not alike."""
+    """Return the pairs of steps with the same view, but with stars that are not alike."""
     steps: dict[str | None, dict[Star, list[int]]] = {}
     apart: dict[int, frozenset[int]] = {}
     for t, (view, star) in enumerate(seen):
@@ -73,19 +75,22 @@ def _pairs(seen: tuple[_Seen, ...]) -> Pairs:
 def are_alike(one: Star, other: Star) -> bool:
     """Whether two stars may show the same gateways to a robot that has not turned.
 
-    Each gateway seen in one star must be a gateway of the other, each a different one.
-    Gateways that were not observed may be there or not. It is enough to pair the seen gateways of
-    each star (Mendelsohn & Dulmage 1958).
+    Each gateway that is seen in one star must match a gateway of the other star, each a different
+    one. A gateway that was not observed may match or not exist. It is enough to match the seen
+    gateways of each star separately (Mendelsohn & Dulmage 1958).
     """
     return _pairable(one, other) and _pairable(other, one)
 
 
 def _pairable(one: Star, other: Star) -> bool:
-    """Whether each gateway seen in one star can be paired with one of the other, in tolerance."""
+    """Whether all gateways seen in one star can match different gateways of the other star.
+
+    Two gateways match if their bearings differ by at most the sum of their spreads.
+    """
     partner: dict[int, int] = {}  # gateways of `one`, by their partner in `other`
 
     def pair(k: int, tried: set[int]) -> bool:
-        """Find a partner for gateway k; a gateway that loses its partner gets another one."""
+        """Find a partner for gateway k. A gateway that loses its partner to k gets another one."""
         here = one.gateways[k]
         for j, there in enumerate(other.gateways):
             if (

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Asserted:
-    """The fields `same`, `different` and `elsewhere` of a theory.
+    """Evidence from the fields `same`, `different` and `elsewhere` of a theory.
 
     Pairs with a step that the trace does not have yet are ignored.
     """

@@ -1,4 +1,4 @@
-"""The error at the end of a loop of the trace, in numbers and in words."""
+"""The error at the end of a loop of the trace: by odometry, the robot is not back where it was."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from dataclasses import dataclass
 class Closing:
     """The error at the end of a loop, in metres and radians, with standard deviations.
 
+    A loop is the way between two steps that may be one dstate or at one place.
+
     Attributes:
-        way: Metres driven from its first step to its last one.
-        size: The distance between its ends.
-        size_sigma: The standard deviation of that distance.
-        turned: The difference of heading.
-        turned_sigma: The standard deviation of that difference.
+        way: The metres driven from the first step of the loop to its last step.
+        size: The distance between the ends of the loop.
+        size_sigma: The standard deviation of `size`.
+        turned: The difference between the headings at the ends of the loop.
+        turned_sigma: The standard deviation of `turned`.
         square_of_position: The chi-square of the position, with two degrees of freedom.
     """
 
@@ -33,12 +35,12 @@ class Closing:
 
     @property
     def metres(self) -> str:
-        """The distance in words, such as "11.2 ± 1.4 m"."""
+        """The distance between the ends in words, such as "11.2 ± 1.4 m"."""
         return f"{self.size:.1f} ± {self.size_sigma:.1f} m"
 
     @property
     def degrees(self) -> str:
-        """The difference of heading in words, such as "90 ± 3 degrees"."""
+        """The difference between the headings in words, such as "90 ± 3 degrees"."""
         return (
             f"{abs(math.degrees(self.turned)):.0f} ± {math.degrees(self.turned_sigma):.0f} degrees"
         )

@@ -1,22 +1,22 @@
 """Displacements as evidence: a dstate has one pose, and a place one position.
 
-A *return* is a pair of visits that a map takes for one place, or a pair of steps that it takes for
-one dstate. The displacements between the two steps make a loop. The loop fails to close by some
-distance, and the covariance says how likely that is (`loops.py`). The axiom `one_pose` demands that
-no set of at most `joint` returns is rejected.
+A *return* is a pair of visits that a map has at one place, or a pair of steps that it has at one
+dstate. The displacements between the two steps make a loop. By these displacements, the end of the
+loop is some distance from its beginning, and the covariance says how likely that is (`loops.py`).
+The axiom `one_pose` demands that no set of at most `joint` returns is rejected.
 
-*One return* does not depend on others. So the search knows the rejected returns beforehand:
-pairs of steps at different places, or of different dstates. They prune the domains of all engines.
+*One return* can be tested before the search. If it is rejected, its steps are at different places,
+or are different dstates. Such pairs of steps prune the domains of all engines.
 
 *Two returns* are tested together if both are between first steps of visits, and their loops share
-displacements. Each answer is checked for rejected sets.
+displacements. This is tested on each map that clingo finds.
 
 *How often a true map is rejected.* A true map has many returns, and each is tested. So half of
-`reject` is shared among all returns that may be true, and the other half among all sets of two.
+`reject` is divided among all returns that may be true, and the other half among all sets of two.
 Then a true map is rejected with probability `reject` at most. Half of the true returns have a
-p-value above one half (Storey 2002, "A direct approach to false discovery rates"), so about twice
-that number of returns may be true. The number is rounded up to a power of two, so that it seldom
-changes while a robot drives.
+p-value above one half (Storey 2002, "A direct approach to false discovery rates"). So the returns
+with such a p-value are counted, and about twice their number may be true. This number is rounded up
+to a power of two, so that it seldom changes while a robot drives.
 """
 
 from __future__ import annotations
@@ -36,12 +36,22 @@ if TYPE_CHECKING:
     from ssh_abduction.theory.theory import Theory
 
 
-KEPT = 8  # traces whose returns are remembered
+KEPT = 8  # how many traces are remembered, with their returns
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """The fields `reject` and `joint` of a theory."""
+    """Evidence from displacements, with the fields `reject`, `joint` and `returns` of a theory.
+
+    Attributes:
+        reject: The largest probability of rejecting the true map.
+        joint: The most returns that are tested together: 1 or 2.
+        returns: How many returns may be true.
+        has_places: Whether maps have places.
+        turns_stay: Whether a test of two visits says something about all steps of these visits.
+        has_one_view: Whether a dstate has only one view.
+        known: The returns of the last traces.
+    """
 
     name: ClassVar[str] = "displacement"
     axiom: ClassVar[str] = "one_pose"
@@ -56,8 +66,8 @@ class Displacement:
     @classmethod
     def of(cls, theory: Theory) -> Displacement:
         topological, hard = theory.level == "topological", theory.hard
-        # If displacements may be wrong, a pair is excused by a wrong displacement between its own
-        # steps. So it says nothing about other steps of the same visits.
+        # If displacements may be wrong, a wrong displacement between two steps excuses the pair. So
+        # the pair says nothing about other steps of the same visits.
         turns_stay = "turn_stays" in hard and not theory.jumped
         return cls(
             theory.reject,
@@ -85,17 +95,17 @@ class Displacement:
         return replace(self, known=known.known)
 
     def count_returns(self, trace: Trace) -> int:
-        """The number of returns that may be true, rounded up to a power of two.
+        """Return the number of returns that may be true, rounded up to a power of two.
 
-        The length of the trace does not limit it.
+        It may be larger than the number of steps.
         """
         return replace(self, returns=0).returns_of(trace).count()
 
     def returns_of(self, trace: Trace) -> Returns:
-        """The returns of a trace, made when they are first needed.
+        """Make the returns of a trace, or return them if they were made before.
 
         The last few traces are remembered, because several parts of a search need them. If a trace
-        has grown, the returns of its first steps are kept.
+        has grown, the results about its first steps are reused.
         """
         kept = list(self.known)
         for known in kept:
@@ -116,12 +126,12 @@ class Displacement:
 
 
 def jumped(ssh_map: SSHMap) -> tuple[int, ...]:
-    """The steps whose displacements a map ignores."""
+    """Return the steps whose displacements a map treats as wrong."""
     return tuple(fault.step for fault in ssh_map.faults if fault.kind == "jumped")
 
 
 def _has_grown(before: Trace, trace: Trace) -> bool:
-    """Whether a trace is an earlier one, perhaps with more steps."""
+    """Whether a trace is the same as an earlier one, perhaps with more steps."""
     last = len(before) - 1
     if last >= len(trace) or before.odometry != trace.odometry:
         return False

@@ -8,27 +8,27 @@
 >>> bool(abs(closing[0]).max() < 0.001), covariance.shape
 (True, (1, 3, 3))
 
-A loop leads from step i to a later step j. It closes if the robot is back where it was. By the
-displacements between the steps it is off by P(j) - P(i). P is the pose by dead reckoning: all
-displacements composed from the first step on. An error e of the displacement that leads to step k
-turns all that comes after it. To first order, it moves the end of the loop by
+A loop leads from step i to a later step j. It closes if the robot is back where it was. Otherwise
+its error, the *closing*, is P(j) - P(i). P is the pose by dead reckoning: all displacements
+composed from the first step on. Let p be its position. An error e of the displacement that leads to
+step k turns the rest of the loop. To first order, it moves the end of the loop by
 
     R(k) e_xy + e_theta S (p(j) - p(k))
 
 where R(k) is the heading before the displacement, and S a quarter turn. The covariance of the
-closing is the sum of these over the loop (Smith, Self & Cheeseman 1990, "Estimating uncertain
-spatial relationships in robotics"). It is a polynomial in p(j), so prefix sums give it for any
-loop at once.
+closing is the sum of the covariances of these moves (Smith, Self & Cheeseman 1990, "Estimating
+uncertain spatial relationships in robotics"). It is a polynomial in p(j), so prefix sums give it
+for any loop at once.
 
 Two errors are not noise, but unknown constants of the whole trace: a wrong scale, and a steady
-drift of heading. The measured pose of a dstate may also be off at each visit, for example if the
-middle of a place is estimated from laser scans. This adds to the covariance at both ends of the
-loop and does not grow along the way.
+drift of heading. The measured pose of a dstate (a place and a direction) may also be off at each
+visit, for example if the middle of a place is estimated from laser scans. This adds to the
+covariance at both ends of the loop and does not grow along the way.
 
-*Lost headings.* First order replaces an arc by its tangent. A rare error of heading, of SIGMAS
-standard deviations, moves the end off the tangent by half of that error, as a share of the
-first-order move. This much is added to the covariance in all directions. If the heading is known to
-a few degrees, that is next to nothing. If it is lost, the loop says nothing any more.
+*Lost headings.* First order replaces an arc by its tangent. Let e be a rare error of heading, of
+SIGMAS standard deviations. It moves the end off the tangent by e / 2 times the first-order move.
+The square of this is added to the variance in all directions. If the heading is known to a few
+degrees, this changes almost nothing. If the heading is lost, no closing is unlikely any more.
 """
 
 from __future__ import annotations
@@ -53,30 +53,30 @@ SIGMAS = 6.0
 # Loops with a more uncertain heading than this, in radians, are not tested: the covariance that is
 # added for it exceeds any error.
 LOST = 1.0
-# Values of the steady drift of heading that are tried for each of its standard deviations. A loop
+# How many values of the steady drift of heading are tried for each standard deviation of it. A loop
 # is rejected if it closes badly with each of them.
 BENDS_A_SIGMA = 2
 # Drifts of more standard deviations than this are too unlikely to try.
 MOST_BENDS = 6
-# Steps that are computed at once. Intermediate arrays take some ten megabytes.
+# How many steps are computed at once. Intermediate arrays take some ten megabytes.
 AT_A_TIME = 1000
-# The columns of a step: its pose, and sums up to it.
+# How many columns a step has: 3 for its pose, 17 for `moments`, 3 for `ways`.
 COLUMNS = 3 + 17 + 3
 
 
 @dataclass(frozen=True)
 class Loops:
-    """Dead reckoning of a trace, with prefix sums for the covariances of loops.
+    """Dead reckoning of a trace of n steps, with prefix sums for the covariances of loops.
 
     Attributes:
         poses: Poses by dead reckoning, n x 3, in metres and radians. After a missing displacement,
             the pose is that of the step before.
-        part: For each step, the number of missing displacements up to it. Nothing is known about
-            loops across a missing one.
-        moments: Sums over the displacements up to each step, n x 17.
-        ways: Metres driven up to each step, and the sum of metres times positions, turned by S,
-            n x 3.
-        odometry: The errors that all displacements share.
+        part: For each step, the number of missing displacements up to it. If a displacement on a
+            loop is missing, nothing is known about the loop.
+        moments: Sums over the displacements up to each step, n x 17. They give covariances.
+        ways: Metres driven up to each step, and the sum of metres times positions, turned by S (a
+            quarter turn), n x 3.
+        odometry: The noise model, for errors that all displacements share.
         bend: The drift of heading that was removed from the displacements, in radians a metre.
         drift: The standard deviation of the drift that is left, in radians a metre.
     """
@@ -91,7 +91,7 @@ class Loops:
 
     @staticmethod
     def of(trace: Trace, bend: float = 0.0, drift: float | None = None) -> Loops:
-        """The loops of a trace after a drift of heading is removed from its displacements.
+        """Make the loops of a trace. First remove a steady drift of heading from its displacements.
 
         Args:
             trace: The trace.
@@ -109,14 +109,14 @@ class Loops:
         return Loops(sums[..., :3], part, sums[..., 3:20], sums[..., 20:], odometry, bend, drift)
 
     def closings(self, first: ArrayLike, last: ArrayLike) -> tuple[Array, Array]:
-        """The error at the end of loops, in the frame of the first step of the trace.
+        """Return the errors at the end of m loops, in the frame of the first step of the trace.
 
         Args:
             first: The steps at which the loops begin, m.
             last: The steps at which they end, m.
 
         Returns:
-            The closings, m x 3, in metres and radians, and their covariances, m x 3 x 3.
+            The errors, m x 3, in metres and radians, and their covariances, m x 3 x 3.
         """
         i, j = np.asarray(first, dtype=int), np.asarray(last, dtype=int)
         closing = self._closing(i, j)
@@ -134,9 +134,16 @@ class Loops:
     def shared(
         self, loops: tuple[ArrayLike, ArrayLike], others: tuple[ArrayLike, ArrayLike]
     ) -> Array:
-        """The covariance between closings of two sets of loops, m x 3 x 3.
+        """Return the covariances between the closings of m loops and those of m other loops.
 
-        It comes from displacements in both loops, and from errors that all displacements share.
+        They come from displacements in both loops, and from errors that all displacements share.
+
+        Args:
+            loops: The steps at which the loops begin, and those at which they end.
+            others: The same for the other loops.
+
+        Returns:
+            The covariances, m x 3 x 3.
         """
         (i, j), (k, m) = (
             tuple(np.asarray(steps, dtype=int) for steps in pair) for pair in (loops, others)
@@ -146,7 +153,17 @@ class Loops:
         return covariance + self._repeated((i, j), (k, m))
 
     def _white(self, i: Steps, j: Steps, end: Steps, other_end: Steps) -> Array:
-        """The covariance that the noise of steps i + 1 to j adds between loops with these ends."""
+        """Return the covariances, between closings, that the noise of some displacements causes.
+
+        Args:
+            i: The steps from which these displacements lead, m.
+            j: The steps to which they lead, m.
+            end: The steps at which the loops end, m.
+            other_end: The steps at which the other loops end, m.
+
+        Returns:
+            The covariances, m x 3 x 3.
+        """
         sums = self.moments[j] - self.moments[i]
         position, mixed, mixed_across = (
             sums[:, :4].reshape(-1, 2, 2),
@@ -177,7 +194,7 @@ class Loops:
         return covariance
 
     def _repeated(self, loops: tuple[Steps, Steps], others: tuple[Steps, Steps]) -> Array:
-        """The covariance between closings that a wrong scale and a steady drift add."""
+        """Return the covariances, between closings, from a wrong scale and a steady drift."""
         scaled, other_scaled = (self._by_scale(*pair) for pair in (loops, others))
         bent, other_bent = (self._by_bend(*pair) for pair in (loops, others))
         by_scale: Array = self.odometry.scale**2 * scaled[:, :, None] * other_scaled[:, None, :]
@@ -189,11 +206,11 @@ class Loops:
         return closing
 
     def _by_scale(self, i: Steps, j: Steps) -> Array:
-        """By how much a scale that is wrong by 1 moves the end of each loop."""
+        """Return how far a scale that is wrong by 1 moves the end of each loop, m x 3."""
         return (self.poses[j] - self.poses[i]) * (1.0, 1.0, 0.0)
 
     def _by_bend(self, i: Steps, j: Steps) -> Array:
-        """By how much a drift of 1 radian a metre moves the end of each loop."""
+        """Return how far a drift of 1 radian a metre moves the end of each loop, m x 3."""
         sums = self.ways[j] - self.ways[i]
         return np.hstack(
             [sums[:, :1] * _quarter_turned(self.poses[j, :2]) - sums[:, 1:], sums[:, :1]]
@@ -208,7 +225,7 @@ class Loops:
         return variance
 
     def _moved_by_heading(self, i: Steps, j: Steps) -> Array:
-        """The variance of the end of each loop from errors of heading, in both directions."""
+        """Return the variance of each loop's end, in x plus in y, from errors of heading."""
         sums = self.moments[j] - self.moments[i]
         end = _quarter_turned(self.poses[j, :2])
         white = (
@@ -223,33 +240,46 @@ class Loops:
         return moved
 
     def of_ends(self, end: int) -> Array:
-        """The covariance at step `end` from the noise up to each step, n x 9."""
+        """Return the covariance of the pose at step `end` from the noise up to each earlier step.
+
+        Its shape is (end + 1) x 9: one row for each of the steps 0 to `end`.
+        """
         every = np.arange(end + 1)
         there = np.full(end + 1, end)
         return self._white(np.zeros_like(every), every, there, there).reshape(-1, 9)
 
     def noise(self, first: Steps, last: Steps) -> Array:
-        """The covariance at the last steps from the noise since the first ones, m x 3 x 3."""
+        """Return the covariances of closings from the noise of displacements, m x 3 x 3.
+
+        Args:
+            first: The steps at which the loops begin, m.
+            last: The steps at which they end, m.
+        """
         return self._white(first, last, last, last)
 
     def repeated(self, first: Steps, last: Steps) -> Array:
-        """The covariance of closings from a wrong scale and a steady drift, m x 3 x 3."""
+        """Return the covariances of closings from a wrong scale and a steady drift, m x 3 x 3."""
         return self._repeated((first, last), (first, last))
 
 
 class Reckoning:
-    """Dead reckoning of a trace for each drift of heading that it may have. No drift comes first.
+    """Dead reckoning of a trace for each drift of heading that it may have.
 
     Attributes:
-        bends: The drifts, in radians a metre.
+        bends: The drifts, in radians a metre. The first one is 0.
         unlikely: The chi-square of each drift.
-        begins: For each step, the first earlier step with a known relative pose: no displacement
-            is missing since, and the heading is not lost. It does not depend on the drift, or on
-            later steps.
+        begins: For each step, the earliest step with a known pose relative to it: no displacement
+            is missing since then, and the heading is not lost. It does not depend on the drift, or
+            on later steps.
     """
 
     def __init__(self, trace: Trace, before: Reckoning | None = None) -> None:
-        """The reckoning of a trace. `before` is that of its first steps, if known."""
+        """Compute the poses and sums for each drift.
+
+        Args:
+            trace: The trace.
+            before: The reckoning of its first steps, if known.
+        """
         self.odometry = trace.odometry or Odometry()
         sigma = self.odometry.bend
         step = sigma / BENDS_A_SIGMA
@@ -259,7 +289,7 @@ class Reckoning:
             else [0]
         )
         self.bends = [number * step for number in numbers]
-        # Each drift stands for an interval, and is as likely as the likeliest drift in it.
+        # Each drift represents an interval of drifts. Take the chi-square of the likeliest of them.
         self.unlikely = [(max(abs(number) - 0.5, 0.0) / BENDS_A_SIGMA) ** 2 for number in numbers]
         self._drift = step / 2
         self._size = len(trace)
@@ -279,7 +309,7 @@ class Reckoning:
         self.begins: Steps = self._begins(before.begins if before else np.zeros(0, dtype=int))
 
     def loops(self, number: int) -> Loops:
-        """The loops for the drift with this number."""
+        """Return the loops with the drift `bends[number]` removed."""
         return Loops._of(
             self._rows.array[number, : self._size],
             self._part,
@@ -289,13 +319,19 @@ class Reckoning:
         )
 
     def loops_of_unknown_drift(self) -> Loops:
-        """The loops with the whole drift that the odometry allows as uncertainty."""
+        """Return the loops with no drift removed. All drift adds to their covariances."""
         return Loops._of(
             self._rows.array[0, : self._size], self._part, self.odometry, 0.0, self.odometry.bend
         )
 
     def closings(self, numbers: Steps, first: Steps, last: Steps) -> tuple[Array, Array]:
-        """As `Loops.closings`, for loops that each have a drift of their own."""
+        """Compute closings and covariances as `Loops.closings` does, with a drift for each loop.
+
+        Args:
+            numbers: The index in `bends` of the drift of each loop, m.
+            first: The steps at which the loops begin, m.
+            last: The steps at which they end, m.
+        """
         array = self._rows.array
         flat = Loops._of(array.reshape(-1, COLUMNS), self._part, self.odometry, 0.0, self._drift)
         offset = numbers * array.shape[1]
@@ -326,7 +362,7 @@ class Reckoning:
 
 
 class _Rows:
-    """An array of drifts x rows x columns with spare room, so that adding a row is cheap."""
+    """An array of drifts x rows x columns with spare room, so that adding rows is cheap."""
 
     def __init__(self, array: Array, size: int | None = None) -> None:
         self.array = array
@@ -334,9 +370,10 @@ class _Rows:
         self._lock = Lock()
 
     def extended(self, size: int, new: Array) -> _Rows:
-        """The first `size` rows and new ones.
+        """Return the first `size` rows, followed by new rows.
 
-        It shares the array, unless there is no room or other rows were added meanwhile.
+        The result is this object if it has room and nobody added other rows meanwhile. Otherwise
+        the rows are copied.
         """
         total = size + new.shape[1]
         with self._lock:
@@ -350,9 +387,12 @@ class _Rows:
 
 
 def _parts(trace: Trace, start: int = 0, missing: int = 0) -> Steps:
-    """For each step from `start` on, the number of missing displacements up to it.
+    """Return, for each step from `start` on, the number of missing displacements up to it.
 
-    `missing` is that number for the step before.
+    Args:
+        trace: The trace.
+        start: The first step.
+        missing: The number for the step before.
     """
     unknown = [t > 0 and trace.steps[t].displacement is None for t in range(start, len(trace))]
     parts: Steps = missing + np.cumsum(unknown, dtype=int)
@@ -360,13 +400,13 @@ def _parts(trace: Trace, start: int = 0, missing: int = 0) -> Steps:
 
 
 def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Array:
-    """The poses, moments and ways of some steps for each drift, as in Loops.
+    """Compute the poses, moments and ways of some steps for each drift, as in Loops.
 
     Args:
         trace: The trace.
         start: The first step.
-        stop: The step behind the last one.
-        bends: The drifts.
+        stop: The step after the last one.
+        bends: The drifts, in radians a metre.
         last: The row of the step before, drifts x COLUMNS; zeros if there is none.
 
     Returns:
@@ -413,13 +453,20 @@ def _sums(trace: Trace, start: int, stop: int, bends: Array, last: Array) -> Arr
 
 
 def _summed(before: Array, values: Array) -> Array:
-    """Cumulative sums along the second axis, starting from `before`."""
+    """Return cumulative sums along the second axis, starting from `before`."""
     summed: Array = np.cumsum(np.concatenate([before[:, None], values], axis=1), axis=1)[:, 1:]
     return summed
 
 
 def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
-    """The chi-square of each closing by position (2 degrees of freedom), and with heading (3)."""
+    """Return two chi-squares of each closing: by position, and by position and heading.
+
+    They have 2 and 3 degrees of freedom.
+
+    Args:
+        closing: The closings, m x 3.
+        covariance: Their covariances, m x 3 x 3.
+    """
     (a, b, p), (_, c, q), (_, _, s) = covariance.transpose(1, 2, 0)
     x, y, turned = closing.T
     determinant = a * c - b * b
@@ -431,7 +478,7 @@ def chi_squares(closing: Array, covariance: Array) -> tuple[Array, Array]:
 
 
 def turned(vectors: Array, angles: Array) -> Array:
-    """Vectors, ... x 2, turned counterclockwise by angles."""
+    """Turn vectors, ... x 2, counterclockwise by angles in radians."""
     cos, sin = np.cos(angles), np.sin(angles)
     return np.stack(
         [
@@ -443,5 +490,5 @@ def turned(vectors: Array, angles: Array) -> Array:
 
 
 def _quarter_turned(vectors: Array) -> Array:
-    """Vectors, ... x 2, turned counterclockwise by a quarter."""
+    """Turn vectors, ... x 2, counterclockwise by a right angle."""
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)

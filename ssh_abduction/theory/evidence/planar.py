@@ -5,15 +5,16 @@
 >>> [len(solve(trace, Theory(planar=planar, prefer=())).maps) for planar in (False, True)]
 [2, 1]
 
-A travel leads along an edge from a gateway of one place to a gateway of another, and passes no
-place unseen. So a gateway leads to exactly one other gateway. Turns give the order of the gateways
-around a place; in frames, so do stars (openings). If the order is unknown, any will do. A map is
-planar if *some* orders allow a drawing. The first steps of a planar map are planar as well: they
-have fewer edges, and no other orders.
+A gateway is a way out of a place. A travel leads along an edge from a gateway of one place to a
+gateway of another, and passes no place unseen. So a gateway leads to exactly one other gateway.
+Turns show the order of the gateways around a place. If places have frames (numbered directions),
+stars (the openings seen) show it, too. A map is planar if *some* orders that agree with this allow
+a drawing without a crossing. If a map is planar, so is the map of its first steps: it has fewer
+edges, and its orders are parts of the same orders.
 
-If steps at one place are put at two places, a planar map may become one that is not: edges that met
-at the place may now cross elsewhere. So a conflict says which steps are at one place, and which are
-at different ones. It consists of few travels and turns that cross by themselves. For given places,
+If a map is not planar, `refuse` returns a conflict: statements about a few travels and turns whose
+edges cross by themselves. They say which steps are at one place, and which are at different places.
+Both matter: if one place becomes two, edges that met there may cross elsewhere. For given places,
 more equal dstates only make drawing harder. So the conflict has only the equalities of dstates that
 make the edges cross.
 """
@@ -44,7 +45,8 @@ SLOTS = 4
 BEHIND = 2  # slots from the one that is faced to the one behind
 
 AHEAD, BACK = 1, -1
-# The end of an edge: its place, its group of dstates, and its slot relative to that group.
+# The end of an edge: its place, its group of dstates that turns link, and its slot relative to the
+# first dstate of the group.
 End: TypeAlias = tuple[int, int, int]
 Arm: TypeAlias = tuple[int, int]  # a dstate, and whether ahead of it or behind it
 Gateway: TypeAlias = tuple[int, Arm]  # a place, and one of the arms that are this gateway
@@ -52,14 +54,14 @@ Gateway: TypeAlias = tuple[int, Arm]  # a place, and one of the arms that are th
 
 @dataclass(frozen=True)
 class Planar:
-    """The field `planar` of a theory.
+    """Evidence that maps can be drawn in the plane (the field `planar` of a theory).
 
     Attributes:
-        frames: Whether places have frames of four slots. Turns then give the number of slots
-            between the headings of two dstates; else they give sides only.
-        turns: Whether the turns can be relied on.
-        stars: Whether stars of a place agree when turned by their headings.
-        distinct: Whether different dstates face different slots.
+        frames: Whether places have frames of four slots (directions). Turns then give the number
+            of slots between the headings of two dstates. Otherwise they give right and left only.
+        turns: Whether the axioms allow using the turns.
+        stars: Whether the stars (openings seen) of a place agree when turned by their headings.
+        distinct: Whether different dstates at a place face different slots.
         crossing: Without frames: whether two edges cross if a turn leads from one to the other.
     """
 
@@ -118,14 +120,14 @@ class Planar:
         at: Mapping[int, int],
         distinct: bool,
     ) -> bool:
-        """Whether these travels and turns alone cannot be drawn.
+        """Whether some travels and turns cannot be drawn without a crossing.
 
         Args:
             trace: The trace.
-            moves: The steps at which they begin.
+            moves: The steps at which these travels and turns begin.
             labels: The dstate of each step.
             at: The place of each step.
-            distinct: Whether different dstates face different slots.
+            distinct: Whether different dstates at a place face different slots.
         """
         shown = _Shown(trace, moves, labels, at, stars=self.stars)
         return not (
@@ -136,7 +138,7 @@ class Planar:
 
 
 def _first_moves(trace: Trace, labels: Sequence[int]) -> list[int]:
-    """The steps where each travel and turn of a map is done for the first time."""
+    """List the steps where each travel and turn of a map is done for the first time."""
     first: dict[tuple[int, str, int], int] = {}
     for t, (here, there) in enumerate(pairwise(labels)):
         action = trace.steps[t].action
@@ -149,8 +151,10 @@ class _Shown:
     """What some travels and turns of a trace show.
 
     Attributes:
-        travels: Pairs of dstates.
-        turns: Turns at a place: a dstate, the direction, and the dstate that is faced then.
+        travels: For each travel, the dstate where it starts and the dstate where it ends. These
+            are keys of a dict, which keeps their order.
+        turns: For each turn at a place, the dstate before it, the direction, and the dstate after
+            it; also keys of a dict.
         places: The place of each dstate.
         stars: The openings seen at each dstate, clockwise from ahead.
     """
@@ -184,10 +188,15 @@ class _Shown:
 
 
 def _can_draw_framed(shown: _Shown, turns: bool, distinct: bool) -> bool:
-    """Whether some headings allow the edges to be drawn.
+    """Whether some headings allow the edges to be drawn, if places have frames of four slots.
 
     Turns fix the headings of the dstates that they link, relative to each other. The others may
-    have any heading that the stars allow.
+    have any heading that the stars (openings seen) allow.
+
+    Args:
+        shown: What the travels and turns show.
+        turns: Whether the axioms allow using the turns.
+        distinct: Whether different dstates at a place face different slots.
     """
     group, slot, agree = _groups(shown, turns)
     ahead = {s: (place, group[s], slot[s]) for s, place in shown.places.items()}
@@ -218,7 +227,21 @@ def _slots_of(
     ends: Sequence[End],
     distinct: bool,
 ) -> list[dict[End, int]]:
-    """The slots that the ends of edges at a place may have, up to a rotation of the place."""
+    """List all ways to choose slots for the ends of edges at a place.
+
+    Ways that differ only by a rotation of the whole place count once.
+
+    Args:
+        shown: What the travels and turns show.
+        group: For each dstate, the first dstate of its group that turns link.
+        slot: For each dstate, its slot relative to that first dstate.
+        place: The place.
+        ends: The ends of edges at the place.
+        distinct: Whether different dstates at a place face different slots.
+
+    Returns:
+        For each way, the slot of each end.
+    """
     here = [s for s in shown.places if shown.places[s] == place]
     groups = list(dict.fromkeys(group[s] for s in here))
     found: dict[tuple[int, ...], dict[End, int]] = {}
@@ -240,7 +263,10 @@ def _slots_of(
 
 
 def _is_drawing(edges: Iterable[tuple[End, End]], slots: Mapping[End, int]) -> bool:
-    """Whether the edges with known slots pair all gateways and do not cross."""
+    """Whether the edges whose slots are known can be drawn without a crossing.
+
+    Also, each gateway must be the end of only one of them.
+    """
     joined = {
         frozenset((end[0], slots[end]) for end in edge)
         for edge in edges
@@ -258,16 +284,17 @@ def _is_drawing(edges: Iterable[tuple[End, End]], slots: Mapping[End, int]) -> b
 
 
 def _are_paired(edges: Collection[frozenset[Side]]) -> bool:
-    """Whether each gateway is the end of one edge."""
+    """Whether each gateway is the end of only one edge."""
     return len({gateway for edge in edges for gateway in edge}) == sum(map(len, edges))
 
 
 def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int], bool]:
-    """The groups of dstates that turns link.
+    """Find the groups of dstates that turns link.
 
     Returns:
-        For each dstate, the first dstate of its group, and the number of slots between their
-        headings; and whether the turns agree on these.
+        A dict from each dstate to the first dstate of its group; a dict from each dstate to the
+        number of slots from the heading of that first dstate to its own; and whether all turns
+        agree on these numbers.
     """
     links: dict[int, list[tuple[int, int]]] = {dstate: [] for dstate in shown.places}
     for x, turn, y in shown.turns if turns else ():
@@ -299,8 +326,8 @@ def _groups(shown: _Shown, turns: bool) -> tuple[dict[int, int], dict[int, int],
 def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
     """Whether some orders of gateways allow the edges to be drawn, if turns give sides only.
 
-    A turn says which gateway is to the right of an edge, if both dstates are at an edge. After
-    turning around, a robot faces the gateway that was behind it.
+    A turn shows which gateway is to the right of an edge, if both its dstates are at an edge.
+    After turning around, a robot faces the gateway that was behind it.
 
     Args:
         shown: What the travels and turns show.
@@ -336,9 +363,13 @@ def _can_draw_sided(shown: _Shown, crossing: bool) -> bool:
 
 
 def _paired(shown: _Shown, same: _Classes) -> list[frozenset[Gateway]] | None:
-    """The edges, each between two gateways.
+    """Find the edges, each between two gateways.
 
     Gateways of one place that lead to the same gateway become one.
+
+    Args:
+        shown: What the travels and turns show.
+        same: Which arms are known to be one gateway. Those that become one are added.
 
     Returns:
         The edges; None if a gateway leads to gateways of different places.
@@ -363,7 +394,10 @@ def _paired(shown: _Shown, same: _Classes) -> list[frozenset[Gateway]] | None:
 
 
 def _at_edges(shown: _Shown) -> set[int]:
-    """The dstates where a travel starts or ends, and those linked to them by turning around."""
+    """Return the dstates at which travels start or end.
+
+    Dstates that turning around links to them are added.
+    """
     found = {dstate for travel in shown.travels for dstate in travel}
     around = [{x, y} for x, turn, y in shown.turns if turn == "around"]
     while more := {dstate for pair in around if pair & found for dstate in pair} - found:
@@ -372,7 +406,13 @@ def _at_edges(shown: _Shown) -> set[int]:
 
 
 def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Sequence[Arm]]) -> bool:
-    """Whether the others fit into a clockwise order, as the turns demand."""
+    """Whether other arms can be inserted into a clockwise order so that it agrees with all turns.
+
+    Args:
+        order: The clockwise order of some arms.
+        others: The other arms.
+        clockwise: The clockwise orders that turns show.
+    """
     if not all(_is_clockwise(order, told) for told in clockwise):
         return False
     if not others:
@@ -385,7 +425,7 @@ def _can_complete(order: list[Arm], others: list[Arm], clockwise: Sequence[Seque
 
 
 def _is_clockwise(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
-    """Whether `told` is clockwise in this order; arms that it lacks are ignored."""
+    """Whether the arms of `told` come in this clockwise order. Arms not in `order` are ignored."""
     positions = [order.index(arm) for arm in told if arm in order]
     if len(set(told)) < len(told):
         return False
@@ -393,7 +433,7 @@ def _is_clockwise(order: Sequence[Arm], told: Sequence[Arm]) -> bool:
 
 
 class _Classes:
-    """Classes of arms that are one gateway."""
+    """Classes of arms that are one gateway. An arm is the way ahead of a dstate, or behind it."""
 
     def __init__(self) -> None:
         self._one_of: dict[Arm, Arm] = {}
@@ -404,7 +444,7 @@ class _Classes:
         return arm
 
     def join(self, first: Arm, second: Arm) -> None:
-        """Say that two arms are one. Then the opposite arms, straight on, are one too."""
+        """Record that two arms are one gateway. Then their opposite arms are also one gateway."""
         for turned in (1, -1):
             one, other = (self.of((dstate, side * turned)) for dstate, side in (first, second))
             if one != other:
@@ -412,7 +452,12 @@ class _Classes:
 
 
 def _fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
-    """A minimal subset of the travels and turns that still crosses."""
+    """Return a minimal subset of the travels and turns that still crosses.
+
+    Args:
+        moves: The steps at which they begin.
+        cross: Whether such a subset crosses.
+    """
     size = max(1, len(moves) // 2)
     while True:
         begin = 0
@@ -431,7 +476,16 @@ def _fewest(moves: list[int], cross: Callable[[list[int]], bool]) -> list[int]:
 def _split(
     labels: Mapping[int, int], steps: Sequence[int], cross: Callable[[Mapping[int, int]], bool]
 ) -> Mapping[int, int]:
-    """Labels of these steps with the fewest equal dstates that still make edges cross."""
+    """Give each of these steps a dstate of its own, unless the edges then no longer cross.
+
+    Args:
+        labels: The dstate of each step.
+        steps: The steps.
+        cross: Whether edges cross with some labels.
+
+    Returns:
+        The new labels.
+    """
     new = max(labels.values()) + 1
     for step in steps:
         look_at_clock()
@@ -444,7 +498,14 @@ def _split(
 def _description(
     labels: Mapping[int, int], at: Mapping[int, int], steps: Sequence[int], distinct: bool
 ) -> Iterator[Equality]:
-    """Which of these steps are one dstate, at one place, or not."""
+    """Yield which of these steps are one dstate or at one place, and which are not.
+
+    Args:
+        labels: The dstate of each step.
+        at: The place of each step.
+        steps: The steps.
+        distinct: Whether to yield that dstates at one place are different.
+    """
     first: dict[int, int] = {}  # the first step of each dstate
     for step in steps:
         if first.setdefault(labels[step], step) != step:

@@ -15,7 +15,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Equality:
-    """Two steps are one dstate, or at one place; or they are not, if `holds` is False."""
+    """The statement that two steps are one dstate or at one place, or that they are not.
+
+    Attributes:
+        first: One step.
+        second: The other step.
+        of: "dstate" or "place".
+        holds: False for the statement that they are not one.
+    """
 
     first: int
     second: int
@@ -24,9 +31,13 @@ class Equality:
 
 
 class Evidence(Protocol):
-    """A kind of evidence.
+    """A kind of evidence: what is known besides views and actions.
 
-    encodings/NAME.lp holds its axiom. The `if` behind the axiom says for which theories it holds.
+    encodings/NAME.lp declares its axiom. The `if` after the axiom says for which theories it holds.
+
+    Attributes:
+        name: The name of the kind and of its encoding.
+        axiom: The name of its axiom.
     """
 
     name: ClassVar[str]
@@ -34,34 +45,44 @@ class Evidence(Protocol):
 
     @classmethod
     def of(cls, theory: Theory) -> Evidence:
-        """The evidence that a theory uses."""
+        """Make the evidence for a theory."""
         ...
 
     def remembering(self, known: Any) -> Evidence:
-        """This evidence, with what `known` of the same kind computed about traces."""
+        """Return this evidence with results about traces from earlier evidence.
+
+        Args:
+            known: Earlier evidence of the same kind.
+        """
         return self
 
     def pairs(self, trace: Trace) -> Pairs:
-        """What is known about pairs of steps before the search.
+        """Return the pairs of steps that are known, before the search, to be equal or different.
 
-        It must also hold for the first steps of a map, when a map is cut.
+        If a map of the trace is cut to its first steps, the pairs must still hold there.
         """
         ...
 
     def facts(self, trace: Trace, start: int, stop: int) -> str:
-        """Further facts for its encoding, about steps `start` to `stop - 1`."""
-        ...
-
-    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        """A small set of equalities and inequalities that cannot all hold, in any map.
+        """Return further facts for the encoding of this kind, as a text for clingo.
 
         Args:
             trace: The trace.
-            ssh_map: A map of its first steps.
-            since: The map of the steps before this one is known not to be rejected. So only later
+            start: The first step that the facts are about.
+            stop: The step after the last one.
+        """
+        ...
+
+    def refuse(self, trace: Trace, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
+        """Find equalities and inequalities of steps in a map that cannot all hold in any map.
+
+        Args:
+            trace: The trace.
+            ssh_map: A map of the first steps of the trace.
+            since: The map of the first `since` steps is known to have no such set. So only later
                 steps need to be checked.
 
         Returns:
-            The set, which holds in the map; None if there is none.
+            A small set of such equalities and inequalities; None if there is none.
         """
         ...

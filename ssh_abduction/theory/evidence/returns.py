@@ -1,6 +1,7 @@
-"""The returns of a trace: which pairs of steps displacements allow to be one place or dstate.
+"""Which returns of a trace the displacements allow.
 
-`displacement.py` says what a return is, and how often a true one is rejected.
+A return is a pair of visits at one place, or a pair of steps at one dstate. `displacement.py`
+explains how often a true one is rejected.
 """
 
 from __future__ import annotations
@@ -26,15 +27,18 @@ if TYPE_CHECKING:
 
 # The first and the last steps of returns to places (True) and to dstates (False).
 _Tested: TypeAlias = "dict[bool, tuple[Steps, Steps]]"
-# Loops that are computed at once. Their sums take some hundred megabytes.
+# How many loops are computed at once. Their sums take some hundred megabytes.
 AT_A_TIME = 200_000
-# Accepted maps and rejected sets that are remembered. Accepted maps may be checked again, or grow
-# with the trace. The next maps mostly contain the same rejected sets.
+# How many accepted maps, and how many rejected sets, are remembered. Accepted maps may be checked
+# again, or grow with the trace. The next maps mostly contain the same rejected sets.
 REMEMBERED = 64
 
 
 class Returns:
-    """The returns of a trace, and the tests that reject some of them."""
+    """The returns of a trace (pairs of visits at one place, or of steps at one dstate), and tests.
+
+    The tests reject returns that do not agree with the displacements.
+    """
 
     def __init__(
         self,
@@ -43,12 +47,12 @@ class Returns:
         before: Returns | None = None,
         reckoning: Reckoning | None = None,
     ) -> None:
-        """No test is done yet, except those that `before` has done.
+        """Prepare the tests. If `before` has tested its steps, test the new steps now.
 
         Args:
-            evidence: The fields of the theory.
+            evidence: The evidence that says how to test.
             trace: The trace.
-            before: The returns of the first steps, if known.
+            before: The returns of the first steps of the trace, if known.
             reckoning: The dead reckoning of the trace, if known.
         """
         from ssh_abduction.theory.evidence.loops import Reckoning  # loads numpy
@@ -73,15 +77,15 @@ class Returns:
 
     @property
     def pairs(self) -> Pairs:
-        """The pairs of steps at different places, or of different dstates."""
+        """The pairs of steps that displacements show to be at different places or dstates."""
         if self._pairs is None:
             self._pairs = self._pairs_of(self._tested())
         return self._pairs
 
     def count(self) -> int:
-        """The number of returns that may be true: twice those with a p-value above one half.
+        """Return the number of returns that may be true, rounded up to a power of two.
 
-        It is rounded up to a power of two.
+        It is twice the number of returns with a p-value above one half.
         """
         if self._likely is None:
             self._likely = self._likely_among(self._tested())
@@ -91,12 +95,19 @@ class Returns:
     def arrivals(self) -> list[int]:
         """The first step of each visit to a place.
 
-        If it is not known which actions are turns, each step is a visit.
+        If it is not known which actions are turns, each step counts as a visit.
         """
         return [0, *(t for t, action in enumerate(self.trace.actions, 1) if action.kind != "turn")]
 
     def _tested(self, since: int = 0) -> _Tested:
-        """The returns without a missing displacement that end at step `since` or later."""
+        """List the possible returns that end at step `since` or later.
+
+        Loops are left out if a displacement is missing on the way, or if the heading is lost.
+
+        Returns:
+            Two arrays, with the first step and the last step of each return: for places at True,
+            and for dstates at False.
+        """
         views: dict[object, list[int]] = defaultdict(list)
         for t, step in enumerate(self.trace.steps):
             views[step.view if self.evidence.has_one_view else None].append(t)
@@ -107,7 +118,17 @@ class Returns:
         }
 
     def _loops_within(self, groups: Sequence[Sequence[int]], since: int = 0) -> tuple[Steps, Steps]:
-        """Loops within a group that end at `since` or later and miss no displacement."""
+        """List the loops that end at step `since` or later, between two steps of one group.
+
+        Loops are left out if a displacement is missing on the way, or if the heading is lost.
+
+        Args:
+            groups: Groups of steps, each sorted.
+            since: The earliest step where a loop may end.
+
+        Returns:
+            Two arrays, with the first step and the last step of each loop.
+        """
         import numpy as np
 
         begins = self.reckoning.begins
@@ -132,10 +153,10 @@ class Returns:
         )
 
     def _pairs_of(self, tested: _Tested, since: int = 0) -> Pairs:
-        """The pairs of steps that these returns distinguish, because they are rejected alone.
+        """Return the pairs of steps that are different, because the displacements reject a return.
 
         Args:
-            tested: All returns, or those that end at new steps.
+            tested: All possible returns, or those that end at new steps.
             since: The first new step.
         """
         far, other = (self._refused_among(*tested[places], places) for places in (True, False))
@@ -144,7 +165,7 @@ class Returns:
         return Pairs.of([*other, *self._steps_of_visits(elsewhere, since)], far)
 
     def _likely_among(self, tested: _Tested) -> int:
-        """The number of these returns with a p-value above one half."""
+        """Count the returns with a p-value above one half."""
         from scipy.special import gammainccinv
 
         from ssh_abduction.theory.evidence.loops import chi_squares
@@ -158,11 +179,12 @@ class Returns:
         return likely
 
     def threshold(self, freedom: int, together: bool) -> float:
-        """The chi-square above which a return, or a set of two, is rejected.
+        """Return the chi-square above which a return, or a set of two, is rejected.
 
         Args:
-            freedom: The degrees of freedom.
-            together: Whether it is a set of two.
+            freedom: The degrees of freedom: 2 for a return to a place, 3 for one to a dstate, and
+                the sum for a set of two.
+            together: Whether the threshold is for a set of two.
         """
         from scipy.special import gammainccinv
 
@@ -172,7 +194,13 @@ class Returns:
         return float(2 * gammainccinv(freedom / 2, share / max(tests, 1)))
 
     def _refused_among(self, first: Steps, last: Steps, places: bool) -> list[tuple[int, int]]:
-        """The returns that are rejected alone: they close badly for every drift of heading."""
+        """List the returns that are rejected alone: they close badly for every drift of heading.
+
+        Args:
+            first: The first steps of the returns.
+            last: The last steps.
+            places: Whether these are returns to places. Then only positions are compared.
+        """
         import numpy as np
 
         from ssh_abduction.theory.evidence.loops import chi_squares
@@ -196,13 +224,14 @@ class Returns:
         return list(zip(first.tolist(), last.tolist(), strict=True))
 
     def _steps_of_visits(self, elsewhere: Earlier, since: int) -> Iterator[tuple[int, int]]:
-        """The pairs of steps with the same view in visits to different places.
+        """Yield the pairs of steps with the same view in visits to different places.
 
-        Steps with different views are distinct anyway.
+        Steps with different views are different dstates anyway.
 
         Args:
-            elsewhere: The first steps of visits to different places.
-            since: Only pairs whose later step is this one or a later one.
+            elsewhere: For the first step of a visit, the first steps of earlier visits to other
+                places.
+            since: The earliest step that may be the later one of a pair.
         """
         if not self.evidence.turns_stay:
             return
@@ -217,22 +246,23 @@ class Returns:
     def _returns_of(
         self, labels: tuple[int, ...], places: tuple[int | None, ...], since: int = 0
     ) -> Steps:
-        """The returns of a map: pairs of visits that begin at one place, or at one dstate.
+        """List the returns of a map: pairs of visits whose first steps are at one place or dstate.
 
         Args:
             labels: The dstate of each step.
             places: The place of each dstate.
-            since: Only returns that end at this step or later.
+            since: The earliest step where a return may end.
 
         Returns:
-            One row (first step, last step, one dstate) for each return, sorted by last step.
+            One row for each return, sorted by last step: the first step, the last step, and 1 for a
+            return to a dstate or 0 for one to a place.
         """
         return self._returns_among(labels, [places[label] for label in labels], since)
 
     def _returns_among(
         self, labels: Sequence[int], places: Sequence[int | None], since: int = 0
     ) -> Steps:
-        """The same as `_returns_of`, with the place of each step in `places`."""
+        """Do the same as `_returns_of`, with the place of each step (not dstate) in `places`."""
         import numpy as np
 
         at_dstate: dict[int, list[int]] = defaultdict(list)
@@ -251,14 +281,15 @@ class Returns:
         return ordered
 
     def refused_together(self, ssh_map: SSHMap, since: int = 0) -> frozenset[Equality] | None:
-        """Two returns of a map that are rejected together; None if there are none.
+        """Find two returns of a map that are rejected together; None if there are none.
 
-        It prefers a set that was rejected in an earlier map, then the clearest one.
+        If such a set was rejected in an earlier map, return that one. Otherwise, return the two
+        that are rejected most clearly.
 
         Args:
             ssh_map: The map.
-            since: The map of the steps before this one is known to be accepted. So only returns
-                that end later are tested.
+            since: The map of the first `since` steps is known to be accepted. So only returns that
+                end later are tested.
         """
         import numpy as np
 
@@ -293,10 +324,10 @@ class Returns:
     def refused_at(
         self, labels: Sequence[int], places: Sequence[int | None], step: int
     ) -> frozenset[Equality] | None:
-        """The two returns that are most clearly rejected together, but not alone.
+        """Find the two returns that are rejected most clearly together, while neither is alone.
 
         Args:
-            labels: The dstate of each step. It need not be that of a map.
+            labels: The dstate of each step. They need not be those of a map.
             places: The place of each step.
             step: The step where the later return ends.
 
@@ -321,7 +352,7 @@ class Returns:
     def refused_alone_at(
         self, labels: Sequence[int], places: Sequence[int | None], step: int
     ) -> list[Equality]:
-        """The returns that are rejected alone and end at a step.
+        """List the returns that end at a step and are rejected alone.
 
         Args:
             labels: The dstate of each step.
@@ -338,7 +369,7 @@ class Returns:
         ]
 
     def excess(self, refused: Equality) -> float:
-        """The chi-square of a return minus the threshold."""
+        """Return the chi-square of a return minus the threshold above which it is rejected."""
         import numpy as np
 
         from ssh_abduction.theory.evidence.loops import chi_squares
@@ -350,12 +381,12 @@ class Returns:
         return float(squares[which][0]) - self.threshold(2 + which, together=False)
 
     def why_apart(self, first: int, last: int, number_from: int = 0) -> str | None:
-        """Why two steps are not one dstate or place, in words; None if displacements allow it.
+        """Say in words why two steps are not one dstate or place; None if displacements allow it.
 
         Args:
             first: The earlier step.
             last: The later step.
-            number_from: The number of the first step, if the trace is a part of a longer one.
+            number_from: A number to add to the steps, if the trace is a part of a longer one.
         """
         named = f"steps {first + number_from} and {last + number_from}"
         i, j = self._begin_of_visit(first), self._begin_of_visit(last)
@@ -385,7 +416,12 @@ class Returns:
         return f"{named} are not one dstate: by the odometry they are {off} apart"
 
     def why_not_both(self, returns: Collection[Equality], number_from: int = 0) -> str:
-        """Why two returns cannot both be true, in words."""
+        """Say in words why two returns cannot both be true.
+
+        Args:
+            returns: The two returns.
+            number_from: A number to add to the steps, if the trace is a part of a longer one.
+        """
         ordered = sorted(returns, key=lambda e: (e.second, e.first, e.of))
         closings = [self.closing(e.first, e.second) for e in ordered]
         named = ", and ".join(
@@ -406,7 +442,7 @@ class Returns:
         return f"{named} cannot both be returns: the loops of {ways} close {sizes} off{headings}"
 
     def closing(self, first: int, last: int) -> Closing:
-        """The error at the end of a loop. A drift of heading counts as uncertainty."""
+        """Return the error at the end of a loop. A drift of heading counts as uncertainty."""
         import numpy as np
 
         from ssh_abduction.theory.evidence.loops import chi_squares
@@ -425,7 +461,10 @@ class Returns:
         )
 
     def _begin_of_visit(self, step: int) -> int:
-        """The first step of the visit of a step; the step itself if turns may leave their place."""
+        """Return the first step of the visit that a step belongs to.
+
+        If turns may leave their place, it is the step itself.
+        """
         return self.arrivals[bisect(self.arrivals, step) - 1] if self.evidence.turns_stay else step
 
     def _together(self, rows: Steps, before: Together | None = None) -> Together:
@@ -435,7 +474,7 @@ class Returns:
         return Together(self.reckoning, thresholds, rows, before)
 
     def _is_new(self, rows: Steps) -> Mask:
-        """Which returns are not in the map that was accepted last."""
+        """Mark the returns that are not in the map that was accepted last."""
         import numpy as np
 
         if not self._accepted:
@@ -450,21 +489,21 @@ class Returns:
 
 
 class _Course(NamedTuple):
-    """The parts of a map that displacements depend on."""
+    """The parts of a map that displacements depend on: labels of steps, and places of dstates."""
 
     labels: tuple[int, ...]
     places: tuple[int | None, ...]
 
     @staticmethod
     def of(labels: tuple[int, ...], places: tuple[int | None, ...]) -> _Course:
-        """The course of the dstates of these steps. The map may have more dstates."""
+        """Make a course of some labels. Places of dstates with larger numbers are left out."""
         return _Course(labels, places[: max(labels, default=-1) + 1])
 
 
 def _hold(
     equalities: Collection[Equality], labels: Sequence[int], places: Sequence[int | None]
 ) -> bool:
-    """Whether all of these equalities hold.
+    """Whether all these equalities hold in a map.
 
     Args:
         equalities: Equalities of two steps, the earlier one first.
@@ -483,7 +522,7 @@ def _hold(
 
 
 def _parts(size: int, most: int = AT_A_TIME) -> Iterator[slice]:
-    """Slices of a number of loops that fit into memory."""
+    """Yield slices of at most `most` loops, so that each part fits into memory."""
     for start in range(0, size, most):
         look_at_clock()
         yield slice(start, start + most)

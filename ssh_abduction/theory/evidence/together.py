@@ -1,22 +1,24 @@
-"""Which pairs of returns of a map are rejected together, though neither is rejected alone.
+"""Find pairs of returns of a map that are rejected together, though neither is rejected alone.
 
-Let the loops of two returns be off by o1 and o2, with covariances S1 and S2, and C between them.
-Their joint chi-square is
+A return is a pair of steps that the map has at one place or dstate. Its loop is the way between
+them. Let the loops of two returns be off by o1 and o2, with covariances S1 and S2, and C between
+them. Their joint chi-square is
 
     (o1, o2)' (S1, C; C', S2)^-1 (o1, o2)
 
 and that of each alone is z = o' S^-1 o.
 
 A map of a thousand steps has several thousand returns and some ten million pairs. Solving a system
-of six equations for each pair takes minutes. So a bound accepts most pairs. Let s be the largest
-singular value of S1^-1/2 C S2^-1/2. The eigenvalues of the whitened matrix are at least 1 - s, so
-the joint chi-square is at most (z1 + z2) / (1 - s).
+of six equations for each pair takes minutes. So most pairs are accepted by an upper bound on their
+joint chi-square. Let s be the largest singular value of S1^-1/2 C S2^-1/2. The eigenvalues of the
+whitened matrix are at least 1 - s, so the joint chi-square is at most (z1 + z2) / (1 - s).
 
-C comes from what both loops share: some displacements, and the errors that repeat. If this
-contributes F to S1, then s squared is at most the largest eigenvalue of S1^-1 F. A first bound on
-that is the trace, a sum over displacements, which two look-ups in a table give. For the few pairs
-that it does not accept, there is a sharper bound (Wolkowicz & Styan 1980, "Bounds for eigenvalues
-using traces").
+C comes from the errors that both loops share: those of some displacements, and those that repeat.
+If these errors contribute F to S1, then s squared is at most the largest eigenvalue of S1^-1 F. A
+first bound on this eigenvalue is the trace of the matrix. The matrix trace is a sum over
+displacements, so two look-ups in a table give it. Pairs that the first bound does not accept are
+few. For these, there is a sharper bound (Wolkowicz & Styan 1980, "Bounds for eigenvalues using
+traces").
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 # A bound accepts a pair only with this margin, because sums are rounded.
 MARGIN = 1e-3
-# Pairs that are computed at once.
+# How many pairs are computed at once.
 AT_A_TIME = 1_000_000
 # At most this many returns decide which drift of heading is tried first.
 SAMPLE = 300
@@ -46,10 +48,10 @@ class _Alone:
     """What is known about each of m returns alone, for one drift of heading.
 
     Attributes:
-        inverse: The inverse covariance of its closing, m x 9. For a return to a place, the heading
-            says nothing and has zeros.
-        square: Its chi-square, m.
-        repeated: The covariance from errors that repeat, m x 9.
+        inverse: The inverse covariance of each closing (the error at the end of the loop), m x 9.
+            Its entries for the heading are 0 for a return to a place.
+        square: The chi-square of each closing, m.
+        repeated: The covariance of each closing from errors that repeat, m x 9.
     """
 
     inverse: Array
@@ -68,9 +70,11 @@ class _Alone:
 class Together:
     """The returns of one map, and tests of pairs of them.
 
+    A return is a pair of steps that the map has at one place or dstate.
+
     Attributes:
-        rows: One row for each return, sorted by last step: its first step, its last step, and
-            whether it is one dstate rather than one place.
+        rows: One row for each return, sorted by last step: its first step, its last step, and 1
+            for a return to a dstate or 0 for one to a place.
     """
 
     def __init__(
@@ -80,13 +84,14 @@ class Together:
         rows: Steps,
         before: Together | None = None,
     ) -> None:
-        """No test is done yet.
+        """Choose the drift of heading that is tried first. No pair is tested yet.
 
         Args:
             reckoning: The dead reckoning of the trace.
             thresholds: The chi-square above which a pair is rejected, by its degrees of freedom.
             rows: The returns.
-            before: The same for the first of these rows and steps, whose results are kept.
+            before: The same for the first of these rows and steps, if known. Its results are
+                reused.
         """
         self.rows = rows
         self._reckoning, self._thresholds = reckoning, thresholds
@@ -99,13 +104,13 @@ class Together:
             self._number, self._chosen_among = self._likeliest(), len(rows)
 
     def worst(self, new: Mask) -> tuple[Steps, Steps] | None:
-        """The pair that is rejected most clearly, out of those with a new return.
+        """Find the pair that is rejected most clearly, out of the pairs with a new return.
 
         Args:
             new: Whether each return is new.
 
         Returns:
-            The two rows; None if no pair is rejected.
+            The later row and the earlier row of the pair; None if no pair is rejected.
         """
         rows = self.rows
         worst, most = None, 0.0
@@ -129,7 +134,15 @@ class Together:
         return worst
 
     def _overlapping(self, later: Steps, new: Mask) -> Sequence[Steps]:
-        """In parts, the rows that end no later than these and may share displacements with them."""
+        """Find the rows that may share displacements with some rows, and end no later.
+
+        Args:
+            later: The indices of these rows. They end at one step.
+            new: Whether each return is new.
+
+        Returns:
+            The indices of the rows found, in parts that fit into memory.
+        """
         stop = int(later[-1]) + 1
         begin = int(np.searchsorted(self.rows[:stop, 1], self.rows[later, 0].min(), side="right"))
         earlier = np.arange(begin, stop)
@@ -139,9 +152,16 @@ class Together:
         return [earlier[at : at + size] for at in range(0, len(earlier), size)]
 
     def _unsafe(self, end: int, later: Steps, earlier: Steps, new: Mask) -> tuple[Steps, Steps]:
-        """The pairs of rows that the bound by the trace does not accept, for the first drift.
+        """Find the pairs that the first bound does not accept, for the drift that is tried first.
 
-        The later row of each pair ends at step `end`.
+        Args:
+            end: The step at which the later rows end.
+            later: The indices of the later rows.
+            earlier: The indices of the earlier rows.
+            new: Whether each return is new.
+
+        Returns:
+            Two arrays: the index of the later row and of the earlier row of each pair.
         """
         alone, rows = self._of_each(self._number), self.rows
         first = rows[later, 0]
@@ -164,12 +184,12 @@ class Together:
         return later[these], earlier[others]
 
     def _is_safe(self, share: Array, squares: Array, number: int) -> Mask:
-        """Whether a bound shows that pairs are not rejected.
+        """Whether a bound shows, for each pair, that it is not rejected.
 
         Args:
-            share: A bound on the largest eigenvalue of what both returns share.
-            squares: The sums of their chi-squares.
-            number: The number of the drift.
+            share: An upper bound on s squared (see the head of this module).
+            squares: The sums of the chi-squares of both returns.
+            number: The index of the drift.
         """
         allowed = min(self._thresholds.values()) - self._reckoning.unlikely[number]
         left = 1 - squares / allowed if allowed > 0 else np.full_like(squares, -1.0)
@@ -177,7 +197,10 @@ class Together:
         return safe
 
     def _least_excess(self, end: int, later: Steps, earlier: Steps) -> Array:
-        """The chi-square of each pair minus the threshold, for its best drift; 0 if negative."""
+        """Return the chi-square of each pair minus the threshold; 0 if this is negative.
+
+        The smallest result of all drifts counts.
+        """
         excess = np.full(len(later), np.inf)
         others = (number for number in range(len(self._reckoning.bends)) if number != self._number)
         for number in (self._number, *others):
@@ -190,7 +213,14 @@ class Together:
         return excess
 
     def _excess(self, number: int, end: int, later: Steps, earlier: Steps) -> Array:
-        """The chi-square of each pair minus the threshold, for one drift; 0 if negative."""
+        """Return the chi-square of each pair minus the threshold, for one drift; 0 if negative.
+
+        Args:
+            number: The index of the drift.
+            end: The step at which the later rows end.
+            later: The index of the later row of each pair.
+            earlier: The index of the earlier row of each pair.
+        """
         alone, rows, loops = self._of_each(number), self.rows, self._loops(number)
         squares = alone.square[later] + alone.square[earlier]
         # The stretch that both loops share.
@@ -225,12 +255,14 @@ class Together:
         return excess
 
     def _largest_share(self, alone: _Alone, returns: Steps, noise: Array) -> Array:
-        """A bound on the largest share of noise and repeated errors in the covariance of returns.
+        """Return an upper bound on the largest eigenvalue of S^-1 F for some returns.
+
+        S is the covariance of a return, and F the part of it that noise and repeated errors cause.
 
         Args:
             alone: What is known about each return.
-            returns: The returns.
-            noise: The noise, m x 9.
+            returns: The indices of the returns.
+            noise: The covariance that the noise causes, m x 9.
         """
         product = alone.inverse[returns].reshape(-1, 3, 3) @ (
             noise + alone.repeated[returns]
@@ -246,7 +278,7 @@ class Together:
         return bound
 
     def _likeliest(self) -> int:
-        """The drift with which a sample of the loops closes best."""
+        """Return the index of the drift with which a sample of the loops closes best."""
         if not len(self.rows):
             return 0
         rows = self.rows[:: max(len(self.rows) // SAMPLE, 1)]
@@ -260,7 +292,7 @@ class Together:
         return int((squares.reshape(len(numbers), -1).sum(1) + self._reckoning.unlikely).argmin())
 
     def _of_each(self, number: int) -> _Alone:
-        """What is known about each return alone, for one drift."""
+        """Return what is known about each return alone, for the drift with this index."""
         known = self._alone.get(number)
         if known is None or len(known.square) < len(self.rows):
             loops, rows = (
@@ -280,7 +312,13 @@ class Together:
 
 
 def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
-    """The joint chi-square of each of these rows with its partner in `others`."""
+    """Return the joint chi-square of each return with its partner.
+
+    Args:
+        loops: The loops of the trace.
+        these: Rows of returns, as in `Together.rows`.
+        others: The row of the partner of each return.
+    """
     joint, off = np.empty((len(these), 6, 6)), np.empty((len(these), 6))
     for rows, at in ((these, slice(3)), (others, slice(3, 6))):
         closing, covariance = loops.closings(rows[:, 0], rows[:, 1])
@@ -295,7 +333,14 @@ def joint_squares(loops: Loops, these: Steps, others: Steps) -> Array:
 
 
 def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps) -> _Alone:
-    """What is known about each return alone, from its closing and the covariance."""
+    """Compute what is known about each of m returns alone.
+
+    Args:
+        closing: The errors at the end of the loops, m x 3.
+        covariance: Their covariances, m x 3 x 3.
+        repeated: The parts of the covariances from errors that repeat, m x 3 x 3.
+        one_dstate: 1 for a return to a dstate, 0 for one to a place.
+    """
     _cut_off_headings(closing, covariance, one_dstate)
     inverse: Array = np.asarray(np.linalg.inv(covariance), dtype=float)
     inverse[one_dstate == 0, 2, 2] = 0.0
@@ -304,7 +349,10 @@ def _alone(closing: Array, covariance: Array, repeated: Array, one_dstate: Steps
 
 
 def _cut_off_headings(closing: Array, covariance: Array, one_dstate: Steps) -> None:
-    """Ignore the heading of returns to places: let it close, and be independent."""
+    """Ignore the heading in returns to places: set its error to 0 and its covariances to 0.
+
+    The arrays are changed. The variance becomes 1, so that the matrix can be inverted.
+    """
     places = one_dstate == 0
     closing[places, 2] = 0.0
     covariance[places, 2, :] = covariance[places, :, 2] = 0.0
