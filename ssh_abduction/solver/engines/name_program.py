@@ -1,8 +1,8 @@
-"""Asks clingo about named dstates (names.lp), for the engines without frames.
+"""The control of clingo that assigns names of dstates to steps (names.lp).
 
-Clingo is given only some links of the trace at first, and more if an answer needs them. That is a
-relaxation, so a proven bound holds for the trace. An answer is followed along the trace
-(`NameProgram.follow`): if it explains each link, it is a map.
+The engines without frames use it. Clingo gets only some links of the trace at first, and more if an
+answer needs them. Fewer links are a relaxation, so a proven bound holds for the trace. Each answer
+is followed along the trace (`NameProgram.follow`). If it explains every link, it is a map.
 """
 
 from __future__ import annotations
@@ -23,25 +23,26 @@ from ssh_abduction.solver.engines.nearby import AT_A_TIME, SECONDS_A_CHARACTER
 from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.steps.chart import Chart, Link
 
-# After grounding, clingo prepares to solve for about this share of the time that grounding took.
-# It cannot be stopped meanwhile.
+# Clingo cannot be stopped while it prepares to solve. That takes about this share of the time that
+# grounding took.
 PREPARING = 0.6
-# Of a long trace, give clingo this many more links at a time; of others all that are left.
+# Give clingo this many more links of a long trace at a time. Of a shorter trace it gets all links
+# that are left.
 MORE_LINKS = 1000
 
-# Links that were followed since the last node that clingo named, the latest first.
+# A linked list of the links that were followed since the last node that clingo named, latest first.
 _Trail: TypeAlias = "tuple[Link, _Trail] | None"
 
 
 class Fitting(Protocol):
-    """Demands on labels beyond the causal theory (`engines/frameless.py`)."""
+    """Axioms beyond the causal theory that labels have to satisfy (`engines/frameless.py`)."""
 
     def fits(self, labels: Sequence[int]) -> bool:
-        """Whether these labels of a causal map have a map with the demands."""
+        """Whether some map has these labels and satisfies the further axioms."""
         ...
 
     def forbid(self, labels: Sequence[int]) -> None:
-        """Forbid the reason why these labels have no map."""
+        """Give clingo rules that exclude these labels, as they have no map."""
         ...
 
     def tell_again(self) -> None:
@@ -51,16 +52,17 @@ class Fitting(Protocol):
 
 @dataclass
 class _Known:
-    """What one control knows.
+    """A record of everything that one control was given.
 
     Attributes:
-        spare: The spare names of each view; the last one is the rest.
-        choices: For each node, the names that it may be at.
-        is_open: Whether some given node is not pinned.
-        links: The links that were given.
-        nodes: The nodes that were given.
-        last: For each view, the last node given that has a choice.
-        batches: The number of batches given.
+        spare: The spare names of each view. The last one is the rest, which any number of dstates
+            without a name of their own share.
+        choices: For each node, the names that it may have.
+        is_open: For each node, whether the control has it and it may have several names.
+        links: The links, as keys in the order in which they were given.
+        nodes: The nodes.
+        last: For each view, the last given node that may have several names.
+        batches: The number of batches.
     """
 
     spare: dict[int, list[int]]
@@ -73,11 +75,11 @@ class _Known:
 
 
 class NameProgram:
-    """The control that names dstates, and what it was given.
+    """The control that assigns names of dstates to nodes, and a record of what it was given.
 
     Attributes:
-        pinned: The nodes, their links, and the nodes that have names of their own.
-        forbidden: Sets of pairs of nodes. In each set, some pair is not one dstate.
+        pinned: The nodes, their links, and the clique of nodes that have names of their own.
+        forbidden: Sets of pairs of nodes. In no map are all pairs of one set at one dstate each.
     """
 
     def __init__(
@@ -91,17 +93,17 @@ class NameProgram:
         fitting: Fitting | None,
         check_ahead: Callable[[float], None],
     ) -> None:
-        """Make a control that has the names, and no node yet.
+        """Make a control that has the names, but no node yet.
 
         Args:
             task: The trace and the speed-ups that are on.
-            asker: It asks the control.
-            pinned: The nodes and links.
-            spares: The number of spare names of each view, besides the rest.
-            forbidden: See the attribute.
-            fitting: Further demands on labels; None in the causal theory.
-            check_ahead: Raises LimitError if there is no time for this many seconds of work that
-                cannot be interrupted.
+            asker: Asks the control.
+            pinned: The nodes, their links and the clique.
+            spares: The number of spare names of each view, not counting the rest.
+            forbidden: The forbidden sets of pairs, as in the attribute.
+            fitting: Further axioms for labels; None in the causal theory.
+            check_ahead: Called with the seconds that clingo cannot be stopped. Raises LimitError
+                if there is not enough time left.
         """
         self.pinned, self.forbidden = pinned, forbidden
         self._task, self._asker, self._fitting = task, asker, fitting
@@ -110,21 +112,21 @@ class NameProgram:
 
     @property
     def chart(self) -> Chart:
-        """The nodes and links of the first steps."""
+        """The nodes of the first steps and the links between them."""
         return self.pinned.chart
 
     @property
     def has_all_links(self) -> bool:
-        """Whether clingo was given all links."""
+        """Whether clingo has all links of the chart."""
         return len(self._known.links) == len(self.chart.links)
 
     @property
     def links_given(self) -> int:
-        """How many links clingo was given."""
+        """The number of links that clingo has."""
         return len(self._known.links)
 
     def tell_all(self, links: Iterable[Link]) -> None:
-        """Give a new control these links, and all that is forbidden."""
+        """Give a new control these links, and the rules for all that is forbidden."""
         self.add(links)
         for number in range(len(self.forbidden)):
             self.tell_forbidden(number)
@@ -132,7 +134,7 @@ class NameProgram:
             self._fitting.tell_again()
 
     def name_more(self, views: Collection[int]) -> None:
-        """Add a spare name to each of these views. This makes a new control."""
+        """Add a spare name to each of these views, in a new control with the same links."""
         for view in views:
             self._spares[view] += 1
         self._asker.watch.check()
@@ -141,7 +143,7 @@ class NameProgram:
         self.tell_all(links)
 
     def _new_control(self) -> _Known:
-        """Make a control that has the names, and no node yet."""
+        """Make a control that has the names, but no node yet."""
         with self._asker.grounding_timed():
             seen, clique = self.chart.seen, self.pinned.clique
             names = [(name, seen[node]) for name, node in enumerate(clique)]
@@ -149,7 +151,7 @@ class NameProgram:
             for view, count in self._spares.items():
                 spare[view] = list(range(len(names), len(names) + count + 1))
                 names += [(name, view) for name in spare[view]]
-            # A node of the clique has no choice; others also choose among the spare names.
+            # A node of the clique has one name. All others may also have any spare name.
             choices = [
                 options
                 if len(options) == 1 and t == clique[options[0]]
@@ -163,9 +165,9 @@ class NameProgram:
             return _Known(spare, choices, np.zeros(len(seen), dtype=bool))
 
     def add(self, links: Iterable[Link]) -> None:
-        """Give clingo more links, and the nodes at their ends.
+        """Give clingo more links and the nodes at their ends, in batches.
 
-        Give some at a time, as clingo cannot be stopped meanwhile.
+        Limits are checked between batches, as clingo cannot be stopped while it grounds one.
         """
         added, before = list(links), self._asker.ground_seconds
         for start in range(0, len(added), AT_A_TIME):
@@ -175,7 +177,7 @@ class NameProgram:
         self._check_ahead(PREPARING * (self._asker.ground_seconds - before))
 
     def add_links_at(self, nodes: Collection[int]) -> None:
-        """Give clingo the links to and from these nodes, unless it has them."""
+        """Give clingo all links to and from these nodes that it lacks."""
         self.add(
             link
             for link in self.chart.links
@@ -183,9 +185,9 @@ class NameProgram:
         )
 
     def more_links(self) -> list[Link]:
-        """Links that clingo lacks: all of them, or some if the trace is long.
+        """List links that clingo lacks: all of them, or `MORE_LINKS` if the trace is long.
 
-        Links whose ends have the fewest possible names come first.
+        In a long trace, the links whose ends may have the fewest names come first.
         """
         known = self._known
         left = [link for link in self.chart.links if link not in known.links]
@@ -196,7 +198,7 @@ class NameProgram:
         )[:MORE_LINKS]
 
     def _give(self, links: Iterable[Link]) -> None:
-        """Give clingo one batch of links, and the nodes at their ends."""
+        """Ground one batch of links, with the nodes at their ends."""
         known = self._known
         added = [link for link in links if link not in known.links]
         given: list[tuple[int, int, Sequence[int], int | None]] = []
@@ -219,29 +221,35 @@ class NameProgram:
         known.batches += 1
 
     def tell(self, part: str, rules: str) -> None:
-        """Give clingo rules in a program part of this name."""
+        """Ground rules for clingo, in a program part of this name."""
         self._asker.control.add(part, [], rules)
         self._asker.control.ground([(part, [])])
 
     def tell_forbidden(self, number: int) -> None:
-        """Give clingo the rule that the pairs of a forbidden set are not all one dstate.
+        """Give clingo the rule that excludes a forbidden set of pairs, and the nodes in it.
 
-        Also give it their nodes, unless it has them.
+        Args:
+            number: The position of the set in `forbidden`.
         """
         pairs = self.forbidden[number]
         self.add_links_at({step for pair in pairs for step in pair})
         self.tell(f"not_together_{number}", names_lp.not_together(number, pairs))
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
-        """Whether labels of a map agree with evidence about pairs of steps."""
+        """Whether the labels of a map agree with evidence about pairs of nodes.
+
+        Args:
+            labels: The dstate of each node.
+        """
         if any(all(labels[i] == labels[j] for i, j in pairs) for pairs in self.forbidden):
             return False
         return not self.chart.excluded or self.chart.is_map(labels)
 
     def names(self) -> dict[tuple[int, int], int]:
-        """The names of dstates, without the rests, by keys that stay when names are added.
+        """Return the names of dstates, without the rests, by keys.
 
-        A key is a view and a number, or -1 and a number for a pinned node.
+        A key is (-1, number) for a pinned node, and (view, number) for a spare name. Keys stay the
+        same when names are added.
         """
         pinned = {(-1, name): name for name in range(len(self.pinned.clique))}
         return pinned | {
@@ -251,25 +259,32 @@ class NameProgram:
         }
 
     def rests(self, answer: dict[int, int]) -> set[int]:
-        """The views whose rest the answer uses."""
+        """Return the views whose rest an answer uses.
+
+        Args:
+            answer: The name of each node.
+        """
         used = set(answer.values())
         return {view for view, spare in self._known.spare.items() if spare[-1] in used}
 
     def resting(self, value: bool) -> tuple[clingo.Symbol, bool]:
-        """The assumption that some node is at a rest, or that none is."""
+        """Return the assumption that some node is at a rest (True), or that none is (False)."""
         return names_lp.resting(self._known.batches - 1), value
 
     def reader(self) -> names_lp.NameReader:
-        """A reader of answers for a control that was given all links."""
+        """Make a reader of answers, for a control that has all links."""
         actions = self._task.log.actions[: len(self.chart.seen) - 1]
         return names_lp.NameReader(actions, self._known.choices)
 
     def follow(self, answer: dict[int, int]) -> tuple[list[int], list[Link]]:
-        """Follow the links of an answer from node to node.
+        """Follow the links of an answer through all nodes of the chart.
+
+        Args:
+            answer: The name of each node that clingo has.
 
         Returns:
-            The name of each node, and the links that the answer does not explain. Clingo needs
-            these links.
+            The name of each node, -1 if it is unknown; and the links that the answer does not
+            explain, to be given to clingo next. If there are none, the names are those of a map.
         """
         if self.has_all_links and not self.rests(answer):
             return [answer[node] for node in range(len(answer))], []
@@ -299,14 +314,15 @@ class NameProgram:
                         followed[u] = None if u in answer else trail
                 labels[u] = answer.get(u, -1) if there is None else there
             elif here >= 0 and labels[u] >= 0 and goes.setdefault(key, labels[u]) != labels[u]:
-                # The action leads to two names: all links that led here may be wrong.
+                # The action leads to two names, so any link that was followed to get here may be
+                # wrong.
                 failed.update(self._not_given((link, followed[t])))
                 failed.update(self._not_given(followed[u]))
         failed.update(dict.fromkeys(self._links_at_excluded(labels)))
         return labels, list(failed)
 
     def _links_at_excluded(self, labels: Sequence[int]) -> list[Link]:
-        """Links at nodes that share a label, though evidence says they are two dstates."""
+        """List links that clingo lacks, at nodes that share a label against evidence."""
         excluded = {
             node
             for pair in self.chart.excluded
@@ -322,7 +338,7 @@ class NameProgram:
         ]
 
     def _not_given(self, trail: _Trail) -> Iterator[tuple[Link, None]]:
-        """The links on a trail that clingo does not know."""
+        """Yield the links on a trail that clingo lacks, as keys for a dict."""
         while trail is not None:
             link, trail = trail
             if link not in self._known.links:

@@ -1,35 +1,37 @@
-"""Labels with the fewest dstates for theories without frames: the dstates have names.
+"""Finds labels with the fewest dstates, for theories without frames.
 
-This serves the causal engine and the frameless one. It finds labels of the first steps with the
-fewest dstates, proves that none have fewer, and lists all that have as few.
+A label is the number of the dstate of a step. This module finds labels of the first steps with the
+fewest dstates, proves that none have fewer, and lists all labels with that number of dstates. The
+causal engine and the frameless one use it.
 
-Pairwise distinct steps (`steps/apart.py`) are pinned to names of their own. Their number is a
-lower bound on the dstates. Pinning leaves only one way to name these dstates. Every other step
-chooses among the names of steps that it is not apart from. A view has a few spare names, at the
-cost of one dstate each, and a *rest*, which stands for all other dstates of the view. Of several
-largest cliques, the one whose steps are apart from most others is pinned. That leaves the other
-steps the fewest names.
+The search works with names. Clingo assigns a name, which is a dstate, to each step. Pairwise
+distinct steps, a clique (`steps/apart.py`), are *pinned*: each gets a name of its own. Their number
+is a lower bound on the dstates. Pinning leaves only one way to name these dstates. Any other step
+may have the name of a pinned step that it can share a dstate with, or a *spare* name of its view. A
+spare name costs one dstate. Each view also has a *rest*, one name that all its other dstates share.
+If there are several largest cliques, the one that leaves the other steps the fewest names is
+pinned.
 
-*Claim.* A map of minimal cost that uses no rest is a minimal map, and its cost is the minimum.
-*Proof.* Name the dstates of any map: those of the pinned steps as pinned, the others by spare
-names of their view as far as these reach, then by the rest. This keeps every rule of names.lp, as
-a rest asks nothing of the steps at it, and costs at most as many spare names as the map has
-dstates beyond the clique. So the cost found is a lower bound; a map without a rest is a map of
-the trace, and reaches it. ∎
-If a minimal answer does use a rest, its view gets one more spare name, and clingo is asked again.
+*Claim.* An answer of minimal cost that uses no rest is a minimal map, and its cost is the minimum.
+*Proof.* Name the dstates of any map. The pinned steps have their names. The other dstates get spare
+names of their view, while there are any, and then the rest. These names satisfy each rule of
+names.lp, as the rules say nothing about steps at a rest. They cost no more spare names than the map
+has dstates beyond the clique. So the minimal cost is a lower bound. An answer without a rest is a
+map of the trace with this cost. ∎
+If a minimal answer uses a rest, its view gets one more spare name, and clingo is asked again.
 
-Not every step is needed. Clingo starts with the links of the pinned steps. An answer is followed
-along the trace, and the links at which it fails are added, until one holds everywhere
-(`engines/name_program.py`). If clingo does not answer soon, it is given all links, or of a long
-trace some at a time. A very long trace is charted only up to a step at which the clique is as large
-as that of all steps.
+Not every step is needed. Clingo starts with the links of the pinned steps. Each answer is followed
+along the trace, and the links that it does not explain are added, until it explains all links
+(`engines/name_program.py`). If clingo does not answer soon, it gets all links, or some at a time if
+the trace is long. A very long trace is charted only up to a step at which the clique is as large as
+that of all steps.
 
-The search for the fewest dstates is in `engines/name_search.py`. Which minimal maps come first may
-differ from run to run, as the search may use threads; the set of minimal maps is the same.
+The search for the fewest dstates is in `engines/name_search.py`. It may use threads, so the order
+of the minimal maps may differ from run to run. The set of minimal maps is always the same.
 
 Python reads an answer more slowly than clingo finds it. So only the atoms that say where actions
-lead are read. The labels of all steps follow from them. While a map is made of one answer, clingo
-searches for the next.
+lead are read, and the labels of all steps are derived from these. While a map is made from one
+answer, clingo searches for the next.
 """
 
 from __future__ import annotations
@@ -47,18 +49,19 @@ from ssh_abduction.solver.engines.pinned import Pinned
 from ssh_abduction.solver.steps.apart import Continuations
 from ssh_abduction.solver.steps.chart import Chart, Link, numbered
 
-# Hold back this many maps until clingo has all links; then they stream. Until then any answer may
-# show that clingo lacks a link.
+# Before clingo has all links, any answer may show that a link is missing. So hold back the maps of
+# a list until it is complete. If it has this many maps, give clingo all links instead, and then
+# yield each map at once.
 HELD_BACK = 100
-# A view begins with this many spare names: one to use, and one to show that no more are needed.
+# A view has this many spare names at first: one to use, and one to show that no more are needed.
 SPARES = 2
-# Take at most this many steps of a long trace at once, if its clique still grows: the clique of
-# more takes minutes.
+# Of a long trace whose clique grows, take at most this many steps at once. The clique of more steps
+# would take minutes.
 WHOLE = 100_000
 
 
 class NamedLabels:
-    """Labels of the first steps of a trace with the fewest dstates.
+    """Finds labels with the fewest dstates for the first steps of a trace.
 
     Attributes:
         size: The number of these steps.
@@ -71,18 +74,19 @@ class NamedLabels:
         given_map: Sequence[int] = (),
         fitting: Fitting | None = None,
     ) -> None:
-        """Labels of no steps yet.
+        """Begin without any steps.
 
         Args:
             task: The trace and the speed-ups that are on.
-            asker: It asks clingo.
-            given_map: Labels of all steps in a map with few dstates, if known.
-            fitting: Further demands on labels; None in the causal theory.
+            asker: Asks clingo.
+            given_map: The dstate of each step of the trace in a map with few dstates; empty if
+                none is known.
+            fitting: Further axioms for labels; None in the causal theory.
         """
         self.size = 0
         self._task, self._asker, self._given_map, self._fitting = task, asker, given_map, fitting
         self._incumbent = Incumbent(asker, self.is_allowed)
-        # Sets of pairs of steps. In each set, some pair is not one dstate.
+        # Sets of pairs of steps. In no map are all pairs of one set at one dstate each.
         self._forbidden: list[list[tuple[int, int]]] = []
         self._pinned: Pinned | None = None
         self._program: NameProgram | None = None
@@ -90,17 +94,17 @@ class NamedLabels:
 
     @property
     def bound(self) -> int | None:
-        """A lower bound on the dstates; None if unknown."""
+        """A proven lower bound on the number of dstates; None if none is known."""
         return self._incumbent.bound
 
     @property
     def clique(self) -> Sequence[int]:
-        """Pairwise distinct steps, which have names of their own."""
+        """The pinned steps, which are pairwise distinct; empty before `grow`."""
         return self._pinned.clique if self._pinned else []
 
     @property
     def program(self) -> NameProgram:
-        """The control that names dstates."""
+        """The control that assigns names of dstates to steps."""
         assert self._program is not None  # `grow` comes first
         return self._program
 
@@ -110,9 +114,9 @@ class NamedLabels:
         return self.program.chart
 
     def large_enough(self, size: int) -> int:
-        """The number of steps to take of a long trace; at least `size`.
+        """Return how many steps of the trace to take: at least `size`.
 
-        More steps do not have a larger clique.
+        In a long trace this is enough for a clique as large as that of the whole trace.
         """
         most = min(len(self._task.trace), WHOLE)
         if AT_ONCE <= size < most and self._task.speedups.clique:
@@ -126,7 +130,7 @@ class NamedLabels:
         return len(Continuations(log.seen[:steps], log.actions[: steps - 1]).clique())
 
     def grow(self, size: int) -> None:
-        """Take the first `size` steps."""
+        """Make the first `size` steps the prefix."""
         if size == self.size:
             return
         try:
@@ -156,15 +160,15 @@ class NamedLabels:
         )
         self._search = NameSearch(self._task, self._asker, self._program, known, self._fitting)
         links: Iterable[Link] = pinned.chart.links
-        if speedups.lazy:  # only those that begin at the first step or at one of the clique
+        if speedups.lazy:  # only links that begin at the first step or at a pinned one
             first = {0, *pinned.clique}
             links = [link for link in links if link[0] in first]
         self._program.tell_all(links)
 
     def _first_spares(self, pinned: Pinned) -> dict[int, int]:
-        """How many spare names each view has at first.
+        """Return the number of spare names that each view has at first.
 
-        As many as the given map needs and one more, or a few if there is no such map.
+        It is the number that the given map needs and one more, but at least `SPARES`.
         """
         seen = pinned.chart.seen
         found = Counter(dict(zip(self._given_map, seen, strict=False)).values())
@@ -175,19 +179,19 @@ class NamedLabels:
         }
 
     def improving(self) -> Iterator[list[int]]:
-        """Labels of all steps; the last ones have the fewest dstates.
+        """Yield labels of all steps of the prefix. The last ones have the fewest dstates.
 
-        If the search takes long, other labels with few dstates come first.
+        If the search takes long, labels with few dstates come before.
         """
         assert self._search is not None  # `grow` comes first
         return self._search.improving()
 
     def is_allowed(self, labels: Sequence[int]) -> bool:
-        """Whether labels of a map agree with evidence about pairs of steps."""
+        """Whether the labels of a map agree with evidence about pairs of steps."""
         return self.program.is_allowed(labels)
 
     def forbid_together(self, pairs: Collection[tuple[int, int]]) -> None:
-        """Forbid that these pairs of steps are all one dstate."""
+        """Exclude labels in which each of these pairs of steps is at one dstate."""
         self._forbidden.append(list(pairs))
         known = self._incumbent
         if known.labels and not self.is_allowed(known.labels):
@@ -195,15 +199,15 @@ class NamedLabels:
         self.program.tell_forbidden(len(self._forbidden) - 1)
 
     def settle(self) -> None:
-        """End the search in the other thread."""
+        """Stop the search in the other thread."""
         self._incumbent.end_beside()
 
     def all_of(self, dstates: int, enough: int) -> Generator[list[int], None, None]:
-        """All labels with this many dstates. Labels that are known come first.
+        """Yield all labels with this many dstates, each once. Labels already known come first.
 
         Args:
             dstates: The number of dstates.
-            enough: Stop after this many labels; 0 for all.
+            enough: Clingo is asked for this many labels, beside the known ones; 0 for all.
         """
         known = self._incumbent.labels
         if known and len(set(known)) != dstates:
@@ -217,7 +221,7 @@ class NamedLabels:
             )
 
     def _listed(self, dstates: int, enough: int) -> Iterator[list[int]]:
-        """As `all_of`, in the order in which clingo lists them."""
+        """Yield the same labels as `all_of`, in the order in which clingo lists them."""
         program, spares = self.program, dstates - len(self.clique)
         if spares < 0:
             return
@@ -225,7 +229,7 @@ class NamedLabels:
             yield [0]
             return
         while True:
-            # Ask again when nodes were added, as they may be at a rest.
+            # Ask again after nodes were added, as these may be at a rest.
             while not enough and self._needs_rest(spares):
                 pass
             held: list[list[int]] = []
@@ -247,7 +251,7 @@ class NamedLabels:
                         failed = program.chart.links
                         break
             except LimitError:
-                yield from held  # they cost what the bound is, and fit all links
+                yield from held  # these are minimal, and explain all links
                 raise
             if failed:
                 program.add(failed)
@@ -256,10 +260,13 @@ class NamedLabels:
                 return
 
     def _needs_rest(self, spares: int) -> bool:
-        """Add spare names if some answer of this cost uses a rest.
+        """Look for an answer of this cost that uses a rest, and if so add spare names.
+
+        Args:
+            spares: The cost, as a number of spare names.
 
         Returns:
-            Whether some answer did.
+            Whether there was such an answer.
         """
         assert self._search is not None  # `grow` comes first
         answers = self._asker.answers(
@@ -275,7 +282,7 @@ class NamedLabels:
         return bool(views)
 
     def _answers_of(self, spares: int) -> Iterator[dict[int, int]]:
-        """All answers that cost this many spare names and use no rest."""
+        """Yield all answers that cost this many spare names and use no rest."""
         program = self.program
         read = program.reader().read if program.has_all_links else names_lp.read_names
         return self._asker.answers(

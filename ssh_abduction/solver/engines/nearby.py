@@ -1,32 +1,32 @@
-"""Small maps near a guess, and the proof that none is smaller, from the guess outwards.
+"""Finds small maps near a guess, and proves that there are none with fewer dstates.
 
-This serves the causal theory, and the causal axioms of theories with frames. `NearbySearch` yields
-ever smaller maps; when it ends with a `bound`, the last one is minimal.
+It is used for the causal theory, and for the causal axioms of theories with frames. `NearbySearch`
+yields ever smaller maps. If it ends with a `bound`, the last map is minimal.
 
-If all steps were free, the search would take long. So most steps keep the dstates of a known map.
-The search tries to spare one dstate. If that is impossible, clingo returns a
-core of assumptions: the steps that are in the way. Their dstates become free, until some steps can
-move, or the dstate is proven to be needed. If neither happens soon, all steps of some part of the
-map become free at once. The size of parts is adapted so that each is solved soon (large
-neighbourhood search: Shaw 1998).
+If all steps were free to change their dstates, the search would take long. So most steps keep the
+dstates of a known map, and the search tries to save one dstate. If that is impossible, clingo
+returns an unsat core: a set of steps that cannot all stay where they are. The dstates of these
+steps become free. This is repeated until a dstate is saved, or is proven to be needed. If neither
+happens soon, all steps in some part of the map become free at once. The size of parts is adapted so
+that each question is answered soon (large neighbourhood search: Shaw 1998).
 
-When each dstate is needed, all steps become free. But each view may still use no more names than in
-the known map. Then views are allowed more names, one after the other, and in the end any number of
-dstates (the rest, see `engines/naming.py`). Each time clingo is asked for a map of fewer dstates in
-all.
+When each single dstate is needed, all steps become free. But at first no view may have more dstates
+than in the known map. Then views are allowed more dstates, one view after the other, and in the end
+any number (the rest, see `engines/naming.py`). Each time clingo is asked for a map with fewer
+dstates in total.
 
-*Claim.* If there is none when everything is allowed, the known map is minimal.
-*Proof.* What is asked then is what `engines/naming.py` asks, at a cost of one less: by the claim
-there, each map with fewer dstates is an answer. ∎
+*Claim.* If there is no such map when everything is allowed, the known map is minimal.
+*Proof.* This last question is the one of `engines/naming.py`, for a cost that is lower by one. By
+the claim there, every map with fewer dstates is an answer to it. ∎
 
-If everything were allowed at once, a proof might take hours. What clingo learns from each question
-makes the next one short. So one, two, four names are allowed at a time, as long as answers come
-soon.
+If everything were allowed at once, the proof might take hours. What clingo learns from one question
+makes the next one shorter. So one, two, four names and so on are allowed at a time, while the
+answers come soon.
 
 The nodes need not be the steps of a trace. If places have frames, the nodes are those of
 `Chart.framed`, and rotations are links like actions. The maps then need not fit a frame, as
-names.lp does not know how rotations compose; but the bound holds. Names are good for this search,
-but poor for raising the bound core by core. So `engines/visit_labels.py` has none.
+names.lp does not know how rotations compose, but the bound holds. Names suit this search, but not
+one that raises the bound core by core. So `engines/visit_labels.py` has none.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Chart, numbered
 from ssh_abduction.theory.speedups import Speedups
 
-# At first, a question is left open after this many conflicts. Each round of questions doubles it.
+# At first, give up a question after this many conflicts. Each round of questions doubles it.
 CONFLICTS = 2000
 # A question in which all steps are free may take this many times as many conflicts.
 WIDE = 10
@@ -59,19 +59,20 @@ WIDE = 10
 REGIONS = 40
 # A part has this many dstates at first, and at least.
 FIRST_REGION = 10
-# A part gets this many more dstates after a proof that it needs its own, and this many fewer after
-# an open question.
+# A part gets this many more dstates after a proof that it needs all its dstates, and this many
+# fewer after a question was given up.
 LARGER, SMALLER = 2, 4
-# After grounding, clingo prepares to solve for about as long again, and cannot be stopped.
+# Clingo cannot be stopped while it prepares to solve. That takes about this many times as long as
+# grounding took.
 PREPARING = 1.0
-# Give clingo this many links at once, as it cannot be stopped meanwhile.
+# Give clingo this many links at once. It cannot be stopped while it grounds them.
 AT_A_TIME = 100
-# Seconds a character, about and at most, that clingo takes to read and ground where names lead. It
-# cannot be stopped meanwhile.
+# Clingo cannot be stopped while it reads and grounds the facts about names. That takes at most
+# about this many seconds for each character of the facts.
 SECONDS_A_CHARACTER = 1e-6
 
 Labels: TypeAlias = list[int]
-Key: TypeAlias = tuple[int, int]  # what is seen at a node, and its label
+Key: TypeAlias = tuple[int, int]  # the observation at a node, and the label of the node
 _Verdict: TypeAlias = Literal["moved", "needed", "open"]
 
 
@@ -79,12 +80,15 @@ _Verdict: TypeAlias = Literal["moved", "needed", "open"]
 class _Names:
     """The names that the control knows.
 
+    A literal is a number by which clingo is asked about an atom.
+
     Attributes:
-        spare: The spare names of each view; the last one is the rest.
-        rests: All rests.
-        choices: For each node, the names that it may be at.
-        used: For each spare name, the literal that it is used.
-        ordered: The literal that nodes are at spare names in the order of the names.
+        spare: The spare names of each view. The last one is the rest, which any number of dstates
+            without a name of their own share.
+        rests: The rests of all views.
+        choices: For each node, the names that it may have.
+        used: For each spare name, the literal that some node has it.
+        ordered: The literal that spare names occur in their order, for the first time each.
     """
 
     spare: Mapping[int, range]
@@ -95,10 +99,10 @@ class _Names:
 
 
 class NearbySearch:
-    """Maps near a guess.
+    """A search for small maps near a guess.
 
     Attributes:
-        bound: The number of dstates of the last map, once that is proven to be the fewest.
+        bound: The fewest dstates, which the last map has; None until that is proven.
     """
 
     def __init__(
@@ -115,10 +119,10 @@ class NearbySearch:
         Args:
             watch: The limits.
             speedups: The speed-ups that are on.
-            pinned: The nodes and links, and the nodes that have names of their own.
-            far: Returns a row of the nodes that are different dstates from a node, if clingo
-                needs these.
-            configuration: Of clasp, if not its default.
+            pinned: The nodes, their links, and the clique of nodes that have names of their own.
+            far: Returns, for a node, a row of flags: the nodes at other dstates. Clingo gets
+                these pairs. None to give it none.
+            configuration: A configuration of clasp; None for its default.
         """
         self.bound: int | None = None
         self._asker = Asker(watch)
@@ -126,24 +130,25 @@ class NearbySearch:
         self._configuration = configuration
         self._names = _Names({}, frozenset(), (), {}, 0)
         self._labels: Labels = []
-        self._needed: set[int] = set()  # names that cannot be spared
-        # By view, the spare names that it keeps, as fewer were not enough once.
+        self._needed: set[int] = set()  # names whose dstate is proven to be needed
+        # For each view, the number of spare names that it keeps, as fewer were not enough once.
         self._fewest: dict[int, int] = {}
-        # Names that do not help, though all are allowed; None before each was tried.
+        # Names that do not help even if all of them are allowed at once. None before each name was
+        # tried alone.
         self._allowed: list[int] | None = None
-        self._waiting: list[int] = []  # names yet to be allowed
+        self._waiting: list[int] = []  # names that are not yet allowed
         self._region = FIRST_REGION
         self._random = random.Random(0)
 
     def fewer(self, guess: Sequence[int], tries: int | None = None) -> Iterator[Labels]:
-        """Labels of all nodes, each with fewer dstates than the ones before.
+        """Yield labels of all nodes, each time with fewer dstates.
 
-        After the last ones, `bound` says whether there are no fewer dstates.
+        At the end, `bound` is set if the last labels are proven to have the fewest dstates.
 
         Args:
-            guess: A label of each node, -1 where it is not known. It need not be a map.
-            tries: How often to ask with more conflicts before giving up. None: until fewer
-                dstates are found or refuted.
+            guess: The dstate of each node, -1 if it is unknown. It need not be a map.
+            tries: Give up after this many rounds of questions without a proof; None to go on until
+                there is one.
         """
         if known := self._pinned.chart.is_map(guess):
             yield list(guess)
@@ -151,15 +156,15 @@ class NearbySearch:
         name_of = {
             guessed[node]: name for name, node in reversed(list(enumerate(self._pinned.clique)))
         }
-        # What the guess has beyond the clique needs spare names.
+        # The dstates of the guess that no pinned node has need spare names.
         extra = dict.fromkeys(key for key in guessed if key is not None and key not in name_of)
         counts = Counter(view for view, _ in extra)
         self._take({view: counts[view] for view in dict.fromkeys(self._pinned.chart.seen)})
         left = {view: iter(spare) for view, spare in self._names.spare.items()}
         name_of |= {key: next(left[key[0]]) for key in extra}
         self._labels = [-1 if key is None else name_of[key] for key in guessed]
-        # Do so even if the guess is a map: clasp keeps choosing as in its last answer, and so stays
-        # near. First allow only the names of the guess, then all others.
+        # Ask even if the guess is a map: clasp keeps choosing as in its last answer, and so stays
+        # near the guess. First allow only the names of the guess, then all names but the rests.
         for allowed in ((), [name for spare in self._names.spare.values() for name in spare[:-1]]):
             verdict = self._moved(
                 self._not_allowed(allowed), (), WIDE * CONFLICTS, step_by_step=True
@@ -183,7 +188,11 @@ class NearbySearch:
                 conflicts, failed = 2 * conflicts, failed + 1
 
     def listed(self, watch: Watch) -> Iterator[list[int]]:
-        """All labels with as few dstates as `bound`, once that is known. Some may come twice."""
+        """Yield all labels with the fewest dstates. Some may come twice.
+
+        Args:
+            watch: The limits. `bound` must be known.
+        """
         self._asker.watch = watch
         assert self.bound is not None
         spares = self.bound - len(self._pinned.clique)
@@ -206,7 +215,11 @@ class NearbySearch:
             self._name_more(resting)
 
     def _take(self, counts: Mapping[int, int]) -> None:
-        """Take a control with this many spare names for each view, one more, and a rest."""
+        """Make a new control with names and all links.
+
+        Args:
+            counts: For each view, a number of spare names. The view gets one more, and a rest.
+        """
         began = time.perf_counter()
         seen, clique = self._pinned.chart.seen, self._pinned.clique
         names = [(name, seen[node]) for name, node in enumerate(clique)]
@@ -240,10 +253,10 @@ class NearbySearch:
         self._asker.watch.check(PREPARING * (time.perf_counter() - began))
 
     def _give_links(self, pinned: Collection[int]) -> None:
-        """Give a new control all links, in batches, and their nodes."""
+        """Give a new control all links and their nodes, in batches."""
         seen, links = self._pinned.chart.seen, self._pinned.chart.links
         given: set[int] = set()
-        last: dict[int, int] = {}  # by view, the last node that has a choice
+        last: dict[int, int] = {}  # for each view, the last node that is not pinned
         for batch, start in enumerate(range(0, len(links), AT_A_TIME)):
             self._asker.watch.check()
             part, added = f"batch_{batch}", links[start : start + AT_A_TIME]
@@ -268,7 +281,7 @@ class NearbySearch:
         return atom.literal
 
     def _not_allowed(self, allowed: Collection[int]) -> list[int]:
-        """The assumptions that allow only the names of the labels and these names."""
+        """Return assumptions that exclude all spare names but those in use and `allowed`."""
         taken = {*self._labels, *allowed}
         return [-literal for name, literal in self._names.used.items() if name not in taken]
 
@@ -280,19 +293,20 @@ class NearbySearch:
         *,
         step_by_step: bool = False,
     ) -> _Verdict:
-        """Move nodes so that the assumptions hold.
+        """Change the labels of some nodes so that the assumptions hold.
 
-        Nodes at names that are not free stay, unless a core shows that they are in the way.
+        Nodes whose name is not free keep it, unless a core shows that this is impossible.
 
         Args:
-            assumed: Literals.
-            free: Names whose nodes may move.
-            conflicts: After this many, the question is left open.
-            step_by_step: Let only the nodes of a core move. Otherwise all nodes at their names
-                may move.
+            assumed: The assumptions, as literals.
+            free: Names whose nodes may change their labels.
+            conflicts: Give up after this many conflicts.
+            step_by_step: If a core shows that some nodes cannot all stay, free only these nodes.
+                Otherwise free all nodes that have the same names.
 
         Returns:
-            "moved"; "needed" if the assumptions cannot hold; "open" if that is unknown.
+            "moved" if the labels were changed; "needed" if the assumptions cannot hold; "open" if
+            that is unknown.
         """
         free = {-1, *free}
         literals = self._literals()
@@ -319,7 +333,7 @@ class NearbySearch:
                 free |= {stay[literal] for literal in moving}
 
     def _literals(self) -> list[int]:
-        """For each node, the literal that it is where its label says; 0 if it has no choice."""
+        """Return the literal that each node has its label; 0 if it has no choice, or no label."""
         return [
             0
             if name < 0 or len(self._names.choices[t]) == 1 or name not in self._names.choices[t]
@@ -328,7 +342,7 @@ class NearbySearch:
         ]
 
     def _keep(self, answer: Mapping[int, int]) -> None:
-        """Make an answer the labels, renamed so that it uses the first spare names."""
+        """Take over the labels of an answer, renamed so that each view uses its first names."""
         taken = set(answer.values())
         name_of = {name: name for name in range(len(self._pinned.clique))}
         for spare in self._names.spare.values():
@@ -339,9 +353,12 @@ class NearbySearch:
         self._labels, self._allowed, self._needed = labels, None, set()
 
     def _spared(self, conflicts: int) -> Iterator[Labels]:
-        """Labels with one dstate less, and again, while some dstate can be spared.
+        """Save one dstate after the other, and yield the labels each time, until none can be saved.
 
         Only names that the labels use are allowed.
+
+        Args:
+            conflicts: Give up each question after this many conflicts.
         """
         tried: set[int] = set()
         while True:
@@ -366,9 +383,10 @@ class NearbySearch:
                 self._needed.add(name)
 
     def _redrawn(self, conflicts: int) -> Iterator[Labels]:
-        """Labels with fewer dstates, from freeing the nodes of one part of the map at a time.
+        """Save dstates by freeing all nodes in one part of the map at a time, and yield the labels.
 
-        A part begins at a spare name drawn at random, and grows along the links.
+        A part begins at a spare name drawn at random, and grows along the links. The search ends
+        after `REGIONS` parts without success.
         """
         tried = 0
         while tried < REGIONS:
@@ -408,13 +426,16 @@ class NearbySearch:
                 self._region = max(self._region - SMALLER, FIRST_REGION)
 
     def _widened(self, conflicts: int) -> Generator[Labels, None, _Verdict]:
-        """Labels with fewer dstates, if allowing more names leads to some.
+        """Look for labels with fewer dstates by allowing more and more names.
+
+        Yields:
+            The new labels, if any are found.
 
         Returns:
-            "moved"; "needed" if all names are allowed and there are none; "open" if that is
-            unknown.
+            "moved" if labels or names have changed; "needed" if all names are allowed and there
+            are no labels with fewer dstates; "open" if that is unknown.
         """
-        if self._allowed is None:  # first no more names, then each of them alone
+        if self._allowed is None:  # first allow no more names, then each of them alone
             taken = set(self._labels)
             more = [
                 name
@@ -430,7 +451,7 @@ class NearbySearch:
                 [],
                 [*more, *(spare[-1] for spare in self._names.spare.values())],
             )
-        at_once = 1  # names that are allowed in one go
+        at_once = 1  # the number of names to allow next
         left: list[int] | None = None
         while self._waiting and left != self._waiting:
             left, self._waiting = self._waiting, []
@@ -452,7 +473,10 @@ class NearbySearch:
         return "open" if self._waiting else "needed"
 
     def _asked(self, allowed: Collection[int], conflicts: int) -> Generator[Labels, None, _Verdict]:
-        """Labels with fewer dstates that may also use these names."""
+        """Ask for labels with fewer dstates that may also use these names.
+
+        Yields and returns the same as `_widened`.
+        """
         answer, core = self._with_fewer(
             [self._names.ordered, *self._not_allowed(allowed)], conflicts
         )
@@ -468,14 +492,19 @@ class NearbySearch:
     def _with_fewer(
         self, assumed: Sequence[int], conflicts: int
     ) -> tuple[dict[int, int] | None, list[int] | None]:
-        """An answer of fewer dstates under these assumptions, or a core of them."""
+        """Ask for an answer with fewer dstates under these assumptions.
+
+        Returns:
+            The name of each node, and None; or None, and a core of the assumptions. Both are None
+            if clingo gave up.
+        """
         cost = len(set(self._labels)) - 1 - len(self._pinned.clique)
         if cost < 0:
             return None, []
         return self._asker.verdict(names_lp.read_names, assumed, conflicts, f"enum,{cost},{cost}")
 
     def _name_more(self, resting: Collection[int]) -> None:
-        """Take a control with more names for the views of these rests."""
+        """Make a new control with more names for the views of these rests."""
         before, taken = self._names.spare, set(self._labels)
         used = {view: [name for name in spare if name in taken] for view, spare in before.items()}
         self._fewest |= {
@@ -493,7 +522,12 @@ class NearbySearch:
 
 
 def seen_labels(guess: Sequence[int], chart: Chart) -> list[Key | None]:
-    """The observation and the label of each node; None if the label is unknown."""
+    """Return the pair of observation and label for each node; None if the label is unknown.
+
+    Args:
+        guess: The label of each node, -1 if it is unknown.
+        chart: The nodes.
+    """
     return [
         None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)
     ]

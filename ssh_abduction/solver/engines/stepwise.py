@@ -1,7 +1,7 @@
-"""The engine that grounds the readable encodings, step by step.
+"""The engine that grounds the readable encodings step by step.
 
-It serves every theory and finds all minimal maps of the prefix. Other engines are faster for the
-theories that they serve.
+It works for every theory, and finds all minimal maps of the prefix. The other engines are faster,
+but each is for certain theories only.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from ssh_abduction.theory import encodings
 from ssh_abduction.theory.evidence import Equality
 from ssh_abduction.theory.fields import Count
 
-# A prefix grows by this factor at least, so that there are few of them.
+# A prefix grows by at least this factor, so that few prefixes are tried.
 GROWTH = 1.25
-# Ground this many steps in one call until the prefix has FIRST_STEPS: for a short prefix the call
-# costs more than the steps.
+# Ground AT_FIRST steps in one call until the prefix has FIRST_STEPS, and then one step a call. For
+# a short prefix the call takes longer than the steps.
 AT_FIRST, FIRST_STEPS = 8, 32
 
 
 class StepEngine:
-    """The encodings of all levels: a dstate is named by the first step at it."""
+    """The engine that grounds the readable encodings. The first step at a dstate is its name."""
 
     lists_least = False
     goes_on = True
@@ -41,12 +41,12 @@ class StepEngine:
         self.size = 0
         self.paths = paths
         self._task = task
-        self._asked: int | None = None  # the step that is the last one, as far as clingo knows
+        self._asked: int | None = None  # the step that clingo takes as the last one
         self._forbidden: list[Collection[Equality]] = []
         # The exact number of dstates, places or paths that maps must have, if one is set.
         self._number: tuple[int, Count] | None = None
-        # Seconds and MiB that it took to ground the last step. The next one takes about as much,
-        # and cannot be stopped.
+        # The seconds and MiB that grounding the last step took. The next one takes about as much,
+        # and clingo cannot be stopped meanwhile.
         self._last_step = 0.0, 0.0
         control = self.asker.control
         self._doubts = Doubts(self.asker, control, questions.steps_are_one)
@@ -90,7 +90,7 @@ class StepEngine:
                 self._tell_number()
 
     def _ground_steps(self, stop: int) -> None:
-        """Ground the steps up to this one."""
+        """Ground the steps up to, but not including, `stop`."""
         self.asker.watch.check(*self._last_step)
         control, start = self.asker.control, self.size
         part = f"steps_from_{start}"
@@ -104,7 +104,7 @@ class StepEngine:
         self.size = stop
 
     def _let_end_with(self, last: int) -> None:
-        """Make this step the last one for clingo."""
+        """Make `last` the last step of the prefix for clingo."""
         if self._asked == last:
             return
         control = self.asker.control
@@ -117,7 +117,7 @@ class StepEngine:
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         if most:
             configuration: Any = self.asker.control.configuration
-            # As a good map is known, a bound is missing.
+            # A good map is known already, so clingo only has to raise the bound.
             configuration.solver.opt_strategy = "usc"
         if self._task.theory.priorities:
             return self.asker.answers(self._read, ",".join(["opt", *map(str, most)]), 0)
@@ -128,11 +128,14 @@ class StepEngine:
         return self.asker.answers(self._read, f"enum,{bound}" if bound else "ignore", 0)
 
     def map_with(self, doubts: Collection[Doubt], cost: tuple[int, ...]) -> SSHMap | None:
-        """A map of the prefix in which any of these doubts about steps holds; None if none does.
+        """Find a map of the prefix in which at least one of these doubts holds.
 
         Args:
-            doubts: About steps.
-            cost: What the map costs at most.
+            doubts: Each says that two steps are one in some respect, or that they are not.
+            cost: The most that the map may cost.
+
+        Returns:
+            The map; None if there is none.
         """
         found = self._doubts.answer(
             doubts, self._read, f"enum,{','.join(map(str, cost))}" if cost else "ignore"
@@ -140,7 +143,7 @@ class StepEngine:
         return None if found is None else found.map
 
     def labellings(self, cost: tuple[int, ...]) -> None:
-        """None: this engine finds dstates with places and paths."""
+        """Return None: this engine finds dstates together with places and paths."""
 
     def forbid(self, equalities: Collection[Equality]) -> bool:
         self._forbidden.append(equalities)
@@ -148,7 +151,14 @@ class StepEngine:
         return True
 
     def ask_for(self, number: int, count: Count) -> None:
-        """Require exactly this many of `count` in maps. The prefix must not grow any more."""
+        """Ask only for maps with an exact number of something, from now on.
+
+        The prefix must not grow any more.
+
+        Args:
+            number: The number that maps must have.
+            count: "dstates", "places" or "paths".
+        """
         if self._number is not None:
             self.asker.control.release_external(questions.of_number(*self._number))
         self._number = number, count
@@ -183,12 +193,12 @@ class StepEngine:
 
 
 def paths_needed(task: Task, size: int, cost: tuple[int, ...] | None) -> int:
-    """How many names for paths are enough to prove the cost of a prefix, or to list its maps.
+    """Return a number of names for paths that is enough to prove a cost, or to list all its maps.
 
     Args:
         task: The problem and the speed-ups.
-        size: How many steps the prefix has.
-        cost: The cost of its maps; None if it is not known.
+        size: The number of steps in the prefix.
+        cost: The cost of the maps of the prefix; None if it is unknown.
     """
     theory = task.theory
     segments = readable.most_paths(task.trace, theory, size)

@@ -1,8 +1,9 @@
-"""Keeps "is the same place as" transitive in answers of visits.lp.
+"""Makes "is at the same place as" transitive in answers of visits.lp.
 
-The rules of transitivity are not grounded beforehand, as there are millions of threes of visits.
-`intransitive` finds the threes at which an answer fails. `Transitive` is a propagator for listing
-many answers.
+If visits I and J are at one place, and J and K, then so are I and K. These rules are not grounded
+beforehand, as there are millions of triples of visits. `intransitive` finds the triples that an
+answer violates. `Transitive` is a propagator that adds clauses for them while many answers are
+listed.
 """
 
 from __future__ import annotations
@@ -16,24 +17,28 @@ import numpy as np
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.steps.chart import FramedChart
 
-# Give clingo at most this many threes of visits at once: they are found faster than grounded.
+# Give clingo about this many triples of visits at once at most. Grounding them takes longer than
+# finding them.
 AT_A_TIME = 20_000
 
-# Visits I < J at one place, where slot 0 of I is slot R of J.
+# (I, J, R): visits I < J are at one place, and slot (direction) 0 of I is slot R of J.
 Pair: TypeAlias = tuple[int, int, int]
-# Visits I < J < K at one place, and how I is turned to J, and J to K.
+# (I, J, K, R, Q): visits I < J < K are at one place, slot 0 of I is slot R of J, and slot 0 of J is
+# slot Q of K.
 Three: TypeAlias = tuple[int, int, int, int, int]
-# For each visit, the visits at its place, each with the slot that is its own slot 0.
+# For each visit, the other visits at its place, each with the slot there that is its own slot 0.
 Turned: TypeAlias = dict[int, dict[int, int]]
 
 
 def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> list[Three]:
-    """Threes of visits at which an answer, with what follows from it, is not transitive.
+    """Find the triples of visits at which an answer is not transitive.
+
+    Pairs that follow from the answer by the axioms are also checked.
 
     Args:
-        pairs: The visits that are at one place in the answer.
-        fits: The pairs that may be at one place for clingo.
-        chart: The visits, and how they end.
+        pairs: The pairs of visits that are at one place in the answer.
+        fits: The pairs that clingo may put at one place.
+        chart: The visits, and the action that ends each of them.
     """
     found: dict[Three, None] = {}
     turned: Turned = {}
@@ -44,7 +49,8 @@ def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> 
     for pair in pairs:
         take(turned, pair)
     for i, j, r in work:
-        # If two visits are one and end alike, the next visits are also one.
+        # If two visits are at one place and end by the same action in the same direction, then the
+        # next visits are also at one place.
         follows = (
             [(i + 1, j + 1, 0)]
             if i in leaves and leaves.get(j) == ((leaves[i][0] + r) % 4, leaves[i][1])
@@ -63,12 +69,12 @@ def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> 
 
 
 class Transitive(clingo.Propagator):
-    """A propagator for listing: there are few conflicts, and each answer has to be transitive.
+    """A propagator of clingo that makes each answer of a list transitive.
 
     Attributes:
-        asked: Whether the propagator is at work.
-        failed: How often an answer was not transitive since this was set to 0.
-        literals: The program literals of pairs of visits.
+        asked: Whether the propagator is switched on. It takes effect with the next question.
+        failed: The number of violations since the caller last set this to 0.
+        literals: For each pair of visits, the program literal that they are at one place.
     """
 
     def __init__(self) -> None:
@@ -95,7 +101,7 @@ class Transitive(clingo.Propagator):
             init.add_watch(literal)
 
     def propagate(self, control: clingo.PropagateControl, changes: Sequence[int]) -> None:
-        """Add a clause for each three of visits that is not transitive."""
+        """Add a clause for each triple of visits that violates transitivity."""
         pairs = [pair for literal in changes for pair in self._watched.get(literal, ())]
         for pair in pairs:
             take(self._turned, pair)
@@ -120,7 +126,7 @@ class Transitive(clingo.Propagator):
 
 
 class PairOf(dict[clingo.Symbol, Pair]):
-    """The visits that an atom says are one; each atom is read once."""
+    """The pair of visits of each atom `same`. An atom is read when it is first looked up."""
 
     def __missing__(self, symbol: clingo.Symbol) -> Pair:
         pair = self[symbol] = visits_lp.read_same(symbol)
@@ -128,14 +134,19 @@ class PairOf(dict[clingo.Symbol, Pair]):
 
 
 def scattered(pairs: Sequence[Pair], visits: int) -> list[Pair]:
-    """The pairs whose group of visits is not yet a consistent clique.
+    """Find the pairs whose group of visits is not consistent.
 
-    A group is consistent if each two of its visits are a pair, turned as the others say.
+    A group is all visits that pairs connect to each other. It is consistent if each two of its
+    visits are a pair, and the turns of all pairs agree.
+
+    Args:
+        pairs: The pairs of visits that are at one place.
+        visits: The number of visits.
     """
     first, second, turns = np.array(pairs, dtype=int).reshape(-1, 3).T
-    group = np.arange(visits)  # the first visit that each is one with
+    group = np.arange(visits)  # for each visit, the first visit that it is paired with
     np.minimum.at(group, second, first)
-    turned = np.zeros(visits, dtype=int)  # the slot that slot 0 of that visit is
+    turned = np.zeros(visits, dtype=int)  # the slot that is slot 0 of that first visit
     at_first = group[second] == first
     turned[second[at_first]] = turns[at_first]
     members, joined = (
@@ -150,7 +161,7 @@ def scattered(pairs: Sequence[Pair], visits: int) -> list[Pair]:
 
 
 def take(turned: Turned, pair: Pair) -> None:
-    """Note that two visits are at one place."""
+    """Record in `turned` that two visits are at one place."""
     i, j, r = pair
     turned.setdefault(i, {})[j] = r
     turned.setdefault(j, {})[i] = -r % 4
@@ -159,13 +170,16 @@ def take(turned: Turned, pair: Pair) -> None:
 def apart_yet_joined(
     pair: Pair, turned: Turned
 ) -> list[tuple[int, tuple[int, int], tuple[int, int]]]:
-    """Visits that are not the same though each is the same as a third one.
+    """Find triples of visits in which two pairs are at one place, but not the third pair.
 
-    The third one is one of this pair.
+    Args:
+        pair: A pair of visits at one place. Each triple includes both of them.
+        turned: All pairs that are known.
 
     Returns:
-        Triples: the first visit, the third one, and the last one. The latter two come with the
-        slot that slot 0 of the first would be.
+        Triples (first, (middle, slot), (last, slot)). The middle visit is at the place of each of
+        the others, but these two are not known to be at one place, turned accordingly. Each slot
+        is the one of its visit that is slot 0 of the first visit.
     """
     i, j, r = pair
     of_i, of_j = turned[i], turned[j]
@@ -182,11 +196,15 @@ def apart_yet_joined(
 
 
 def ordered_pair(i: int, j: int, r: int) -> Pair:
-    """Two visits in order, where slot 0 of the one is slot R of the other."""
+    """Make a pair of two visits, the earlier first. Slot 0 of visit `i` is slot `r` of `j`."""
     return (i, j, r) if i < j else (j, i, -r % 4)
 
 
 def _in_order(*visits: tuple[int, int]) -> Three:
-    """Three visits at one place, each given with the slot that slot 0 of the first one is."""
+    """Make a triple of three visits at one place, in their order.
+
+    Args:
+        *visits: Each visit, with its slot that is slot 0 of the first argument.
+    """
     (i, a), (j, b), (k, c) = sorted(visits)
     return i, j, k, (b - a) % 4, (c - b) % 4

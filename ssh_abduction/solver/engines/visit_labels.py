@@ -1,32 +1,36 @@
-"""Labels with the fewest dstates where places have frames, without naming any dstate.
+"""Finds labels with the fewest dstates, for theories with frames. It gives no names to dstates.
 
-This serves the framed engine. Clingo is asked which visits are at one place (visits.lp). It finds
-labels of all nodes with the fewest dstates, proves that none have fewer, and lists all that have
-as few. `engines/framed.py` checks whether order and sides allow them.
+A label is the number of the dstate of a node; a node is the steps of a visit that face one
+direction. The framed engine uses this module. Clingo is asked which visits are at one place
+(visits.lp). The module finds labels of all nodes with the fewest dstates, proves that none have
+fewer, and lists all labels with that number of dstates. `engines/framed.py` checks them by the
+axioms of order and sides.
 
-Names help little if many dstates have few visits. What clingo learns about one spare name it has
-to learn again about the next, and nodes all over the world may choose each name. An equality of
-visits is only about these two. A node is *alone* if no node before it, in an order of choice, is
-at its dstate; there are as many dstates as lone nodes.
+Names, as in `engines/naming.py`, help little if there are many dstates with few visits. Whatever
+clingo learns about one spare name, it has to learn again about the next. And any node of the view
+may have the name. An equality of two visits, in contrast, is only about these two. A node is *lone*
+if no earlier node, in an order of choice, is at its dstate. So the number of dstates is the number
+of lone nodes.
 
-*Order.* A clique of nodes comes first, then the nodes that fit few others. New nodes of a trace
-that grows come last, so the rules that clingo has, and what it learned, still hold. If the number
-of nodes has grown by a tenth, a new control begins with a new clique.
+*Order of choice.* A clique of nodes comes first, then the nodes that can share a dstate with few
+others. When the trace grows, new nodes are put last. So the rules that clingo has, and the clauses
+that it learned, still hold. When the number of nodes has grown by a tenth, a new control begins
+with a new clique.
 
-*Transitive.* If I is J and J is K, then I is K. Clingo gets this rule only for visits at which an
-answer violates it (`engines/transitive.py`). Until no answer does, clingo solves a relaxation, so
-its bounds hold.
+*Transitivity.* If visits I and J are at one place, and J and K, then so are I and K. Clingo gets
+this rule only for visits at which an answer violates it (`engines/transitive.py`). Until then
+clingo solves a relaxation, so its bounds hold.
 
-*Lazily.* Of a long trace clingo is given the visits of the clique and the first visits, until many
-of them may be one. An answer mostly says where the other visits are (`steps/localising.py`). If it
-does not, clingo is given these visits, and as many before them as needed. Fewer visits are a
+*Few visits.* Of a long trace, clingo first gets the visits of the clique, and the first visits as
+long as few pairs of them may be at one place. Mostly an answer also determines the places of all
+other visits (`steps/localising.py`). If not, clingo gets further visits. Fewer visits are a
 relaxation, and an answer that locates all visits is an answer for all of them.
 
-*From below.* Cores raise the bound (`Cores`). Clasp has that built in, but begins anew with each
-call, and an answer that fails to be transitive is a call.
+*From below.* Unsat cores raise the bound (`Cores`). Clasp has this built in, but starts again with
+each call, and each answer that is not transitive needs another call.
 
-*Near a guess.* If the search takes long, clingo is asked for answers that keep the equalities of a
-guessed map. These answers need not have the fewest dstates, unless they have as few as the bound.
+*Near a guess.* If the search takes long, clingo is asked for answers near a guessed map. Such an
+answer has the fewest dstates only if their number equals the bound.
 """
 
 from __future__ import annotations
@@ -54,25 +58,25 @@ from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
 from ssh_abduction.solver.steps.localising import Located, states_of
 
-# Give clingo the first visits with this many pairs that may be one, and others as answers need
-# them.
+# Give clingo as many first visits as have at most this many pairs that may be at one place. It gets
+# others if answers need them.
 FIRST_PAIRS = 10_000
-# After this many conflicts, stop asking whether fewer places still clash.
+# To shrink a set of places that clash, ask whether fewer of them still clash. Give up each question
+# after this many conflicts, and the shrinking after FAILED_TRIES failed questions.
 TRY_CONFLICTS = 100
-# After this many failed tries, stop shrinking a set of places that clash.
 FAILED_TRIES = 20
-# If the number of nodes has grown by this factor, take a new control: the order of choice was made
-# for the first nodes.
+# If the number of nodes has grown by this factor, make a new control, as the order of choice was
+# made for the first nodes.
 GROWN = 1.1
-# After this many answers found one by one, look for the next ones near the last. That pays if there
-# are many.
+# After this many answers found one by one, look for the next ones near the last. That is faster if
+# there are many answers.
 MANY = 5
-# After this many intransitive answers nearby, ask for one anew.
+# After this many violations of transitivity nearby, ask for single answers again.
 FAR = 200
 
 
 class Open(Enum):
-    """Stands for an answer that is unknown because the search was interrupted."""
+    """The result of a search that was interrupted before it had an answer."""
 
     OPEN = "open"
 
@@ -85,10 +89,10 @@ class VisitLabels:
 
     Attributes:
         size: The number of these steps.
-        bound: A lower bound on the dstates.
+        bound: A proven lower bound on the number of dstates; None if none is known.
         clique: Nodes that are pairwise distinct.
-        known: Labels of the best known map, or None. The engine sets them.
-        has_forbidden: Whether evidence has rejected equalities of a map.
+        known: The labels of the best known map, which the engine sets; None if there is none.
+        has_forbidden: Whether `forbid_together` was called, as evidence contradicted a map.
     """
 
     def __init__(
@@ -98,14 +102,14 @@ class VisitLabels:
         charted: Callable[[int, FramedChart | None], FramedChart | None],
         sides: Sides,
     ) -> None:
-        """Labels of no steps yet.
+        """Begin without any steps.
 
         Args:
             task: The trace and the speed-ups that are on.
-            asker: It asks clingo.
-            charted: Makes the chart of the first steps, from one of fewer steps if there is one;
-                None if they fit no frame.
-            sides: Called for new controls and batches.
+            asker: Asks clingo.
+            charted: Makes a chart of this many first steps, given a chart of fewer steps or None.
+                It returns None if the steps fit no frames.
+            sides: Adds axioms of order and sides. It is called for each new control and batch.
         """
         self.bound: int | None = None
         self.clique: list[int] = []
@@ -114,13 +118,13 @@ class VisitLabels:
         self.size = 0
         self._task, self._asker, self._charted, self._sides = task, asker, charted, sides
         self._program: VisitProgram | None = None
-        self._first_nodes = 0  # how many nodes there were when the control was new
+        self._first_nodes = 0  # the number of nodes when the control was made
         self._found: list[tuple[int, ...]] = []  # labels with the fewest dstates
-        self._excluded = 0  # the number of these that clingo will not find again
+        self._excluded = 0  # clingo will not find this many of them again, from the first
 
     @property
     def program(self) -> VisitProgram:
-        """The control that knows visits."""
+        """The control that decides which visits are at one place."""
         assert self._program is not None  # `grow` comes first
         return self._program
 
@@ -130,16 +134,16 @@ class VisitLabels:
         return self.program.chart
 
     def work_on(self, task: Task) -> None:
-        """Go on with a trace that the one before has grown to."""
+        """Go on with a longer trace that begins with the one before."""
         self._task = task
 
     def grow(self, size: int) -> bool:
-        """Chart the first steps, and give clingo their new visits.
+        """Chart the first `size` steps, and give clingo their new visits.
 
-        If there are many, take a new control.
+        If there are many new nodes, make a new control.
 
         Returns:
-            Whether visits fit a frame.
+            False if the steps fit no frames; then nothing has changed.
         """
         if size == self.size:
             return True
@@ -153,7 +157,7 @@ class VisitLabels:
                 chart = self._charted(size, None)
                 if chart is None:
                     return False
-                # The order finds the clique, whose visits are among the first.
+                # `_order_of_choice` also finds the clique, and `_first_visits` needs it.
                 order = self._order_of_choice(chart)
                 self._give(chart, self._first_visits(chart), order, anew=True)
             self.size = size
@@ -162,7 +166,10 @@ class VisitLabels:
             return True
 
     def _order_of_choice(self, chart: FramedChart) -> list[int]:
-        """The nodes, those first that are pairwise distinct, then those that fit few others."""
+        """Order the nodes, and set `clique`.
+
+        The clique comes first, then the nodes that can share a dstate with the fewest others.
+        """
         apart = chart.apart()
         self._asker.watch.check()
         self.clique = clique(apart, chart.seen) if self._task.speedups.clique else []
@@ -173,17 +180,27 @@ class VisitLabels:
         ]
 
     def _first_visits(self, chart: FramedChart) -> set[int]:
-        """The visits that clingo is given first: all, unless too many may be one."""
+        """Return the visits that clingo gets first.
+
+        These are all visits, or those of the clique and some first ones if there are many pairs.
+        """
         first = chart.visits_with(FIRST_PAIRS) if self._task.speedups.lazy else len(chart.stars)
         return {*range(first), *(chart.facing[node][0] for node in self.clique)}
 
     def _give(
         self, chart: FramedChart, visits: set[int], order: Iterable[int], *, anew: bool = False
     ) -> None:
-        """Give clingo what it lacks about these visits of a chart."""
+        """Give clingo all that it lacks about these visits of a chart.
+
+        Args:
+            chart: All visits and nodes.
+            visits: The visits that clingo shall have.
+            order: Nodes in the order of choice.
+            anew: Make a new control first.
+        """
         known = 0 if anew else len(self.program.fits)
         fits = fits_in_time(self._asker.watch, chart, visits, known)
-        size, self.size = self.size, 0  # until clingo was told all of it
+        size, self.size = self.size, 0  # an error may leave this prefix incomplete
         if anew:
             self._program = VisitProgram(self._task, self._asker, chart, self._sides)
             self._first_nodes = len(chart.seen)
@@ -193,7 +210,7 @@ class VisitLabels:
         self.size = size
 
     def _give_more(self, visits: Iterable[int]) -> None:
-        """Also give clingo these visits."""
+        """Give clingo these visits in addition to those that it has."""
         more = {*self.program.visits, *visits}
         assert more != self.program.visits  # else the search would never end
         with self._asker.grounding_timed():
@@ -203,11 +220,14 @@ class VisitLabels:
         self.bound = max(self.bound or 0, self.program.cores.least)
 
     def fewest(self, until: Callable[[], bool] = lambda: False) -> list[int] | Open | None:
-        """Labels of all nodes with the fewest dstates.
+        """Find labels of all nodes with the fewest dstates.
+
+        Args:
+            until: Called now and then; the search stops when it returns True.
 
         Returns:
-            The labels; None if no labels satisfy all constraints; OPEN if `until` held before
-            they were found.
+            The dstate of each node; None if no labels satisfy all constraints; OPEN if the search
+            was stopped.
         """
         while not self._found:
             if self.known and self.bound == len(set(self.known)):
@@ -224,14 +244,17 @@ class VisitLabels:
         return list(self._found[0])
 
     def _tell_why(self, reason: Refusal) -> None:
-        """Tell clingo why an answer was rejected."""
+        """Give clingo the rules or the visits whose lack made it find a rejected answer."""
         if reason.threes:
             self.program.close(reason.threes)
         else:
             self._give_more(reason.missed)
 
     def _best_answer(self, until: Callable[[], bool]) -> Answer | None:
-        """An answer with the fewest lone nodes; None if there is none."""
+        """Find an answer with the fewest lone nodes, which is open if `until` stops the search.
+
+        None if there is no answer. Cores that clingo returns meanwhile raise the bound.
+        """
         program = self.program
         if not self._task.speedups.core_guided:
             read = program.read
@@ -254,19 +277,23 @@ class VisitLabels:
             self._raise_bound()
 
     def near(self, guess: Sequence[int]) -> Iterator[tuple[int, ...] | None]:
-        """The guess itself, then improved labels of all nodes.
+        """Yield the labels of a guess, and then better and better labels near it.
 
-        Yields None between queries, so that the caller can do other work.
+        Also yields None before each question, so that the caller can do other work meanwhile.
 
-        At first clingo is asked for labels that put visits at one place exactly if the guess does,
-        if possible. If some places of the guess contradict each other, their visits become free.
-        Once the caller sets `known` to such labels, clingo is asked for no lone nodes. If a core
-        shows that some node has to be alone, one of the core may be.
+        At first clingo is asked for labels that put two visits at one place exactly if the guess
+        does. If some places of the guess contradict each other, their visits become free. Once the
+        caller has set `known` to labels with a map, clingo is asked for an answer without lone
+        nodes. If a core shows that one of its nodes is lone, one of them is allowed to be.
+
+        Args:
+            guess: The dstate of each node.
         """
         program = self.program
         yield tuple(numbered(guess))
         states = states_of(self.chart, guess)
-        place_of: dict[int, int] = {}  # by the literal that two of its visits are one
+        # For each literal that two visits are at one place: their place in the guess.
+        place_of: dict[int, int] = {}
         freed: set[int] = set()
         avoided: set[int] = set()
         patient, pairs, batch = False, 0, -1
@@ -305,7 +332,12 @@ class VisitLabels:
                 yield program.labels(answer.located)
 
     def _together_impossible(self, places: list[int], place_of: Mapping[int, int]) -> list[int]:
-        """A small subset of places that cannot all be as guessed."""
+        """Reduce a set of places that cannot all be as guessed to a small one.
+
+        Args:
+            places: Numbers of places of the guess.
+            place_of: For each literal that two visits are at one place, their place in the guess.
+        """
 
         def impossible(some: list[int]) -> list[int] | None:
             core = self._asker.verdict(
@@ -318,11 +350,14 @@ class VisitLabels:
         return smaller(places, impossible, FAILED_TRIES)
 
     def all_of(self, dstates: int) -> Generator[list[int], None, None]:
-        """All labels with this many dstates, each once.
+        """Yield all labels with this many dstates, each once.
 
-        Clingo is forbidden to find labels twice, and asked as for the fewest dstates. So it soon
-        shows that there are no others. If there are many, the next ones are near the last, and a
-        propagator keeps answers transitive (`_nearby`).
+        Clingo gets a rule against each labelling that was found, and the same question as for the
+        fewest dstates. So it soon proves that there are no others. If there are many, it lists
+        further ones near the last one, while a propagator keeps them transitive (`_nearby`).
+
+        Args:
+            dstates: The number of dstates, the fewest possible.
         """
         program = self.program
         if self.fewest() is None or program.cores.least > dstates:
@@ -350,10 +385,10 @@ class VisitLabels:
                     return
 
     def _nearby(self, dstates: int) -> Generator[list[int], None, bool]:
-        """Labels that clingo finds near the ones before.
+        """Let clingo list labels near the last ones, and yield those that are new.
 
         Returns:
-            Whether these are all labels left.
+            Whether clingo has listed all labels that were left.
         """
         program = self.program
         transitive = program.transitive
@@ -388,7 +423,7 @@ class VisitLabels:
         return False
 
     def _other(self, dstates: int) -> tuple[int, ...] | None:
-        """Labels with this many dstates that were not excluded; None if there are none."""
+        """Find labels with this many dstates that are not excluded; None if there are none."""
 
         def ask() -> Answer | None:
             mode, assumed = self._asking_for(dstates)
@@ -399,24 +434,26 @@ class VisitLabels:
         return None if answer is None else self.program.labels(answer.located)
 
     def _asking_for(self, dstates: int) -> tuple[str, list[int]]:
-        """The opt-mode and the assumptions that allow at most this many dstates."""
+        """Return the opt-mode and the assumptions that allow at most this many dstates."""
         cores = self.program.cores
         if self._task.speedups.core_guided and cores.least == dstates:
             return "ignore", list(cores.avoided)
         return f"enum,{dstates}", []
 
     def take_back(self, labels: Sequence[int]) -> None:
-        """Forget labels that were yielded and turned out to be no answer."""
+        """Forget labels that were found, but turned out to have no map."""
         if (refused := tuple(labels)) in self._found:
             self._excluded -= self._found.index(refused) < self._excluded
             self._found.remove(refused)
 
     def forbid(self, labels: Sequence[int], clashes: Collection[Collection[int]]) -> None:
-        """Forbid that the nodes of a set are one dstate exactly if they have one label.
+        """Exclude all labels that agree with the given ones on the nodes of some clash.
+
+        To agree means that two nodes of the clash share a dstate exactly if they have one label.
 
         Args:
-            labels: Those of all nodes.
-            clashes: The sets of nodes.
+            labels: The dstate of each node.
+            clashes: Sets of nodes.
         """
         program = self.program
         clashing = {self.chart.facing[node][0] for clash in clashes for node in clash}
@@ -431,21 +468,21 @@ class VisitLabels:
                 if (pair := program.pair(a, b)) in program.fits
             ]
             together = program.spanning(labels, clash)
-            if program.fits.issuperset(together):  # else clingo knows by now
+            if program.fits.issuperset(together):  # if not, clingo cannot find such labels anyway
                 rules.append(visits_lp.forbidden_pairs(together, different))
         program.tell("\n".join(rules))
 
     def forbid_together(
         self, pairs: Collection[tuple[int, int]], places: Collection[tuple[int, int]] = ()
     ) -> None:
-        """Forbid that all `pairs` are one dstate while all `places` are at one place.
+        """Exclude labels in which each of `pairs` is one dstate and each of `places` one place.
 
-        Labels alone do not show which nodes are at one place. So if places are given, known labels
-        stay; the search for their paths rejects them.
+        If places are given, labels found before are not removed, as labels do not show which nodes
+        are at one place. The search for their paths rejects them later.
 
         Args:
-            pairs: Pairs of nodes that are one dstate.
-            places: Pairs of nodes that are at one place.
+            pairs: Pairs of nodes.
+            places: Pairs of nodes.
         """
         self.has_forbidden = True
         program, facing = self.program, self.chart.facing
@@ -459,7 +496,8 @@ class VisitLabels:
         for a, b in away:
             (i, _), (j, _) = sorted((facing[a], facing[b]))
             choices.append([(i, j, turned) for turned in range(4) if (i, j, turned) in fits])
-        if len(choices) == len(apart) + len(away):  # else they are apart by now
+        # If a pair has no choice, it is known to be distinct, so nothing has to be forbidden.
+        if len(choices) == len(apart) + len(away):
             program.tell(visits_lp.forbidden_places(choices))
         if away:
             return

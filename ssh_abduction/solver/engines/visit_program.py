@@ -1,7 +1,7 @@
-"""Asks clingo which visits are at one place (visits.lp), for the engine with frames.
+"""The control of clingo that decides which visits are at one place (visits.lp).
 
-Clingo is given some visits at first, and others as answers need them. Fewer visits are a
-relaxation, so a bound proven for them holds for the trace.
+The engine with frames uses it. Clingo gets some visits at first, and others if an answer needs
+them. Fewer visits are a relaxation, so a bound proven for them holds for the trace.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from ssh_abduction.solver.engines.transitive import Pair, PairOf, Three, Transit
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
 from ssh_abduction.solver.steps.localising import Located, State, faced, located
 
-# Seconds, about, that clingo takes to ground two visits that may be one. It cannot be stopped
-# meanwhile.
+# Clingo takes about this many seconds to ground one pair of visits that may be at one place. It
+# cannot be stopped meanwhile.
 SECONDS_A_PAIR = 3e-5
 
 
@@ -30,19 +30,22 @@ class Sides(Protocol):
     """Adds axioms of order and sides to those of visits (`engines/sides.py`)."""
 
     def begin(self) -> None:
-        """Start over with a new control."""
+        """Start again, with a new control."""
         ...
 
     def extend(self, batch: int) -> None:
-        """Take note of a batch of new visits."""
+        """Extend the axioms to the visits of a new batch."""
         ...
 
 
 class Cores:
-    """Raises a lower bound on how many nodes are alone, core by core (OLL).
+    """Raises a lower bound on the number of dstates, core by core (OLL).
 
-    Clingo is asked for an answer without lone nodes. A core, nodes that cannot all be avoided,
-    raises the bound by one. From then on at most one of them may be alone, then two, and so on.
+    A node is *lone* if no earlier node, in the order of choice, is at its dstate. So there is one
+    lone node for each dstate. Clingo is first asked for an answer without lone nodes. If there is
+    none, it returns an unsat core: nodes of which at least one is lone. This raises the bound by
+    one. From then on one node of the core may be lone. A later core may allow a second one, and so
+    on.
 
     Attributes:
         least: A lower bound on the number of lone nodes.
@@ -53,11 +56,12 @@ class Cores:
     """
 
     def __init__(self, asker: Asker, tell: Callable[[str, str, int], None]) -> None:
-        """Know no core yet.
+        """Begin without any core.
 
         Args:
-            asker: Its control has the atoms.
-            tell: Gives clingo rules, and grounds a program part for a number.
+            asker: Asks the control that has the atoms.
+            tell: Called with rules, a program part and a number: adds the rules, and grounds the
+                part for the number.
         """
         self.least = 0
         self.avoided: dict[int, clingo.Symbol] = {}
@@ -65,16 +69,20 @@ class Cores:
         self._sizes: list[int] = []  # sizes of cores
 
     def avoid(self, symbol: clingo.Symbol) -> None:
-        """Assume that this atom is false, if it exists."""
+        """Assume from now on that this atom is false, if the control has it."""
         if atom := self._asker.control.symbolic_atoms[symbol]:
             self.avoided[-atom.literal] = atom.symbol
 
     def relax(self, core: Sequence[int]) -> None:
-        """Raise the bound: from now on only two members of the core are not both true."""
+        """Raise the bound by one, and allow one member of a core to be true.
+
+        Args:
+            core: Literals of assumptions that cannot all hold.
+        """
         members = [self.avoided.pop(literal) for literal in core]
         self.least += 1
         for member in members:
-            # A limit of an earlier core that cannot hold becomes looser.
+            # If the member is a limit on an earlier core, loosen this limit by one.
             if (over := visits_lp.read_over(member)) is not None:
                 self._limit(over[0], over[1] + 1)
         if len(members) > 1:
@@ -84,7 +92,12 @@ class Cores:
             self._limit(number, 2)
 
     def _limit(self, core: int, count: int) -> None:
-        """Assume that fewer than `count` members of a core are true."""
+        """Assume from now on that fewer than `count` members of a core are true.
+
+        Args:
+            core: The number of the core.
+            count: The number of true members that is one too many.
+        """
         if count <= self._sizes[core]:
             self._asker.control.ground([("over", numbers(core, count))])
             self.avoid(visits_lp.over(core, count))
@@ -92,12 +105,12 @@ class Cores:
 
 @dataclass
 class Answer:
-    """An answer of clingo.
+    """An answer of clingo, or the result that it has not answered.
 
     Attributes:
-        pairs: The visits that are at one place.
-        everywhere: Where all visits are, once the pairs are known to be transitive.
-        is_open: Whether the answer is still unknown.
+        pairs: The pairs of visits that are at one place.
+        everywhere: The places of all visits; None until the pairs are known to be transitive.
+        is_open: Whether the search was interrupted, so that there is no answer.
     """
 
     pairs: Sequence[Pair] = ()
@@ -106,18 +119,18 @@ class Answer:
 
     @property
     def located(self) -> Located:
-        """Where all visits are, in an answer that was not rejected."""
+        """The places of all visits, in an answer that was not rejected."""
         assert self.everywhere is not None
         return self.everywhere
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why an answer is rejected.
+    """The reason to reject an answer.
 
     Attributes:
-        threes: Threes of visits at which the answer is not transitive.
-        missed: Visits whose places a transitive answer leaves open.
+        threes: Triples of visits at which the answer is not transitive.
+        missed: If there are none, the visits that clingo needs next to locate all visits.
     """
 
     threes: Sequence[Three]
@@ -126,13 +139,13 @@ class Refusal:
 
 @dataclass
 class _Known:
-    """What the control has of a chart.
+    """A record of everything about the chart that the control was given.
 
     Attributes:
-        visits: The visits that it was given.
+        visits: The visits.
         place_of: For each node, its position in the order of choice.
-        ends: The visits whose end it has.
-        turns: The turns that it has.
+        ends: The visits for which the control has the action that ends them.
+        turns: The turns, as (node, direction, node).
         fits: The pairs of visits that may be at one place.
     """
 
@@ -144,13 +157,13 @@ class _Known:
 
 
 class VisitProgram:
-    """The control of visits.lp, and what it was given.
+    """The control of visits.lp, and a record of what it was given.
 
     Attributes:
-        chart: The chart of the first steps.
-        batch: The number of the last batch of visits.
-        cores: The lower bound, and its assumptions.
-        transitive: The propagator, with the literals that were read.
+        chart: The visits and nodes of the first steps.
+        batch: The number of the last batch of visits; -1 before the first.
+        cores: The lower bound, and the assumptions that raise it.
+        transitive: The propagator, which also holds the literals of pairs.
     """
 
     def __init__(self, task: Task, asker: Asker, chart: FramedChart, sides: Sides) -> None:
@@ -158,9 +171,10 @@ class VisitProgram:
 
         Args:
             task: The trace and the speed-ups that are on.
-            asker: It asks the control.
-            chart: The first chart.
-            sides: Called for new controls and batches.
+            asker: Asks the control.
+            chart: The visits and nodes of the first steps.
+            sides: Adds axioms of order and sides. It is called for the new control, and for each
+                batch.
         """
         self.chart = chart
         self.batch = -1
@@ -178,17 +192,17 @@ class VisitProgram:
 
     @property
     def visits(self) -> Set[int]:
-        """The visits that clingo was given."""
+        """The visits that clingo has."""
         return self._known.visits
 
     @property
     def knows_all(self) -> bool:
-        """Whether clingo was given all visits."""
+        """Whether clingo has all visits of the chart."""
         return len(self._known.visits) == len(self.chart.stars)
 
     @property
     def fits(self) -> frozenset[Pair]:
-        """The pairs of clingo's visits that may be at one place."""
+        """The pairs of visits that clingo may put at one place."""
         return self._known.fits
 
     @property
@@ -199,12 +213,12 @@ class VisitProgram:
     def give(
         self, chart: FramedChart, visits: set[int], order: Iterable[int], fits: frozenset[Pair]
     ) -> None:
-        """Give clingo what it lacks about these visits.
+        """Give clingo a new batch: all that it lacks about these visits.
 
         Args:
-            chart: The visits and nodes.
-            visits: All visits that clingo is to have.
-            order: Nodes in the order of choice. New ones come after those that clingo has.
+            chart: All visits and nodes.
+            visits: The visits that clingo shall have, with those that it has already.
+            order: Nodes in the order of choice. Those new to clingo are put behind the others.
             fits: The pairs of these visits that may be at one place.
         """
         control, known = self._asker.control, self._known
@@ -243,7 +257,11 @@ class VisitProgram:
         self._sides.extend(self.batch)
 
     def _avoid_lone(self, places: Iterable[int]) -> None:
-        """Assume that none of these new nodes is alone, or count those that have to be."""
+        """Assume that none of these new nodes is lone; count those that are lone in any case.
+
+        Args:
+            places: The positions of the nodes in the order of choice.
+        """
         atoms = self._asker.control.symbolic_atoms
         for place in places:
             atom = atoms[visits_lp.first(place)]
@@ -253,13 +271,14 @@ class VisitProgram:
                 self.cores.avoided[-atom.literal] = atom.symbol
 
     def read(self, model: clingo.Model) -> list[Pair]:
-        """The pairs of visits that are at one place in an answer."""
+        """Read the pairs of visits that are at one place in an answer."""
         return [self._pair_of[symbol] for symbol in model.symbols(shown=True)]
 
     def read_literals(self) -> Mapping[Pair, int]:
-        """The literals that two visits are at one place, in the order in which they came.
+        """Look up the literal of each pair of visits: that they are at one place.
 
-        Looking up many literals takes seconds, so call this only if needed.
+        The pairs come in the order in which clingo got them. Looking up many literals takes
+        seconds, so call this only if they are needed.
         """
         atoms = self._asker.control.symbolic_atoms
         for pair in self._unread:
@@ -269,9 +288,15 @@ class VisitProgram:
         return self.transitive.literals
 
     def tell(self, told: str, part: str | None = None, number: int = 0) -> None:
-        """Give clingo more rules, and ground a program part for a number if one is given.
+        """Give clingo more rules.
 
-        No limit stops this: a relaxed core must get the limit on its members.
+        This does not check any limits. If it stopped halfway, a core would be relaxed without the
+        limit on its members.
+
+        Args:
+            told: The rules.
+            part: A program part to ground; None for none.
+            number: The argument of that part.
         """
         with self._asker.grounding_timed():
             name = f"told_{self._parts}"
@@ -282,15 +307,22 @@ class VisitProgram:
                 self._asker.control.ground([(part, numbers(number))])
 
     def close(self, threes: Iterable[Three]) -> None:
-        """Give clingo the rules of transitivity for these visits."""
+        """Give clingo the rules of transitivity for these triples of visits."""
         self.tell(visits_lp.three_facts(self._parts, threes), "closed", self._parts)
 
     def intransitive(self, pairs: Sequence[Pair]) -> list[Three]:
-        """Threes of visits at which an answer is not transitive."""
+        """Find the triples of visits at which an answer is not transitive."""
         return intransitive(pairs, self._known.fits, self.chart)
 
     def located(self, pairs: Iterable[Pair]) -> Located:
-        """Where all visits are in an answer that is transitive."""
+        """Locate all visits of the chart by a transitive answer.
+
+        Args:
+            pairs: The pairs of visits that are at one place in the answer.
+
+        Returns:
+            The places of all visits; or, if they do not all follow, the visits needed next.
+        """
         first: dict[int, tuple[int, int]] = {}
         for i, j, r in sorted(pairs):
             first.setdefault(j, (i, r))
@@ -302,13 +334,17 @@ class VisitProgram:
         return located(self.chart, states)
 
     def labels(self, everywhere: Located) -> tuple[int, ...]:
-        """The dstate of each node, numbered by the first node there."""
+        """Return the dstate of each node. Dstates are numbered in the order of their first nodes.
+
+        Args:
+            everywhere: The places of all visits.
+        """
         return tuple(
             numbered(faced(everywhere.states[visit], slot) for visit, slot in self.chart.facing)
         )
 
     def why_not(self, answer: Answer) -> Refusal | None:
-        """Why an answer is rejected; None if it is not."""
+        """Return the reason to reject an answer; None if it is accepted, or open."""
         if answer.is_open:
             return None
         threes = self.intransitive(answer.pairs)
@@ -318,11 +354,22 @@ class VisitProgram:
         return Refusal(threes, missed) if threes or missed else None
 
     def standing(self, labels: Sequence[int]) -> dict[int, tuple[int, int]]:
-        """The visit and slot of some node at each dstate, if clingo has one."""
+        """For each dstate, return the visit and slot (direction) of some node there.
+
+        Dstates of which clingo has no node are left out.
+
+        Args:
+            labels: The dstate of each node.
+        """
         return {labels[node]: self.chart.facing[node] for node in self._known.place_of}
 
     def spanning(self, labels: Sequence[int], nodes: Iterable[int]) -> list[Pair]:
-        """Pairs that are at one place if these nodes are at the dstates of their labels."""
+        """List pairs of visits that, put at one place, give these nodes the dstates of the labels.
+
+        Args:
+            labels: The dstate of each node.
+            nodes: The nodes.
+        """
         first: dict[int, int] = {}
         return [
             self.pair(other, node)
@@ -331,24 +378,25 @@ class VisitProgram:
         ]
 
     def pair(self, a: int, b: int) -> Pair:
-        """How the visits of two nodes are turned if these are at one dstate."""
+        """Return the pair of visits that is at one place if two nodes are at one dstate."""
         (i, s), (j, t) = sorted((self.chart.facing[a], self.chart.facing[b]))
         return i, j, (t - s) % 4
 
 
 def fits_in_time(watch: Watch, chart: FramedChart, visits: set[int], known: int) -> frozenset[Pair]:
-    """The pairs of these visits that may be at one place.
-
-    Raises LimitError if there is no time to ground them.
+    """List the pairs of these visits that may be at one place, if there is time to ground them.
 
     Args:
         watch: The limits.
-        chart: The visits.
-        visits: The visits that clingo is to have.
-        known: The number of pairs that it has already.
+        chart: All visits.
+        visits: The visits that clingo shall have.
+        known: The number of pairs that clingo has already.
+
+    Raises:
+        LimitError: There is not enough time.
     """
     told = sorted(visits)
-    if len(told) == len(chart.stars):  # count the pairs before they are listed
+    if len(told) == len(chart.stars):  # the number of pairs is known before they are listed
         watch.check(SECONDS_A_PAIR * (int(chart.fitting[-1]) - known))
     else:
         watch.check()
