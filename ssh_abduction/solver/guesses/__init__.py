@@ -1,1 +1,1 @@
-"""Guesses at maps without clingo. They may be wrong: the checker or an encoding tests them."""
+"""Guesses of maps, made without clingo. A guess may be wrong, so the caller has to check it."""

@@ -1,7 +1,9 @@
-"""Classes of steps, merged by evidence.
+"""Classes of steps that are taken to be one dstate. Evidence decides which classes to merge.
 
-A merge of two classes also merges the steps that the same actions lead to from them, and so on. A
-merge that contradicts what is apart is taken back.
+A merge of two classes also merges the classes that the same actions lead to from both, and so on.
+Steps are *apart* if they are known to be different dstates. A merge of steps that are apart is
+undone. The *evidence* for a merge is the number of classes that it merges, plus the number of
+earlier merges that it confirms (`guesses/merging.py`).
 """
 
 from __future__ import annotations
@@ -16,9 +18,9 @@ from numpy.typing import NDArray
 from ssh_abduction.solver.steps.apart import Matrix
 from ssh_abduction.solver.steps.chart import Link, numbered
 
-# The demands on a merge, from strict to lenient: the least lead of its evidence over the next best
-# merge of the same step, and the most known dstates that may fit the step. By the last demand,
-# every step is merged that fits some known dstate.
+# The demands on the merge of a step with a known dstate, from strict to lenient. The first number
+# is the least lead of its evidence over that of the next best merge of the step. The second number
+# is how many known dstates may fit the step at most. The last demand allows practically any merge.
 DEMANDS = (
     (10, 1),
     (5, 1),
@@ -33,19 +35,22 @@ DEMANDS = (
     (0, 2),
     (0, 1000),
 )
-# The leads for merges of two known dstates, when a map is thinned.
+# The same leads for merges of two known dstates, when a map is thinned.
 THINNED = 10, 5, 3, 0
 
 # The fields of Classes that merges change.
 Snapshot: TypeAlias = tuple[
     NDArray[np.int_], NDArray[np.bool_], Matrix, list[NDArray[np.int_]], list[dict[int, int]]
 ]
-# Two steps whose classes are merged. If they are one class, it becomes a known dstate.
+# Two steps whose classes are merged. If their class is the same, it becomes a known dstate.
 Merge: TypeAlias = tuple[int, int]
 
 
 class Classes:
-    """Classes of merged steps. Some of them are known dstates.
+    """Classes of steps that are taken to be one dstate.
+
+    Some classes are *known* dstates. All other classes are to be merged with these, or become known
+    dstates.
 
     Attributes:
         root: For each step, the step that represents its class.
@@ -62,10 +67,10 @@ class Classes:
         """Begin with a class for each step.
 
         Args:
-            apart: Which steps are apart, as a matrix of steps x steps.
+            apart: The pairs of steps that are apart, as a matrix of steps x steps.
             links: Triples (step, action, step).
-            check: Called now and then; may raise.
-            nodes: The number of nodes that each step stands for; 1 by default.
+            check: Called now and then; may raise to stop.
+            nodes: If the steps are dstates of a map: the number of nodes at each. None for 1 each.
         """
         steps = len(apart)
         self._nodes = nodes
@@ -78,7 +83,7 @@ class Classes:
         self._leads: list[dict[int, int]] = [{} for _ in range(steps)]
         for t, action, u in links:
             self._leads[t][action] = u
-        # What the last call of `merge` changed, to be taken back.
+        # The values before the last call of `merge`, to undo it.
         self._undo: list[
             tuple[int, int, bool, NDArray[np.bool_], dict[int, int], NDArray[np.int_]]
         ] = []
@@ -86,9 +91,12 @@ class Classes:
         self._check = check
 
     def take(self, guess: Sequence[int]) -> None:
-        """Merge the nodes that share a label in a guess, where they can be one dstate.
+        """Merge the steps that share a label in a guess, if they can be one dstate.
 
-        Their classes become known dstates. Nodes labelled -1 are ignored.
+        Their classes become known dstates.
+
+        Args:
+            guess: The label of each step, -1 if it is unknown.
         """
         first = {label: node for node, label in reversed(list(enumerate(guess))) if label >= 0}
         self.known[list(first.values())] = True
@@ -98,11 +106,11 @@ class Classes:
                 self.merge(first[label], node)
 
     def labels(self) -> list[int]:
-        """The class of each step. Classes are numbered by their first steps."""
+        """Return the class of each step. Classes are numbered in the order of their first steps."""
         return numbered(self.root.tolist())
 
     def settle_all(self) -> None:
-        """Make every class a known dstate."""
+        """Merge classes with known dstates, or make them known, until every class is known."""
         for evidence, rivals in DEMANDS:
             while self._advanced(partial(self.settle, evidence, rivals)):
                 pass
@@ -116,13 +124,13 @@ class Classes:
                 pass
 
     def _advanced(self, step: Callable[[], None]) -> bool:
-        """Take a step. Returns whether it made any merges."""
+        """Call `step`, and return whether it made any merges."""
         self._made = []
         step()
         return bool(self._made)
 
     def make(self, merge: Merge) -> None:
-        """Merge the classes of two steps. If they are one class, make it a known dstate."""
+        """Merge the classes of two steps. If their class is the same, make it a known dstate."""
         a, b = (int(self.root[t]) for t in merge)
         if a == b:
             self.known[a] = True
@@ -131,15 +139,17 @@ class Classes:
         self._made.append(merge)
 
     def unsettled(self) -> NDArray[np.int_]:
-        """The steps whose classes are not known dstates."""
+        """List the steps whose classes are not known dstates."""
         return np.flatnonzero(~self.known[self.root])
 
     def settle(self, evidence: int, rivals: int) -> None:
-        """Merge other classes with known dstates. A class that fits none becomes known.
+        """Merge each other class with its best known dstate, if the evidence is clear enough.
+
+        A class that fits no known dstate becomes known. Classes that fit the fewest come first.
 
         Args:
-            evidence: The least lead over the evidence for the next best dstate.
-            rivals: The most known dstates that may fit the class.
+            evidence: By how much the evidence has to exceed that for the next best dstate.
+            rivals: How many known dstates may fit the class at most.
         """
         steps = self.unsettled()
         fitting = (~self._apart[np.flatnonzero(self.known)][:, steps]).sum(axis=0)
@@ -158,9 +168,9 @@ class Classes:
                 self.make((ranked[0][1], root))
 
     def settle_at_any_rate(self) -> None:
-        """Merge the class of the first open step with the known dstate of most evidence.
+        """Merge the class of the first step that is not at a known dstate with the best one.
 
-        If it fits no known dstate, it becomes one.
+        The best known dstate is the one with most evidence. If none fits, the class becomes known.
         """
         for t in self.unsettled()[:1].tolist():
             root = int(self.root[t])
@@ -168,15 +178,17 @@ class Classes:
             self.make((ranked[0][1] if ranked else root, root))
 
     def thin(self, evidence: int) -> None:
-        """Merge known dstates with others, those with the fewest nodes first.
+        """Merge each known dstate with its best other one, if the evidence is clear enough.
+
+        Dstates with the fewest nodes come first.
 
         Args:
-            evidence: The least lead over the evidence for the next best dstate.
+            evidence: By how much the evidence has to exceed that for the next best dstate.
         """
         nodes = np.bincount(self.root, self._nodes)
         for root in sorted(np.flatnonzero(self.known).tolist(), key=lambda root: nodes[root]):
             self._check()
-            if self.known[root]:  # not merged since
+            if self.known[root]:  # it was not merged meanwhile
                 ranked = self._ranked(
                     root, [dstate for dstate in self._fitting(root) if dstate != root], forced=True
                 )
@@ -184,7 +196,11 @@ class Classes:
                     self.make((ranked[0][1], root))
 
     def _fitting(self, root: int) -> list[int]:
-        """The known dstates from which no step of the class is apart."""
+        """List the known dstates from which no step of a class is apart.
+
+        Args:
+            root: The root of the class.
+        """
         known = np.flatnonzero(self.known)
         fits: list[int] = known[
             ~self._apart[np.ix_(known, self._members[root])].any(axis=1)
@@ -194,7 +210,16 @@ class Classes:
     def _ranked(
         self, root: int, fits: Sequence[int], *, forced: bool = False
     ) -> list[tuple[int, int]]:
-        """The dstates that the class can be merged with, as (evidence, dstate), best first."""
+        """Find the dstates that a class can be merged with, and the evidence for each.
+
+        Args:
+            root: The root of the class.
+            fits: The dstates to try.
+            forced: Whether two known dstates may be merged.
+
+        Returns:
+            Pairs (evidence, dstate), those with most evidence first.
+        """
         found = []
         for dstate in fits:
             evidence = self.merge(dstate, root, forced=forced)
@@ -212,7 +237,8 @@ class Classes:
             forced: Whether two known dstates may be merged.
 
         Returns:
-            The evidence. None if this would merge steps that are apart; then nothing is changed.
+            The evidence. None if this would merge steps that are apart, or two known dstates
+            without `forced`; then nothing is changed.
         """
         self._undo = []
         work = [(a, b)]
@@ -226,7 +252,7 @@ class Classes:
             if (both_known and not forced) or self._apart[a, self._members[b]].any():
                 self._take_back()
                 return None
-            # Keep the known class, or else the larger one.
+            # Keep the class that is known. If none is, keep the larger one.
             if self.known[b] or (
                 not self.known[a] and len(self._members[a]) < len(self._members[b])
             ):
@@ -247,14 +273,14 @@ class Classes:
         """Mark all steps of two classes as apart.
 
         Args:
-            first: The steps of one class.
-            second: The steps of the other.
+            first: The steps of one class, as an array.
+            second: The steps of the other class.
         """
         self._apart[np.ix_(first, second)] = self._apart[np.ix_(second, first)] = True
         self._apart[self.root[first[0]], second] = self._apart[self.root[second[0]], first] = True
 
     def separate_all(self, apart: Matrix) -> None:
-        """Mark these further pairs of steps as apart."""
+        """Mark further pairs of steps as apart, given as a matrix of steps x steps."""
         self._apart |= apart
         for root in np.flatnonzero(np.bincount(self.root) > 1):
             self._apart[root] |= apart[self._members[root]].any(axis=0)
@@ -272,7 +298,7 @@ class Classes:
         self._undo = []
 
     def restore(self, before: Snapshot, merges: Iterable[Merge]) -> None:
-        """Go back to a snapshot, and make these merges."""
+        """Go back to a snapshot, and then make these merges."""
         root, known, apart, members, leads = before
         self.root, self.known, self._apart, self._members, self._leads = (
             root.copy(),
@@ -285,7 +311,7 @@ class Classes:
             self.make(merge)
 
     def snapshot(self) -> Snapshot:
-        """A copy of all that merges change, for `restore`."""
+        """Copy everything that merges change, for `restore`."""
         return (
             self.root.copy(),
             self.known.copy(),
@@ -296,5 +322,10 @@ class Classes:
 
 
 def _is_ahead(ranked: Sequence[tuple[int, int]], evidence: int) -> bool:
-    """Whether the best merge leads the next best by this much evidence, or has it if alone."""
+    """Whether the evidence for the best merge exceeds that for the next best by this much.
+
+    Args:
+        ranked: Pairs (evidence, dstate), the best first. A single one is compared with 0.
+        evidence: The least difference.
+    """
     return ranked[0][0] >= evidence + (ranked[1][0] if len(ranked) > 1 else 0)

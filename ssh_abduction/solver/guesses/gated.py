@@ -1,4 +1,4 @@
-"""A greedy consistent map, as in `guesses/tree.py`, for places with gateways at any angles.
+"""Builds a map step by step without a search, for places with gateways at any angles.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.solver.guesses.gated import gated_map
@@ -11,19 +11,23 @@
 >>> gated_map(straight, settle(straight).theory, homing=True).labels
 (0, 1, 2, 3)
 
-A star is the gateways that a step sees. Steps can be at one place if one frame, and a shift for
-each star, satisfy all axioms of gateways. The map grows by one step at a time. If the end of an
-action is unknown, the options are tried in order. The first that the stars of the place allow is
-kept:
+A star is the gateways, the ways out of a place, that are seen at a step. The stars seen at one
+place have to fit one frame, which numbers the gateways of the place: each star is turned by some
+shift so that all axioms of gateways hold.
 
-- a turn leads to a dstate of the place with the right view, or to a new dstate;
-- a travel goes along the reverse of a course at the place, or along a new path; it leads to the
-  next place on the path, to a new place before that, to a place beyond, or to a new place at the
-  end.
+The map grows by one step at a time. If no link says where an action leads, there are several
+options. They are tried in order, and the first one that the stars of the places allow is kept:
 
-A star has a gateway wherever a path goes on. So when the robot turned at a dead end and drives
-back, there can be no new place on the way. Whether known or new places are tried first only changes
-the order of the options.
+- A turn leads to a dstate of the place with the right view, or to a new dstate.
+- A travel follows the course of its dstate. If that is unknown, it follows the reverse of another
+  course at the place, or a new path. It leads to a place ahead on the path, near ones first, or to
+  a new place before one of these or behind all. `homing` decides whether a known place or the new
+  place before it is tried first.
+
+A star has a gateway in each direction in which a path goes on. This excludes many options. For
+example, if a travel ends without a gateway ahead, it cannot end at a new place before a known one.
+
+This is the counterpart of `guesses/tree.py`.
 """
 
 from __future__ import annotations
@@ -40,21 +44,24 @@ from ssh_abduction.runtime.clock import look_at_clock
 from ssh_abduction.theory.pairs import NO_PAIRS, Pairs
 from ssh_abduction.theory.theory import Theory
 
-_Seen = tuple[int, Star]  # a dstate and a star seen there
+_Seen = tuple[int, Star]  # a dstate, and a star that was seen there
 
 
 def gated_map(
     trace: Trace, theory: Theory, *, homing: bool, pairs: Pairs = NO_PAIRS
 ) -> SSHMap | None:
-    """A map of a trace whose stars agree within tolerance. The caller has to check it.
-
-    None if the first choices lead to no map.
+    """Build a map of a trace greedily. The caller has to check it.
 
     Args:
         trace: The trace.
-        theory: Resolved for the trace, with star=gateways.
-        homing: Whether known places are tried before new ones.
-        pairs: What evidence says of pairs of steps.
+        theory: A theory with star=gateways and all defaults filled in.
+        homing: Try a known place ahead before a new place on the way to it. If False, try the new
+            place first.
+        pairs: Pairs of steps that evidence says are one, or different.
+
+    Returns:
+        The map, in which the stars of each place agree within the tolerance of the theory. None if
+        the first options lead to no map, or the theory has axioms that this does not support.
     """
     if theory.all_on_paths or theory.path_order != "total":
         return None
@@ -80,18 +87,21 @@ def gated_map(
 
 @dataclass
 class _Growing:
-    """A map of the steps so far.
+    """A map of the steps so far, which options extend.
+
+    A *course* is a path and one of its directions, 1 or -1.
 
     Attributes:
         labels: The dstate of each step.
-        dstates: The dstates.
-        sights: For each place, the dstates and stars seen there, with their first steps.
+        dstates: All dstates, by number.
+        sights: For each place, its pairs of a dstate and a star seen there, each with the first
+            step that saw it.
         star: The star of the last step.
-        links: Where actions lead, by dstate and action.
+        links: For each dstate and name of an action, the dstate that it leads to.
         orders: For each path, its places in the order of direction 1.
         reverse: Pairs of dstates that a turn around links.
         sideways: Pairs of dstates that a turn right or left links.
-        turns: The turns from one sight to another.
+        turns: For two pairs of a dstate and a star, the turns that lead from one to the other.
     """
 
     labels: list[int]
@@ -127,7 +137,11 @@ class _Growing:
     def options(
         self, action: Action, step: Step, homing: bool
     ) -> Iterator[Callable[[_Growing], int]]:
-        """The options for the next step. Each changes a copy, and returns the next dstate."""
+        """Yield the options for the next step, the preferred ones first.
+
+        An option is a function. It is called with a copy of this map, extends the copy, and returns
+        the dstate of the next step.
+        """
         here = self.labels[-1]
         known = self.links.get((here, action.name))
         if known is not None:
@@ -157,9 +171,9 @@ class _Growing:
         return (s.path, s.direction) == (x.path, -x.direction) if around else s.path != x.path
 
     def _courses(self, here: int) -> Iterator[tuple[int, int]]:
-        """The courses that a dstate may have.
+        """Yield the courses that a dstate may have: only its own, if that is known.
 
-        These are its own course, or else the reverse of others at its place, and a new path.
+        Otherwise these are the reverses of other courses at its place, and then a new path.
         """
         s = self.dstates[here]
         if s.path is not None and s.direction is not None:
@@ -187,7 +201,7 @@ class _Growing:
         assert place is not None
         order = self.orders[path] if path < len(self.orders) else (place,)
         ahead = (order if direction == 1 else order[::-1])[order[::direction].index(place) + 1 :]
-        # Try the places ahead from near to far, with a new place before each.
+        # Try the places ahead from near to far, and a new place before each.
         for number in range(len(ahead) + 1):
             known = [self._homing(here, course, ahead[number], step)] if number < len(ahead) else []
             new = [self._leaving(here, course, number, step)]
@@ -197,10 +211,10 @@ class _Growing:
     def _homing(
         self, here: int, course: tuple[int, int], place: int, step: Step
     ) -> Iterator[Callable[[_Growing], int]]:
-        """Options to travel to a known place ahead.
+        """Yield options to travel to a known place ahead.
 
-        They lead to the dstate that goes on there, to one with the right view and without a course,
-        or to a new one.
+        They lead to the dstate there that has this course, if its view is right. If no dstate there
+        has this course, they lead to one with the right view and no course yet, or to a new one.
         """
         there = [x for x in self.dstates if x.place == place]
         onward = [x.id for x in there if (x.path, x.direction) == course]
@@ -217,7 +231,7 @@ class _Growing:
     def _leaving(
         self, here: int, course: tuple[int, int], number: int, step: Step
     ) -> Iterator[Callable[[_Growing], int]]:
-        """An option to travel to a new place, behind `number` known places."""
+        """Yield the option to travel past `number` known places to a new place."""
 
         def leave(other: _Growing) -> int:
             place = len(other.sights)
@@ -241,7 +255,7 @@ class _Growing:
         return len(self.dstates) - 1
 
     def turned(self, here: int, there: int, around: bool) -> int:
-        """Add a turn between two dstates, and return the second."""
+        """Add a turn between two dstates, and return the second one."""
         (self.reverse if around else self.sideways).append((here, there))
         if around:
             for s in (self.dstates[here], self.dstates[there]):
@@ -251,7 +265,7 @@ class _Growing:
         return there
 
     def travelled(self, here: int, there: int, course: tuple[int, int]) -> int:
-        """Add a travel between two dstates along a course, and return the second."""
+        """Add a travel between two dstates along a course, and return the second one."""
         for s in (here, there):
             self._set(s, course)
             self._set_reverse(s)
@@ -262,7 +276,7 @@ class _Growing:
         self.dstates[s] = replace(self.dstates[s], path=course[0], direction=course[1])
 
     def _set_reverse(self, s: int) -> None:
-        """Give the dstates that turns around link to this one the reverse course, and so on."""
+        """Give the reverse course to all dstates that turns around link to this one, and so on."""
         queue = [s]
         while queue:
             here = self.dstates[queue.pop()]
@@ -275,7 +289,14 @@ class _Growing:
                     queue.append(other)
 
     def arrive(self, action: Action, there: int, step: Step, t: int) -> None:
-        """Add the end of an action and what is seen there."""
+        """Record that the last action has led to a dstate, and the star that is seen there.
+
+        Args:
+            action: The action.
+            there: The dstate that it has led to.
+            step: The step there.
+            t: The number of that step.
+        """
         here = self.labels[-1]
         star = step.gateways or Star(())
         place = self.dstates[there].place
@@ -290,16 +311,17 @@ class _Growing:
         self.star = star
 
     def fits(self, place: int, axioms: frozenset[str]) -> bool:
-        """Whether a place is consistent.
+        """Whether a place satisfies the axioms.
 
-        Its courses have to differ and agree with its turns, and its stars have to fit one frame.
+        No two dstates may have one course, courses have to agree with turns, and the stars have to
+        fit one frame.
         """
         course = {
             s.id: None if s.path is None or s.direction is None else (s.path, s.direction)
             for s in self.dstates
             if s.place == place
         }
-        # No two dstates have one course, and turns agree with the courses that they link.
+        # Check the courses, and whether turns agree with the courses that they link.
         known = [found for found in course.values() if found is not None]
         if len(set(known)) < len(known):
             return False
@@ -316,7 +338,7 @@ class _Growing:
     def _seen_at(
         self, place: int
     ) -> tuple[list[Sight], dict[tuple[Sight, Sight], tuple[Action, ...]]]:
-        # A sight knows whether it is the first of its dstate, and of its place.
+        # A sight has flags for the first one of its dstate, and of its place.
         sights: dict[_Seen, Sight] = {}
         shown: set[int] = set()
         for (s, star), step in self.sights[place].items():
@@ -337,7 +359,10 @@ class _Growing:
         return list(sights.values()), turns
 
     def _onward(self, s: DState) -> tuple[int, ...]:
-        """Where the path of a dstate goes on to another place: 0 for ahead, 180 for behind."""
+        """List the directions in which the path of a dstate goes on to another place.
+
+        They are in degrees: 0 is ahead, 180 behind.
+        """
         if s.path is None or s.place is None:
             return ()
         order = self.orders[s.path][:: s.direction]
@@ -349,11 +374,15 @@ class _Growing:
         )
 
     def map(self, axioms: frozenset[str]) -> SSHMap | None:
-        """The map, numbered by first visit, with headings that fit all stars."""
+        """Build the map, with headings that fit all stars, in degrees.
+
+        Dstates, places and paths are numbered in the order of first visits.
+        """
         facing: dict[int, int] = {}
         for place in range(len(self.sights)):
             facing |= headings(*self._seen_at(place), axioms)
-        # Renumber dstates, places and paths by first visit; a path is first faced in direction 1.
+        # Renumber dstates, places and paths in the order of first visits. Direction 1 of a path is
+        # the one that is faced first.
         first = {s: i for i, s in enumerate(dict.fromkeys(self.labels))}
         paths: dict[int, tuple[int, int]] = {}
         places: dict[int, int] = {}
@@ -392,5 +421,5 @@ class _Growing:
 
 
 def _stay(known: int, _: _Growing) -> int:
-    """The option to follow a known link."""
+    """Follow a known link: the option if the action has one."""
     return known

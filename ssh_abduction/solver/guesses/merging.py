@@ -1,4 +1,4 @@
-"""Small maps of the causal theory without a search: merge steps, those with most evidence first.
+"""Finds small maps of the causal theory without a search: it merges steps by evidence.
 
 >>> from ssh_abduction.solver.steps.apart import Continuations
 >>> from ssh_abduction.solver.guesses.merging import merged
@@ -6,21 +6,27 @@
 >>> merged(Continuations([0, 1, 0, 1], [0, 0, 0]).apart(), links, [0, 1])
 [0, 1, 0, 1]
 
-At first, the steps of a clique are *known* dstates. If two steps are one dstate, then so are the
-steps that the same actions lead to from them, and so on. All of these are merged, or none if two of
-them are apart. The more steps a merge affects without a contradiction, the less likely is it to be
-wrong. So the *evidence* for a merge is the number of classes that it merges, plus the number of
-earlier merges that it confirms. Steps that fit only one known dstate, with much evidence, are
-merged first. Then come steps with less evidence, or with clearly less evidence for other known
-dstates. A step that fits no known dstate becomes one.
+Two steps are *apart* if they are known to be different dstates. At first, the steps of a clique,
+which are pairwise apart, are *known* dstates. All other steps are merged with known dstates.
 
-A guess is completed in the same way. Nodes with one label in the guess are merged first if they can
-be one, and become known dstates. Meanwhile a caller can say which nodes are apart or one; the merge
-that led to a contradiction is then taken back. A map is thinned in the same way: dstates with the
-fewest nodes are merged with others as long as the result is a map, those with most evidence first.
+If two steps are one dstate, then so are the steps that the same action leads to from both, and so
+on. All of these are merged. If two of them are apart, nothing is merged. The more steps a merge
+affects without a contradiction, the less likely it is wrong. So the *evidence* for a merge is the
+number of classes that it merges, plus the number of earlier merges that it confirms. Steps that fit
+only one known dstate, with much evidence, are merged first. Then follow steps with less evidence,
+and steps that fit several known dstates if the evidence for one of them is clearly the greatest. A
+step that fits no known dstate becomes one.
+
+A guess is completed in the same way. First, nodes with one label in the guess are merged if they
+can be one dstate. They become known dstates. After merges, a caller may add pairs of nodes that are
+apart, or one, because of these merges. A merge that led to a contradiction is then undone.
+
+A map is thinned in the same way. The dstates with the fewest nodes are merged first, each with the
+dstate for which there is most evidence, while the result is still a map.
 
 This is evidence-driven state merging (Lang, Pearlmutter, Price 1998, "Results of the Abbadingo One
-DFA Learning Competition") for one trace, from known dstates all over it instead of from a root.
+DFA Learning Competition"). It is applied to one trace, and it begins at known dstates all over the
+trace instead of at a root.
 """
 
 from __future__ import annotations
@@ -40,10 +46,10 @@ from ssh_abduction.solver.steps.chart import Chart, Link, numbered
 # Give up a guess after this many merges that contradicted the caller.
 TAKEN_BACK = 20
 # Stop thinning after this many merges that contradicted the caller. With 40, maps had at most 1 %
-# fewer dstates, and took twice as long.
+# fewer dstates, and thinning took twice as long.
 THIN_ENOUGH = 5
 
-# Which nodes are apart, and pairs of nodes that are one dstate.
+# The answer of a caller: which nodes are apart (a matrix), and pairs of nodes that are one dstate.
 Told: TypeAlias = tuple[Matrix, Sequence[tuple[int, int]]]
 
 
@@ -53,13 +59,16 @@ def merged(
     clique: Sequence[int],
     check: Callable[[], None] = lambda: None,
 ) -> list[int]:
-    """The dstate of each node of a chart in a small map, numbered by first node.
+    """Find a small map of the causal theory.
 
     Args:
-        apart: Which nodes are apart, as a matrix of nodes x nodes.
-        links: The links of the chart.
+        apart: The pairs of nodes that are apart, as a matrix of nodes x nodes.
+        links: Triples (node, action, node).
         clique: Nodes that are pairwise distinct.
-        check: Called now and then; may raise.
+        check: Called now and then; may raise to stop.
+
+    Returns:
+        The dstate of each node. Dstates are numbered in the order of their first nodes.
     """
     classes = Classes(apart, links, check)
     classes.known[list(clique)] = True
@@ -73,14 +82,17 @@ def merged_near(
     guess: Sequence[int],
     check: Callable[[], None] = lambda: None,
 ) -> list[int]:
-    """The dstate of each node of a chart in a small map near a guess.
+    """Find a small map of the causal theory near a guess.
 
     Args:
-        apart: Which nodes are apart, as a matrix of nodes x nodes.
-        links: The links of the chart.
-        guess: A label for each node; -1 if unknown. The label of a node is ignored if the node
-            cannot be one dstate with earlier nodes of that label.
-        check: Called now and then; may raise.
+        apart: The pairs of nodes that are apart, as a matrix of nodes x nodes.
+        links: Triples (node, action, node).
+        guess: The label of each node, -1 if it is unknown. A label is ignored if the node cannot
+            be one dstate with earlier nodes of that label.
+        check: Called now and then; may raise to stop.
+
+    Returns:
+        The dstate of each node.
     """
     classes = _from_guess(apart, links, guess, check)
     classes.settle_all()
@@ -95,20 +107,21 @@ def merged_as_told(
     fits: Callable[[Sequence[int], Sequence[int]], bool],
     check: Callable[[], None] = lambda: None,
 ) -> list[int] | None:
-    """The dstate of each node in a small map near a guess, with the caller's knowledge.
+    """Find a small map near a guess that agrees with further axioms, which the caller knows.
 
     Args:
-        apart: Which nodes are apart, as a matrix of nodes x nodes.
-        links: The links of the chart.
-        guess: A label for each node; -1 if unknown.
-        tell: Called with the labels of all nodes, and the nodes whose labels are still open, when
-            labels have changed. Returns which nodes are apart and which are one, or None if the
-            labels contradict what the caller knows.
-        fits: Called with the same arguments. Returns whether the labels may hold; it is faster.
-        check: Called now and then; may raise.
+        apart: The pairs of nodes that are apart, as a matrix of nodes x nodes.
+        links: Triples (node, action, node).
+        guess: The label of each node, -1 if it is unknown.
+        tell: Called after merges, with the labels of all nodes and the nodes that are not yet at a
+            known dstate. Returns which nodes are apart (a matrix) and which are one (pairs), or
+            None if the labels contradict the axioms.
+        fits: Called with the same arguments. Returns only whether the labels may hold, and is
+            faster.
+        check: Called now and then; may raise to stop.
 
     Returns:
-        The labels of a thinned map; None if the guess contradicts what the caller knows, or if no
+        The dstate of each node in a thinned map; None if the guess contradicts the axioms, or no
         map is found soon.
     """
     classes = _ToldClasses(apart, links, tell, fits, check)
@@ -124,10 +137,18 @@ def merged_as_told(
 
 
 def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int]:
-    """The dstate of each node in a map that keeps the labels of a guess as far as possible.
+    """Make a map that keeps the labels of a guess as far as possible, and merges nothing else.
 
-    Only nodes that have to be one dstate because of that are merged. Nodes that are -1 in the
-    guess, or cannot keep their labels, are dstates of their own.
+    Nodes whose label is unknown (-1) or cannot be kept are dstates of their own, unless the links
+    make them one with others.
+
+    Args:
+        apart: The pairs of nodes that are apart, as a matrix of nodes x nodes.
+        links: Triples (node, action, node).
+        guess: The label of each node, -1 if it is unknown.
+
+    Returns:
+        The dstate of each node.
     """
     return _from_guess(apart, links, guess).labels()
 
@@ -135,15 +156,18 @@ def kept(apart: Matrix, links: Iterable[Link], guess: Sequence[int]) -> list[int
 def thinned(
     chart: Chart, labels: Sequence[int], check: Callable[[], None] = lambda: None
 ) -> list[int]:
-    """The dstate of each node in a smaller map.
+    """Merge dstates of a map of a chart until no two can be one.
 
-    Dstates are merged until no two can be one. Those with the fewest nodes are merged first, each
-    with the dstate for which there is most evidence.
+    Dstates with the fewest nodes are merged first, each with the dstate for which there is most
+    evidence.
 
     Args:
-        chart: The chart.
-        labels: The dstate of each node of the chart, in a map.
-        check: Called now and then; may raise.
+        chart: The nodes and links.
+        labels: The dstate of each node in the map.
+        check: Called now and then; may raise to stop.
+
+    Returns:
+        The dstate of each node in the smaller map.
     """
     dstates = numbered(labels)
     first = np.unique(dstates, return_index=True)[1]
@@ -168,7 +192,7 @@ def thinned_map(
     check: Callable[[], None] = lambda: None,
     excluded: Sequence[tuple[int, int]] = (),
 ) -> list[int]:
-    """The dstate that each dstate of a map is merged with, until no two can be one.
+    """Merge dstates of a map until no two can be one.
 
     Dstates with the fewest nodes are merged first, each with the dstate for which there is most
     evidence.
@@ -177,8 +201,11 @@ def thinned_map(
         shows: The view of each dstate.
         links: Triples (dstate, action, dstate).
         visits: The number of nodes at each dstate.
-        check: Called now and then; may raise.
+        check: Called now and then; may raise to stop.
         excluded: Pairs of dstates that are not one.
+
+    Returns:
+        For each dstate, the dstate that now represents it; itself if it was not merged.
     """
     classes = Classes(
         _apart_in_map(np.asarray(shows), links, excluded, check), links, check, np.asarray(visits)
@@ -195,10 +222,19 @@ def _apart_in_map(
     excluded: Sequence[tuple[int, int]],
     check: Callable[[], None],
 ) -> Matrix:
-    """The pairs of dstates of a map that are apart.
+    """Find the pairs of dstates of a map that are apart.
 
-    Two dstates are apart if they show different views, if they are excluded, or if one action leads
-    from them to dstates that are apart.
+    Two dstates are apart if they show different views, if they are excluded, or if the same action
+    leads from them to dstates that are apart.
+
+    Args:
+        seen: The view of each dstate.
+        links: Triples (dstate, action, dstate).
+        excluded: Pairs of dstates that are not one.
+        check: Called now and then; may raise to stop.
+
+    Returns:
+        A matrix of dstates x dstates.
     """
     leads: dict[int, NDArray[np.int_]] = {}
     for dstate, action, leads_to in links:
@@ -222,20 +258,21 @@ def _from_guess(
     guess: Sequence[int],
     check: Callable[[], None] = lambda: None,
 ) -> Classes:
-    """Classes in which the nodes that share a label in a guess are merged, if they can be one."""
+    """Make classes, and merge the nodes that share a label in a guess if they can be one."""
     classes = Classes(apart, links, check)
     classes.take(guess)
     return classes
 
 
 class _Contradicted(Exception):  # noqa: N818 - not an error
-    """The guess contradicts what the caller knows, or too many merges do."""
+    """The guess contradicts the axioms of the caller, or too many merges do."""
 
 
 class _ToldClasses(Classes):
-    """Classes near a guess. After merges, the caller says what follows from them.
+    """Classes near a guess, checked by a caller that knows further axioms.
 
-    Merges that contradict what the caller knows are taken back.
+    After merges, the caller returns which nodes are apart, or one, because of them. Merges that
+    contradict its axioms are undone.
     """
 
     def __init__(
@@ -264,7 +301,15 @@ class _ToldClasses(Classes):
         return advanced
 
     def _take_back_first_wrong(self, before: Snapshot, made: Sequence[Merge]) -> None:
-        """Repeat merges up to the first that contradicts the caller, and separate its classes."""
+        """Undo merges from the first one on that contradicts the caller, and separate its classes.
+
+        Args:
+            before: The classes before the merges.
+            made: The merges, in order.
+
+        Raises:
+            _Contradicted: The merge only made a class known, or too many merges were undone.
+        """
 
         def fits(merges: int) -> bool:
             self._check()
@@ -280,9 +325,10 @@ class _ToldClasses(Classes):
         self.separate(a, b)
 
     def _keeps_what_is_told(self) -> bool:
-        """Ask the caller which steps are apart and which are one, and apply the answer.
+        """Ask the caller which nodes are apart and which are one, and apply the answer.
 
-        Returns False if the classes contradict what the caller knows.
+        Returns:
+            False if the classes contradict the axioms of the caller.
         """
         self._check()
         told = self._tell(self.labels(), self.unsettled().tolist())
@@ -296,9 +342,11 @@ class _ToldClasses(Classes):
 
 
 def first_failing(holds: Callable[[int], bool], first: int, last: int) -> int:
-    """The first number from `first` to `last` for which `holds` is false, by bisection.
+    """Find the first number from `first` to `last` for which `holds` is false, by bisection.
 
-    If `holds` is false for a number, it has to be false for all larger ones. It counts as false for
-    `last`.
+    Args:
+        holds: A condition on a number. If it is false for a number, it is false for larger ones.
+        first: The least number.
+        last: The greatest number. `holds` is taken to be false for it, and is not called.
     """
     return first + bisect_left(range(first, last), True, key=lambda number: not holds(number))

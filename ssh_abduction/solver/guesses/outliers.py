@@ -1,14 +1,16 @@
-"""Find displacements that are outliers, by labels that are nearly right.
+"""Finds displacements that are outliers, from labels that are nearly right.
 
-When a robot comes back to a dstate or a place, the displacements in between have to close the loop
-within their covariance. Each such return votes on all displacements in between. Its vote is the log
-likelihood ratio of the residual of the loop, if one of the displacements is wrong versus if none
-is. A wrong displacement moves the robot by about FAR metres and turns it arbitrarily. The
-displacement with the most votes is taken to be wrong, and returns across it vote no more. This
-repeats as long as any displacement has votes.
+A displacement is how the robot moved between two steps, by its odometry. When the robot comes back
+to a dstate or a place, the displacements in between have to add up to nothing, within their
+covariance. Each such return votes on all displacements in between. Its vote is a log likelihood
+ratio: that one of them is wrong, against that none is, given the residual of the loop. A wrong
+displacement is off by about FAR metres and turns the robot arbitrarily.
 
-The result is a guess. Wrong labels also vote, so each vote is bounded, and a map has to pay for
-what it ignores.
+The displacement with the most votes is taken to be wrong. Returns across it vote no more. This is
+repeated while some displacement has enough votes.
+
+The result is a guess. Returns by wrong labels also vote, so each vote is limited. A map has to pay
+for each displacement that it treats as wrong.
 """
 
 from __future__ import annotations
@@ -21,25 +23,28 @@ import numpy as np
 from ssh_abduction.data.trace import Trace
 from ssh_abduction.theory.evidence.loops import Loops, Reckoning, chi_squares
 
-# Standard deviations of a wrong displacement: metres in each direction, and radians of a uniformly
-# distributed heading.
+# Standard deviations of a wrong displacement: metres along each axis, and the radians of a heading
+# that is uniformly distributed.
 FAR, ANYHOW = 15.0, math.pi / math.sqrt(3)
-# The largest vote of a return, as its labels may be wrong instead.
+# The largest vote of a return. It is limited as the labels may be wrong instead.
 MOST_VOTES = 15.0
-# Fewer votes than this are chance: a wrong displacement has to make the returns e**3 times
-# likelier.
+# Fewer votes than this may be chance. With 3 votes, a wrong displacement makes the residuals of the
+# returns e**3 times likelier.
 FEWEST_VOTES = 3.0
 
 
 def wrong_displacements(
     trace: Trace, labels: Sequence[int], places: Sequence[int | None]
 ) -> tuple[int, ...]:
-    """The steps that wrong displacements lead to, those with the most votes first.
+    """Find the displacements that are outliers.
 
     Args:
         trace: A trace with displacements.
         labels: The dstate of each step, nearly right.
-        places: The place of each step; None if unknown.
+        places: The place of each step; None if it is unknown.
+
+    Returns:
+        The steps that wrong displacements lead to, those with the most votes first.
     """
     loops = Reckoning(trace).loops_of_unknown_drift()
     voters: list[tuple[int, int, float]] = []
@@ -70,7 +75,11 @@ def wrong_displacements(
 
 
 def _returns(sites: Sequence[int | None]) -> Iterator[tuple[int, int]]:
-    """Pairs of successive steps at one site with other sites in between."""
+    """Yield pairs of steps at one site, a dstate or a place, with only other sites in between.
+
+    Args:
+        sites: The site of each step; None if it is unknown.
+    """
     last: dict[int, int] = {}
     for t, site in enumerate(sites):
         if site is None:
@@ -81,12 +90,15 @@ def _returns(sites: Sequence[int | None]) -> Iterator[tuple[int, int]]:
 
 
 def _votes(loops: Loops, pairs: Sequence[tuple[int, int]], with_heading: bool) -> list[float]:
-    """The votes of returns: log likelihood ratios of a wrong displacement, up to MOST_VOTES.
+    """Compute the vote of each return, at most `MOST_VOTES`.
+
+    A vote is the log likelihood ratio that one displacement of the loop is wrong.
 
     Args:
         loops: The displacements of the trace.
         pairs: The first and last step of each return.
-        with_heading: Whether the robot comes back to a dstate, so that headings have to agree.
+        with_heading: Whether the robot comes back to a dstate, so that headings have to agree. If
+            False, it comes back to a place.
     """
     if not pairs:
         return []

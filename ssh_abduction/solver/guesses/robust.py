@@ -1,12 +1,14 @@
-"""Small maps of the causal theory with faults, without a search and without a proof.
+"""Finds small maps of the causal theory with faults, without a search and without a proof.
 
 A hidden Markov model is trained on the trace (Baum, Petrie, Soules, Weiss 1970). Each state shows
-one view, and several states show the same view (cloned hidden Markov models: George et al. 2021),
-apart from small probabilities that a view is misread and that an action slips. The most probable
-states give labels, and a map is read off the labels: a dstate shows the majority view of its steps,
-and an action leads where it leads most often. A Viterbi pass (Viterbi 1967) finds labels with the
-fewest faults for that map. These two steps repeat while the cost falls. In between, dstates are
-merged if they can be one, and dropped if they cost more than the faults without them.
+one view, and several states show the same view (cloned hidden Markov models: George et al. 2021).
+There are small probabilities that a view is misread and that an action slips. The most probable
+states give labels, the dstate of each step.
+
+A map is then read off the labels: a dstate shows the majority view of its steps, and an action
+leads where it leads most often. A Viterbi pass (Viterbi 1967) finds new labels with the cheapest
+faults for this map. Both are repeated while the cost falls. In between, dstates are merged if they
+can be one. A dstate is dropped if it costs more than the faults without it.
 
 >>> seen = [t % 4 for t in range(60)]
 >>> seen[30] = 0
@@ -30,7 +32,8 @@ from numpy.typing import NDArray
 from ssh_abduction.solver.guesses.merging import thinned_map
 from ssh_abduction.solver.steps.chart import Link, numbered
 
-# The states of each view, for each start of EM. More states than needed lead to better optima.
+# The number of states of each view, for each start of EM. More states than needed lead to better
+# optima.
 CLONES = (4, 10, 16, 10, 16, 10, 16, 10)
 AGREE = 2  # stop after this many starts that reach the cheapest map
 ROUNDS = 100  # the most EM steps of a start
@@ -38,23 +41,23 @@ ENOUGH = 1e-4  # stop EM below this gain in log-likelihood per step of the trace
 PSEUDOCOUNT = 2e-3  # added to all counts, as by George et al.
 MISREAD, SLIPPED = 0.01, 0.01  # probabilities of faults in the model
 RARE = 4  # a dstate with at most this many visits may be dropped
-TRIED = 20  # the most dropped dstates, and merged pairs, to try in a round
-# The cost of a forbidden fault while a map is refined, relative to an allowed one: a few forbidden
-# faults can be mended at the end.
+TRIED = 20  # try to drop at most this many dstates, and to merge this many pairs, in a round
+# While a map is refined, a fault that is forbidden costs this many times as much as an allowed one.
+# The last pass can replace a few of them by allowed faults.
 DEARER = 4 / 3
 NEVER = 1_000_000  # the cost of a forbidden fault in the final Viterbi pass
-UNKNOWN = 0.5  # the cost of an unknown link, in tenths of a dstate: less than any fault
+UNKNOWN = 0.5  # the cost of an unknown link, in tenths of dstates: less than any fault
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Dstates and links, which need not cover all actions.
+    """Dstates with their views, and links. An action at a dstate need not have a link.
 
     Attributes:
         shows: The view of each dstate.
-        goes: The dstate to which an action leads, by dstate and action.
+        goes: For each (dstate, action) with a link, the dstate that it leads to.
     """
 
     shows: Sequence[int]
@@ -65,11 +68,17 @@ class Machine:
         return frozenset(action for _, action in self.goes)
 
     def folded(self, s: int, x: int) -> tuple[int, list[int]]:
-        """The labels after merging two dstates, and their equal successors, and so on.
+        """Merge two dstates, the dstates that the same action leads to from both, and so on.
+
+        Dstates with different views are not merged, but count as a contradiction.
+
+        Args:
+            s: A dstate.
+            x: Another dstate.
 
         Returns:
-            The net cost: links contradicted minus dstates merged; and the new label of each dstate.
-            Try the cheapest merges first.
+            The net cost, contradictions minus dstates saved, by which callers rank merges; and the
+            new label of each dstate.
         """
         root = list(range(len(self.shows)))
         members = {dstate: [dstate] for dstate in root}
@@ -82,7 +91,7 @@ class Machine:
                 contradicted += 1
                 continue
             merges += 1
-            # The ends of equal actions are also merged.
+            # Also merge the dstates that the same action leads to from both.
             work += [
                 (self.goes[p, action], self.goes[q, action])
                 for action in self.actions
@@ -96,7 +105,7 @@ class Machine:
         return contradicted - merges, root
 
     def without(self, dropped: int) -> Machine:
-        """The machine without a dstate."""
+        """Make a machine without one dstate and its links. Higher numbers drop by one."""
         number = {s: s - (s > dropped) for s in range(len(self.shows)) if s != dropped}
         goes = {
             (number[s], a): number[x]
@@ -108,15 +117,15 @@ class Machine:
 
 @dataclass(frozen=True)
 class Explained:
-    """An explanation of a trace by a machine.
+    """An explanation of a trace by a machine: labels, and the faults that they imply.
 
     Attributes:
         machine: The machine.
         labels: The dstate of each step.
         misread: The steps whose views are treated as wrong.
         slips: The steps whose actions are treated as wrong.
-        unknown: The steps whose actions the machine does not know.
-        tenths: The cost of dstates and faults, in tenths of a dstate.
+        unknown: The steps whose actions have no link in the machine.
+        tenths: The cost of dstates and faults, in tenths of dstates.
     """
 
     machine: Machine
@@ -133,14 +142,14 @@ class Explained:
 
 @dataclass(frozen=True)
 class Explainer:
-    """A trace as integers, and the costs of faults.
+    """Explains a trace by machines with the cheapest faults, and improves machines.
 
     Attributes:
         seen: The view of each step, numbered from 0.
         actions: The action after each step but the last, numbered from 0.
-        price: For each allowed kind of fault (misread, slipped), its cost at each step, in tenths
-            of a dstate.
-        check: Called now and then; may raise.
+        price: For each allowed kind of fault ("misread", "slipped"), its cost at each step, in
+            tenths of dstates.
+        check: Called now and then; may raise to stop.
     """
 
     seen: Sequence[int]
@@ -149,9 +158,9 @@ class Explainer:
     check: Callable[[], None] = field(default=lambda: None)
 
     def explained(self, machine: Machine) -> Explained:
-        """The labels with the cheapest faults for a machine, by a Viterbi pass.
+        """Find the labels with the cheapest faults for a machine, by a Viterbi pass.
 
-        An action that the machine does not know may lead anywhere.
+        An action without a link may lead anywhere.
         """
         steps, count = len(self.seen), len(machine.shows)
         slip, misread = (
@@ -171,8 +180,8 @@ class Explainer:
             if t % 500 == 0:
                 self.check()
             action = self.actions[t - 1]
-            # A dstate is reached by a slip from the cheapest dstate, by an unknown link from the
-            # cheapest dstate that has one, or by a known link.
+            # A dstate is reached by a slip from the cheapest dstate, from the cheapest dstate
+            # without a link for this action, or by a link.
             cheapest = int(spent.argmin())
             now = np.full(count, spent[cheapest] + slip[t - 1])
             came[t] = cheapest
@@ -195,9 +204,9 @@ class Explainer:
         return self._told(machine, labels)
 
     def completed(self, machine: Machine) -> Explained:
-        """The explanation by a machine, completed so that it knows all actions of the trace.
+        """Add the links that a machine lacks for the trace, and explain the trace by the result.
 
-        An unknown action leads where the labels take it most often.
+        An action without a link gets one to the dstate that follows most often in the labels.
         """
         explained = self.explained(machine)
         while explained.unknown:
@@ -212,10 +221,13 @@ class Explainer:
         return explained
 
     def read_off(self, labels: Sequence[int]) -> Machine:
-        """The machine that labels make.
+        """Make a machine from labels.
 
-        A dstate shows the view that is most expensive to ignore, and an action leads where it
+        A dstate gets the view that is most expensive to treat as misread. An action leads where it
         leads most often.
+
+        Args:
+            labels: The dstate of each step.
         """
         labels = numbered(labels)
         views: list[Counter[int]] = [Counter() for _ in range(max(labels) + 1)]
@@ -231,10 +243,13 @@ class Explainer:
         )
 
     def refined(self, labels: Sequence[int]) -> Explained:
-        """The cheapest explanation near these labels, by local search.
+        """Find a cheap explanation near these labels, by local search.
 
-        A machine is read off the labels, and explains the trace anew, while the cost falls. So do
-        machines with dstates merged that can be one, or without a rarely visited dstate.
+        Make a machine from the labels and explain the trace by it again, while the cost falls. Then
+        try machines with merged dstates, or without a rarely visited one.
+
+        Args:
+            labels: The dstate of each step.
         """
         best = self._settled(labels)
         while True:
@@ -244,8 +259,9 @@ class Explainer:
             best = better
 
     def _near(self, best: Explained) -> Iterator[Explained]:
-        """Explanations by machines near the one of an explanation."""
-        # Merge dstates that can be one, drop rare dstates, then merge dstates that are nearly one.
+        """Yield explanations by machines like a given one, with dstates merged or dropped."""
+        # First merge all dstates that can be one. Then drop rare dstates, one at a time. Then merge
+        # pairs of dstates with few contradictions.
         machine = self.read_off(best.labels)
         labels = numbered(best.labels)
         visits = Counter(labels)
@@ -269,14 +285,19 @@ class Explainer:
             yield self._settled([root[label] for label in labels])
 
     def _settled(self, labels: Sequence[int]) -> Explained:
-        """Read off a machine and explain the trace by it, again and again while the cost falls."""
+        """Explain the trace by the machine of the labels, and repeat that while the cost falls."""
         best = self.completed(self.read_off(labels))
         while (better := self.completed(self.read_off(best.labels))).tenths < best.tenths:
             best = better
         return best
 
     def _told(self, machine: Machine, labels: Sequence[int]) -> Explained:
-        """The explanation by these labels, with its faults and costs."""
+        """Make the explanation that these labels are, with its faults and its cost.
+
+        Args:
+            machine: The machine.
+            labels: The dstate of each step.
+        """
         # A step is at fault if its view, or where its action leads, differs from the machine.
         misread = [t for t, s in enumerate(labels) if machine.shows[s] != self.seen[t]]
         leads = [
@@ -297,14 +318,18 @@ class Explainer:
         )
 
     def _cost(self, kind: str, step: int) -> int:
-        """The cost of a fault, in tenths of a dstate."""
+        """Return the cost of a fault in tenths of dstates; `NEVER` if the kind is not allowed."""
         return self.price[kind][step] if kind in self.price else NEVER
 
 
 def robust_maps(explainer: Explainer, seed: int = 0) -> Iterator[Explained | None]:
-    """Explanations of a trace, each cheaper than the one before.
+    """Yield explanations of a trace, each cheaper than the one before.
 
-    Each item takes one start of EM. It is None if that start led to no cheaper explanation.
+    There is an item for each start of EM. It is None if that start led to no cheaper explanation.
+
+    Args:
+        explainer: The trace and the costs of faults.
+        seed: The seed of the random numbers with which EM starts.
     """
     rng = np.random.default_rng(seed)
     dearer = [round(DEARER * max(found)) for found in zip(*explainer.price.values(), strict=True)]
@@ -354,7 +379,7 @@ class _Model:
         return self._most_probable()
 
     def _train(self) -> float:
-        """Do a step of EM. Returns the log-likelihood before it."""
+        """Do one step of EM, and return the log-likelihood of the trace before it."""
         steps, states = self._sees.shape
         ahead = np.ones((steps, states)) / states
         behind = np.ones((steps, states))
@@ -384,7 +409,7 @@ class _Model:
         return float(np.log(scale).sum())
 
     def _most_probable(self) -> list[int]:
-        """The most probable sequence of states, by a Viterbi pass."""
+        """Find the most probable state of each step, by a Viterbi pass."""
         with np.errstate(divide="ignore"):
             matrices, sees = list(np.log(self._chances)), np.log(self._sees)
         spent = sees[0]
@@ -399,7 +424,11 @@ class _Model:
         return labels[::-1]
 
     def _normal(self, counts: Floats) -> Floats:
-        """Counts as transition probabilities, mixed with the probability of a slip."""
+        """Turn counts into transition probabilities, and mix in the probability of a slip.
+
+        Args:
+            counts: Counts of transitions, with the shape (actions, from states, to states).
+        """
         chances: Floats = counts / counts.sum(axis=2, keepdims=True)
         slipping: Floats = (1 - self._slip) * chances + self._slip / counts.shape[2]
         return slipping

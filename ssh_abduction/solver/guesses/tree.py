@@ -1,4 +1,4 @@
-"""A greedy consistent map: each step leads somewhere new unless the axioms say where it leads.
+"""Builds a consistent map without a search: an action leads to a new dstate if the axioms allow it.
 
 >>> from ssh_abduction import Theory
 >>> from ssh_abduction.data import Action, Step
@@ -11,24 +11,27 @@
 >>> sketch.map().labels
 (0, 1, 2, 3, 0)
 
-A sketch is a tree of paths. A travel leads to a new place, or back along its path to the place that
-it came from. So two paths share at most one place, and the places ahead on a branch lie on no path
-that the branch leaves. The axioms of order and sides therefore hold. Within a place, the axioms of
-turns, courses and headings decide which dstates are one.
+Such a map is a *sketch*, and it is a tree of paths. A travel leads to a new place, or back along
+its path to the place that the robot came from. So two paths share at most one place. The places on
+a branch lie on no path that the branch leaves. Therefore the axioms of order and sides hold. Within
+a place, the axioms of turns, courses and headings determine which dstates are one.
 
-If the place that a travel comes back to contradicts what was seen there, the travel leads to a new
-place instead. If the trace later contradicts a step at a known place, the sketch fails. A sketch
-without `homing` never comes back to a place, unless the axiom next_place demands it, so it may hold
-where another fails.
+If a travel comes back to a place, but the step there contradicts what was seen there, the travel
+leads to a new place instead. If a later step contradicts a known dstate, the sketch fails. A sketch
+without `homing` never comes back to a place, unless the axiom next_place demands it. So it may
+succeed when a sketch with `homing` fails.
 
-A sketch may have frames even if the theory has none: that only adds axioms.
+A sketch may have frames, numbered directions at each place, even if the theory has none. That only
+adds axioms.
 
 A sketch may also begin with a map of some steps, and grow like a tree from there. New dstates lie
-on new paths, or on one known path, and contradict nothing. In three cases the sketch cannot tell
-whether it is consistent. A turn may be the first to show how two known paths cross, which has to
-fit all their places. Without frames, a turn may lead from a dstate to itself, which then can be on
-no path. Also without frames, two turns to the right may lead back, so that a new place ahead would
-lie on both sides of a path.
+on new paths, or on one known path, and contradict nothing. Three cases are exceptions, and the
+sketch does not know whether it is consistent then:
+
+- A turn is the first one that shows how two known paths cross. That has to fit all their places.
+- Without frames, a turn leads from a dstate to itself. Then the dstate can be on no path.
+- Without frames, two turns to the right lead back. Then a new place ahead would be on both sides of
+  a path.
 """
 
 from __future__ import annotations
@@ -43,21 +46,21 @@ from ssh_abduction.theory.theory import Theory
 
 
 class _Contradiction(Exception):  # noqa: N818 - not an error
-    """The axioms contradict what was seen."""
+    """A step contradicts the axioms."""
 
 
 @dataclass(slots=True)
 class _Known:
-    """What is known of a dstate so far.
+    """A dstate of a sketch, as far as it is known.
 
     Attributes:
-        view: Its view.
-        seen: Its observation.
-        place: Its place.
-        heading: Its heading in the frame of the place, in quarters clockwise.
-        path: Its path, if known.
-        direction: Its direction along the path, 1 or -1.
-        reverse: The dstates that a turn around links it to.
+        view: The view.
+        seen: The observation: the view, and the star if the theory uses stars.
+        place: The number of the place.
+        heading: The heading in the frame of the place, in quarters clockwise.
+        path: The number of the path; None if it is unknown.
+        direction: The direction along the path, 1 or -1.
+        reverse: The dstates that a turn around links with this one.
     """
 
     view: View
@@ -66,7 +69,7 @@ class _Known:
     heading: int
     path: int | None = None
     direction: int = 1
-    reverse: list[int] = field(default_factory=list)  # the dstates that a turn around links it to
+    reverse: list[int] = field(default_factory=list)
 
 
 class Sketch:
@@ -75,15 +78,15 @@ class Sketch:
     Args:
         first: The first step.
         theory: The theory.
-        homing: Whether a travel may lead back to where it came from, even without the axiom
-            next_place.
-        framed: Whether places have frames, even if the theory has none. Then most turns lead to
+        homing: Whether a travel may lead back to the place that the robot came from. With the axiom
+            next_place it always may.
+        framed: Whether places have frames even if the theory has none. Then most turns lead to
             known dstates.
 
     Attributes:
         labels: The dstate of each step.
-        certain: Whether the map is known to be consistent. If not, the caller has to check it, and
-            may then set this.
+        certain: Whether the map is known to be consistent. If it is False, the caller has to check
+            the map, and may then set it to True.
     """
 
     def __init__(
@@ -95,10 +98,10 @@ class Sketch:
         self._framed = framed or theory.star == "frame"
         self._states: list[_Known] = []
         self._links: dict[tuple[int, str], int] = {}
-        self._stars: list[object] = []  # for each place, its star
+        self._stars: list[object] = []  # for each place, its star (the openings seen there)
         self._orders: list[list[int]] = []  # for each path, its places in the order of direction 1
         self._along: dict[tuple[int, int, int], int] = {}  # place, path, direction: dstate
-        # With frames only: the dstate, and the path and direction, by place and heading.
+        # Only with frames: for each place and heading, the dstate, and the path and direction.
         self._facing: dict[tuple[int, int], int] = {}
         self._slots: dict[tuple[int, int], tuple[int, int]] = {}
         self._excused: tuple[tuple[int, int], ...] = ()  # pairs of paths
@@ -110,7 +113,14 @@ class Sketch:
 
     @classmethod
     def all_of(cls, first: Step, theory: Theory) -> list[Sketch]:
-        """All kinds of sketches that begin with this step, those with smaller maps first."""
+        """Make a sketch of each kind, with and without frames and `homing`.
+
+        Sketches that mostly have smaller maps come first.
+
+        Args:
+            first: The first step.
+            theory: The theory.
+        """
         framed = (
             [True, False] if theory.level == "topological" and theory.star != "frame" else [False]
         )
@@ -118,7 +128,13 @@ class Sketch:
 
     @classmethod
     def beyond(cls, ssh_map: SSHMap, trace: Trace, theory: Theory) -> Sketch:
-        """A sketch that begins with a map of a trace. The map has to satisfy all axioms."""
+        """Make a sketch that begins with a map of a trace.
+
+        Args:
+            ssh_map: The map. It has to satisfy all axioms.
+            trace: The trace of the map.
+            theory: The theory.
+        """
         sketch = cls(trace.steps[0], theory)
         sketch._map, sketch._tree, sketch.labels = ssh_map, False, list(ssh_map.labels)
         sketch._links = {(s, action): x for s, action, x in ssh_map.links}
@@ -126,7 +142,7 @@ class Sketch:
         sketch._orders = [list(path.order) for path in ssh_map.paths]
         sketch._states, sketch._along, sketch._facing, sketch._slots = [], {}, {}, {}
         stars: dict[int, object] = {}
-        # The first step at each dstate gives its observation.
+        # The observation of a dstate is that of its first step.
         seen = dict(zip(reversed(ssh_map.labels), reversed(trace.steps), strict=True))
         for s in ssh_map.dstates:
             place, heading, direction = s.place or 0, s.heading or 0, s.direction or 1
@@ -154,7 +170,7 @@ class Sketch:
         """Add an action and the step after it.
 
         Returns:
-            Whether the sketch allows them. If not, it cannot be used any more.
+            False if they contradict the sketch. Then it cannot be used any more.
         """
         here = self.labels[-1]
         there = self._links.get((here, action.name))
@@ -169,13 +185,13 @@ class Sketch:
         return True
 
     def map(self) -> SSHMap:
-        """The sketch as a map of all steps so far, numbered by first visit."""
+        """Return the map of all steps so far. Numbers follow the order of first visits."""
         labels = tuple(self.labels)
         self._map = replace(self._map, labels=labels) if self._map else self._made(labels)
         return self._map
 
     def _untried(self, here: int, action: Action, step: Step) -> int:
-        """The dstate to which an action leads that was not tried before."""
+        """Decide where an action leads that has no link yet, and return the dstate there."""
         if self._theory.level == "causal":
             return self._new(step, 0, 0)
         if action.slipped:
@@ -185,12 +201,12 @@ class Sketch:
         return self._turn(here, action, step)
 
     def _turn(self, here: int, action: Action, step: Step) -> int:
-        """The dstate to which a turn leads that was not tried before."""
+        """Decide where a turn leads that has no link yet, and return the dstate there."""
         s = self._states[here]
         around = action.turn == "around"
         heading = (s.heading + QUARTERS[action.turn]) % 4
         there: int | None = None
-        # Look for a known dstate that the axioms demand.
+        # Look for a known dstate to which the axioms say that the turn leads.
         if self._framed:
             there = self._facing.get((s.place, heading))
         elif around and s.path is not None:
@@ -211,7 +227,10 @@ class Sketch:
         return there
 
     def _turned_around(self, here: int, there: int) -> None:
-        """Add a turn around. If one of its dstates has a course, the other has the reverse."""
+        """Add a turn around between two dstates.
+
+        If one of them has a course (a path and its direction), the other gets the reverse.
+        """
         self._states[here].reverse.append(there)
         self._states[there].reverse.append(here)
         for s in (self._states[here], self._states[there]):
@@ -221,7 +240,7 @@ class Sketch:
                     self._set_course(x, s.path, -s.direction)
 
     def _travel(self, here: int, step: Step) -> int:
-        """The dstate to which a travel leads that was not tried before."""
+        """Decide where a travel leads that has no link yet, and return the dstate there."""
         path, direction = self._find_course(here)
         place, order = self._states[here].place, self._orders[path]
         position = order.index(place)
@@ -239,9 +258,15 @@ class Sketch:
         return there
 
     def _known_ahead(self, place: int, path: int, direction: int, step: Step) -> int | None:
-        """The dstate at which a travel ends at a known place.
+        """Return the dstate at which a travel ends if it leads to a known place.
 
-        None if the step contradicts what was seen at the place.
+        None if the step contradicts what was seen at that place.
+
+        Args:
+            place: The place.
+            path: The path of the travel.
+            direction: The direction along the path.
+            step: The step after the travel.
         """
         there = self._along.get((place, path, direction))
         heading = 0
@@ -260,9 +285,10 @@ class Sketch:
         return there
 
     def _find_course(self, here: int) -> tuple[int, int]:
-        """The path and direction of a dstate.
+        """Return the path and direction of a dstate, and choose them if they are unknown.
 
-        A dstate without a path gets the path that leaves through its slot, or a new one.
+        The dstate gets the path that leaves the place in its heading. If that is unknown, or there
+        are no frames, it gets a new path.
         """
         s = self._states[here]
         if s.path is None:
@@ -277,14 +303,17 @@ class Sketch:
         return s.path, s.direction
 
     def _doubt_if_grown_from_map(self) -> None:
-        """Note that the last action may contradict the map that the sketch began with.
+        """Set `certain` to False if the sketch began with a map.
 
-        A sketch that is a tree stays certain.
+        Its last action may contradict that map. A sketch that is a tree stays certain.
         """
         self.certain = self._tree
 
     def _set_course(self, here: int, path: int, direction: int) -> None:
-        """Give a dstate its course, and the reverse to all dstates that turns around link to it."""
+        """Give a dstate a path and direction.
+
+        Dstates that a turn around links with it get the same path in the reverse direction.
+        """
         s = self._states[here]
         if (s.path, s.direction) == (path, direction):
             return
@@ -298,12 +327,12 @@ class Sketch:
             self._set_course(x, path, -direction)
 
     def _new_place(self, step: Step) -> int:
-        """A dstate at a new place."""
+        """Add a place with a dstate for a step, and return the dstate."""
         self._stars.append(self._star(step, 0))
         return self._new(step, len(self._stars) - 1, 0)
 
     def _new(self, step: Step, place: int, heading: int) -> int:
-        """A new dstate at a place."""
+        """Add a dstate for a step at a place, and return the dstate."""
         assert step.view is not None
         if self._star(step, heading) != self._stars[place]:
             raise _Contradiction
@@ -313,9 +342,9 @@ class Sketch:
         return len(self._states) - 1
 
     def _star(self, step: Step, heading: int) -> object:
-        """The star of a place, by a step that sees it with this heading.
+        """Return the star (openings) of a place, as a step with this heading sees it.
 
-        If the place has a frame, the star is turned into it.
+        With frames, the star is turned so that it begins with slot 0 of the place.
         """
         star = step.openings if self._theory.star in ("pattern", "frame") else None
         if self._framed and star is not None:
@@ -323,12 +352,16 @@ class Sketch:
         return observation(step, self._theory)[1]
 
     def _must_show(self, there: int, step: Step) -> None:
-        """Raise _Contradiction if a step contradicts the observation of its dstate."""
+        """Raise `_Contradiction` if a step differs from the observation of its dstate."""
         if self._states[there].seen != observation(step, self._theory):
             raise _Contradiction
 
     def _made(self, labels: tuple[int, ...]) -> SSHMap:
-        """Build the map."""
+        """Build the map.
+
+        Args:
+            labels: The dstate of each step.
+        """
         links = tuple(sorted((s, action, x) for (s, action), x in self._links.items()))
         if self._theory.level == "causal":
             return SSHMap(

@@ -1,15 +1,18 @@
-"""Find wrong views and stars (openings seen): merge visits, so that right observations win.
+"""Finds wrong views and stars by merging visits to groups, in which the majority is right.
 
-If places have frames, the steps between two travels are a visit. A place is a group of visits,
-each turned by some quarters. The cost of a group is the cost of its dstates, plus the cost of
-ignoring each view and star that differs from what most of its steps show. Groups are merged
-while that lowers the total cost, those with the largest gain first. If two visits of a group leave
-by the same action, the next visits are also merged, as actions are deterministic. This is
-evidence-driven state merging (Lang, Pearlmutter & Price 1998) with votes instead of contradictions.
-Evidence such as displacements is obeyed.
+A star is the openings that are seen at a step. A visit is the steps between two travels. This is
+for places with frames, so the directions at a place are numbered: the slots. A place is a group of
+visits, each turned by some quarters (right angles).
 
-The groups are a guess, not a map: they ignore the axioms of paths. Outvoted views and stars are
-replaced in the trace, and the mended trace is solved.
+A group costs its dstates, plus the cost of each view and star that differs from the majority of its
+steps. Groups are merged while that lowers the total cost, those with the largest gain first. If two
+visits of a group end by the same action in the same direction, the next visits are also merged, as
+actions are deterministic. Groups that evidence, such as displacements, keeps from being one place
+are not merged. This is evidence-driven state merging (Lang, Pearlmutter & Price 1998), with votes
+instead of contradictions.
+
+The groups are a guess, not a map, as they ignore the axioms of paths. Callers replace the outvoted
+views and stars in the trace, and solve the mended trace.
 """
 
 from __future__ import annotations
@@ -28,11 +31,11 @@ from ssh_abduction.solver.steps.chart import QUARTERS
 from ssh_abduction.theory.pairs import Pairs, pairs_in
 from ssh_abduction.theory.theory import Theory
 
-# The most pairs of visits to compare; those furthest apart in the trace are left out first.
+# Compare at most this many pairs of visits. Pairs with the most visits in between are left out.
 MOST_PAIRS = 60_000
 DSTATE = 10  # cost of a dstate, in tenths
 
-# A visit or group, and a number of quarters: slot K of the visit is slot K + quarters of the place.
+# A visit or a group, and a number of quarters: its slot K is slot K + quarters of the place.
 _Turned = tuple[int, int]
 
 
@@ -41,9 +44,9 @@ class _Visit:
     """The steps between two travels.
 
     Attributes:
-        steps: The steps, each with the slot that it faces. The robot faces slot 0 as it arrives.
-        leaves: The slot and the name of the action that ends the visit; None for the last visit,
-            and if that action slipped.
+        steps: The steps, each with the slot that it faces. The robot faces slot 0 when it arrives.
+        leaves: The slot at which the visit ends and the name of the action that ends it; None for
+            the last visit, and if that action slipped.
     """
 
     steps: tuple[tuple[int, int], ...]
@@ -51,12 +54,13 @@ class _Visit:
 
 
 class _Group:
-    """Visits that are one place, each turned by some quarters, and the votes of their steps.
+    """Visits to one place, each turned by some quarters, and the votes of their steps.
 
     Attributes:
         members: For each visit, the quarters by which it is turned.
-        views: For each slot and view, the cost of ignoring all steps that show it.
-        stars: For each star as seen from slot 0, the cost of ignoring all steps that show it.
+        views: For each slot and view, the cost of treating it as wrong at all steps that show it.
+        stars: The same cost for each star, as seen from slot 0.
+        cost: The cost of the dstates and of all outvoted views and stars, in tenths of dstates.
     """
 
     def __init__(
@@ -70,7 +74,7 @@ class _Group:
 
     @staticmethod
     def joined(parts: Iterable[tuple[_Group, int]]) -> _Group:
-        """The union of groups, each turned by some more quarters."""
+        """Make the union of groups, each turned by further quarters."""
         members: dict[int, int] = {}
         views: dict[int, Counter[View]] = {}
         stars: Counter[Openings] = Counter()
@@ -84,13 +88,16 @@ class _Group:
 
 
 class Merging:
-    """The visits of a trace, as groups that are merged.
+    """The visits of a trace in groups, which are merged to places.
 
     Args:
-        trace: The trace; its theory has frames.
-        theory: The theory.
-        pairs: Evidence about pairs of steps.
-        check: Called now and then; may raise.
+        trace: The trace.
+        theory: A theory with frames.
+        pairs: Pairs of steps that evidence says are different.
+        check: Called now and then; may raise to stop.
+
+    Attributes:
+        visits: The visits of the trace, in order.
     """
 
     def __init__(
@@ -106,7 +113,7 @@ class Merging:
         """Merge the visits that a map has at one place.
 
         Args:
-            places: The place of each step and the slot of the place that it faces; None if unknown.
+            places: For each step, its place and the slot there that it faces; None if unknown.
         """
         first: dict[int, _Turned] = {}
         for number, visit in enumerate(self.visits):
@@ -136,7 +143,7 @@ class Merging:
                 gain, joined = self._gain(*pair)
                 if gain <= 0:
                     continue
-                # The gain may have dropped since the pair was queued.
+                # The gain may have dropped since the pair was put into the queue.
                 if waiting and gain < -waiting[0][0]:
                     heapq.heappush(waiting, (-gain, pair))
                     continue
@@ -148,7 +155,7 @@ class Merging:
                 return
 
     def mended(self) -> Trace:
-        """The trace with outvoted views and stars replaced by those of the majority."""
+        """Return the trace with outvoted views and stars replaced by those of the majority."""
         steps = list(self._trace.steps)
         for group in self._groups.values():
             star = _winner(group.stars)
@@ -161,7 +168,7 @@ class Merging:
         return replace(self._trace, steps=tuple(steps))
 
     def labels(self) -> list[int]:
-        """The place and slot that each step faces, as one number."""
+        """Return a label for each step: 4 times its place, plus the slot there that it faces."""
         return [
             4 * self._group_of[number] + (slot + self._turn(number)) % 4
             for number, visit in enumerate(self.visits)
@@ -169,11 +176,11 @@ class Merging:
         ]
 
     def places(self) -> list[int]:
-        """The place of each step, as a number."""
+        """Return the place of each step, as a number."""
         return [label // 4 for label in self.labels()]
 
     def _turn(self, visit: int) -> int:
-        """The quarters by which a visit is turned in its group."""
+        """Return the quarters by which a visit is turned in its group."""
         return self._groups[self._group_of[visit]].members[visit]
 
     def _of_visit(self, number: int) -> _Group:
@@ -189,9 +196,16 @@ class Merging:
         return _Group({number: 0}, views, stars)
 
     def _misfitting(self, pairs: Pairs) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """Which groups cannot be one place, as an array of R x I x J.
+        """Find the visits that cannot be at one place.
 
-        True if groups I and J cannot be one place with slot K of I at slot K + R of J.
+        Each visit is a group at first.
+
+        Args:
+            pairs: Pairs of steps that evidence says are different.
+
+        Returns:
+            An array (4, visits, visits). Element [R, I, J] says that I and J cannot be at one place
+            with slot K of I at slot K + R of J.
         """
         count = len(self.visits)
         misfits = np.zeros((4, count, count), dtype=bool)
@@ -212,7 +226,11 @@ class Merging:
         return misfits
 
     def _candidates(self) -> list[tuple[int, int, int]]:
-        """Pairs of groups that may be one place, as triples (I, J, R)."""
+        """List the pairs of groups that may be one place, at most `MOST_PAIRS`.
+
+        Returns:
+            Triples (I, J, R): slot K of group I would be slot K + R of group J.
+        """
         some = np.array(sorted(self._groups))
         turns, first, second = np.nonzero(
             ~self._misfits[:, some[:, None], some]
@@ -224,15 +242,16 @@ class Merging:
         return list(zip(some[first].tolist(), some[second].tolist(), turns.tolist(), strict=True))
 
     def _beside(self, visit: int, other: int, turn: int) -> list[_Turned]:
-        """The group of another visit, and the quarters to turn it to join the group of this visit.
+        """Find how to turn the group of another visit so that it joins the group of this visit.
 
         Args:
             visit: This visit.
             other: The other visit.
-            turn: Slot K of this visit is to be slot K + turn of the other.
+            turn: Slot K of this visit shall be slot K + turn of the other.
 
         Returns:
-            A list with the group, or an empty one if the two are in one group.
+            A list with the group of the other visit and the quarters to turn it by; empty if both
+            visits are in one group already.
         """
         mine, its = self._group_of[visit], self._group_of[other]
         if mine == its:
@@ -243,18 +262,18 @@ class Merging:
         return [(its, (here - turn - there) % 4)]
 
     def _gain(self, first: int, second: int, turn: int) -> tuple[int, list[list[_Turned]]]:
-        """The gain of merging the groups of two visits, and all groups that follow from it.
+        """Compute the gain of merging the groups of two visits, and all groups that follow.
 
         Args:
             first: A visit.
             second: Another visit.
-            turn: Slot K of the first visit is to be slot K + turn of the second.
+            turn: Slot K of the first visit shall be slot K + turn of the second.
 
         Returns:
-            The gain in tenths of dstates, and the groups to merge. Zero and none if they cannot be
-            one.
+            The gain in tenths of dstates, and a list for each merge of the groups to merge, with
+            their quarters. Zero and an empty list if the groups cannot be one place.
         """
-        # For each group, all groups that become one place with it, and their turns.
+        # For each group, all groups that become one place with it, and the quarters of each.
         together: dict[int, dict[int, int]] = {}
         work = [(first, second, turn)]
         while work:
@@ -287,7 +306,16 @@ class Merging:
     def _follow(
         self, mine: Mapping[int, int], its: Mapping[int, int], shift: int
     ) -> list[tuple[int, int, int]]:
-        """The visits to merge next: those that the same action leads to from the same slot."""
+        """List the visits to merge next, as the same action leads to them from the same slot.
+
+        Args:
+            mine: Groups that become one place, with their quarters.
+            its: Further groups that become the same place, with their quarters.
+            shift: The quarters by which all of `its` are turned more.
+
+        Returns:
+            Triples (visit, visit, turn), as the arguments of `_gain`.
+        """
         leads = dict(self._leads(mine, 0))
         return [(leads[key], there, 0) for key, there in self._leads(its, shift) if key in leads]
 
@@ -298,7 +326,7 @@ class Merging:
                     yield ((leaves[0] + turn + t + shift) % 4, leaves[1]), visit + 1
 
     def _merge(self, parts: Sequence[_Turned]) -> None:
-        """Merge these groups into the first."""
+        """Merge groups, each with the quarters by which it is turned, into the first of them."""
         (kept, by), *others = parts
         whole = _Group.joined([(self._groups[x], (t - by) % 4) for x, t in parts])
         for x, t in others:
@@ -313,7 +341,7 @@ class Merging:
 
 
 def _visits(trace: Trace) -> Iterator[_Visit]:
-    """The visits of a trace, in order."""
+    """Yield the visits of a trace, in order."""
     steps: list[tuple[int, int]] = [(0, 0)]
     for t, action in enumerate(trace.actions):
         slot = steps[-1][1]
@@ -326,16 +354,16 @@ def _visits(trace: Trace) -> Iterator[_Visit]:
 
 
 def _outvoted(votes: Counter[Any]) -> int:
-    """The votes against the majority."""
+    """Return the sum of all votes but those for the winner."""
     return sum(votes.values()) - max(votes.values())
 
 
 def _winner(votes: Counter[Any]) -> Any:
-    """The option with the most votes; of several, the first."""
+    """Return the option with the most votes. The first one wins a tie."""
     return max(votes, key=lambda what: votes[what])
 
 
 def _turned(star: Openings, quarters: int) -> Openings:
-    """The star as seen from a heading some quarters to the left."""
+    """Return a star as seen from a heading that is some quarters further to the left."""
     ahead, right, back, left = (star[(k - quarters) % 4] for k in range(4))
     return ahead, right, back, left
