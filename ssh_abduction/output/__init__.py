@@ -1,6 +1,6 @@
-"""Pictures, graphs, tables, notebook cards and files for other programs: functions of a map.
+"""Functions that turn a map into pictures, graphs, tables, notebook cards and files.
 
-Each name is loaded when it is first used, as some need networkx, scipy, matplotlib or pandas.
+Each function is loaded when it is first used, as some need networkx, scipy, matplotlib or pandas.
 """
 
 from ssh_abduction import lazy_names

@@ -1,6 +1,6 @@
-"""Notebook cards of maps and traces, and their parts: headings, tables and pictures as HTML.
+"""Make notebook cards of maps and traces: HTML with headings, tables and pictures.
 
-All text is escaped, as views and names may hold anything.
+All text is escaped, because views and names may contain any character.
 
 >>> table(("view", "place"), [("<b>", 0)])
 '<table><thead><tr><th>view</th><th>place</th></tr></thead><tbody><tr><td>&lt;b&gt;</td><td>0</td></tr></tbody></table>'
@@ -17,15 +17,15 @@ from ssh_abduction.data.star import star_to_json
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.data.words import counted
 
-# Limits of a card. A longer one makes a notebook slow, and nobody reads it there.
+# Limits of a card. A longer one makes a notebook slow, and nobody reads all of it.
 ROWS = 50  # rows of a table
 LONGEST = 80  # characters of a cell
 STEPS = 10  # steps of a trace
-DRAWN = 150  # dstates of a map that is drawn, as the layout of more takes seconds
+DRAWN = 150  # dstates of a map that is drawn, as the layout of a larger one takes seconds
 
 
 def map_card(ssh_map: SSHMap) -> str:
-    """A map as HTML: its picture, faults, fit and dstates."""
+    """Make a card of a map as HTML: picture, faults, fit of displacements, and table of dstates."""
     from ssh_abduction.output.picture import to_svg  # loads scipy
 
     parts = [
@@ -41,7 +41,7 @@ def map_card(ssh_map: SSHMap) -> str:
     leads: dict[int, list[str]] = {}
     for source, action, target in ssh_map.links:
         leads.setdefault(source, []).append(f"{action} → {target}")
-    # Without places only the columns that every map has.
+    # A map without places has fewer columns.
     topological = bool(ssh_map.places)
     head = ("dstate", "view", *(("place", "path") if topological else ()), "links")
     rows = [
@@ -53,7 +53,7 @@ def map_card(ssh_map: SSHMap) -> str:
 
 
 def trace_card(trace: Trace) -> str:
-    """A trace as HTML: its first steps, with the fields that any of them has."""
+    """Make a card of a trace as HTML: a table of its first steps without empty columns."""
     columns: dict[str, Callable[[Step], object]] = {
         "view": lambda step: "" if step.view is None else step.view,
         "image": _image,
@@ -71,22 +71,27 @@ def trace_card(trace: Trace) -> str:
 
 
 def card(heading: str, *parts: str) -> str:
-    """A heading with parts of HTML below it."""
+    """Make HTML of a heading, with parts below it.
+
+    Args:
+        heading: The heading as plain text.
+        parts: The parts as HTML.
+    """
     return f"<div><p><b>{text(heading)}</b></p>{''.join(parts)}</div>"
 
 
 def paragraph(sentence: str) -> str:
-    """A sentence."""
+    """Make an HTML paragraph of plain text."""
     return f"<p>{text(sentence)}</p>"
 
 
 def table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "rows") -> str:
-    """A table of at most ROWS rows.
+    """Make an HTML table of at most ROWS rows. If rows are left out, say how many below it.
 
     Args:
         head: The names of the columns.
-        rows: The cells of each row.
-        more: What the sentence calls the rows that are left out.
+        rows: The cells of each row. They become plain text.
+        more: The word for rows in the sentence below the table, such as "dstates".
     """
     listed = list(rows)
     names = "".join(f"<th>{text(name)}</th>" for name in head)
@@ -99,17 +104,22 @@ def table(head: Sequence[str], rows: Iterable[Iterable[object]], more: str = "ro
 
 
 def folded(title: str, part: str) -> str:
-    """A part that opens when its title is clicked."""
+    """Make a section that opens when its title is clicked.
+
+    Args:
+        title: The title as plain text.
+        part: The content as HTML.
+    """
     return f"<details><summary>{text(title)}</summary>{part}</details>"
 
 
 def picture(svg: str) -> str:
-    """A picture, no wider than the notebook."""
+    """Limit an SVG picture to the width of the notebook."""
     return svg.replace("<svg ", '<svg style="max-width:100%;height:auto" ', 1)
 
 
 def text(value: str) -> str:
-    """Text that HTML shows as it is."""
+    """Escape plain text for HTML."""
     return escape(printable(value))
 
 
@@ -124,6 +134,6 @@ def _image(step: Step) -> object:
 
 
 def _where(s: DState) -> tuple[object, object]:
-    """The place of a dstate, and its path with the direction."""
+    """The place of a dstate, and its path with the sign of the direction; "" if unknown."""
     course = "" if s.path is None else f"{s.path}{'+' if s.direction == 1 else '-'}"
     return "" if s.place is None else s.place, course

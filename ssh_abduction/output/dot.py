@@ -1,4 +1,4 @@
-"""A map as Graphviz DOT."""
+"""Write a map in DOT, the language of Graphviz."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from ssh_abduction.data.maps import DState, SSHMap, checked_map
 
 
 def to_dot(ssh_map: SSHMap) -> str:
-    """The causal graph as DOT text: a node for each dstate, a cluster for each place.
+    """Write the dstates and links of a map as DOT text.
+
+    Each dstate (distinctive state: a place and a direction) is a node, each link an edge, and each
+    place a cluster of nodes.
 
     Raises:
-        MapError: If `ssh_map` is not a map.
+        MapError: `ssh_map` is not a map.
     """
     checked_map(ssh_map)
     lines = ["digraph map {", "  node [shape=box, style=rounded];"]
@@ -31,6 +34,6 @@ def _node(s: DState) -> str:
 
 
 def _quoted(text: str) -> str:
-    """A DOT string. Characters that would steer a terminal are escaped."""
+    """Quote text as a DOT string, and escape control characters of terminals."""
     lines = (printable(line).replace("\\", "\\\\").replace('"', '\\"') for line in text.split("\n"))
     return '"' + "\\n".join(lines) + '"'

@@ -1,4 +1,7 @@
-"""The parts of pictures of maps as SVG: elements, labels, marks of faults, and the page."""
+"""Make the parts of SVG pictures of maps: elements, labels, marks of faults, and the page.
+
+Units are those of the page, with x to the right and y down. Functions return SVG text.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +23,13 @@ ALARM = "#b00020"  # of faults
 
 
 def element(tag: str, content: str = "", /, **attributes: object) -> str:
-    """An SVG element.
+    """Make an SVG element.
 
     Args:
-        tag: Its tag.
-        content: What is inside of it, as SVG.
-        attributes: Its attributes. An underscore in a name stands for a hyphen, and one at the end
-            of a name for nothing.
+        tag: The name of the element, such as "circle".
+        content: The content of the element, as SVG; empty for none.
+        attributes: The attributes by name. Underscores in names become hyphens. Underscores at the
+            end are removed, so that `class_` is possible.
     """
     written = "".join(
         f' {name.rstrip("_").replace("_", "-")}="{value}"' for name, value in attributes.items()
@@ -35,22 +38,28 @@ def element(tag: str, content: str = "", /, **attributes: object) -> str:
 
 
 def titled(title: str, /, *marks: str, **attributes: object) -> str:
-    """Marks with a title, which browsers show under the pointer."""
+    """Group marks and give them a title, which browsers show under the pointer.
+
+    Args:
+        title: The title as plain text.
+        marks: The marks as SVG.
+        attributes: Attributes of the group, as in `element`.
+    """
     return element("g", f"<title>{escaped(title)}</title>{''.join(marks)}", **attributes)
 
 
 def at(point: Point) -> str:
-    """A point as the data of an SVG path has it."""
+    """Write a point as "x,y", for the data of an SVG path."""
     return f"{point[0]:.1f},{point[1]:.1f}"
 
 
 def line(a: Point, b: Point) -> str:
-    """A line as the data of an SVG path has it."""
+    """Write a straight line as the data of an SVG path."""
     return f"M{at(a)} L{at(b)}"
 
 
 def placed(point: Point, degrees: float) -> str:
-    """The transform that turns a mark clockwise and moves it to a point."""
+    """Write the SVG transform that turns a mark by degrees clockwise and moves it to a point."""
     return f"translate({at(point)}) rotate({degrees:.1f})"
 
 
@@ -63,7 +72,17 @@ def text(
     weight: str = "normal",
     halo: bool = False,
 ) -> str:
-    """A label whose middle is at a point, perhaps with a white halo."""
+    """Make a label that is centred at a point.
+
+    Args:
+        x: The centre.
+        y: The centre.
+        label: The plain text.
+        colour: The colour of the text.
+        size: The font size.
+        weight: The font weight.
+        halo: Whether the text has a white outline, so that it can be read on top of lines.
+    """
     return element(
         "text",
         escaped(label),
@@ -79,7 +98,14 @@ def text(
 
 
 def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
-    """A red diamond with an exclamation mark, for what a map ignores."""
+    """Make a red diamond with an exclamation mark, which shows a fault of a map.
+
+    Args:
+        x: The centre.
+        y: The centre.
+        title: The text that browsers show under the pointer.
+        size: A factor for the size; 1 is 16 units across.
+    """
     u = 8 * size
     diamond = element(
         "path",
@@ -92,7 +118,11 @@ def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
 
 
 def faults_of(ssh_map: SSHMap) -> dict[int, str]:
-    """What a map ignores, by the dstate of the step."""
+    """Describe the faults of a map (observations and actions that it treats as wrong).
+
+    Returns:
+        For each dstate with a fault at one of its steps, the faults in words.
+    """
     faults: dict[int, list[str]] = {}
     for fault in ssh_map.faults:
         faults.setdefault(ssh_map.labels[fault.step], []).append(str(fault))
@@ -100,7 +130,11 @@ def faults_of(ssh_map: SSHMap) -> dict[int, str]:
 
 
 def links_of(ssh_map: SSHMap) -> dict[tuple[int, int], str]:
-    """The names of the actions that lead from one dstate to another."""
+    """Find the actions that lead from one dstate to another one.
+
+    Returns:
+        For each pair (start, end) of different dstates with a link, the names, joined by commas.
+    """
     actions: dict[tuple[int, int], list[str]] = {}
     for source, action, target in ssh_map.links:
         if source != target:
@@ -109,12 +143,18 @@ def links_of(ssh_map: SSHMap) -> dict[tuple[int, int], str]:
 
 
 def escaped(label: str) -> str:
-    """A text as XML can hold it."""
+    """Escape text for XML, and replace characters that XML cannot hold."""
     return escape(xml_text(label))
 
 
 def page(marks: Sequence[str], points: Sequence[Point], margin: float = MARGIN) -> str:
-    """An SVG file of these marks, large enough for the points and a margin around them."""
+    """Make the text of an SVG file.
+
+    Args:
+        marks: The elements to draw, as SVG.
+        points: Points that the page has to include.
+        margin: The width of the margin around these points.
+    """
     xs, ys = [x for x, _ in points] or [0.0], [y for _, y in points] or [0.0]
     left, top = min(xs) - margin, min(ys) - margin
     width, height = max(xs) + margin - left, max(ys) + margin - top

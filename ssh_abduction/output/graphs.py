@@ -1,4 +1,4 @@
-"""A map as a graph of networkx, and as GraphML."""
+"""Convert a map to a graph of networkx, or to GraphML text."""
 
 from __future__ import annotations
 
@@ -22,24 +22,27 @@ def to_networkx(
     level: Literal["causal", "topological", "places"] = "causal",
     turns: Trace | Turns | None = None,
 ) -> nx.Graph[Any]:
-    """A map as a graph of networkx.
+    """Convert a map to a graph of networkx.
 
     Args:
         ssh_map: The map.
-        level: Which graph.
-            "causal" is a MultiDiGraph with a node for each dstate (view, place, path, direction,
-            heading) and an edge for each link (action).
-            "topological" is a bipartite Graph with the nodes ("place", p) and ("path", h), and an
-            edge for each place on a path (index: where in the order of the path).
-            "places" is a MultiGraph with a node for each place (pos: x to the right, y up; dstates)
-            and an edge for each two neighbours on a path, with the path's id as its key (path;
-            order: the index of the first of the two; travelled: whether the robot went from one to
-            the other; metres, if the map has poses). Its `graph["metric"]` says whether positions
-            are metres.
-        turns: How actions turn, as in `to_svg`; for the positions of places without poses.
+        level: The kind of graph.
+            "causal" is a MultiDiGraph. Each dstate (distinctive state: a place and a direction) is
+            a node with the attributes view, place, path, direction and heading. Each link is an
+            edge with the attribute action. Unknown attributes are left out.
+            "topological" is a bipartite Graph with the nodes ("place", p) and ("path", h). Each
+            place on a path gives an edge with the attribute index, its position in the order of
+            the path.
+            "places" is a MultiGraph. Each place is a node with the attributes pos (x to the right,
+            y up) and dstates. Each two neighbours on a path give an edge with the path's id as its
+            key. Its attributes are path; order, the index of the first neighbour; travelled,
+            whether the robot went from one to the other; and metres, if the map has poses. The
+            attribute `graph["metric"]` says whether positions are metres.
+        turns: How actions turn, as in `to_svg`. It decides the positions of "places" if the map
+            has no poses.
 
     Raises:
-        MapError: If an argument is none of these.
+        MapError: An argument is wrong.
     """
     checked_map(ssh_map)
     one_of("level", level, LEVELS, MapError)
@@ -50,10 +53,10 @@ def to_networkx(
 
 
 def to_graphml(ssh_map: SSHMap) -> str:
-    """The causal graph as GraphML text.
+    """Write the dstates and links of a map as GraphML text.
 
     Raises:
-        MapError: If `ssh_map` is not a map.
+        MapError: `ssh_map` is not a map.
     """
     graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
     causal = to_networkx(ssh_map)
@@ -69,7 +72,7 @@ def to_graphml(ssh_map: SSHMap) -> str:
 
 
 def _causal(ssh_map: SSHMap) -> nx.MultiDiGraph[Any]:
-    """Dstates and links. Attributes that are None are left out."""
+    """Make the graph of dstates and links. Attributes that are None are left out."""
     graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
     for s in ssh_map.dstates:
         facts = {
@@ -86,7 +89,7 @@ def _causal(ssh_map: SSHMap) -> nx.MultiDiGraph[Any]:
 
 
 def _topological(ssh_map: SSHMap) -> nx.Graph[Any]:
-    """Places and paths, as a bipartite graph."""
+    """Make the bipartite graph of places and paths."""
     graph: nx.Graph[Any] = nx.Graph()
     graph.add_nodes_from((("place", p) for p in ssh_map.places), bipartite=0)
     graph.add_nodes_from((("path", p.id) for p in ssh_map.paths), bipartite=1)
@@ -97,7 +100,7 @@ def _topological(ssh_map: SSHMap) -> nx.Graph[Any]:
 
 
 def _places(ssh_map: SSHMap, turns: Trace | Turns | None) -> nx.MultiGraph[Any]:
-    """Places and the streets between neighbours on paths."""
+    """Make the graph of places, with an edge for each two neighbours on a path."""
     from ssh_abduction.output.layout import layout, travelled  # loads scipy
 
     found = layout(ssh_map, turns)

@@ -1,8 +1,9 @@
-"""Headings of dstates on a page, from the turns between them.
+"""Find headings for drawing dstates on a page, from the turns between them.
 
-Each course (a path or a part of one, which is drawn straight) gets the heading that agrees best
-with all turns. This is angular synchronisation (Singer 2011, "Angular synchronization by
-eigenvectors and semidefinite programming").
+A dstate (distinctive state) is a place and a direction. A course is a path, or a part of one, that
+is drawn straight. Each course gets the heading that agrees best with all turns. This is angular
+synchronisation (Singer 2011, "Angular synchronization by eigenvectors and semidefinite
+programming").
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from scipy.sparse import coo_array
 from ssh_abduction.data.maps import DState, SSHMap
 from ssh_abduction.output.turns import SURE
 
-# What has a heading: a path, a part of one, or a dstate that is along no path.
+# Key of what has one heading in the drawing: a path, a part of a path, or a dstate along no path.
 Course: TypeAlias = tuple[int, ...]
 
-# Radians: a turn that a drawing misses by more may go to the wrong side. The first is for turns by
-# known degrees, the second for turns with a known side only.
+# Radians. If a drawing is off by more than this, a turn may go to the wrong side. The first is for
+# turns by known degrees, the second for turns of which only the side is known.
 WRONG, WRONG_GUESS = math.radians(46), math.radians(61)
-# Sweeps of averaging, and how often the turns get new weights.
+# Number of averaging sweeps for each set of weights, and number of times that weights are updated.
 SWEEPS, REWEIGHTED = 60, 15
-LEAST_MISSED = 0.02  # radians: turns that are missed by less all get the same weight
-EXACT = 1e-6  # radians by which headings may miss turns that they agree with
+LEAST_MISSED = 0.02  # radians: turns with a smaller error all get the same weight
+EXACT = 1e-6  # radians: a turn with a smaller error agrees with the headings
 
 
 class Turn(NamedTuple):
@@ -36,9 +37,9 @@ class Turn(NamedTuple):
 
     Attributes:
         a: The first dstate.
-        b: The second one.
+        b: The second dstate.
         angle: Radians counterclockwise from the heading of a to that of b.
-        weight: SURE or GUESSED.
+        weight: SURE if the angle is known, GUESSED if only the side is known.
     """
 
     a: DState
@@ -50,12 +51,14 @@ class Turn(NamedTuple):
 def turns_between(
     ssh_map: SSHMap, degrees: Mapping[str, tuple[float, float]], spot: Sequence[int]
 ) -> Iterator[Turn]:
-    """The turns between dstates: by their headings in the frames of places, and by actions.
+    """Yield the known turns between dstates.
+
+    They follow from the headings of dstates at one place, and from the actions of links.
 
     Args:
         ssh_map: The map.
-        degrees: For each action's name the degrees clockwise, and the weight of that.
-        spot: Spot of each dstate. Dstates with one spot are at one place.
+        degrees: For each action's name, the degrees clockwise that it turns, and their weight.
+        spot: For each dstate, a number that is equal for dstates at one place.
     """
     dstates = ssh_map.dstates
     in_slots = max((s.heading or 0 for s in dstates), default=0) < 4
@@ -70,7 +73,7 @@ def turns_between(
     for source, action, target in ssh_map.links:
         s, x = dstates[source], dstates[target]
         if action in degrees:
-            # Headings in the frame of a place say more than an action at this place.
+            # Headings at a place say more than an action at this place.
             if s.heading is None or x.heading is None or s.place != x.place:
                 turn, weight = degrees[action]
                 yield Turn(s, x, -math.radians(turn), weight)
@@ -79,23 +82,27 @@ def turns_between(
 
 
 def in_quarters(turns: Sequence[Turn]) -> bool:
-    """Whether all turns are multiples of a quarter turn."""
+    """Whether all turns are multiples of 90 degrees."""
     return all(abs(math.remainder(turn.angle, math.pi / 2)) < EXACT for turn in turns)
 
 
 def headings_by(
     turns: Sequence[Turn], courses: Mapping[int, tuple[Course, float]], robust: bool
 ) -> tuple[dict[int, float], int]:
-    """The heading of each dstate. The first dstate of each connected part faces right.
+    """Find headings that agree best with all turns.
+
+    In each connected part of the map, the first dstate faces right.
 
     Args:
         turns: The turns between dstates.
-        courses: For each dstate its course, and the radians by which it faces another way.
-        robust: Whether to keep most of the turns that contradict each other as they are, instead
-            of making all of them a little wrong.
+        courses: For each dstate, its course, and the angle in radians from the heading of the
+            course to that of the dstate.
+        robust: Whether to draw most turns exactly and a few of them very wrong if turns contradict
+            each other, instead of drawing all of them a little wrong.
 
     Returns:
-        The headings in radians counterclockwise from x, and how many turns may go to a wrong side.
+        The heading of each dstate, in radians counterclockwise from x, and the number of turns that
+        may go to a wrong side.
     """
     graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
     graph.add_nodes_from(course for course, _ in courses.values())
@@ -122,10 +129,18 @@ def headings_by(
 
 
 def _synchronised(graph: nx.MultiDiGraph[Any], first: Course, robust: bool) -> dict[Course, float]:
-    """The heading of each course of a connected part; that of the first is 0.
+    """Find the headings of the courses of a connected part, relative to the first course.
 
-    With `robust` a missed turn counts by its size and not by its square. This is done by averaging
-    repeatedly, with weights that fall with the last error.
+    With `robust`, the sum of absolute errors is minimised, not the sum of squares. This is done by
+    averaging again and again, with weights that are lower for turns with larger errors.
+
+    Args:
+        graph: The courses, and an edge with angle and weight for each turn between two of them.
+        first: The course with the heading 0.
+        robust: See above.
+
+    Returns:
+        The heading of each course in radians counterclockwise.
     """
     # Begin with headings along a tree of turns.
     angles = {first: 0.0}

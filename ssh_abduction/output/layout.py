@@ -1,11 +1,14 @@
-"""Where to draw a map: by the poses of its dstates or, without poses, by its turns.
+"""Choose positions for drawing a map, by the poses of its dstates or, without poses, by its turns.
 
-A map without poses says nothing of metres, but it says which way turns go. It is drawn with
-straight paths and turns to their side: first each path gets a heading (`headings`), then places are
-put along these headings (`streets`). Turns that fit right angles give a drawing at right angles.
+A dstate (distinctive state) is a place and a direction. A street joins two neighbours on a path.
 
-A map with few paths may join streets to one path that is not straight. If turns would then go to a
-wrong side, or streets would bend, only what was travelled in one go is drawn straight.
+A map without poses has no distances, but it says to which side turns go. It is drawn with straight
+paths: first each path gets a heading (`headings`), then places are put along these headings
+(`streets`). If all turns fit right angles, the drawing is at right angles.
+
+A map with the fewest paths may contain a path that is not straight in the world. If turns would
+therefore go to a wrong side, or streets would bend, only the segments of each path are drawn
+straight: the parts whose places the robot's travels join.
 """
 
 from __future__ import annotations
@@ -26,18 +29,18 @@ from ssh_abduction.output.headings import Course, headings_by, turns_between
 from ssh_abduction.output.streets import LOOSE, Point, StreetProgram, Streets
 from ssh_abduction.output.turns import Turns, degrees_of
 
-FARTHEST = 1e7  # metres: positions farther away are not those of a robot
-GAP = 1.5  # between parts of a map that nothing connects
+FARTHEST = 1e7  # metres: a robot's positions are nearer than this
+GAP = 1.5  # distance in the drawing between parts of a map that nothing connects
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where the places and dstates of a map are drawn, x to the right and y up.
+    """The positions at which a map is drawn, with x to the right and y up.
 
     Attributes:
-        places: (x, y) of each place, by id.
-        dstates: (x, y, heading) of each dstate, by id. The heading is in radians counterclockwise
-            from x; None if it is unknown.
+        places: The position (x, y) of each place, by id.
+        dstates: The position and heading (x, y, heading) of each dstate, by id. The heading is in
+            radians counterclockwise from x; None if it is unknown.
         metric: Whether positions are metres. Otherwise the shortest street has about length 1.
     """
 
@@ -46,10 +49,11 @@ class Layout:
     metric: bool = False
 
     def to_dict(self) -> dict[str, Any]:
-        """The layout as plain data.
+        """The layout as a dict for JSON.
 
         Returns:
-            `places` as pairs [id, [x, y]], `dstates` as [x, y, heading or None], and `metric`.
+            Keys: `places`, a list of [id, [x, y]]; `dstates`, a list of [x, y, heading or None];
+            and `metric`.
         """
         return {
             "metric": self.metric,
@@ -63,14 +67,14 @@ class Layout:
 
 
 def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
-    """Where to draw a map: at its poses, if it has any.
+    """Choose positions for drawing a map: its poses if it has any, else computed ones.
 
     Args:
         ssh_map: The map.
         turns: How actions turn, as in `to_svg`.
 
     Raises:
-        MapError: If a turn is none.
+        MapError: `turns` has a value that is no turn.
     """
     degrees = degrees_of(turns)
     poses = located(ssh_map)
@@ -85,10 +89,10 @@ def layout(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> Layout:
 
 
 def located(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
-    """The poses of the dstates; None if the map cannot be drawn by them.
+    """Return the poses of the dstates if the map can be drawn at them; None otherwise.
 
-    If displacements are missing between parts of the map, each part has poses relative to its own
-    first dstate. Such a map cannot be drawn by its poses.
+    A map cannot be drawn at its poses if displacements between its parts are missing. Each part
+    then has poses relative to its own first dstate.
     """
     poses = ssh_map.fit.poses if ssh_map.fit else ()
     if not poses or any(
@@ -107,7 +111,10 @@ def located(ssh_map: SSHMap) -> tuple[Pose, ...] | None:
 
 
 def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
-    """The pairs of places on a path between which the robot travelled, the lower id first."""
+    """List the pairs of places between which the robot travelled along a path, sorted.
+
+    In each pair, the place with the lower id comes first.
+    """
     ends = [(ssh_map.dstates[s], ssh_map.dstates[x]) for s, _, x in ssh_map.links]
     pairs = {(a.place, b.place) for a, b in ends if a.path == b.path == path.id}
     return sorted(
@@ -116,9 +123,13 @@ def travelled(ssh_map: SSHMap, path: MapPath) -> list[tuple[int, int]]:
 
 
 class _Drawing:
-    """The layout of a map without poses.
+    """Computes the layout of a map without poses.
 
-    A spot is a place or, as a negative number, a dstate without a place.
+    A spot is the id of a place, or a negative number for a dstate without a place.
+
+    Args:
+        ssh_map: The map.
+        degrees: For each action's name, the degrees clockwise that it turns, and their weight.
     """
 
     def __init__(self, ssh_map: SSHMap, degrees: Mapping[str, tuple[float, float]]) -> None:
@@ -127,13 +138,13 @@ class _Drawing:
         self.spots = list(dict.fromkeys([*ssh_map.places, *self.spot]))
         self.turns = list(turns_between(ssh_map, degrees, self.spot))
         ends = [(ssh_map.dstates[s], ssh_map.dstates[x]) for s, _, x in ssh_map.links]
-        # A path with the two spots between which the robot travelled along it.
+        # Each path with two spots between which the robot travelled along it.
         self.travels = {
             (s.path, *sorted((self.spot[s.id], self.spot[x.id])))
             for s, x in ends
             if s.path is not None and s.path == x.path and s.place != x.place
         }
-        # Places of a path are in one segment if the robot travelled between them.
+        # Travels between places of a path join these places to one segment.
         self.segments: Any = nx.utils.UnionFind(
             (path.id, place) for path in ssh_map.paths for place in path.order
         )
@@ -141,9 +152,10 @@ class _Drawing:
             self.segments.union((path, p), (path, q))
 
     def layout(self) -> Layout:
-        """The drawing with the fewest wrong turns and bent streets.
+        """Choose the drawing with the fewest wrong turns and bent streets out of four.
 
-        It draws whole paths straight, or only their segments, each with robust headings or not.
+        It draws straight either whole paths or only their segments, each with robust headings and
+        without.
         """
         if not self.map.places:
             return self._spread()
@@ -165,7 +177,7 @@ class _Drawing:
         )
 
     def _spread(self) -> Layout:
-        """Dstates without places, with neighbours near each other (Kamada & Kawai 1989)."""
+        """Lay out a map without places: linked dstates are near (Kamada & Kawai 1989)."""
         graph: nx.Graph[Any] = nx.Graph()
         graph.add_nodes_from(s.id for s in self.map.dstates)
         graph.add_edges_from((s, x) for s, _, x in self.map.links if s != x)
@@ -178,14 +190,30 @@ class _Drawing:
         return Layout({}, tuple((float(x), float(y), None) for x, y in at / nearest))
 
     def _course(self, s: DState, whole: bool) -> tuple[Course, float]:
-        """The course of a dstate, and the radians by which it faces another way."""
+        """Find what is drawn straight with a dstate, its course.
+
+        Args:
+            s: The dstate.
+            whole: Whether whole paths are straight. Otherwise only their segments are.
+
+        Returns:
+            The course, and the radians from the heading of the course to that of the dstate.
+        """
         if s.path is None:
             return (-1 - s.id,), 0.0
         course = (s.path,) if whole else (s.path, *self.segments[s.path, self.spot[s.id]])
         return course, 0.0 if s.direction == 1 else math.pi
 
     def _streets(self, headings: Mapping[int, float], whole: bool) -> Streets:
-        """The streets between neighbours on paths and, if only segments are straight, travels."""
+        """Find the streets to draw, each with its heading and its share of the costs.
+
+        They join neighbours on paths. If only segments are straight, the robot's travels along
+        paths are streets, too.
+
+        Args:
+            headings: The heading of each dstate, in radians.
+            whole: Whether whole paths are straight.
+        """
         # The heading of direction +1 of each path at each of its spots.
         facing = {
             (s.path, self.spot[s.id]): headings[s.id] + (0.0 if s.direction == 1 else math.pi)
@@ -210,7 +238,7 @@ class _Drawing:
                 way = facing.get((path.id, p), facing.get((path.id, q), 0.0))
                 if is_travelled or (p, q) not in streets:
                     streets[p, q] = way, 1.0 if is_travelled else LOOSE
-        # Of two streets to and fro keep the one with the larger share, or else the first.
+        # Of two streets between the same spots keep the one with the larger share, else the first.
         kept: dict[tuple[int, int], tuple[float, float]] = {}
         for (p, q), street in sorted(streets.items(), key=lambda street: -street[1][1]):
             if (q, p) not in kept:
@@ -218,7 +246,14 @@ class _Drawing:
         return kept
 
     def _packed(self, at: Mapping[int, Point]) -> dict[int, Point]:
-        """The spots, with parts of the map that no street connects side by side."""
+        """Move parts of the map that no street connects side by side.
+
+        Args:
+            at: The position of each spot.
+
+        Returns:
+            The new position of each spot. The first one is at (0, 0).
+        """
         graph: nx.Graph[Any] = nx.Graph()
         graph.add_nodes_from(self.spots)
         graph.add_edges_from(pair for path in self.map.paths for pair in pairwise(path.order))

@@ -1,8 +1,8 @@
-"""A map with poses as an SVG picture, in metres. The first dstate faces right on the page.
+"""Draw a map with poses as an SVG picture, to scale. The first dstate faces right on the page.
 
-Around each place is an ellipse of two standard deviations, relative to the first dstate. Labels for
-which there is no room are left out. The title of a dstate's arrow, which browsers show under the
-pointer, says the same.
+A dstate (distinctive state) is a place and a direction. Around each place, an ellipse of two
+standard deviations shows how uncertain its position relative to the first dstate is. Labels without
+room are left out. Browsers show the same text as a title when the pointer is on a dstate's arrow.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ TURNS = 0.1
 
 
 def metric_svg(ssh_map: SSHMap, poses: Sequence[Pose]) -> str:
-    """A map as SVG text, with each dstate at its pose."""
+    """Draw a map as SVG text, with each dstate at its pose."""
     return _Picture.of(ssh_map, poses).svg()
 
 
@@ -54,13 +54,16 @@ def metric_svg(ssh_map: SSHMap, poses: Sequence[Pose]) -> str:
 class _Picture:
     """The page while it is drawn.
 
+    Points of the page have x to the right and y down. A site is the id of a place, or a negative
+    number for a dstate without a place.
+
     Attributes:
         map: The map.
-        poses: The poses of its dstates.
-        scale: Units of the page in a metre.
-        unit: The size of marks, as a share of their size with enough room.
-        points: What the page has to hold.
-        boxes: What labels keep clear of, as (left, top, right, bottom).
+        poses: The pose of each dstate.
+        scale: Units of the page for each metre.
+        unit: A factor for the size of all marks, at most 1. It is smaller if there is little room.
+        points: Points that the page has to include.
+        boxes: Boxes (left, top, right, bottom) that labels must not overlap.
     """
 
     map: SSHMap
@@ -72,12 +75,12 @@ class _Picture:
 
     @classmethod
     def of(cls, ssh_map: SSHMap, poses: Sequence[Pose]) -> _Picture:
-        """An empty page for a map."""
+        """Make an empty page of the right scale for a map."""
         nearest = NEAREST if ssh_map.places else 1.4 * NEAREST
         return cls(ssh_map, poses, *_scale(_spots(ssh_map, poses), nearest))
 
     def svg(self) -> str:
-        """Draw the map."""
+        """Draw the map, and return the text of an SVG file."""
         sites = _sites(self.map)
         spots = {site: self.on_page(self.poses[members[0].id]) for site, members in sites.items()}
         dot = DOT * self.unit
@@ -90,7 +93,7 @@ class _Picture:
         ]
         arrows = [self.arrow(s) for s in self.map.dstates]
         lines = self.paths(spots) if self.map.places else self.links()
-        # The first place comes last, on top of the others.
+        # Draw the first place last, on top of the others.
         first = _site(self.map.dstates[self.map.labels[0]])
         dots = [
             self.dot(*spots[site], site) for site in sorted(spots, key=lambda site: site == first)
@@ -108,23 +111,29 @@ class _Picture:
         )
 
     def on_page(self, pose: Pose) -> Point:
-        """Where a pose is on the page."""
+        """Convert the position of a pose to a point of the page."""
         return pose.x * self.scale, -pose.y * self.scale
 
     def along(self, s: DState, ahead: float, left: float = 0.0) -> Point:
-        """The point on the page that is ahead of a dstate, and to its left."""
+        """Find a point of the page relative to a dstate.
+
+        Args:
+            s: The dstate.
+            ahead: How far ahead of the dstate the point is, in units of the page times `unit`.
+            left: How far to the left, in the same units.
+        """
         pose, u = self.poses[s.id], self.unit
         x, y = self.on_page(pose)
         cos, sin = math.cos(pose.heading) * u, math.sin(pose.heading) * u
         return x + ahead * cos - left * sin, y - ahead * sin - left * cos
 
     def keep_clear(self, left: float, top: float, right: float, bottom: float) -> None:
-        """Let no label lie on this box."""
+        """Keep labels from overlapping this box."""
         self.boxes.append((left, top, right, bottom))
         self.points += [(left, top), (right, bottom)]
 
     def dot(self, x: float, y: float, site: int) -> str:
-        """The dot of a place, or of a dstate without one. That of the first dstate is white."""
+        """Draw the dot of a site at a point. It is white where the robot was first, else black."""
         is_first = site == _site(self.map.dstates[self.map.labels[0]])
         circle = element(
             "circle",
@@ -138,7 +147,15 @@ class _Picture:
         return titled(f"place {site}" if site >= 0 else f"dstate {-1 - site}", circle)
 
     def ellipse(self, spot: Point, spread: tuple[float, float, float]) -> list[str]:
-        """The ellipse of two standard deviations, unless it is too small or too large to draw."""
+        """Draw an ellipse of two standard deviations around a point of the page.
+
+        Args:
+            spot: The point.
+            spread: The covariance (xx, xy, yy) in square metres.
+
+        Returns:
+            The ellipse; an empty list if it is too small or too large to draw.
+        """
         (major, minor), angle = axes(spread)
         rx, ry = DEVIATIONS * major * self.scale, DEVIATIONS * minor * self.scale
         if rx < 0.5 or rx > WIDEST:
@@ -163,7 +180,7 @@ class _Picture:
         return [mark]
 
     def arrow(self, s: DState) -> str:
-        """The arrow of a dstate in the direction of its heading. The first dstate is black."""
+        """Draw the arrow of a dstate along its heading. That of the first dstate is black."""
         pose, colour = self.poses[s.id], "#000" if s.id == self.map.labels[0] else _colour(s)
         u = self.unit
         (ax, ay), (bx, by) = self.along(s, BEGIN), self.along(s, END)
@@ -186,10 +203,13 @@ class _Picture:
         return titled(f"dstate {s.id}: {s.shown}, {where}", mark)
 
     def paths(self, spots: Mapping[int, Point]) -> list[str]:
-        """Paths: broad where the robot travelled, dotted where only their order of places leads.
+        """Draw paths: broad lines where the robot travelled, dotted ones between other neighbours.
 
-        Dotted lines need not be straight. The order is one of several that fit, as the robot may
-        have travelled past places without noticing them.
+        In the world, a dotted part of a path need not be straight. The order of places may be one
+        of several that fit, as the robot may have passed places without noticing them.
+
+        Args:
+            spots: The point of each place on the page.
         """
         orders, travels = [], []
         u = self.unit
@@ -205,7 +225,7 @@ class _Picture:
         return orders + travels
 
     def curves(self) -> list[tuple[Point, Point, Point, str]]:
-        """For each link of a causal map its start, bend, end and the actions."""
+        """Find the curve (start, bend, end, actions) of each link, for a map without places."""
         curves = []
         for (source, target), names in links_of(self.map).items():
             a, b = self.map.dstates[source], self.map.dstates[target]
@@ -214,7 +234,7 @@ class _Picture:
             start, end = self.along(a, END + 2), self.along(b, END + 2 if turned else -BEGIN)
             bend = math.dist(start, end) * (0.35 if turned else 0.08)
             mx, my = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
-            # Bend a turn away from the robot, and links to and fro away from each other.
+            # Bend a turn away from the dstate, and two opposite links away from each other.
             away = (mx - x, my - y) if turned else (start[1] - end[1], end[0] - start[0])
             far = math.hypot(*away) or 1.0
             middle = (mx + away[0] / far * bend, my + away[1] / far * bend)
@@ -222,7 +242,7 @@ class _Picture:
         return curves
 
     def links(self) -> list[str]:
-        """The links of a causal map as arrows."""
+        """Draw the links of a map without places as arrows."""
         marks = []
         for start, bend, end, _ in self.curves():
             u = self.unit
@@ -238,7 +258,15 @@ class _Picture:
     def label(
         self, label: str, spots: Iterable[Point], colour: str, size: float, weight: str = "normal"
     ) -> list[str]:
-        """A label at the first clear spot, if there is one."""
+        """Draw a label at the first point where it overlaps nothing; empty if there is none.
+
+        Args:
+            label: The text.
+            spots: The points to try, in order.
+            colour: The colour of the text.
+            size: The font size, before it is reduced for lack of room.
+            weight: The font weight.
+        """
         w, h = self.half(label, size)
         for x, y in spots:
             if all(
@@ -250,15 +278,15 @@ class _Picture:
         return []
 
     def size(self, size: float) -> float:
-        """The text size for this size, less if room is short."""
+        """Reduce a font size if there is little room, but not below 9."""
         return max(size * self.unit, 9.0)
 
     def half(self, label: str, size: float) -> tuple[float, float]:
-        """Half the width and half the height of a label."""
+        """Estimate half the width and half the height of a label, in units of the page."""
         return 0.31 * self.size(size) * len(label) + 1, 0.55 * self.size(size)
 
     def place_labels(self, spots: Mapping[int, Point]) -> list[str]:
-        """The numbers of places, around their dots."""
+        """Draw the numbers of places beside their dots, where there is room."""
         marks = []
         for place in self.map.places:
             x, y = spots[place]
@@ -274,7 +302,7 @@ class _Picture:
         return marks
 
     def dstate_labels(self) -> list[str]:
-        """The numbers of dstates, beside or ahead of their arrows. The first dstate comes first."""
+        """Draw the numbers of dstates beside or ahead of their arrows, the first dstate first."""
         marks = []
         u = self.unit
         for s in sorted(self.map.dstates, key=lambda s: s.id != self.map.labels[0]):
@@ -293,7 +321,7 @@ class _Picture:
         return marks
 
     def path_labels(self, spots: Mapping[int, Point]) -> list[str]:
-        """The names of paths, beside their longest streets."""
+        """Draw the names of paths beside their longest travelled streets, where there is room."""
         marks = []
         for path in self.map.paths:
             streets = sorted(
@@ -314,7 +342,7 @@ class _Picture:
         return marks
 
     def link_labels(self) -> list[str]:
-        """The actions of links, at the middle of their curves."""
+        """Draw the actions of links at the middle of their curves, where there is room."""
         return [
             mark
             for (ax, ay), (mx, my), (bx, by), names in self.curves()
@@ -324,7 +352,10 @@ class _Picture:
         ]
 
     def scale_bar(self) -> list[str]:
-        """A bar of 1, 2 or 5 metres, or tens or tenths of them, below the map on the left."""
+        """Draw a scale bar below the map on the left.
+
+        Its length in metres is 1, 2 or 5 times a power of ten.
+        """
         left, below = min(x for x, _ in self.points), max(y for _, y in self.points) + 24
         metres = _round_length(120 / self.scale)
         right = left + metres * self.scale
@@ -337,14 +368,14 @@ class _Picture:
 
 
 def axes(spread: tuple[float, float, float]) -> tuple[tuple[float, float], float]:
-    """The axes of a covariance.
+    """Find the principal axes of a covariance.
 
     Args:
         spread: The covariance (xx, xy, yy).
 
     Returns:
-        The standard deviations along both axes, the larger first, and the angle of the first in
-        radians counterclockwise from x.
+        The standard deviations along both axes, the larger one first, and the angle of the first
+        axis in radians counterclockwise from x.
     """
     xx, xy, yy = spread
     mean, half = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
@@ -357,7 +388,7 @@ def _line(a: Point, b: Point, colour: str, width: float, **style: object) -> str
 
 
 def _site(s: DState) -> int:
-    """What is drawn as one dot: a place or, as a negative number, a dstate without one."""
+    """The number of the dot for a dstate: its place, or a negative number if it has no place."""
     return s.place if s.place is not None else -1 - s.id
 
 
@@ -375,7 +406,10 @@ def _colour(s: DState) -> str:
 
 
 def _spots(ssh_map: SSHMap, poses: Sequence[Pose]) -> list[Point]:
-    """Where the places are, in metres. Dstates without places count as one if they are near."""
+    """Find the positions of places, in metres.
+
+    If the map has no places, find those of dstates. Of several near each other, take the first.
+    """
     spots = [
         (poses[members[0].id].x, poses[members[0].id].y) for members in _sites(ssh_map).values()
     ]
@@ -390,14 +424,14 @@ def _spots(ssh_map: SSHMap, poses: Sequence[Pose]) -> list[Point]:
 
 
 def _scale(spots: Sequence[Point], nearest: float) -> tuple[float, float]:
-    """Choose the scale so that spots are apart and the page is not too large.
+    """Choose a scale at which places are far enough apart and the page is not too large.
 
     Args:
         spots: Positions of places, in metres.
-        nearest: The distance of the two nearest places, in units of the page.
+        nearest: The distance that the two nearest places should have, in units of the page.
 
     Returns:
-        Units of the page in a metre, and the size of marks.
+        Units of the page for each metre, and a factor for the size of marks, at most 1.
     """
     extent = max((max(numbers) - min(numbers) for numbers in zip(*spots, strict=True)), default=0.0)
     if extent < 1e-3:  # one place, or all in one spot
@@ -412,6 +446,6 @@ def _scale(spots: Sequence[Point], nearest: float) -> tuple[float, float]:
 
 
 def _round_length(metres: float) -> float:
-    """The largest of …, 0.1, 0.2, 0.5, 1, 2, 5, 10, … that is no longer."""
+    """Round down to a number of the series …, 0.1, 0.2, 0.5, 1, 2, 5, 10, …"""
     ten = 10.0 ** math.floor(math.log10(metres))
     return max(ten * k for k in (1, 2, 5) if ten * k <= metres * (1 + 1e-9))

@@ -1,7 +1,7 @@
-"""A map as an SVG picture: paths through places, and at each place marks for its dstates.
+"""Draw a map as an SVG picture: paths through places, and marks for the dstates at each place.
 
-A map with poses is drawn in metres (`metric_picture`). Another one is drawn with straight paths and
-turns to their side (`layout`).
+A dstate (distinctive state) is a place and a direction. A map with poses is drawn to scale
+(`metric_picture`). A map without poses is drawn with straight paths (`layout`).
 """
 
 from __future__ import annotations
@@ -39,15 +39,16 @@ LONGEST_LABEL = 20
 
 
 def to_svg(ssh_map: SSHMap, turns: Trace | Turns | None = None) -> str:
-    """A map as SVG text: in metres if it has poses, else with straight paths.
+    """Draw a map as SVG text: to scale if it has poses, else with straight paths.
 
     Args:
         ssh_map: The map.
-        turns: How actions turn: the trace that was mapped, or for each action's name "right",
-            "left", "around" or degrees clockwise. Actions of these three names need none.
+        turns: How actions turn, for a map without poses: the trace that was mapped; or a dict that
+            gives for names of actions "right", "left", "around" or degrees clockwise. Actions that
+            are themselves named right, left or around need no entry.
 
     Raises:
-        MapError: If an argument is none of these.
+        MapError: An argument is wrong.
     """
     checked_map(ssh_map)
     degrees_of(turns)
@@ -62,7 +63,7 @@ def _on_page(x: float, y: float) -> Point:
 
 
 def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
-    """The marks and points of a map with places."""
+    """Draw a map with places. Return the marks, and the points that the page has to include."""
     spots = {place: _on_page(*spot) for place, spot in found.places.items()}
     lines: list[str] = []
     marks: list[str] = []
@@ -77,7 +78,7 @@ def _topological(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]
 
 
 def _circle(x: float, y: float, colour: str) -> str:
-    """The circle of a place or dstate."""
+    """Draw the circle of a place or dstate."""
     return element(
         "circle",
         cx=f"{x:.1f}",
@@ -90,7 +91,7 @@ def _circle(x: float, y: float, colour: str) -> str:
 
 
 def _path(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[str]:
-    """A path: broad where the robot travelled, dotted where only its order of places leads."""
+    """Draw a path: broad lines where the robot travelled, dotted ones between other neighbours."""
     colour, streets = COLOURS[path.id % len(COLOURS)], travelled(ssh_map, path)
     dotted = {"stroke_width": 2, "stroke_dasharray": "2 6", "opacity": 0.7}
     broad = {"stroke_width": 9, "stroke_linecap": "round", "opacity": 0.55}
@@ -103,7 +104,7 @@ def _path(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[str]:
 
 
 def _path_name(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[str]:
-    """The name of a path beside its first street, and an arrow on this street in direction +1."""
+    """Draw the name of a path beside its first street, and there an arrow in direction +1."""
     if len(path.order) < 2:
         return []
     index = {place: i for i, place in enumerate(path.order)}
@@ -123,9 +124,9 @@ def _path_name(ssh_map: SSHMap, path: MapPath, spots: dict[int, Point]) -> list[
 
 
 def _dstates(ssh_map: SSHMap, place: int, spot: Point, found: Layout) -> list[str]:
-    """The dstates at a place, each on the side that it faces.
+    """Draw the dstates at a place, each on the side of the place that it faces.
 
-    A dstate whose heading is unknown is drawn where there is most room.
+    A dstate with an unknown heading is drawn where there is most room.
     """
     x, y = spot
     taken: list[float] = []
@@ -138,7 +139,7 @@ def _dstates(ssh_map: SSHMap, place: int, spot: Point, found: Layout) -> list[st
         bearing = _freest(taken) if heading is None else -heading
         taken.append(bearing)
         dx, dy = math.cos(bearing), math.sin(bearing)
-        # To the right of the line of the path.
+        # Draw the arrow to the right of the line of the path.
         aside = (0.0, 0.0) if s.path is None else (-dy * LANE, dx * LANE)
         colour = "#555" if s.path is None else COLOURS[s.path % len(COLOURS)]
         tip = x + dx * (RADIUS + 6) + aside[0], y + dy * (RADIUS + 6) + aside[1]
@@ -153,7 +154,7 @@ def _dstates(ssh_map: SSHMap, place: int, spot: Point, found: Layout) -> list[st
 
 
 def _freest(taken: list[float]) -> float:
-    """Of 16 bearings the one that is farthest from those taken."""
+    """Choose the one of 16 bearings that is farthest from those taken, in radians."""
     bearings = [k * math.pi / 8 for k in range(16)]
     return max(
         bearings,
@@ -162,7 +163,11 @@ def _freest(taken: list[float]) -> float:
 
 
 def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
-    """The marks and points of a map without places: dstates and the links between them."""
+    """Draw a map without places: its dstates, and links as arrows.
+
+    Returns:
+        The marks, and the points that the page has to include.
+    """
     spots = [_on_page(x, y) for x, y, _ in found.dstates]
     faults = faults_of(ssh_map)
     marks = []
@@ -170,7 +175,7 @@ def _causal(ssh_map: SSHMap, found: Layout) -> tuple[list[str], list[Point]]:
         (ax, ay), (bx, by) = spots[source], spots[target]
         far = math.hypot(bx - ax, by - ay) or 1.0
         ux, uy = (bx - ax) / far, (by - ay) / far
-        # A curve to the left of the straight line, so that links to and fro are apart.
+        # Bend the curve to the left of the straight line, so that opposite links do not overlap.
         mx, my = (ax + bx) / 2 - uy * 24, (ay + by) / 2 + ux * 24
         end = bx - ux * (RADIUS + 4), by - uy * (RADIUS + 4)
         curve = f"M{at((ax, ay))} Q{at((mx, my))} {at(end)}"

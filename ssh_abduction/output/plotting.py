@@ -1,4 +1,4 @@
-"""A map drawn with matplotlib, as `picture` draws it, into axes that may hold more."""
+"""Draw a map with matplotlib, into new axes or into axes with other content."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ APART, AHEAD, LANE = 0.9, 0.27, 0.07
 
 
 def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) -> Any:
-    """Draw a map with matplotlib, x to the right and y up; in metres if it has poses.
+    """Draw a map with matplotlib, with x to the right and y up; in metres if it has poses.
 
     Args:
         ssh_map: The map.
-        ax: The axes to draw into; None for new ones. `ax.figure` shows and saves them.
+        ax: The matplotlib axes to draw into; None for new ones.
         turns: How actions turn, as in `to_svg`.
 
     Returns:
-        The axes.
+        The axes. Their attribute `figure` can be shown or saved.
 
     Raises:
-        MapError: If an argument is none of these, or matplotlib is not installed.
+        MapError: An argument is wrong, or matplotlib is not installed.
     """
     checked_map(ssh_map)
     if ax is not None and not hasattr(ax, "annotate"):
@@ -64,7 +64,7 @@ def plot(ssh_map: SSHMap, ax: Any = None, turns: Trace | Turns | None = None) ->
 
 
 def _draw_paths(axes: Any, ssh_map: SSHMap, found: Layout) -> None:
-    """Paths: broad where the robot travelled, dotted where only their order of places leads."""
+    """Draw paths: broad lines where the robot travelled, dotted ones between other neighbours."""
     for path in ssh_map.paths:
         colour, streets = COLOURS[path.id % len(COLOURS)], travelled(ssh_map, path)
         dotted = {"linewidth": 1, "linestyle": ":", "alpha": 0.7}
@@ -79,7 +79,7 @@ def _draw_paths(axes: Any, ssh_map: SSHMap, found: Layout) -> None:
 
 
 def _draw_links(axes: Any, ssh_map: SSHMap, found: Layout) -> None:
-    """The links of a map without places."""
+    """Draw the links of a map without places as arrows."""
     style = {"arrowstyle": "-|>", "color": "#888", "shrinkA": 9, "shrinkB": 9}
     for source, _, target in ssh_map.links:
         start, end = found.dstates[source][:2], found.dstates[target][:2]
@@ -89,7 +89,17 @@ def _draw_links(axes: Any, ssh_map: SSHMap, found: Layout) -> None:
 def _draw_dstate(
     axes: Any, s: DState, pose: tuple[float, float, float | None], unit: float
 ) -> tuple[float, float]:
-    """A dstate: a triangle ahead of its place, or its number in a circle. Return where it is."""
+    """Draw a dstate as a triangle ahead of its place, or as its number in a circle.
+
+    Args:
+        axes: The matplotlib axes.
+        s: The dstate.
+        pose: Its position, and its heading in radians (None if it is unknown).
+        unit: The distance of the nearest spots.
+
+    Returns:
+        The position of the mark.
+    """
     x, y, heading = pose
     middle = {"ha": "center", "va": "center"}
     if s.place is None or heading is None:
@@ -106,7 +116,7 @@ def _draw_dstate(
 
 
 def _nearest(spots: list[tuple[float, float]]) -> float:
-    """The distance of the two nearest different spots; 1 if there are no two."""
+    """Compute the distance of the two nearest different spots; 1 if there are no two."""
     return min(
         (far for i, p in enumerate(spots) for q in spots[:i] if (far := math.dist(p, q)) > 1e-6),
         default=1.0,
@@ -114,7 +124,12 @@ def _nearest(spots: list[tuple[float, float]]) -> float:
 
 
 def _new_axes(spots: list[tuple[float, float]], unit: float) -> Any:
-    """Axes large enough for spots if the nearest are a unit apart."""
+    """Make matplotlib axes that are large enough for spots.
+
+    Args:
+        spots: The positions.
+        unit: The distance of the nearest ones.
+    """
     try:
         from matplotlib import pyplot
     except ImportError:

@@ -1,8 +1,9 @@
-"""Positions of spots along streets of given headings, by a linear program.
+"""Find positions of spots by a linear program, given the headings of the streets between them.
 
-A street is at least one unit long. It is expensive for it to leave its heading, and streets are as
-short as that allows. If two streets lie on each other or cross, the program is solved again with
-one street on some side of the other, if that costs less than the crossing.
+A spot is a place, or a dstate (a place and a direction) whose place is unknown. A street should be
+at least one unit long, and otherwise short. A street that leaves its heading costs much. If two
+streets overlap or cross, the program is solved again with one street on a side of the other. This
+drawing is taken if it costs less than the crossing.
 """
 
 from __future__ import annotations
@@ -18,21 +19,21 @@ from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
 Point: TypeAlias = tuple[float, float]
-# For the street from one spot to another: its heading in radians, and its share of the costs.
+# For each street from one spot to another: its heading in radians, and a factor for its costs.
 Streets: TypeAlias = Mapping[tuple[int, int], tuple[float, float]]
-# A sum of variables with these factors, and its least value.
+# A linear inequality: the factor of each variable, and the least value of the weighted sum.
 _Condition: TypeAlias = tuple[dict[int, float], float]
 _Points: TypeAlias = NDArray[np.float64]
 
-# Costs in units of length of a street: for each unit that a street leaves its heading, for each
-# unit that it is too short, and for two streets that lie on each other or cross.
+# Costs; a unit of a street's length costs 1. ASTRAY is for each unit that a street leaves its
+# heading, SHORT for each unit that it is too short, CROSSING for two streets that overlap or cross.
 ASTRAY, SHORT, CROSSING = 300.0, 600.0, 60.0
-LOOSE = 0.001  # the share of the costs of a street that nobody travelled
-CROOKED = 0.1  # a street that leaves its heading by more looks bent
-NEAR, APART = 0.5, 1.0  # streets nearer than the first are put as far apart as the second
-PARALLEL = 0.1  # radians by which the headings of parallel streets may differ
-# The program is solved WORK / streets times at most, but FEWEST times at least. Counts and not
-# seconds limit it, so that a map has one drawing.
+LOOSE = 0.001  # the factor for the costs of a street that the robot never travelled
+CROOKED = 0.1  # a street that leaves its heading by more units than this looks bent
+NEAR, APART = 0.5, 1.0  # streets nearer than NEAR are moved to a distance of APART
+PARALLEL = 0.1  # the largest sine of the angle between streets that count as parallel
+# The program is solved at most WORK / streets times, or FEWEST times if that is more. The limit is
+# a count and not a time, so that a map always has the same drawing.
 WORK, FEWEST = 6000, 12
 BEAM = 3
 
@@ -42,10 +43,10 @@ class _State:
     """A drawing in the search that separates streets.
 
     Attributes:
-        value: What it costs.
-        at: Positions of spots, (spots, 2).
-        conditions: What was added to the program.
-        left_alone: Pairs of streets that stay as they are.
+        value: The cost of the drawing.
+        at: The positions of the spots, (spots, 2).
+        conditions: The inequalities that were added to the program.
+        left_alone: The pairs of streets that may stay near or cross.
     """
 
     value: float
@@ -57,12 +58,12 @@ class _State:
 class StreetProgram:
     """The linear program that puts spots along the headings of streets and separates streets.
 
-    Its variables are x and y of each spot, then for each street how far it leaves its heading, and
-    then how much it is too short.
+    Its variables are x and y of each spot, then for each street the distance by which it leaves its
+    heading, then for each street the length by which it is too short.
 
     Args:
         spots: The ids of the spots.
-        streets: The streets between them.
+        streets: The heading and the cost factor of each street between two spots.
     """
 
     def __init__(self, spots: Sequence[int], streets: Streets) -> None:
@@ -73,7 +74,7 @@ class StreetProgram:
         self.along = np.round(np.array(ways).reshape(-1, 2), 12)
         self.across = self.along[:, ::-1] * (-1, 1)
         self.share = np.array([share for _, share in streets.values()])
-        # The pairs of travelled streets without a common end: these are kept apart.
+        # Keep pairs of travelled streets apart if they have no common end.
         e, f = np.triu_indices(len(streets), 1)
         common = (self.ends[e][:, :, None] == self.ends[f][:, None, :]).any(axis=(1, 2))
         both = (self.share[e] == 1.0) & (self.share[f] == 1.0)
@@ -84,7 +85,7 @@ class StreetProgram:
 
     @property
     def bent(self) -> int:
-        """The number of travelled streets off their headings, or too short."""
+        """The number of travelled streets that leave their headings or are too short."""
         way = self.at[self.ends[:, 1]] - self.at[self.ends[:, 0]]
         astray = np.maximum(
             np.abs(np.sum(way * self.across, axis=1)), 1 - np.sum(way * self.along, axis=1)
@@ -92,10 +93,10 @@ class StreetProgram:
         return int(np.sum((astray > CROOKED) & (self.share == 1.0)))
 
     def put_apart(self) -> dict[int, Point]:
-        """Where each spot is, with streets apart.
+        """Separate streets that are too near each other, and return the position of each spot.
 
-        A search with a narrow beam: each pair of streets that are too near each other is left
-        alone, or put apart to either side.
+        This is a beam search. For each pair of streets that are too near, it tries to leave the
+        pair alone, and to move one street to either side of the other.
         """
         best = _State(self.value, self.at, (), frozenset())
         beam, left = [best], max(FEWEST, WORK // (len(self.ends) + 1))
@@ -119,7 +120,7 @@ class StreetProgram:
         }
 
     def _cost(self) -> NDArray[np.float64]:
-        """The cost of each variable. It also adds the conditions of all streets to `rows`."""
+        """Compute the cost of each variable, and add the inequalities of all streets to `rows`."""
         n, m = len(self.spots), len(self.ends)
         cost = np.concatenate([np.zeros(2 * n), ASTRAY * self.share, SHORT * self.share])
         for e, (p, q) in enumerate(self.ends):
@@ -132,7 +133,12 @@ class StreetProgram:
         return cost
 
     def _solved(self, more: Sequence[_Condition]) -> tuple[_Points, float]:
-        """The best positions with more conditions, and their cost with that of all crossings."""
+        """Solve the program with more inequalities.
+
+        Returns:
+            The positions of the spots, (spots, 2), and their cost, crossings included. The cost is
+            infinite if the inequalities contradict each other.
+        """
         n = len(self.spots)
         if not len(self.ends):
             return np.zeros((n, 2)), 0.0
@@ -157,9 +163,13 @@ class StreetProgram:
         return at, float(answer.fun) + CROSSING * len(self._near(at))
 
     def _ways_apart(self, e: int, f: int) -> Iterator[list[_Condition]]:
-        """Conditions under which two streets are apart.
+        """Yield the ways to separate two streets, each as a list of inequalities.
 
-        One is on a side of the other or, if both are parallel, ahead of it or behind it.
+        One street is on a side of the other or, if both are parallel, ahead of it or behind it.
+
+        Args:
+            e: The index of one street.
+            f: The index of the other.
         """
         parallel = abs(float(self.across[e] @ self.along[f])) < PARALLEL
         for normal in (self.across[e], self.along[e] if parallel else self.across[f]):
@@ -171,7 +181,7 @@ class StreetProgram:
                 ]
 
     def _near(self, at: _Points) -> list[tuple[int, int]]:
-        """Pairs of streets without a common end that are too near each other."""
+        """List the pairs of streets that cross or are too near, but have no common end."""
         e, f = self.ends[self.pairs[:, 0]], self.ends[self.pairs[:, 1]]
         a, b, c, d = at[e[:, 0]], at[e[:, 1]], at[f[:, 0]], at[f[:, 1]]
         far = np.min(
@@ -182,20 +192,26 @@ class StreetProgram:
 
 
 def _difference(p: int, q: int, way: NDArray[np.float64]) -> dict[int, float]:
-    """How far spot q is ahead of spot p along a way, as factors of variables."""
+    """Express the distance from spot p to spot q along a direction, as factors of variables."""
     x, y = float(way[0]), float(way[1])
     return {2 * int(q): x, 2 * int(q) + 1: y, 2 * int(p): -x, 2 * int(p) + 1: -y}
 
 
 def _side(a: _Points, b: _Points, c: _Points) -> NDArray[np.float64]:
-    """The side of the line from a to b that c is on: above 0 to the left."""
+    """For each line from a to b, find the side of point c: positive on the left.
+
+    All arguments have the shape (n, 2), the result (n,).
+    """
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
     side: NDArray[np.float64] = ux * vy - uy * vx
     return side
 
 
 def _distance(p: _Points, a: _Points, b: _Points) -> NDArray[np.float64]:
-    """The distance of points from the streets from a to b."""
+    """Compute the distance of each point p from the line segment between a and b.
+
+    All arguments have the shape (n, 2), the result (n,).
+    """
     way = b - a
     length = np.maximum(np.sum(way * way, axis=1), 1e-12)
     share = np.clip(np.sum((p - a) * way, axis=1) / length, 0, 1)

@@ -1,4 +1,4 @@
-"""A map as a table of pandas, if that is installed."""
+"""Convert a map to a pandas table."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ if TYPE_CHECKING:
 
 
 def to_pandas(ssh_map: SSHMap) -> pd.DataFrame:
-    """A table with a row for each step of the mapped trace.
+    """Make a table with a row for each step of the trace that was mapped.
 
     Returns:
-        The columns dstate, view, place, path, direction and heading; of a map with poses also x, y
-        (metres) and pose_heading (radians). The index is called step.
+        A table with the columns dstate, view, place, path, direction and heading. If the map has
+        poses, also x and y (metres) and pose_heading (radians). The index is named step.
 
     Raises:
-        MapError: If `ssh_map` is not a map, or pandas is not installed.
+        MapError: `ssh_map` is not a map, or pandas is not installed.
     """
     checked_map(ssh_map)
     try:

@@ -1,4 +1,4 @@
-"""How far actions turn, as far as a trace or a caller says so."""
+"""Find how far each action turns, from the trace or from what the caller says."""
 
 from __future__ import annotations
 
@@ -11,24 +11,26 @@ from ssh_abduction.data.trace import Trace
 
 Turns: TypeAlias = Mapping[str, "str | float"]
 
-# Degrees clockwise of turns with a known side only.
+# Degrees clockwise that are assumed for turns of which only the side is known.
 SIDES = {"right": 90.0, "around": 180.0, "left": 270.0}
-# The weights of a turn with known degrees, and of one with a known side only.
+# The weights of a turn with known degrees, and of a turn of which only the side is known.
 SURE, GUESSED = 1.0, 0.2
 
 
 def degrees_of(turns: Trace | Turns | None) -> dict[str, tuple[float, float]]:
-    """By how many degrees each action turns.
+    """Find by how many degrees each action turns.
 
     Args:
-        turns: The trace that was mapped, or for each action's name "right", "left", "around" or
-            degrees clockwise. Actions of these three names need none.
+        turns: The trace that was mapped; or a dict that gives for names of actions "right", "left",
+            "around" or degrees clockwise. Actions that are themselves named right, left or around
+            need no entry.
 
     Returns:
-        For each action's name the degrees clockwise, and the weight of that: SURE or GUESSED.
+        For each action's name, the degrees clockwise, and their weight: SURE if the degrees are
+        known, GUESSED if only the side is known.
 
     Raises:
-        MapError: If a turn is none of these.
+        MapError: A value of `turns` is none of these.
     """
     known: dict[str, str | float] = {name: name for name in SIDES}
     if isinstance(turns, Trace):

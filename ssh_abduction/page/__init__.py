@@ -1,4 +1,4 @@
-"""A page in the browser that shows the maps of a trace, and its server."""
+"""Show the maps of a trace on a page in the browser, with a server that answers its questions."""
 
 from ssh_abduction import lazy_names
 

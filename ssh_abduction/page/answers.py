@@ -1,4 +1,4 @@
-"""The answers of a served page, each found in a process of its own.
+"""Find the answers to questions of a served page. Each answer is found in its own process.
 
 This module imports nothing that draws, so that the process starts sooner.
 """
@@ -15,10 +15,27 @@ from ssh_abduction.theory.theory import Theory
 def explained(
     trace: Trace, first: int, second: int, theory: Theory, limit: float | None, watch: Watch
 ) -> PairExplanation:
-    """Why two steps are one dstate or not. The server ends the process, so `watch` is not used."""
+    """Explain why two steps are one dstate (a place and a direction), or why they are not.
+
+    Args:
+        trace: The trace.
+        first: One step.
+        second: The other step.
+        theory: The theory.
+        limit: Seconds for the answer; None for no limit.
+        watch: Not used, as the server ends the process. Functions that run in a process take it.
+    """
     return explain_pair(trace, first, second, theory, time_limit=limit)
 
 
 def solved(trace: Trace, theory: Theory, maps: int, limit: float | None, watch: Watch) -> Solution:
-    """The minimal maps under a theory with assumptions. `watch` is not used here either."""
+    """Find the minimal maps by a theory with assumptions.
+
+    Args:
+        trace: The trace.
+        theory: The theory, with the pairs of steps that the user assumes to be one dstate or not.
+        maps: List at most this many maps; None lists all.
+        limit: Seconds for the answer; None for no limit.
+        watch: Not used, as in `explained`.
+    """
     return solve(trace, theory, max_maps=maps, time_limit=limit)

@@ -1,4 +1,7 @@
-"""The cost of assuming that two steps are one dstate, or different ones, before the user asks.
+"""Compute in advance what it costs to assume that two steps are one dstate, or different ones.
+
+A dstate (distinctive state) is a place and a direction. The page then shows these costs without a
+server.
 
 >>> from ssh_abduction import Trace, solve
 >>> views = ["end", "hall", "end", "end", "hall", "end", "end"]
@@ -29,16 +32,17 @@ Pair = tuple[int, int]
 def assumptions(
     listing: Listing, trace: Trace, theory: Theory, seconds: float
 ) -> dict[Pair, dict[str, str]]:
-    """The costs for pairs of steps on which all minimal maps agree, as far as there is time.
+    """Find the costs of assumptions for pairs of steps on which all minimal maps agree.
 
     Args:
         listing: The minimal maps.
         trace: Their trace.
         theory: Their theory.
-        seconds: The time limit. Pairs for which there was no time are missing.
+        seconds: The time limit. Pairs for which time runs out are missing in the result.
 
     Returns:
-        For each pair what "same" and "different" cost, in words, as `PairExplanation.assuming`.
+        For each pair, a dict that says in words what "same" and "different" cost, as
+        `PairExplanation.assuming` does.
     """
     end = time.monotonic() + seconds
     problem = settle(trace, theory)
@@ -60,7 +64,7 @@ def assumptions(
         )
         known[pair] = told.assuming
 
-    # First find out which pairs can be otherwise at all. One grounding serves all of them.
+    # First find the pairs for which the opposite is possible at all. All share one grounding.
     piece = Piece.of(problem, range(len(trace) if len(trace) <= UNCUT else SMALL))
     try:
         axioms = Axioms(piece, lambda: time.monotonic() > end)
@@ -71,7 +75,7 @@ def assumptions(
                 tell(pair, one, Side(possible=False))
     except Interrupted:
         return known
-    # Then find the cost of the best such map, pair by pair.
+    # Then find, pair by pair, the cost of the best map that has the opposite.
     for pair, one in left:
         if (rest := end - time.monotonic()) <= 0:
             break
@@ -90,7 +94,12 @@ def assumptions(
 
 
 def _agreed(labels: list[tuple[int, ...]], steps: int) -> Iterator[tuple[Pair, bool]]:
-    """The pairs of the first steps on which all maps agree, and whether these are one dstate."""
+    """Yield the pairs of steps on which all maps agree, and whether both are one dstate.
+
+    Args:
+        labels: For each map, the dstate of each step.
+        steps: The number of first steps to consider.
+    """
     for later in range(steps):
         for earlier in range(later):
             said = {of_map[earlier] == of_map[later] for of_map in labels}

@@ -1,8 +1,9 @@
-"""The content of the page as plain data: maps, what they share, drawings, steps of the trace.
+"""Make the content of the page as plain data: maps, what they share, drawings, steps of the trace.
 
-Maps of one trace share most of what they say. Each labeling, set of places and order of paths is
-therefore listed once, and maps refer to it by number. A place or dstate of a map without a drawing
-of its own is put where its steps are in the first map, so that the reader sees what stays.
+A labeling gives each step its dstate (distinctive state: a place and a direction). Maps of one
+trace have much in common. Therefore each labeling, set of places and order of paths is listed once,
+and maps refer to it by number. Only some maps have their own drawing. In all others, a place or
+dstate is drawn where its steps are in the first map, so that the reader sees what stays the same.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from ssh_abduction.page.replays import Run, replays
 from ssh_abduction.rivals.comparison import compare
 from ssh_abduction.rivals.listing import Listing, Maps
 
-DRAWING = 3.0  # seconds of the processor for drawings of all maps but the first
-DRAWN = 10_000  # dstates of all drawings together: more of them would make the page large
-CUT = 0.5  # the half axis of an ellipse that is drawn, as a share of the extent of the map
+DRAWING = 3.0  # processor seconds for the drawings of all maps except the first
+DRAWN = 10_000  # dstates of all drawings together; more would make the page too large
+CUT = 0.5  # the largest standard deviation of an ellipse, as a share of the extent of the map
 
 
 @dataclass(frozen=True, slots=True)
 class Called:
-    """What commands on the page call its files.
+    """File names and flags for the commands that the page shows.
 
     Attributes:
-        maps: The file of maps.
-        trace: The file of the trace.
-        flags: The flags of the theory.
+        maps: The name of the file of maps.
+        trace: The name of the file of the trace.
+        flags: The flags that choose the theory.
     """
 
     maps: str = "maps.json"
@@ -47,17 +48,17 @@ class Called:
 def content_of(
     source: Maps, trace: Trace | None = None, run: Run | None = None, called: Called | None = None
 ) -> dict[str, Any]:
-    """The content of the page.
+    """Make the content of the page as a dict for JSON.
 
     Args:
         source: A solution, or maps of one trace.
-        trace: The trace that was mapped, for its actions and images.
-        run: A run of a robot that is localised in the maps.
-        called: What commands on the page call its files.
+        trace: The trace that was mapped, for its actions and images; None if it is unknown.
+        run: A run of a robot that was localised in the maps, to be replayed; None for none.
+        called: File names and flags for the commands that the page shows; None for placeholders.
 
     Raises:
-        MapError: If the maps are of several traces, or of another one than this.
-        TraceError: If the header of the trace is wrong of the images.
+        MapError: The maps are of several traces, or not of `trace`.
+        TraceError: The header of the trace describes its images wrongly.
     """
     listing = Listing.of(source)
     called = called or Called()
@@ -111,7 +112,11 @@ def content_of(
 
 
 def _shared(listing: Listing) -> dict[str, Any] | None:
-    """What is proven of the dstates of all minimal maps, if some maps are not listed."""
+    """The pairs of steps that are proven to be one dstate in all, or in some, minimal maps.
+
+    None if all minimal maps are listed, as the page then finds these pairs itself; and None if
+    nothing is proven, or if there are too many pairs.
+    """
     if listing.complete or listing.backbone is None or not listing.backbone.proven:
         return None
     dstates = listing.backbone.dstates
@@ -119,7 +124,7 @@ def _shared(listing: Listing) -> dict[str, Any] | None:
 
 
 class _Pool:
-    """Distinct values, numbered in the order in which they came."""
+    """A list of distinct values, each with a number in the order of their first use."""
 
     def __init__(self) -> None:
         self._numbers: dict[Hashable, int] = {}
@@ -133,7 +138,11 @@ class _Pool:
 
 
 def _choice(data: dict[str, Any]) -> dict[str, Any]:
-    """A choice: the sentences of its questions, and the answers and maps of each option."""
+    """Reduce the dict of a choice to the sentences of its questions and to its options.
+
+    A choice is a set of questions that maps answer differently. An option is one way to answer
+    them.
+    """
     return {
         "questions": [question["sentence"] for question in data["questions"]],
         "options": [
@@ -143,11 +152,12 @@ def _choice(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
-    """The place, path and direction of each dstate in each map, in a short form.
+    """Shorten lists of (place, path, direction), which have an entry for each dstate.
 
-    After the first map an item holds only the differences from it, as {index: value}, if that is
-    shorter. Paths are numbered by first visit, so one more street renumbers others. `paths` says
-    which numbers the paths of the first map mostly have.
+    The first list stays. A later one is replaced by its differences from the first, as a dict
+    {index: value}, if that is shorter. Paths are numbered by first visit, so one more path changes
+    the numbers of others. So the dict may also have the key `paths`, which maps numbers of paths in
+    the first list to their numbers in this one.
     """
     first = items[0]
     told: list[Any] = [first]
@@ -177,10 +187,16 @@ def _differences(items: Sequence[Sequence[tuple[Any, Any, Any]]]) -> list[Any]:
 def _layouts(
     maps: Sequence[SSHMap], told: Sequence[dict[str, Any]], trace: Trace | None
 ) -> list[tuple[int, Layout]]:
-    """Draw the first map and, within limits of time and size, maps with other dstates or places.
+    """Draw the first map and, if time and size allow, the maps with other dstates or places.
+
+    Args:
+        maps: The maps.
+        told: The entry of each map in the content. If the map has a drawing, it gets the key
+            `layout`: the index in the returned list.
+        trace: The trace, if it is known.
 
     Returns:
-        The drawings, each with the number of its map. `told` gets the number of each map's drawing.
+        Pairs of the index of a map and its drawing.
     """
     layouts: list[tuple[int, Layout]] = []
     drawn: dict[Hashable, int] = {}
@@ -202,7 +218,10 @@ def _layouts(
 
 
 def _unit(found: Layout) -> float:
-    """The median distance of places, or of dstates without places, from the nearest other one."""
+    """Compute the median distance of a place from the nearest other one, for at most 200 places.
+
+    If there are no places, take dstates. The distance is |dx| + |dy|.
+    """
     points = list(found.places.values()) or [(x, y) for x, y, _ in found.dstates]
     nearest = [
         min((abs(x - u) + abs(y - v) for u, v in points if (u, v) != (x, y)), default=0.0)
@@ -212,7 +231,7 @@ def _unit(found: Layout) -> float:
 
 
 def _numbers(found: Layout, ssh_map: SSHMap) -> dict[str, Any]:
-    """A drawing in units of the distance between neighbours."""
+    """Make a dict of a drawing. Positions are in units of the distance between neighbours."""
     unit = _unit(found)
     return {
         "metric": found.metric,
@@ -229,11 +248,18 @@ def _numbers(found: Layout, ssh_map: SSHMap) -> dict[str, Any]:
 
 
 def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
-    """The uncertainty of each place, or of each dstate without a place.
+    """Find the ellipses that show how uncertain the positions of places are.
+
+    A dstate without a place has its own ellipse.
+
+    Args:
+        found: The drawing.
+        ssh_map: The map, with poses.
+        unit: The unit for lengths, in metres.
 
     Returns:
-        The number of a dstate there, the standard deviations along two axes, and the angle of the
-        first axis in radians counterclockwise.
+        For each ellipse: the id of a dstate at its middle, the standard deviations along both axes,
+        and the angle of the first axis in radians counterclockwise.
     """
     assert ssh_map.fit is not None
     extent = max(
@@ -253,7 +279,11 @@ def _ellipses(found: Layout, ssh_map: SSHMap, unit: float) -> list[list[float]]:
 
 
 def _spots(first: SSHMap, found: Layout) -> list[Spot]:
-    """Where each step is drawn: at its place in the first map, or at its dstate."""
+    """Find where each step is drawn: at its place in the first map, or at its dstate without one.
+
+    Returns:
+        For each step x, y and the heading in radians (None if it is unknown).
+    """
     unit = _unit(found)
     spots: list[Spot] = []
     for label in first.labels:

@@ -1,4 +1,4 @@
-"""The page as one HTML file, which loads nothing and never reads a text of a trace as HTML."""
+"""Make the page as one HTML file, which loads no other file and never reads trace text as HTML."""
 
 from __future__ import annotations
 
@@ -34,38 +34,38 @@ SCRIPTS = (
     "pairs",
     "main",
 )
-# Characters of JSON that would end the script element, or a line of the script.
+# Characters in JSON that could end the script element or a line of the script.
 ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A page about maps.
+    """A page that shows maps.
 
     Attributes:
-        content: What it shows, as plain data.
+        content: The content as a dict for JSON.
     """
 
     content: Mapping[str, Any] = field(repr=False)
 
     @property
     def html(self) -> str:
-        """The whole page."""
+        """The text of the HTML file."""
         return html_of(self.content)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the page as an HTML file.
 
         Raises:
-            MapError: If the file cannot be written.
+            MapError: The file cannot be written.
         """
         write_map(path, self.html, "page")
 
     def widget(self) -> Any:
-        """The page as a widget of notebooks.
+        """Make a notebook widget that shows the page.
 
         Raises:
-            MapError: If anywidget is not installed.
+            MapError: The package anywidget is not installed.
         """
         from ssh_abduction.page.widget import widget_of
 
@@ -79,19 +79,20 @@ def view_page(
     run: Trace | None = None,
     beliefs: Callable[[SSHMap], Iterable[Any] | None] | None = None,
 ) -> Page:
-    """A page that shows maps, what they share and where they differ.
+    """Make a page that shows maps, what they share, and where they differ.
 
     Args:
         source: A solution, or maps of one trace.
-        trace: The trace that was mapped, for its actions and images.
-        run: A run that the slider replays with a belief at each step; it may be the trace itself.
-        beliefs: A function that gives for a map the belief over its dstates at each step of the
-            run, such as `lambda m: Localiser(m).beliefs(run)`; None for a map in which the robot
-            was not localised.
+        trace: The trace that was mapped, for its actions and images; None if it is unknown.
+        run: The trace of a robot in the mapped world, which the page replays with a belief at each
+            step. It may be `trace` itself. Needs `beliefs`.
+        beliefs: A function that takes a map and returns the belief at each step of the run, such as
+            `lambda m: Localiser(m).beliefs(run)`. It returns None for a map in which the robot was
+            not localised.
 
     Raises:
-        MapError: If the maps are of several traces or of another one than this, or only one of run
-            and beliefs is given.
+        MapError: The maps are of several traces or not of `trace`, or only one of `run` and
+            `beliefs` is given.
     """
     for given in (trace, run):
         if given is not None:
@@ -108,11 +109,11 @@ def view_page(
 
 
 def html_of(content: Mapping[str, Any], *, served: bool = False) -> str:
-    """The page with this content.
+    """Make the text of the HTML file.
 
     Args:
         content: The content, from `content_of`.
-        served: Whether a server answers its questions.
+        served: Whether a server answers the questions of the page.
     """
     style = _file("page.css")
     script = "\n".join(_file(f"script/{name}.js") for name in SCRIPTS)
@@ -145,5 +146,5 @@ def _file(name: str) -> str:
 
 
 def _digest(text: str) -> str:
-    """The digest by which a content security policy allows a script or style."""
+    """Compute the digest by which a content security policy allows a script or style."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

@@ -1,7 +1,7 @@
-"""The images of a trace for the page: ranges around the robot, or panoramas, all on one scale.
+"""Encode the images of a trace for the page: laser ranges or panoramas, all on one scale.
 
-Each number is one character, which compresses better than digits. The alphabet has no character
-that HTML or JSON would escape.
+Each number becomes one character, which compresses better than digits. The alphabet has no
+character that HTML or JSON would escape.
 """
 
 from __future__ import annotations
@@ -22,31 +22,33 @@ from ssh_abduction.data.trace import Trace
 ALPHABET = "".join(chr(c) for c in range(35, 127) if chr(c) not in "&<>\\")
 LOST = "!"  # a beam that measured nothing
 MOST = 100_000  # characters of all images of a page
-BEAMS, FEWEST = 181, 24  # the most beams of an image, and the fewest before images are left out
+# The most beams of an image. If FEWEST beams an image are too many for the page, all images are
+# left out.
+BEAMS, FEWEST = 181, 24
 PIXELS = (12, 90)  # the most rows and columns of a panorama
-# The percentile of all ranges that is the longest one drawn. The longest range of all may be a look
-# down a corridor, which would make all rooms small.
+# The longest range that is drawn, as a percentile of all ranges. The longest of all may be that of
+# a corridor, which would make all rooms small.
 FAR = 95
 HALF = 180.0
 
 
 def beams_of(trace: Trace, count: int) -> tuple[float, float]:
-    """The bearings of the beams of a trace.
+    """Find the bearings of the laser beams of a trace.
 
-    The header's `beams` gives them. By default the beams cover the half circle ahead from the right
-    to the left, as those of most scanners. An odd number of beams begins straight to the right, an
-    even one half a beam from there.
+    The field `beams` of the trace's header gives them. Without it, the beams cover the half circle
+    ahead from right to left, as most scanners do. The first of an odd number of beams points
+    straight to the right. The first of an even number is half a beam further to the left.
 
     Args:
         trace: The trace.
         count: The number of beams.
 
     Returns:
-        The bearing of the first beam and the angle between beams, in degrees counterclockwise from
-        straight ahead.
+        The bearing of the first beam in degrees counterclockwise from straight ahead, and the
+        degrees from each beam to the next.
 
     Raises:
-        TraceError: If the header is wrong.
+        TraceError: The header is wrong.
     """
     told = trace.extra.get("beams")
     if told is None:
@@ -69,12 +71,13 @@ def beams_of(trace: Trace, count: int) -> tuple[float, float]:
 
 
 def drawn_images(trace: Trace) -> dict[str, Any] | None:
-    """The images of a trace; None if there are none, or too many for a page.
+    """Encode the images of a trace.
 
     Returns:
-        `images`, a text or None for each step, and `kind`. The kind "ranges" has `first` and `step`
-        (degrees counterclockwise) and `reach` (the metres of the last character of the alphabet).
-        The kind "panorama" has `rows`, `columns` and `colours`.
+        A dict with `kind` and with `images`, which has a text or None for each step. The kind
+        "ranges" also has `first` and `step` (degrees counterclockwise) and `reach` (the metres that
+        the last character of the alphabet means). The kind "panorama" also has `rows`, `columns`
+        and `colours`. None if the trace has no images that can be read, or too many for a page.
     """
     try:
         held = images_held(trace)
@@ -89,7 +92,7 @@ def drawn_images(trace: Trace) -> dict[str, Any] | None:
         return _panoramas(held, panorama, MOST // len(known))
     most = max(len(image) for image in known)
     first, step = beams_of(trace, most)
-    # Leave out beams until all images fit, but no more than an image can spare.
+    # Leave out beams until all images fit. If too few would remain, leave out the images.
     every = max(-(-most // BEAMS), -(-most * len(known) // MOST))
     if -(-most // every) < min(FEWEST, most):
         _warn_of_too_many(len(known))
@@ -107,7 +110,7 @@ def drawn_images(trace: Trace) -> dict[str, Any] | None:
 
 
 def _text(shares: NDArray[np.float64]) -> str:
-    """Numbers from 0 to 1 as characters. A larger number counts as 1, and NaN is LOST."""
+    """Encode numbers from 0 to 1 as characters. A larger number counts as 1, NaN becomes LOST."""
     last = len(ALPHABET) - 1
     return "".join(
         LOST if math.isnan(x) else ALPHABET[round(last * min(max(x, 0.0), 1.0))]
@@ -118,15 +121,16 @@ def _text(shares: NDArray[np.float64]) -> str:
 def _panoramas(
     held: Sequence[NDArray[np.float64] | None], shape: Any, each: int
 ) -> dict[str, Any] | None:
-    """Panoramas with fewer rows and columns, so that each has at most a number of characters.
+    """Encode panoramas, with rows and columns left out so that they are short enough.
 
     Args:
-        held: The image of each step.
-        shape: The rows, columns and colours, as the header has them.
-        each: The most characters of an image.
+        held: The image of each step; None for a step without one.
+        shape: The numbers of rows, columns and colours from the header of the trace.
+        each: The largest number of characters for an image.
 
     Returns:
-        The images; None if the header has another shape than they.
+        The dict that `drawn_images` returns; None if the images do not have the shape, or are too
+        many.
     """
     if (
         not isinstance(shape, list)

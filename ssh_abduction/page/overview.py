@@ -1,6 +1,7 @@
-"""The overview of the page: everything that some map has, with the number of maps that have it.
+"""Make the overview of the page: everything that any map has, and in how many maps it occurs.
 
-Dstates, places and streets of two maps are the same if they have the same steps.
+A dstate (distinctive state) is a place and a direction. A street joins two neighbours on a path.
+Dstates, places and streets of two maps count as the same if they have the same steps.
 """
 
 from __future__ import annotations
@@ -19,13 +20,16 @@ Pair: TypeAlias = frozenset[Steps]
 
 
 class _Counts:
-    """How many maps have each dstate, place and street, and what is along its path.
+    """Counts the maps that have each dstate, place and street.
+
+    A dstate or place is given by its steps, a street by the steps of its two places.
 
     Attributes:
         dstates: The number of maps with each dstate.
         places: The number of maps with each place.
         streets: The number of maps with each street.
-        along: The number of maps with each dstate or street and what is along its path.
+        along: For each dstate or street with a path: the number of maps in which this path has the
+            same steps. Keys also have a number for these steps.
     """
 
     def __init__(self) -> None:
@@ -36,7 +40,7 @@ class _Counts:
         self._numbers: dict[Steps, int] = {}  # of the steps along a path, as numbers hash faster
 
     def add(self, ssh_map: SSHMap, count: int) -> None:
-        """Count a map this many times."""
+        """Add `count` maps that are the same as this one."""
         at = [ssh_map.dstates[label] for label in ssh_map.labels]
         of_dstate = _members(ssh_map.labels)
         of_place = _members([s.place for s in at])
@@ -50,8 +54,8 @@ class _Counts:
                 self.along[steps, of_path[h]] += count
         for steps in of_place.values():
             self.places[steps] += count
-        # The robot travelled along a street if it went between two places along one path. The order
-        # of a path elsewhere shows only that the map is consistent, and there may be thousands.
+        # Only streets that the robot travelled count: it went between two places along one path.
+        # The order of other places on a path is one of many possible ones.
         streets: dict[Pair, int | None] = {}
         for s, x in set(pairwise(ssh_map.labels)):
             a, b = ssh_map.dstates[s], ssh_map.dstates[x]
@@ -71,18 +75,19 @@ class _Counts:
 
 
 def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
-    """All dstates, places and travelled streets that some map has.
+    """Collect all dstates, places and travelled streets that any map has.
 
     Args:
         maps: The maps.
-        spots: Position of each step.
+        spots: The position and heading of each step.
 
     Returns:
-        `nodes` (places, or dstates if there are no places), `dstates` and `streets`, each with its
-        number of maps. Its `path` is the largest number of maps that agree on what is along the
-        path of a dstate or street.
+        A dict for JSON. `nodes` are places, or dstates if there are no places. `dstates` is empty
+        if there are no places. Each has its `steps`, position and heading, and `maps`, the number
+        of maps with it. `path` of a dstate is the largest number of maps that agree on all steps
+        along its path. `streets` are lists [node, node, maps, path].
     """
-    # Maps that are the same in everything that is counted here are counted at once.
+    # Count maps together if they are the same in everything that is counted here.
     alike: dict[Any, list[SSHMap]] = {}
     for ssh_map in maps:
         key = (ssh_map.labels, tuple((s.place, s.path) for s in ssh_map.dstates))
@@ -119,7 +124,7 @@ def overview(maps: Sequence[SSHMap], spots: Sequence[Spot]) -> dict[str, Any]:
 
 
 def _members(names: Sequence[int | None]) -> dict[int | None, Steps]:
-    """The steps with each name."""
+    """For each number, list the steps that have it. Steps with None are left out."""
     found: dict[int | None, list[int]] = {}
     for t, name in enumerate(names):
         if name is not None:
@@ -128,7 +133,7 @@ def _members(names: Sequence[int | None]) -> dict[int | None, Steps]:
 
 
 def _middle(steps: Steps, spots: Sequence[Spot]) -> dict[str, Any]:
-    """The middle of the spots of steps, and the heading of the first step."""
+    """Compute the mean position of steps as `x` and `y`, with the `heading` of the first step."""
     at = list(dict.fromkeys(spots[t][:2] for t in steps))
     return {
         "x": round(fmean(x for x, _ in at), 3),

@@ -1,4 +1,7 @@
-"""The replays of the page: steps of a trace with their images, and beliefs of a localised robot."""
+"""Make the replays of the page: the steps of traces, with images and a localised robot's beliefs.
+
+A belief gives the probability that the robot is at each dstate (a place and a direction) of a map.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +16,20 @@ from ssh_abduction.data.maps import SSHMap
 from ssh_abduction.data.trace import Step, Trace
 from ssh_abduction.page.images import drawn_images
 
-BELIEVING = 5.0  # seconds of the processor for beliefs in all maps but the first
-# At most this many dstates of a belief are shown, each of this probability at least.
+BELIEVING = 5.0  # processor seconds for beliefs in all maps except the first
+# The largest number of dstates of a belief that are shown, and their least probability.
 BELIEVED, LEAST = 12, 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run of a robot that is localised in the maps, to be replayed with its beliefs.
+    """The trace of a robot that is localised in the maps, to be replayed with its beliefs.
 
     Attributes:
-        trace: The trace of the run; it may be the trace that was mapped.
-        beliefs: A function that gives for a map the belief over its dstates at each step, as
-            `Localiser.beliefs` does, or as dicts of `Belief.to_dict`; None for a map in which the
-            robot was not localised.
+        trace: The trace of the robot. It may be the trace that was mapped.
+        beliefs: A function that takes a map and returns the belief at each step, as Belief objects
+            or as dicts from `Belief.to_dict`. It returns None for a map in which the robot was not
+            localised.
     """
 
     trace: Trace
@@ -36,13 +39,17 @@ class Run:
 def replays(
     maps: Sequence[SSHMap], labelings: Sequence[int], trace: Trace | None, run: Run | None
 ) -> list[dict[str, Any]]:
-    """What the slider replays: the trace that was mapped, and another run before it.
+    """Make the replays for the slider of the page.
 
     Args:
         maps: The maps.
-        labelings: For each map the number of its labeling.
-        trace: The trace that was mapped, if it is known.
-        run: A run that is localised in the maps.
+        labelings: For each map, the number of its labeling (the dstates of all steps).
+        trace: The trace that was mapped; None if it is unknown.
+        run: A run that is localised in the maps; None for none.
+
+    Returns:
+        A dict for each replay. The last one is the trace that was mapped. If `run` has another
+        trace, it comes first.
     """
     first = maps[0]
     name = "the trace that was mapped"
@@ -62,7 +69,13 @@ def replays(
 
 
 def _replay(trace: Trace, name: str, views: Sequence[str]) -> dict[str, Any]:
-    """The steps of a trace and its images. `views` are for steps without a view."""
+    """Make the replay of a trace.
+
+    Args:
+        trace: The trace.
+        name: The name of the replay.
+        views: For each step, the text to show if the step has no view.
+    """
     replay: dict[str, Any] = {
         "name": name,
         "steps": [_step(step, view) for step, view in zip(trace.steps, views, strict=True)],
@@ -72,7 +85,12 @@ def _replay(trace: Trace, name: str, views: Sequence[str]) -> dict[str, Any]:
 
 
 def _step(step: Step, view: str) -> dict[str, Any]:
-    """What a step observed, and the action taken next."""
+    """Make a dict of what was observed at a step, and of the next action.
+
+    Args:
+        step: The step.
+        view: The text to show if the step has no view.
+    """
     told: dict[str, Any] = {
         "view": view if step.view is None else str(step.view),
         "action": step.action.name if step.action else None,
@@ -89,7 +107,10 @@ def _step(step: Step, view: str) -> dict[str, Any]:
 
 
 def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
-    """The views and actions of the mapped trace, as far as a map says."""
+    """Reconstruct the views and actions of the trace from a map.
+
+    An action is None if several actions join the two dstates.
+    """
     actions: dict[tuple[int, int], list[str]] = {}
     for s, action, x in first.links:
         actions.setdefault((s, x), []).append(action)
@@ -106,9 +127,20 @@ def _steps_of_map(first: SSHMap) -> list[dict[str, Any]]:
 
 
 def _beliefs(maps: Sequence[SSHMap], labelings: Sequence[int], run: Run) -> dict[str, Any]:
-    """The beliefs of a run by the number of the labeling.
+    """Compute the beliefs of a run in the maps, as far as there is time.
 
-    Maps with the same dstates have the same links, and therefore the same beliefs.
+    Maps with the same labeling have the same links, and therefore the same beliefs.
+
+    Args:
+        maps: The maps.
+        labelings: For each map, the number of its labeling.
+        run: The run.
+
+    Returns:
+        For the number of each labeling, as text, a belief for each step.
+
+    Raises:
+        MapError: The beliefs are malformed, or not one for each step.
     """
     found: dict[str, Any] = {}
     end = time.process_time() + BELIEVING
@@ -131,7 +163,12 @@ def _beliefs(maps: Sequence[SSHMap], labelings: Sequence[int], run: Run) -> dict
 
 
 def _belief(belief: dict[str, Any], count: int) -> list[Any]:
-    """A belief: its verdict, the probability of being nowhere, and the most probable dstates."""
+    """Shorten a belief to [verdict, nowhere, [[dstate, probability], …]], and check it.
+
+    Args:
+        belief: The belief as a dict from `Belief.to_dict`.
+        count: The number of dstates of the map.
+    """
     try:
         likely = sorted(
             ((int(s), float(p)) for s, p in belief["probabilities"]), key=lambda pair: -pair[1]

@@ -1,10 +1,10 @@
-"""A server on this computer that answers the questions of the page: why, and what if.
+"""Serve the page on this computer, and answer its questions: why is it so, and what if it is not?
 
-It answers only requests with the token in their address that name this computer as their host. So
-no other page in the browser can ask (not by DNS rebinding either), and no other computer.
+The server answers a request only if its address has the secret token and its host is this computer.
+So no other computer can ask, and no other page in the browser (not even by DNS rebinding).
 
-Each question is answered in a process of its own. The server ends this process when the page closes
-the connection, as it does when the user asks something else.
+Each question is answered in its own process. The page closes the connection when the user asks
+something else. The server then ends the process.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from ssh_abduction.solver import LimitError, Watch, in_process
 from ssh_abduction.theory.theory import Theory
 
 LARGEST = 100_000  # bytes of a question
-LENGTH = re.compile("[0-9]{1,9}")  # of the header Content-Length
-POLL = 0.1  # seconds between looks at whether the connection is still open
-# The process of an answer is ended after NET times its time limit and MORE seconds, as it needs
-# time to start, and some work cannot be interrupted.
+LENGTH = re.compile("[0-9]{1,9}")  # values of the header Content-Length
+POLL = 0.1  # seconds between checks whether the connection is still open
+# The process of an answer is ended after NET times its time limit plus MORE seconds. It needs time
+# to start, and some of its work cannot be interrupted earlier.
 NET, MORE = 1.2, 5.0
 
 
@@ -49,14 +49,15 @@ class PageServer(ThreadingHTTPServer):
         listing: The maps.
         trace: Their trace.
         theory: Their theory; None for the topological theory.
-        run: A run that is replayed with its beliefs.
-        called: What commands on the page call its files.
-        port: The port; 0 for any free one.
-        max_maps: The most maps of an answer; None for all.
+        run: A run that the page replays with beliefs; None for none.
+        called: File names and flags for the commands that the page shows; None takes the file that
+            the maps come from.
+        port: The port to listen on; 0 for any free one.
+        max_maps: The largest number of maps in an answer; None for all.
         time_limit: Seconds for each answer; None for no limit.
 
     Raises:
-        MapError: If the maps are not of the trace.
+        MapError: The maps are not of the trace.
     """
 
     daemon_threads = True
@@ -83,34 +84,44 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def port(self) -> int:
-        """The port that the server listens on."""
+        """The number of the port that the server listens on."""
         return int(self.server_address[1])
 
     @property
     def url(self) -> str:
-        """The address of the page, with its token."""
+        """The address of the page, with the secret token."""
         return f"http://127.0.0.1:{self.port}/{self._token}/"
 
     def is_known(self, path: str) -> str | None:
-        """The question in a path with the right token; None if the token is wrong."""
+        """Check the token in the path of a request.
+
+        Returns:
+            The rest of the path, which names the question; empty for the page itself. None if the
+            token is wrong.
+        """
         token, _, rest = path.partition("?")[0].lstrip("/").partition("/")
         return rest if hmac.compare_digest(token.encode(), self._token.encode()) else None
 
     def page(self) -> bytes:
-        """The page as HTML."""
+        """Return the page as the bytes of an HTML file."""
         return self._page
 
     def answer(self, question: str, data: Mapping[str, Any], watch: Watch) -> dict[str, Any]:
-        """The answer to a question of the page.
+        """Answer a question of the page.
 
         Args:
-            question: "explain" or "solve".
-            data: `pair` (of steps), and the pairs that are assumed `same` or `different`.
-            watch: Interrupts the answer.
+            question: "explain", why two steps are one dstate or not; or "solve", to find maps.
+            data: `pair`, the two steps to explain; `same` and `different`, lists of pairs of steps
+                that are assumed to be one dstate, or different ones.
+            watch: Can interrupt the work.
+
+        Returns:
+            A dict with `text`; and with `assuming`, the cost of each assumption, or `content`, the
+            new content of the page.
 
         Raises:
-            AbductionError: If the question is malformed, or has no answer.
-            LimitError: If a limit of the watch was reached.
+            AbductionError: The question is malformed, or has no answer.
+            LimitError: A limit was reached.
         """
         if question not in ("explain", "solve"):
             raise MapError(f"expected explain or solve, got {brief(question)}")
@@ -134,7 +145,7 @@ class PageServer(ThreadingHTTPServer):
 
     @contextmanager
     def _turn(self, watch: Watch) -> Iterator[None]:
-        """Wait for the processor, which works on one question at a time."""
+        """Wait until no other question is being answered, as only one is answered at a time."""
         while not self._one_at_a_time.acquire(timeout=POLL):
             watch.check()
         try:
@@ -145,16 +156,16 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def net(self) -> float | None:
-        """Seconds after which the process of an answer is ended; None for never."""
+        """The seconds after which the process of an answer is ended; None for no limit."""
         return None if self._limit is None else NET * self._limit + MORE
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print no error if the connection was closed before the answer came."""
+        """Print an error, unless the connection was closed before the answer came."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
     def _assuming(self, data: Mapping[str, Any]) -> Theory:
-        """The theory with the assumptions of a question."""
+        """Add the assumptions in a question to the theory. Raise MapError for malformed ones."""
         theory = self._theory or Theory.topological()
         for name in ("same", "different"):
             pairs = data.get(name, [])
@@ -166,7 +177,7 @@ class PageServer(ThreadingHTTPServer):
         return theory
 
     def _pair(self, pair: Any) -> tuple[int, int]:
-        """A pair of steps in order, checked."""
+        """Check a pair of steps, and return it in order. Raise MapError if it is malformed."""
         last = len(self._trace) - 1
         if (
             not isinstance(pair, list)
@@ -178,7 +189,7 @@ class PageServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers a request. The protocol is HTTP/1.0, so each connection is closed afterwards."""
+    """Answers one request by HTTP/1.0, which closes the connection afterwards."""
 
     server: PageServer
     server_version, sys_version = "ssh-abduction", ""
@@ -217,7 +228,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, json.dumps(told).encode(), "application/json")
 
     def _asked(self) -> str | None:
-        """The question of a request; None if the request is rejected."""
+        """The question in the path of the request; None if the request has to be rejected."""
         hosts = [f"{name}:{self.server.port}" for name in ("127.0.0.1", "localhost")]
         origin = self.headers.get("Origin")
         if self.headers.get("Host") not in hosts or (
@@ -227,15 +238,21 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server.is_known(self.path)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Reject a malformed request without saying what is wrong."""
+        """Send an empty answer to a malformed request, without saying what is wrong."""
         self._refuse()
 
     def _refuse(self) -> None:
-        """Send an empty answer."""
+        """Send an empty answer with the status "forbidden"."""
         self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
 
     def _send(self, status: HTTPStatus, body: bytes, kind: str) -> None:
-        """Send an answer that browsers neither store nor show inside another page."""
+        """Send an answer, with headers that keep browsers from storing or framing it.
+
+        Args:
+            status: The status.
+            body: The content.
+            kind: The content type.
+        """
         self.send_response(status)
         for name, value in {
             "Content-Type": kind,
@@ -250,12 +267,12 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing: the URLs contain the secret token."""
+        """Log nothing, because URLs contain the secret token."""
 
 
 @contextmanager
 def _while_there(connection: socket.socket, watch: Watch) -> Iterator[None]:
-    """Interrupt the watch as soon as the other side closes the connection."""
+    """While the block runs, interrupt the watch if the other side closes the connection."""
     done = threading.Event()
 
     def look() -> None:

@@ -1,4 +1,4 @@
-"""The page as a widget of notebooks, by anywidget (the extra `notebook`)."""
+"""Show the page in a notebook, by the package anywidget (the extra `notebook`)."""
 
 from __future__ import annotations
 
@@ -20,10 +20,13 @@ export default { render({ model, el }) {
 
 
 def widget_of(html: str) -> Any:
-    """A widget that shows a page in a frame.
+    """Make a notebook widget that shows a page in a frame.
+
+    Args:
+        html: The text of the page.
 
     Raises:
-        MapError: If anywidget is not installed.
+        MapError: The package anywidget is not installed.
     """
     try:
         import anywidget

@@ -1,4 +1,4 @@
-"""From a robot's log to the minimal maps of the building, and a report."""
+"""Map a building from a robot's log, and write a report."""
 
 from ssh_abduction import lazy_names
 

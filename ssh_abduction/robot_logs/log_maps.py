@@ -1,10 +1,12 @@
-"""From a robot's log to the minimal maps of the building, and to a folder with the whole run.
+"""Find the minimal maps of a building from a robot's log, and make the files of its run folder.
 
-A building whose walls meet at right angles is mapped by the topological theory with stars.
-Elsewhere openings are too often misread, and the sides of a path that bends are not defined. There
-displacements distinguish places, and the theory has no sides. The same theory is used if doors are
-the places, as a path may lead across a room in any direction, and if no map fits the stars: a
-junction may have been passed unnoticed, or a star misread.
+If the walls of a building meet at right angles, it is mapped by the topological theory with stars
+(a star is the set of openings seen at a place). In other buildings, openings are too often misread,
+and paths that bend have no defined sides. There the theory has neither stars nor sides, and
+displacements distinguish places. This theory is also used in two other cases:
+
+- Doors are the places. A path may then lead across a room in any direction.
+- No map fits the stars: the robot passed a junction unnoticed, or a star was misread.
 """
 
 from __future__ import annotations
@@ -32,17 +34,17 @@ from ssh_abduction.theory.theory import Theory
 
 _log = log_of(__name__)
 
-# Without a time limit a log is mapped in this share of the time that the robot drove, the import
-# included. The ladder has the second share of what the import leaves.
+# Without a time limit, import and mapping together take SHARE of the time that the robot drove. Of
+# the part that the import leaves, the ladder (which compares kinds of evidence) gets LADDER.
 SHARE, LADDER = 1 / 20, 1 / 4
-# The minimal maps, and each rung of the ladder, have at least this many seconds.
+# Least numbers of seconds: for the search for minimal maps, and for each rung of the ladder.
 LEAST, LEAST_RUNG = 5.0, 1.0
-# A rung has at most this many seconds: the ladder is for the reader only.
+# Largest number of seconds for a rung, because the ladder is only information for the reader.
 RUNG = 10.0
-# Speed of the robot in metres a second if the log has no clock. Robots whose logs have one drove
-# 0.2 to 0.4 on average.
+# Speed of the robot in metres a second, assumed if the log has no clock. Robots whose logs have a
+# clock drove 0.2 to 0.4 on average.
 SPEED = 0.5
-# At most this many minimal maps are listed, and ranked by how well they close.
+# At most this many minimal maps are listed. They are ranked by how well their loops close.
 MAPS = 300
 # A note, if no map fits the stars.
 NO_STARS = (
@@ -54,27 +56,29 @@ INTERRUPTED = (
     "The run was interrupted: its map is the best one so far, "
     "and the log is mapped again by the next call."
 )
-# Times between scans that are longer than this many times the usual one are gaps of the log, or
-# jumps of its clock. They do not count as driving.
+# A time between scans that exceeds the median by this factor is a gap in the log or a jump of its
+# clock. It does not count as driving.
 GAP = 20.0
 
-# The theory for buildings whose stars cannot be relied on.
+# The theory for buildings where stars are unreliable.
 BARE = Theory.topological().replace(star="none", boundary="none")
 
 
 @dataclass(frozen=True, eq=False)
 class LogMap:
-    """The maps of a log, and how they were made.
+    """The minimal maps of a robot's log, and how they were made.
 
     Attributes:
-        log: The scans.
-        imported: The trace, and how it was made.
-        solution: The minimal maps, those that close best first.
-        rungs: What each kind of evidence is worth; empty without a ladder.
-        seconds: Processor time of each stage in seconds, from the track on.
-        limit: Seconds that the search for the minimal maps had.
-        notes: Notes on the track, and on how it was mapped.
-        interrupted: Whether somebody ended the run.
+        log: The robot's log.
+        imported: The trace of the log, and how it was made.
+        solution: The minimal maps. Those whose loops close best come first.
+        rungs: The rungs of the ladder, each with one more kind of evidence than the last; empty
+            without a ladder.
+        seconds: Processor time of each stage in seconds, by the name of the stage. Reading the log
+            does not count.
+        limit: Seconds that the search for minimal maps was allowed.
+        notes: Sentences about problems of the track and of the mapping.
+        interrupted: Whether the run was interrupted, so that the solution may not be minimal.
     """
 
     log: RobotLog
@@ -88,11 +92,11 @@ class LogMap:
 
     @property
     def drove(self) -> float | None:
-        """Seconds that the robot drove, by `seconds_driven`."""
+        """The seconds that the robot drove; None if the clock of the log is unusable."""
         return seconds_driven(self.log)
 
     def to_dict(self) -> dict[str, Any]:
-        """The contents of run.json: settings, counts, and the time of each stage."""
+        """The contents of run.json as a dict: settings, counts, and the time of each stage."""
         solution, scale, trace = self.solution, self.imported.scale, self.imported.trace
         return {
             "format": "ssh-run",
@@ -124,7 +128,7 @@ class LogMap:
         }
 
     def files(self) -> dict[str, bytes]:
-        """The files of the run's folder, by name; run.json comes last."""
+        """Make the files of the run's folder: a dict from names to contents, run.json last."""
         trace, solution = self.imported.trace, self.solution
         if not self.interrupted:
             shared = find_backbone(solution, trace, time_limit=self.limit)
@@ -141,17 +145,19 @@ class LogMap:
 
 
 def theory_for(imported: Imported) -> Theory:
-    """The theory that suits a building.
+    """Choose the theory for a building by its trace.
 
-    It has stars and sides if places are junctions and walls meet at right angles; else it is BARE.
+    If the trace says that walls meet at right angles, it is Theory.topological(). Otherwise it is
+    BARE, which has neither stars nor sides.
     """
     return Theory.topological() if imported.trace.extra["right_angles"] else BARE
 
 
 def seconds_driven(log: RobotLog) -> float | None:
-    """Seconds that the robot drove, by the clock of a log.
+    """Compute the seconds that the robot drove, by the clock of a log.
 
-    None if its times are cut, wrapped or missing.
+    Long gaps between scans do not count. Return None if the clock is missing, runs backwards, or
+    mostly stands still.
     """
     times = [scan.time for scan in log.scans if scan.time is not None]
     steps = [later - earlier for earlier, later in itertools.pairwise(times)]
@@ -163,20 +169,26 @@ def seconds_driven(log: RobotLog) -> float | None:
 
 
 def seconds_left(log: RobotLog, imported: Imported) -> float:
-    """Seconds that the import leaves for the maps of a log; below 0 if it leaves none."""
+    """Compute the seconds that remain for mapping a log; negative if the import took too long.
+
+    Import and mapping together should take a twentieth of the time that the robot drove.
+    """
     drove = seconds_driven(log) or float(imported.track.way[-1]) / SPEED
     return SHARE * drove - math.fsum(imported.seconds.values())
 
 
 class LogMapping(UnderWay):
-    """The mapping of a log, which another thread or a signal handler may end."""
+    """The mapping of a log while it runs. Another thread or a signal handler may interrupt it."""
 
     def __init__(self) -> None:
         super().__init__()
         self.tell: Callable[[], LogMap] | None = None  # what `known` returns
 
     def known(self) -> LogMap:
-        """What is known once a search has begun, for a program that ends before the mapping."""
+        """The result so far, for a program that has to end before the mapping does.
+
+        Call it only after the search for maps has begun.
+        """
         assert self.tell
         return self.tell()
 
@@ -196,27 +208,29 @@ def map_log(
     with_ladder: bool = True,
     mapping: LogMapping | None = None,
 ) -> LogMap:
-    """The minimal maps of a building, from a robot's log.
+    """Find the minimal maps of a building from a robot's log.
 
-    Ctrl-C during a search ends it, and all that follows, with the best map so far. Then
-    `interrupted` is true.
+    Ctrl-C during a search ends the mapping with the best map so far. `interrupted` of the result is
+    then true.
 
     Args:
         log: The robot's log.
-        theory: The axioms. None takes `theory_for`; if then no map fits, the log is mapped again by
-            BARE.
-        choices: Fields of Theory that replace those of the theory. A choice about one thing leaves
-            the others as they suit the log.
-        gateway: Metres, as in perception.places.scale.Scale; None takes what the log suggests.
-        radius: Metres, as in perception.places.scale.Scale; None takes what the log suggests.
+        theory: The axioms. None chooses them by the log. If no map fits the chosen ones, the log is
+            mapped again without stars and sides, unless `choices` decide about these.
+        choices: Values of fields of Theory, by name. They replace those of the theory.
+        gateway: The minimum width of a gateway in metres, as in perception.places.scale.Scale; None
+            chooses it by the log.
+        radius: How far a way out must lead from the centre of a place, in metres, as in
+            perception.places.scale.Scale; None chooses it by the log.
         doors: Whether doors are the places, as in perception.places.importing.import_log; None
-            takes what the log suggests.
-        name: The name of the trace.
-        time_limit: Seconds for the minimal maps. None takes what is left of a twentieth of the time
-            that the robot drove, and at least LEAST.
+            decides by the log.
+        name: The name of the trace; None for no name.
+        time_limit: Seconds for the search for minimal maps. None takes what the import leaves of a
+            twentieth of the time that the robot drove, but at least 5.
         max_maps: List at most this many minimal maps; None lists all.
-        with_ladder: Whether to find out what each kind of evidence is worth.
-        mapping: Interrupts the mapping from elsewhere.
+        with_ladder: Whether to solve the trace with fewer kinds of evidence, too, to show what each
+            kind contributes.
+        mapping: An object through which another thread can interrupt the mapping; None for none.
 
     Raises:
         LogError: The log cannot be imported.

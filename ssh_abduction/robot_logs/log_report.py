@@ -1,6 +1,8 @@
-"""The report of a run, as a page: the map over the laser scans, the ladder, faults, rivals, times.
+"""Write the report of a run as an HTML page.
 
-Scans are drawn at corrected poses if the log has them. The map was made without these.
+It shows the map over the laser scans, the ladder (the maps with fewer kinds of evidence), faults
+(steps that the map treats as wrong), rival maps, and times. Scans are drawn at corrected poses if
+the log has them. The map itself was made without corrected poses.
 """
 
 from __future__ import annotations
@@ -53,13 +55,13 @@ def report(
     rungs: Sequence[Rung],
     run: Mapping[str, Any],
 ) -> str:
-    """The page, as HTML that loads nothing.
+    """Make the page as the text of an HTML file that loads no other file.
 
     Args:
-        log: The scans.
-        imported: The trace, and how it was made.
+        log: The robot's log, with its scans.
+        imported: The trace of the log, and how it was made.
         solution: The minimal maps.
-        rungs: What each kind of evidence is worth; empty without a ladder.
+        rungs: The rungs of the ladder, each with one more kind of evidence; empty without a ladder.
         run: The contents of run.json.
     """
     name = imported.trace.name or "log"
@@ -89,7 +91,7 @@ def report(
 
 
 def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
-    """What was seen, and how large the map is, in two sentences."""
+    """Say in two sentences how long the log is, and how large the map is."""
     log, cost = run["log"], solution.cost
     seen = (
         f"{log['scans']} scans on a way of {log['metres']:g} m; "
@@ -108,7 +110,7 @@ def _summary(solution: Solution, run: Mapping[str, Any]) -> str:
 
 
 def _figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
-    """The map over the scans."""
+    """Draw the first map over the scans, with a caption."""
     corrected = all(scan.corrected is not None for scan in log.scans)
     poses: list[Pose] = (
         [scan.corrected or (0.0, 0.0, 0.0) for scan in log.scans]
@@ -116,7 +118,7 @@ def _figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
         else [_pose(row) for row in imported.track.poses]
     )
     walls = _walls(log, poses)
-    # The middle of each visit, as seen from the pose that is drawn.
+    # The middle of each visit, relative to the pose at which its scan is drawn.
     spots = {
         number: moved(
             poses[visit.scan],
@@ -159,7 +161,13 @@ def _figure(log: RobotLog, imported: Imported, solution: Solution) -> str:
 def _streets(
     imported: Imported, ssh_map: SSHMap | None, spots: Mapping[int, Point]
 ) -> Iterator[str]:
-    """The streets between places, and the places, each at the mean of its visits."""
+    """Draw the streets and the places of a map, or only the visits without a map.
+
+    Args:
+        imported: The trace, and how it was made.
+        ssh_map: The map; None if there is none.
+        spots: The point of each visit on the page.
+    """
     trace = imported.trace
     if ssh_map is None:
         yield from (
@@ -197,9 +205,14 @@ def _streets(
 
 
 def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
-    """A point in each square of GRAIN metres in which a beam ended, (n, 2).
+    """Find the walls: one point, in metres, for each square in which a laser beam ended, (n, 2).
 
-    In long logs two beams must end there, so that few stray beams are drawn.
+    The squares have sides of GRAIN metres. In a log of more than 100 scans, at least two beams must
+    have ended in a square, so that few stray beams are drawn.
+
+    Args:
+        log: The robot's log.
+        poses: The pose of each scan.
     """
     found = []
     for scan, pose in zip(log.scans, poses, strict=True):
@@ -218,7 +231,7 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
 
 
 def _ladder(rungs: Sequence[Rung]) -> str:
-    """A row a rung."""
+    """Make the table of the ladder, with a row for each rung."""
     rows = []
     for rung in rungs:
         cost = rung.solution.cost
@@ -230,7 +243,7 @@ def _ladder(rungs: Sequence[Rung]) -> str:
 
 
 def _faults(solution: Solution) -> str:
-    """What the first map ignores."""
+    """Make the table of the steps that the first map treats as wrong."""
     faults = solution.maps[0].faults
     if not faults:
         allowed = solution.theory.misread or solution.theory.slipped or solution.theory.jumped
@@ -243,7 +256,7 @@ def _faults(solution: Solution) -> str:
 
 
 def _settings(run: Mapping[str, Any]) -> str:
-    """What the places are, how they are measured, and the theory."""
+    """Make the table of the settings: what counts as a place, and the theory."""
     scale = run["scale"]
     theory = ", ".join(
         f"{name} {value}"
@@ -267,7 +280,7 @@ def _settings(run: Mapping[str, Any]) -> str:
 
 
 def _time(run: Mapping[str, Any]) -> str:
-    """The processor time of each stage, and the share of the drive."""
+    """Make the table of the processor time of each stage, and compare it with the drive."""
     total = math.fsum(run["seconds"].values())
     rows = [
         (stage, f"{seconds:.2f} s", f"{100 * seconds / max(total, 1e-9):.0f} %")
@@ -283,7 +296,7 @@ def _time(run: Mapping[str, Any]) -> str:
 
 
 def _log(log: RobotLog, run: Mapping[str, Any]) -> str:
-    """The notes of the log's reader."""
+    """List what the reader of the log noticed: its format, notes, and damaged parts."""
     said = [f"{log.source}: {log.format}, {len(log)} scans.", *log.notes]
     if log.damaged:
         said.append(
@@ -294,13 +307,13 @@ def _log(log: RobotLog, run: Mapping[str, Any]) -> str:
 
 
 def _visits(imported: Imported, solution: Solution) -> str:
-    """A row a step: what was seen and done, and where the map has it."""
+    """Make a table with a row for each step: what was seen and done, and its dstate and place."""
     labels = solution.maps[0].labels if solution.maps else None
     states = {state.id: state for state in solution.maps[0].dstates} if solution.maps else {}
     rows = []
     for t, step in enumerate(imported.trace.steps):
         state = states[labels[t]] if labels else None
-        # A question mark stands for what was not seen for sure.
+        # A question mark means that it is uncertain what was seen.
         star = " ".join(
             "?"
             if entry is None

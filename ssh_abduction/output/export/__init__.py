@@ -1,4 +1,4 @@
-"""Maps for other programs: one module for each format, and the table of formats."""
+"""Write maps in the formats of other programs. `formats` has the main function."""
 
 from __future__ import annotations
 

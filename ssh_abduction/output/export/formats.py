@@ -1,4 +1,4 @@
-"""The formats of exported maps.
+"""Export a map as the text of a file for another program.
 
 >>> from ssh_abduction import Trace, solve
 >>> moved = [(5, 0, 0), (5, 0, 0)]
@@ -41,24 +41,25 @@ def export_map(
     frame: str = "map",
     turns: Trace | Turns | None = None,
 ) -> str:
-    """A map as the text of a file for another program.
+    """Export a map as the text of a file for another program.
 
-    Positions are metres relative to the first dstate, if the map has poses. Otherwise they are
-    those of a layout, and the file says so.
+    If the map has poses, positions are metres relative to the first dstate (distinctive state: a
+    place and a direction). Otherwise positions are computed by a layout; nav2 and tmap2 files say
+    so.
 
     Args:
         ssh_map: The map.
-        to: "nav2", a route graph of Nav2 (GeoJSON); "tmap2", a topological map of LCAS's
-            topological_navigation (YAML); "graphml"; "dot", Graphviz; "svg", a picture; or
-            "networkx-json", which networkx.node_link_graph reads.
-        level: What nodes are, "places" or "dstates". None means places for nav2 and tmap2, if the
-            map has any, and dstates otherwise.
-        name: What the map is called; in tmap2 also its pointset.
-        frame: The coordinate frame of the positions.
-        turns: How actions turn, as in `to_svg`; for the layout of a map without poses.
+        to: The format: "nav2", a route graph of Nav2 (GeoJSON); "tmap2", a topological map of
+            LCAS's topological_navigation (YAML); "graphml"; "dot", for Graphviz; "svg", a picture;
+            or "networkx-json", which networkx.node_link_graph reads.
+        level: What a node is: "places" or "dstates". None takes places for nav2 and tmap2 if the
+            map has any, and dstates otherwise. Must be None for "svg", and not "places" for "dot".
+        name: The name of the map in nav2 and tmap2 files. In tmap2 it also names the pointset.
+        frame: The name of the coordinate frame of the positions, in nav2 and tmap2 files.
+        turns: How actions turn, as in `to_svg`. The layout of a map without poses uses it.
 
     Raises:
-        MapError: If an argument is none of these, or the format cannot hold the map.
+        MapError: An argument is wrong, or the map has no such level or no roads.
     """
     checked_map(ssh_map)
     degrees_of(turns)
@@ -88,7 +89,10 @@ def export_map(
 
 
 def _graph_of_places(ssh_map: SSHMap, to: str, turns: Trace | Turns | None) -> nx.Graph[Any]:
-    """The graph of places with numbers and texts as attributes, as files can hold them."""
+    """Make the graph of places, with attributes that are numbers or texts, as in files.
+
+    Raises MapError if the map has no places, or the format is DOT.
+    """
     if not ssh_map.places:
         raise MapError(
             "level: expected dstates, got places: the map has no places; export its dstates"
@@ -108,13 +112,16 @@ def _graph_of_places(ssh_map: SSHMap, to: str, turns: Trace | Turns | None) -> n
 def doubts(
     ssh_map: SSHMap, to: str, *, level: str | None = None, turns: Trace | Turns | None = None
 ) -> tuple[str, ...]:
-    """Warnings for a program that navigates by an exported map, a sentence each.
+    """Find reasons why a program may navigate wrongly by an exported map.
 
     Args:
         ssh_map: The map.
-        to: The format, as in `export_map`. Formats that are not for navigation have no warnings.
-        level: What nodes are, as in `export_map`.
+        to: The format, as in `export_map`.
+        level: What a node is, as in `export_map`.
         turns: How actions turn, as in `export_map`.
+
+    Returns:
+        A sentence for each reason. Empty for formats other than nav2 and tmap2.
     """
     if to not in FOR_NAVIGATION:
         return ()
@@ -140,7 +147,7 @@ def doubts(
 
 
 def _level(ssh_map: SSHMap, to: str, level: str | None) -> str:
-    """The level to export: what was asked for, or the usual one of the format."""
+    """Choose the level to export: `level`, or the default of the format if it is None."""
     if level is not None:
         return level
     return "places" if to in FOR_NAVIGATION and ssh_map.places else "dstates"

@@ -1,7 +1,7 @@
-"""Route graphs of Nav2, in GeoJSON (docs.nav2.org, "Navigation2 Route Graph File Formats").
+"""Write route graphs of Nav2, in GeoJSON (docs.nav2.org, "Navigation2 Route Graph File Formats").
 
-Nodes are points and edges are lines. Ids are unsigned, and edges are directed. Metadata are
-numbers, texts, truth values, or objects of these. Nav2 reads no null and no list of objects there.
+Nodes are points, and directed edges are lines. Ids are not negative. Metadata are numbers, texts,
+truth values, or objects of these. Nav2 reads no null and no list of objects in metadata.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ DIGITS = 4  # of coordinates, in metres
 
 
 def nav2(roads: Roads, name: str, frame: str) -> str:
-    """The GeoJSON text of a route graph.
+    """Write a map as the GeoJSON text of a route graph.
 
     Args:
-        roads: The map.
-        name: What it is called.
-        frame: The coordinate frame of the positions.
+        roads: The map as stops and roads.
+        name: The name of the map.
+        frame: The name of the coordinate frame of the positions.
     """
-    # Nav2 wants all ids to be different, so edges are numbered after nodes.
+    # All ids must differ, so the ids of edges follow those of nodes.
     first = max(stop.id for stop in roads.stops) + 1
     at = {stop.id: [round(stop.x, DIGITS), round(stop.y, DIGITS)] for stop in roads.stops}
     nodes = [_feature("Point", at[stop.id], _node(stop, roads, frame)) for stop in roads.stops]
@@ -52,7 +52,7 @@ def _node(stop: Stop, roads: Roads, frame: str) -> dict[str, Any]:
 
 
 def _edge(road: Road, number: int) -> dict[str, Any]:
-    """An edge, with what is known of its action and path, as Nav2 reads no null."""
+    """Make an edge. Its metadata leave out what is unknown, as Nav2 reads no null."""
     known = {"action": road.action, "path": road.path, "direction": road.direction}
     metadata = {
         "travelled": road.action is not None,

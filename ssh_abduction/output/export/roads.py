@@ -1,4 +1,4 @@
-"""A map for navigation programs: stops with positions, and directed roads between them."""
+"""Turn a map into stops with positions and directed roads, for navigation programs."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from ssh_abduction.data.trace import Trace, View
 from ssh_abduction.output.layout import Layout, layout, travelled
 from ssh_abduction.output.turns import Turns
 
-# Costs in metres: the least of an edge, and that of a turn on the spot. A robot that drives 0.5 m/s
-# turns by 90 degrees in about a second.
+# Costs in metres: the least cost of a road, and the cost of a turn on the spot. A robot that drives
+# 0.5 m/s turns by 90 degrees in about a second.
 LEAST, TURN = 0.01, 0.5
-# The action of a road, the path that it is along, and which way.
+# The action of a road, the path that the road is along, and the direction along this path.
 Way: TypeAlias = tuple[str | None, int | None, int | None]
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A destination for a robot.
+    """A destination for a robot: a place, or a dstate (a place and a direction).
 
     Attributes:
-        id: The number of the place or of the dstate.
-        x: Metres, or units of the layout.
-        y: The same.
+        id: The number of the place or dstate.
+        x: Position in metres, or in units of the layout.
+        y: Position in metres, or in units of the layout.
         heading: Radians counterclockwise from x; 0 if it is unknown. A place has the heading of its
-            first dstate with a known one.
-        views: The views there, in the order of the dstates.
+            first dstate with a known heading.
+        views: The views of its dstates, in their order.
     """
 
     id: int
@@ -47,12 +47,12 @@ class Road:
     Attributes:
         start: The id of the stop where it begins.
         end: The id of the stop where it ends.
-        length: The straight distance, in metres or units of the layout.
-        action: The action of the robot; None if it travelled the other way only.
+        length: The straight distance in metres, or in units of the layout.
+        action: The name of the robot's action; None if the robot travelled only the other way.
         path: The path that the road is along; None if there is none.
-        direction: Which way it is along the path, +1 or -1.
-        turns: Whether it is a turn on the spot: both stops are at one place or, if places are
-            unknown, at one point.
+        direction: The direction along this path, +1 or -1; None if there is none.
+        turns: Whether the road is a turn on the spot: both stops are dstates of one place or, if a
+            place is unknown, at one point.
     """
 
     start: int
@@ -65,7 +65,7 @@ class Road:
 
     @property
     def cost(self) -> float:
-        """The length for a planner: above 0, as Nav2 rejects edges that cost nothing."""
+        """The cost for a planner: the length, plus 0.5 for a turn; at least 0.01."""
         return self.length + TURN if self.turns else max(self.length, LEAST)
 
 
@@ -74,8 +74,8 @@ class Roads:
     """A map as stops and directed roads.
 
     Attributes:
-        level: What stops are: "places" or "dstates".
-        metric: Whether positions are metres. Otherwise they are those of a layout.
+        level: What a stop is: "places" or "dstates".
+        metric: Whether positions are metres. Otherwise they are computed by a layout.
         stops: The stops.
         roads: The roads.
     """
@@ -87,16 +87,16 @@ class Roads:
 
     @classmethod
     def of(cls, ssh_map: SSHMap, level: str, turns: Trace | Turns | None = None) -> Roads:
-        """The stops and roads of a map.
+        """Make the stops and roads of a map.
 
         Args:
             ssh_map: The map.
-            level: "dstates": each link is a road. "places": each street that the robot travelled is
-                a road each way, as a path leads both ways.
+            level: What a stop is. With "dstates", each link is a road. With "places", the robot's
+                travels between two places, in either direction, make a road in each direction.
             turns: How actions turn, as in `to_svg`.
 
         Raises:
-            MapError: If there are no places or no roads.
+            MapError: `level` is "places" and the map has none, or there are no roads.
         """
         drawn = layout(ssh_map, turns)
         if level == "places":
@@ -110,7 +110,7 @@ class Roads:
                 Stop(s.id, x, y, heading or 0.0, () if s.view is None else (s.view,))
                 for s, (x, y, heading) in zip(ssh_map.dstates, drawn.dstates, strict=True)
             )
-            # In reverse order, so that the first action of several between two dstates is kept.
+            # Sort in reverse, so that the first action by name remains if several join two dstates.
             ends = {
                 (s, x): _way(ssh_map, s, action, x)
                 for s, action, x in sorted(ssh_map.links, reverse=True)
@@ -136,18 +136,24 @@ class Roads:
 
     @property
     def together(self) -> int:
-        """The number of stops at the position of another one."""
+        """The number of stops that share their position (to 1 cm) with another stop."""
         counts = Counter((round(stop.x, 2), round(stop.y, 2)) for stop in self.stops)
         return sum(count for count in counts.values() if count > 1)
 
 
 def _is_turn(here: int | None, there: int | None, length: float) -> bool:
-    """Whether a road between dstates of these places is a turn on the spot."""
+    """Whether a road is a turn on the spot.
+
+    Args:
+        here: The place where it begins; None if it is unknown.
+        there: The place where it ends; None if it is unknown.
+        length: The length of the road.
+    """
     return length < LEAST if here is None or there is None else here == there
 
 
 def _places(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
-    """A stop for each place."""
+    """Make a stop for each place."""
     stops = []
     for p in ssh_map.places:
         members = [s for s in ssh_map.dstates if s.place == p]
@@ -159,7 +165,12 @@ def _places(ssh_map: SSHMap, drawn: Layout) -> tuple[Stop, ...]:
 
 
 def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
-    """The way from each place to another, where the robot travelled one way or the other."""
+    """Find the pairs of places between which the robot travelled, in each direction.
+
+    Returns:
+        For each pair (start, end): the action, path and direction. The action is None if the robot
+        travelled only from the end to the start.
+    """
     ends: dict[tuple[int, int], Way] = {}
     for path in ssh_map.paths:
         index = {place: i for i, place in enumerate(path.order)}
@@ -175,6 +186,6 @@ def _streets(ssh_map: SSHMap) -> dict[tuple[int, int], Way]:
 
 
 def _way(ssh_map: SSHMap, source: int, action: str, target: int) -> Way:
-    """How a link leads from one dstate to another."""
+    """The action, path and direction of a link. Path and direction are None if the path changes."""
     here, there = ssh_map.dstates[source], ssh_map.dstates[target]
     return (action, here.path, here.direction) if here.path == there.path else (action, None, None)

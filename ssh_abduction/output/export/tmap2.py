@@ -1,9 +1,9 @@
-"""Topological maps of LCAS's topological_navigation: tmap2, in YAML.
+"""Write topological maps for LCAS's topological_navigation: tmap2, in YAML.
 
-Two generations of its navigation read these maps. That of ROS 2 Humble imports the `action` of an
-edge from nav2_msgs.action and sends the `goal` of the edge, in which "$node.pose" stands for the
-pose of the node that the edge leads to. The later one looks the action up in the `actions` of the
-map, and takes `properties.weight` for the cost of an edge.
+Two versions of that program read these maps. The one for ROS 2 Humble imports the `action` of an
+edge from nav2_msgs.action and sends the `goal` of the edge. In the goal, "$node.pose" is replaced
+by the pose of the node where the edge ends. The later version looks the action up in the `actions`
+of the map, and takes `properties.weight` as the cost of an edge.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from ssh_abduction.output.export.roads import Road, Roads, Stop
 
 ACTION = "NavigateToPose"
 DIGITS = 4  # of coordinates, in metres
-# Tolerances of goals in metres and radians, from the program's own examples. A dstate has a
-# heading; at a place any heading will do.
+# Tolerances of goals in metres and radians, from the program's own examples. The robot has to reach
+# the heading of a dstate; at a place, any heading will do.
 NEAR, FACING = 0.3, {"dstates": 0.1, "places": 6.28}
 # The radius in metres of the octagon in which a robot is at a node.
 RADIUS = 0.75
 
 
 def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) -> str:
-    """The YAML text of a topological map.
+    """Write a map as the YAML text of a topological map.
 
     Args:
-        roads: The map.
-        name: What it is called.
-        frame: The coordinate frame of the positions.
-        updated: When the map was made; None for now.
+        roads: The map as stops and roads.
+        name: The name of the map and of its pointset.
+        frame: The name of the coordinate frame of the positions.
+        updated: The time when the map was made; None for now.
     """
     title = {"places": "place", "dstates": "dstate"}[roads.level]
     names = {stop.id: f"{title}-{stop.id}" for stop in roads.stops}
@@ -66,7 +66,7 @@ def tmap2(roads: Roads, name: str, frame: str, updated: datetime | None = None) 
 
 
 def _action() -> dict[str, Any]:
-    """The action of all edges, for the navigation that looks it up in the map."""
+    """Describe the action of all edges, for the later version, which looks it up in the map."""
     return {
         "action_type": f"nav2_msgs.action.{ACTION}",
         "action_server": "/navigate_to_pose",
@@ -80,7 +80,16 @@ def _action() -> dict[str, Any]:
 def _node(
     stop: Stop, leaving: list[Road], names: dict[int, str], pointset: str, frame: str, facing: float
 ) -> dict[str, Any]:
-    """A node: its goal tolerances, the octagon around it, and the edges that leave it."""
+    """Make a node with its goal tolerances, the octagon around it, and the edges from it.
+
+    Args:
+        stop: The stop.
+        leaving: The roads that begin there.
+        names: The name of each stop, by id.
+        pointset: The name of the map.
+        frame: The name of the coordinate frame of the positions.
+        facing: The tolerance of the heading, in radians.
+    """
     corners = [math.tau * (i + 0.5) / 8 for i in range(8)]
     return {
         "meta": {"map": pointset, "node": names[stop.id], "pointset": pointset},
@@ -109,7 +118,7 @@ def _node(
 
 
 def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
-    """An edge for both generations of the navigation."""
+    """Make an edge that both versions of the program read."""
     return {
         "edge_id": f"{names[road.start]}_{names[road.end]}",
         "node": names[road.end],
@@ -134,7 +143,7 @@ def _edge(road: Road, names: dict[int, str]) -> dict[str, Any]:
 
 
 def _rotation(heading: float) -> dict[str, float]:
-    """A turn about the vertical as a quaternion."""
+    """Convert a heading in radians to a quaternion."""
     return {
         "w": _rounded(math.cos(heading / 2), 6),
         "x": 0.0,
@@ -144,12 +153,12 @@ def _rotation(heading: float) -> dict[str, float]:
 
 
 def _rounded(number: float, digits: int = DIGITS) -> float:
-    """A rounded number. A zero gets no sign."""
+    """Round a number, and turn -0.0 into 0.0."""
     return round(number, digits) + 0.0
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes numbers with a decimal point and without an exponent: PyYAML reads 4e-06 as a text."""
+    """Writes numbers with a decimal point and no exponent, because PyYAML reads 4e-06 as text."""
 
 
 _Dumper.add_representer(
