@@ -40,7 +40,7 @@ def a_number(
     what: str = "a number",
     mend: str = "change it",
 ) -> float:
-    """Return a value as a float if it is a finite number from `low` to `high` and above `above`.
+    """Return a value as a float if it is a finite number within bounds, or raise `error`.
 
     Args:
         name: The name of the argument in messages.
@@ -48,9 +48,9 @@ def a_number(
         error: The class of the error to raise.
         low: The least number allowed.
         high: The greatest number allowed.
-        above: A bound below all allowed numbers, not allowed itself.
+        above: A number that the value must exceed.
         what: The kind of number in messages, with its unit, such as "metres".
-        mend: What messages tell the caller to do.
+        mend: What messages advise the caller to do.
     """
     if is_finite(value) and low <= value <= high and value > above:
         return float(value)
@@ -67,7 +67,7 @@ def a_whole_number(
     what: str = "a whole number",
     mend: str = "change it",
 ) -> int:
-    """Return a value as an int if it is a whole number from `low` to `high`.
+    """Return a value as an int if it is a whole number from `low` to `high`, or raise `error`.
 
     The arguments are those of `a_number`.
     """
@@ -77,7 +77,7 @@ def a_whole_number(
 
 
 def a_count_of_maps(value: object, error: Kind) -> int | None:
-    """Return the largest number of maps to list: 1 or more, or None for all maps."""
+    """Return the largest number of maps to list: 1 or more, or None for all. Or raise `error`."""
     mend = "None lists all (--maps 0)"
     return (
         None if value is None else a_whole_number("max_maps (--maps)", value, error, 1, mend=mend)
@@ -87,7 +87,7 @@ def a_count_of_maps(value: object, error: Kind) -> int | None:
 def numbers(
     name: str, value: object, error: Kind, length: int, what: str, mend: str = "change it"
 ) -> tuple[float, ...]:
-    """Return a list, tuple or array as a tuple of floats if it has `length` finite numbers."""
+    """Return a list, tuple or array of `length` finite numbers as floats, or raise `error`."""
     listed = value.tolist() if hasattr(value, "tolist") else value
     if (
         isinstance(listed, Sequence)
@@ -100,14 +100,14 @@ def numbers(
 
 
 def a_flag(name: str, value: object, error: Kind) -> bool:
-    """Return a value as a bool if it is one, also one of numpy."""
+    """Return a value as a bool if it is one, perhaps of numpy, or raise `error`."""
     if isinstance(value, bool) or type(value).__name__ == "bool":  # numpy's, without loading numpy
         return bool(value)
     raise error(f"{name}: expected true or false, got {brief(value)}; take one of these")
 
 
 def a_text(name: str, value: object, error: Kind, *, mend: str = "give a text") -> str:
-    """Return a value if it is a text, which may be empty."""
+    """Return a value if it is a text, which may be empty, or raise `error`."""
     if isinstance(value, str):
         return value
     raise error(f"{name}: expected a text, got {brief(value)}; {mend}")
@@ -121,7 +121,7 @@ def one_of(
     *,
     mend: str = "take one of these",
 ) -> str:
-    """Return a value if it is one of several texts."""
+    """Return a value if it is one of the texts `choices`, or raise `error`."""
     known = list(choices)
     if isinstance(value, str) and value in known:
         return value
@@ -130,7 +130,7 @@ def one_of(
 
 
 def an_instance(name: str, value: object, kind: type[T], error: Kind, *, mend: str) -> T:
-    """Return a value if it is an instance of a class."""
+    """Return a value if it is an instance of the class `kind`, or raise `error`."""
     if isinstance(value, kind):
         return value
     article = "an" if kind.__name__.startswith(("A", "E", "I", "O", "SSH")) else "a"
@@ -140,9 +140,9 @@ def an_instance(name: str, value: object, kind: type[T], error: Kind, *, mend: s
 def all_instances(
     name: str, values: object, kind: type[T], error: Kind, *, mend: str
 ) -> tuple[T, ...]:
-    """Return an iterable as a tuple if all its values are instances of a class.
+    """Return an iterable as a tuple if all its members are of class `kind`, or raise `error`.
 
-    Messages name the first value that is wrong.
+    Messages name the first member that is wrong.
     """
     return tuple(
         an_instance(f"{name}[{i}]", value, kind, error, mend=mend)
@@ -153,28 +153,28 @@ def all_instances(
 def a_list(
     name: str, value: object, error: Kind, *, what: str = "a list", mend: str = "give a list"
 ) -> list[Any]:
-    """Return the members of an iterable as a list, unless it is a text, bytes or a mapping."""
+    """Return the members of an iterable as a list. Raise `error` for a text, bytes or a mapping."""
     if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
         return list(value)
     raise error(f"{name}: expected {what}, got {brief(value)}; {mend}")
 
 
 def an_object(name: str, value: object, error: Kind) -> Mapping[str, Any]:
-    """Return a value if it is a mapping whose keys are texts."""
+    """Return a value if it is a mapping whose keys are texts, or raise `error`."""
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return value
     raise error(f'{name}: expected an object, got {brief(value)}; write {{"name": value}}')
 
 
 def a_function(name: str, value: object, error: Kind, *, what: str) -> Callable[..., Any]:
-    """Return a value if it can be called."""
+    """Return a value if it can be called, or raise `error`."""
     if callable(value):
         return value
     raise error(f"{name}: expected {what}, got {brief(value)}; give a function")
 
 
 def a_path(name: str, value: object, error: Kind) -> str:
-    """Return the path of a file as a text. The file need not exist."""
+    """Return the path of a file as a text, or raise `error`. The file need not exist."""
     path = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if isinstance(path, str):
         return path

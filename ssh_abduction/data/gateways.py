@@ -36,8 +36,8 @@ class Sight:
         dstate: The dstate.
         star: The star.
         step: The first step with this dstate and star.
-        shows: Whether this is the first sight of its dstate. It fixes the dstate's heading.
-        first: Whether this is the first sight at its place. Its heading is 0.
+        shows: Whether this is the first sight of its dstate. That sight fixes the dstate's heading.
+        first: Whether this is the first sight at its place. That sight has heading 0.
         onward: The directions in which the dstate's path goes on, in degrees: 0 (ahead), 180
             (behind), both or neither.
     """
@@ -363,8 +363,14 @@ def _turns_so(action: Action, before: Frame, found: frozenset[int]) -> bool:
 def _ways(first: Frame, then: Frame, shift: int, found: frozenset[int]) -> tuple[bool, bool]:
     """Return two flags: may the robot face the same way in both sights, and opposite ways?
 
-    It may if a rotation by 0 or 180 degrees was found. Gateways that are declared opposite also
-    allow it: they are on one path, which may bend.
+    The flags are true if 0, or 180, is in `found`. They are also true if gateways that are declared
+    opposite match in this way: they are on one path, which may bend.
+
+    Args:
+        first: The gateways in the earlier sight.
+        then: The gateways in the later sight.
+        shift: Gateway k of `then` is taken to be gateway k + shift of `first`.
+        found: By how many degrees the robot may have turned.
     """
     alike, opposite = 0 in found, 180 in found
     here, there = _passes(first), _passes(then)

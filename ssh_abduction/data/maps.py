@@ -1,8 +1,9 @@
 """Maps: distinctive states, the links between them, places, and paths with an order of places.
 
-A map is an immutable value. Dstates (distinctive states), places and paths are numbered by first
-visit. Direction +1 of a path is the one in which the robot first faced along it. So two maps of a
-trace are equal exactly if they are the same up to renaming.
+A map is an immutable value. In maps that this package finds, dstates (distinctive states: places
+and directions), places and paths are numbered by first visit, and direction +1 of a path is the one
+that the robot first faced. So two maps of a trace are equal exactly if they are the same up to
+renaming.
 
 Equality compares the dstates with their places and paths, the links, and the faults. It does not
 compare the orders of paths, the headings, and the excused pairs. These only show that the map is

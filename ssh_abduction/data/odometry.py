@@ -231,6 +231,7 @@ def between(start: Pose, end: Pose) -> Displacement:
 
 def in_words(displacement: Displacement) -> str:
     """Describe a displacement in words: metres to the nearest 0.1, and whole degrees.
+
     >>> in_words((4.1, -0.2, 0.0))
     '4.1 m ahead, 0.2 m right'
     """

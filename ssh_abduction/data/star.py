@@ -1,4 +1,5 @@
 """Stars: the gateways (ways out) that a robot sees at a place, each with its bearing.
+
 >>> from ssh_abduction.data.star import Star
 >>> [gateway.bearing for gateway in Star.of((1, 0, 1, 0)).gateways]
 [0.0, 180.0]
@@ -143,7 +144,7 @@ class Star:
 
     @property
     def openings(self) -> Openings | None:
-        """Whether there is a gateway ahead, right, back and left, as four flags; or None.
+        """Four flags: is there a gateway ahead, right, back and left? Or None.
 
         It is None if a gateway was not observed or is in none of these directions, if two gateways
         are in one direction, or if two that are declared opposite are not straight opposite.

@@ -132,7 +132,7 @@ class Step:
 
     @property
     def openings(self) -> Openings | None:
-        """Whether there is an opening ahead, right, back and left; None if the step has no star.
+        """Four flags: is there an opening ahead, right, back and left? None if there is no star.
 
         Raises:
             TraceError: If a gateway was not observed or is near none of these directions, or if two

@@ -55,11 +55,19 @@ class Axiom:
     conditions: tuple[str, ...]
 
     def holds_in(self, choices: Mapping[str, object]) -> bool:
-        """Whether a theory with these fields has the axiom."""
+        """Whether a theory has the axiom.
+
+        Args:
+            choices: The value of each field of the theory, by name.
+        """
         return all(_holds(condition, choices) for condition in self.conditions)
 
     def has_subject_in(self, choices: Mapping[str, object]) -> bool:
-        """Whether a theory with these fields has what the axiom is about, such as stars."""
+        """Whether a theory has what the axiom is about, such as stars.
+
+        Args:
+            choices: The value of each field of the theory, by name.
+        """
         return all(_holds(condition, choices) for condition in self.subject)
 
 

@@ -107,7 +107,7 @@ def pairs_in(earlier: Earlier) -> list[tuple[int, int]]:
 
 
 def _united(several: Sequence[Earlier]) -> Earlier:
-    """Return the union of several dicts."""
+    """Return the union of several dicts from steps to sets of earlier steps."""
     first, *rest = several
     united = dict(first)
     for earlier in rest:

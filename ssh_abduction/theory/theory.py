@@ -153,7 +153,7 @@ class Theory:
 
     @classmethod
     def topological(cls) -> Theory:
-        """Return the default preset: all axioms, fewest dstates first.
+        """Return the default preset: causal and topological axioms, fewest dstates first.
 
         Reference: Kuipers & Beeson (2002).
         """
@@ -161,9 +161,9 @@ class Theory:
 
     @classmethod
     def circumscriptive(cls) -> Theory:
-        """Return the preset with all axioms and the fewest paths, then places, then dstates.
+        """Return the preset with causal and topological axioms, and fewest paths first.
 
-        Reference: Remolina & Kuipers (2004).
+        After the paths, it minimises places, then dstates. Reference: Remolina & Kuipers (2004).
         """
         return cls(prefer=("paths", "places", "dstates"))
 
@@ -183,7 +183,7 @@ class Theory:
 
     @property
     def priorities(self) -> tuple[Count, ...]:
-        """The counts to minimise, most important first.
+        """The names of the counts to minimise, most important first.
 
         With boundary=defeasible, they include "excuses". With faults, "tenths" comes first: the
         cost in tenths of a dstate. With displacement=auto, the order is that for a trace without
@@ -299,11 +299,11 @@ class Theory:
         return Pairs.of(self.different, self.elsewhere, self.same)
 
     def with_frames(self) -> Theory:
-        """Return a theory with star=frame and fewest dstates first, for a theory with star=pattern.
+        """Return a stricter theory with star=frame, for a theory with star=pattern.
 
-        The maps of the new theory, without their headings, are also maps of this theory. The new
-        theory has paths with a total order and axioms of sides without excuses. Stars that agree in
-        a frame are one pattern.
+        It prefers the fewest dstates, gives paths a total order, and allows no excuses. Stars that
+        agree in a frame are also one pattern. So its maps, without headings, are maps of this
+        theory.
         """
         boundary = "none" if self.boundary == "none" else "strict"
         rest = [count for count in self.priorities if count in ("paths", "places")]

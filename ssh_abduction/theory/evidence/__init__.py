@@ -1,6 +1,7 @@
 """Kinds of evidence: what is known besides views and actions.
 
 Each kind of evidence is a module of this folder, with an encoding of the same name.
+
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.theory.evidence import pairs_of
 >>> trace = Trace.from_steps("aaa", ["travel", "travel"])

@@ -197,9 +197,14 @@ class Together:
         return safe
 
     def _least_excess(self, end: int, later: Steps, earlier: Steps) -> Array:
-        """Return the chi-square of each pair minus the threshold; 0 if this is negative.
+        """Return the chi-square of each pair minus the threshold, for the drift with the least.
 
-        The smallest result of all drifts counts.
+        It is 0 if the chi-square is below the threshold.
+
+        Args:
+            end: The step at which the later rows end.
+            later: The index of the later row of each pair.
+            earlier: The index of the earlier row of each pair.
         """
         excess = np.full(len(later), np.inf)
         others = (number for number in range(len(self._reckoning.bends)) if number != self._number)
@@ -213,7 +218,9 @@ class Together:
         return excess
 
     def _excess(self, number: int, end: int, later: Steps, earlier: Steps) -> Array:
-        """Return the chi-square of each pair minus the threshold, for one drift; 0 if negative.
+        """Return the chi-square of each pair minus the threshold, for one drift.
+
+        It is 0 if the chi-square is below the threshold.
 
         Args:
             number: The index of the drift.
