@@ -155,7 +155,7 @@ class Theory:
     def topological(cls) -> Theory:
         """Return the default preset: causal and topological axioms, fewest dstates first.
 
-        Reference: Kuipers & Beeson (2002).
+        It is based on Kuipers & Beeson (2002).
         """
         return cls()
 
@@ -163,7 +163,7 @@ class Theory:
     def circumscriptive(cls) -> Theory:
         """Return the preset with causal and topological axioms, and fewest paths first.
 
-        After the paths, it minimises places, then dstates. Reference: Remolina & Kuipers (2004).
+        After the paths, it minimises places, then dstates, as in Remolina & Kuipers (2004).
         """
         return cls(prefer=("paths", "places", "dstates"))
 
