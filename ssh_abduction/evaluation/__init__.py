@@ -1,4 +1,4 @@
-"""Compare maps with the truth, rung by rung of evidence, and repeat the paper's experiments."""
+"""Compare maps with the truth, measure how evidence helps, and repeat the paper's experiments."""
 
 from ssh_abduction import lazy_names
 

@@ -1,6 +1,7 @@
-"""What each kind of evidence is worth for a trace, one kind more on each rung of a ladder.
+"""Measure how much each kind of evidence helps to find the true map of a trace.
 
-The first rung has the minimal maps by views alone.
+The ladder is a list of theories. The first theory uses views alone. Each further theory, a rung of
+the ladder, adds one kind of evidence: stars (the openings seen), displacements, planarity.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.evaluation.ladder import ladder
@@ -9,8 +10,9 @@ The first rung has the minimal maps by views alone.
 >>> [(rung.name, rung.solution.cost.places, rung.solution.count) for rung in ladder(trace)]
 [('views', 3, 1), ('+ pairs', 4, 1), ('+ geometry', 4, 1), ('+ planarity', 4, 1)]
 
-A square whose corners look alike is explained by a triangle, unless displacements say otherwise.
-Each rung is a theory of its own, and its maps are solved for from scratch.
+In this example the robot drives around a square whose corners look alike. Views alone give a
+triangle as the minimal map. With displacements the map is the square. Each rung is solved from
+scratch.
 """
 
 from __future__ import annotations
@@ -31,12 +33,13 @@ from ssh_abduction.theory.theory import Theory, checked_theory
 
 @dataclass(frozen=True, slots=True)
 class Rung:
-    """One more kind of evidence.
+    """The result of one theory of the ladder, which adds one kind of evidence.
 
     Attributes:
-        name: What the rung adds.
-        solution: The minimal maps by all evidence up to this rung.
-        evaluation: Their accuracy; None if the trace has no truth, or there is no map.
+        name: The evidence that the rung adds, for example "+ star".
+        solution: The minimal maps by the evidence of this rung and all rungs before.
+        evaluation: The accuracy of these maps; None if the trace has no truth, if there is no map,
+            or if the ladder was interrupted.
     """
 
     name: str
@@ -45,11 +48,11 @@ class Rung:
 
     @property
     def rank(self) -> int | None:
-        """The number of the true map, from 1; None if none is true, or the truth is unknown."""
+        """The number of the true map, from 1; None if no map is true or the truth is unknown."""
         return self.evaluation.rank if self.evaluation else None
 
     def to_dict(self) -> dict[str, Any]:
-        """The rung as plain data, as `ladder --json` prints it."""
+        """Return the rung as plain data, as `ladder --json` prints it."""
         solution = self.solution
         best = self.evaluation.maps[0] if self.evaluation else None
         return {
@@ -65,13 +68,13 @@ class Rung:
 
 
 class UnderWay:
-    """Successive searches that can be ended together.
+    """A series of searches that can be ended together.
 
-    A signal handler or another thread ends the search that is under way, and all that come after.
+    A signal handler or another thread can end the current search and all later ones.
 
     Attributes:
-        search: The current or last search; None before the first.
-        interrupted: Whether somebody asked for an end.
+        search: The current or last search; None before the first one.
+        interrupted: Whether `interrupt` was called, or Ctrl-C ended a search.
     """
 
     def __init__(self) -> None:
@@ -79,15 +82,16 @@ class UnderWay:
         self.interrupted = False
 
     def interrupt(self) -> None:
-        """End the current search soon, with its best answer so far."""
+        """End the current search soon, with its best answer so far, and all later ones."""
         self.interrupted = True
         if self.search is not None:
             self.search.interrupt()
 
     def snapshot(self) -> Solution:
-        """What the current search knows, if it is in another thread that cannot be stopped.
+        """Return what the current search knows so far.
 
-        The search cannot be used afterwards.
+        This is for a search in another thread that cannot be stopped. The search cannot be used
+        afterwards.
         """
         assert self.search
         return self.search.snapshot("interrupted")
@@ -106,12 +110,15 @@ class UnderWay:
 
 
 def rungs(trace: Trace, theory: Theory, stars: bool = True) -> Iterator[tuple[str, Theory]]:
-    """The theories of the ladder, each with one more kind of evidence that the trace has.
+    """List the theories of the ladder. Each one adds a kind of evidence that the trace has.
 
     Args:
         trace: The trace.
-        theory: The other choices.
-        stars: Whether stars have a rung.
+        theory: The theory to start from. Its stars, displacements and planarity are replaced.
+        stars: Whether there is a rung for stars, if the trace has some.
+
+    Yields:
+        The name of each rung, and its theory.
     """
     jumped = theory.jumped
     theory = theory.replace(star="none", displacement="none", planar=False, jumped=0)
@@ -140,17 +147,23 @@ def ladder(
     known: Solution | None = None,
     under_way: UnderWay | None = None,
 ) -> Iterator[Rung]:
-    """Solve the rungs of a trace, one after the other. An interrupted rung is the last one.
+    """Solve a trace with one theory after the other, each with one more kind of evidence.
 
     Args:
         trace: The trace.
-        theory: The other choices; Theory.topological() by default. The ladder replaces what it says
-            of stars, displacements and planarity.
+        theory: The theory to start from; Theory.topological() by default. The ladder replaces its
+            stars, displacements and planarity.
         time_limit: Seconds for each rung; None for no limit.
         max_maps: List and evaluate at most this many minimal maps on each rung; None for all.
-        stars: Whether stars have a rung, if the trace has some.
-        known: A solution of this trace. The rung with its theory takes it, and is not solved again.
-        under_way: Interrupts the ladder from elsewhere. Ctrl-C does so without it.
+        stars: Whether there is a rung for stars, if the trace has some.
+        known: A solution of this trace. The rung with the same theory uses it and is not solved
+            again.
+        under_way: An object with which a signal handler or another thread can interrupt the ladder.
+            Ctrl-C works without it.
+
+    Returns:
+        An iterator over the rungs. Each one is solved when it is asked for. An interrupted rung is
+        the last one.
     """
     checked_trace(trace)
     theory = checked_theory(theory)
@@ -181,7 +194,7 @@ def _solved(
     known: Solution | None,
     under_way: UnderWay,
 ) -> Iterator[Rung]:
-    """Solve the rungs, with checked arguments."""
+    """Solve the rungs. The arguments are those of `ladder`, already checked."""
     has_truth = tells_names(trace)
     for name, chosen in rungs(trace, theory, stars):
         solution = (

@@ -1,4 +1,4 @@
-"""The accuracy of maps, if the steps of a trace name their true dstates, places and paths.
+"""Measure the accuracy of maps of a trace whose steps name their true dstates, places and paths.
 
 >>> from dataclasses import replace
 >>> from ssh_abduction import Theory, Trace, evaluate, solve
@@ -10,13 +10,13 @@
 >>> found.rank, found.true_dstates, found.maps[0].dstates, found.maps[0].accuracy
 (None, 3, 2, 0.75)
 
-The minimal map takes the yard for the hall, which looks the same: three of four steps have the
-right label.
+In this example the yard looks like the hall, and the minimal map makes them one dstate. Three of
+four steps have the right label.
 
-Only steps with truth are counted; for places, only steps whose true place is known. A value is None
-if it cannot be said: a share of nothing, or a sort of thing (dstates, places, paths) that the truth
-or the map does not have. Maps of causal theories have no places, for example.
-docs/reference/formats.md says in which forms a trace has its truth. Nothing that infers maps may
+Only steps with truth are counted. For places, these are the steps whose true place is known. A
+value is None if it is not defined: a share of nothing, or a value about dstates, places or paths
+that the truth or the map does not have. For example, maps of causal theories have no places.
+docs/reference/formats.md describes how a trace stores its truth. Code that infers maps must not
 import this module.
 """
 
@@ -42,31 +42,34 @@ from ssh_abduction.data.words import counted
 
 @dataclass(frozen=True, slots=True)
 class MapEvaluation:
-    """The accuracy of one map. Shares are from 0 to 1; an unknown value is None.
+    """The accuracy of one map. Shares are from 0 to 1. A value that is not defined is None.
 
-    An edge joins the places at both ends of a travel, in either direction. Edges are counted for
-    travels that were driven, from one step to the next: the edges of TOPO-Bench (Wang et al., arXiv
-    2510.04100) with a budget of one hop. A link is a dstate, an action, and the dstate that it
-    leads to.
+    An edge joins the places at both ends of a travel, in either direction. Edges are counted only
+    for travels that the robot did, from one step to the next. These are the edges of TOPO-Bench
+    (Wang et al., arXiv 2510.04100) with a budget of one hop. A link is a dstate, an action, and the
+    dstate that the action leads to.
 
     Attributes:
-        dstates_right: Whether the labels are the true dstates up to renaming: two steps have one
-            label exactly if they are at one true dstate.
-        places_right: The same for places.
-        paths_right: The same for paths, and for courses (a path and a direction) if the truth has
-            directions. The order of places on a path is no part of the truth.
+        dstates_right: Whether the labels are the true dstates up to renaming: two steps have the
+            same label if and only if they are at one true dstate.
+        places_right: Whether the places are the true places, up to renaming.
+        paths_right: Whether the paths are the true paths, up to renaming. If the truth has
+            directions, the directions also have to be right. The order of the places along a path
+            is not judged.
         accuracy: Localisation accuracy: the share of steps with the right label, under the best
             one-to-one assignment of dstates to true dstates.
-        place_precision: Of the pairs of steps at one place in the map, the share that truly is.
-        place_recall: Of the pairs of steps that truly are at one place, the share in the map.
-        edge_precision: Of the map's edges, the share that is true, under the best one-to-one
+        place_precision: The share of pairs of steps at one place of the map that are truly at one
+            place.
+        place_recall: The share of pairs of steps truly at one place that the map has at one place.
+        edge_precision: The share of edges of the map that are true, under the best one-to-one
             assignment of places to true places.
-        edge_recall: Of the true edges, the share that the map has.
-        link_precision: Of the map's links, the share that is true, under the assignment of dstates.
-        link_recall: Of the true links, the share that the map has.
-        dstates: How many dstates the map has at the counted steps.
-        places: Number of places.
-        paths: Number of paths.
+        edge_recall: The share of true edges that the map has.
+        link_precision: The share of links of the map that are true, under the assignment of
+            dstates to true dstates.
+        link_recall: The share of true links that the map has.
+        dstates: The number of dstates that the map has at the counted steps.
+        places: The number of places at the counted steps.
+        paths: The number of paths at the counted steps.
     """
 
     dstates_right: bool | None
@@ -85,16 +88,17 @@ class MapEvaluation:
 
     @property
     def isomorphic(self) -> bool | None:
-        """Whether the map is the true one up to renaming.
+        """Whether the map is the true one up to renaming; None if the true dstates are unknown.
 
-        Its dstates are right, and its places and paths as far as they are known.
+        The dstates have to be right, and also the places and paths if their truth is known. The
+        value is False if any of these is wrong.
         """
         if False in (self.dstates_right, self.places_right, self.paths_right):
             return False
         return self.dstates_right
 
     def to_dict(self) -> dict[str, Any]:
-        """The values under their names, as `evaluate --json` prints them."""
+        """Return a dict from names to values, as `evaluate --json` prints it."""
         return {"isomorphic": self.isomorphic, **asdict(self)}
 
 
@@ -103,12 +107,13 @@ class Evaluation:
     """The accuracy of maps of one trace.
 
     Attributes:
-        maps: Each map, in the order given.
-        steps: How many steps have truth.
-        true_dstates: How many different dstates the truth names; None if it names none.
-        true_places: Number of distinct places.
-        true_paths: Number of distinct paths.
-        ambiguity: Of the pairs of different true dstates, the share that shares a view.
+        maps: The accuracy of each map, in the given order.
+        steps: The number of steps that have truth.
+        true_dstates: The number of different dstates in the truth; None if it has none.
+        true_places: The number of different places in the truth; None if it has none.
+        true_paths: The number of different paths in the truth; None if it has none.
+        ambiguity: The share of pairs of different true dstates that have a view in common; None if
+            there are no such pairs.
     """
 
     maps: tuple[MapEvaluation, ...]
@@ -131,7 +136,7 @@ class Evaluation:
         return next((i for i, found in enumerate(self.maps, 1) if found.isomorphic), None)
 
     def to_dict(self) -> dict[str, Any]:
-        """The values under their names, as `evaluate --json` prints them."""
+        """Return a dict from names to values, as `evaluate --json` prints it."""
         own = {
             name: getattr(self, name)
             for name in ("rank", "steps", "true_dstates", "true_places", "true_paths", "ambiguity")
@@ -140,15 +145,18 @@ class Evaluation:
 
 
 def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
-    """The accuracy of maps of a trace.
+    """Measure the accuracy of maps of a trace, by the true dstates, places and paths of its steps.
 
     Args:
         maps: Maps of the trace.
-        trace: A trace whose steps name what is true.
+        trace: A trace with `truth` at some of its steps.
+
+    Returns:
+        The accuracy of each map, and counts of the truth.
 
     Raises:
         TraceError: No step has truth, or the truth contradicts itself.
-        MapError: A map is of other steps.
+        MapError: A map is not of the steps of this trace.
     """
     maps = checked_maps(maps)
     truth = _Truth(checked_trace(trace))
@@ -166,9 +174,10 @@ def evaluate(maps: Iterable[SSHMap], trace: Trace) -> Evaluation:
 
 
 def tells_names(trace: Trace) -> bool:
-    """Whether the truth of some step names a dstate, a place or a path.
+    """Tell whether the truth of some step names a dstate, a place or a path.
 
-    Raises TraceError for what cannot be a name.
+    Raises:
+        TraceError: A name is not valid JSON.
     """
     return any(
         name
@@ -178,9 +187,17 @@ def tells_names(trace: Trace) -> bool:
 
 
 class _Truth:
-    """The true names of dstates, places, paths and courses, one a step; None if unknown.
+    """The true names of the dstate, place, path and course of each step.
 
-    Raises TraceError if no step has a name, or one dstate has two places, paths or courses.
+    Attributes:
+        trace: The trace.
+        dstates: The name of the true dstate of each step; None if unknown.
+        places: The name of the true place of each step; None if unknown.
+        paths: The name of the true path of each step; None if unknown.
+        courses: The true path and direction of each step; None if unknown.
+
+    Raises:
+        TraceError: No step has a name, or a dstate has two places, paths or courses.
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -195,7 +212,7 @@ class _Truth:
                 'some step, got none; write "truth": {"dstate": …, "place": …} on the steps, '
                 'or {"pose": [x, y, heading]}'
             )
-        # The first step at each dstate that names its place, path or course.
+        # For each dstate, the first step there that names its place, path or course.
         first: dict[tuple[Hashable, str], tuple[int, Hashable]] = {}
         for t, step in enumerate(told):
             dstate = step.get("dstate")
@@ -214,11 +231,11 @@ class _Truth:
                     )
 
     def dstate_hops(self) -> list[int]:
-        """The steps with a true dstate at this and the next step."""
+        """List the steps with a known true dstate at this step and at the next one."""
         return _hops(self.dstates)
 
     def place_hops(self) -> list[int]:
-        """The steps before a travel with a true place at this and the next step."""
+        """List the steps before a travel with a known true place at this step and the next one."""
         return [t for t in _hops(self.places) if self.trace.actions[t].kind == "travel"]
 
 
@@ -226,10 +243,19 @@ _SORTS = ("dstate", "place", "path", "course")
 
 
 def _told(value: Any, where: str) -> dict[str, Hashable]:
-    """The true names of a step, by sort.
+    """Read the true names of a step.
 
-    Names become JSON texts, so that lists and objects can also be names. Raises TraceError for what
-    JSON cannot hold.
+    Names are converted to JSON texts, so that lists and objects can also be names.
+
+    Args:
+        value: The `truth` of the step.
+        where: The name of the step, for messages.
+
+    Returns:
+        A dict from sorts (dstate, place, path, course) to names. Unknown names are None or missing.
+
+    Raises:
+        TraceError: A name is not valid JSON.
     """
 
     def name(value: Any) -> str | None:
@@ -259,7 +285,16 @@ def _hops(names: Sequence[Hashable]) -> list[int]:
 
 
 def checked_map(ssh_map: object, where: str, trace: Trace) -> SSHMap:
-    """A map that has a label for each step of the trace. Raises MapError for anything else."""
+    """Return the map if it has a valid label for each step of the trace.
+
+    Args:
+        ssh_map: Any value.
+        where: The name of the map, for messages.
+        trace: The trace.
+
+    Raises:
+        MapError: The value is not an SSHMap, or its labels do not fit the trace.
+    """
     if not isinstance(ssh_map, SSHMap):
         raise MapError(
             f"{where}: expected an SSHMap, got {brief(ssh_map)}; "
@@ -279,7 +314,7 @@ def checked_map(ssh_map: object, where: str, trace: Trace) -> SSHMap:
 
 
 def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
-    """The accuracy of a map."""
+    """Measure the accuracy of a map."""
     at = [ssh_map.dstates[label] for label in ssh_map.labels]
     dstates = _Sort([s.id for s in at], truth.dstates)
     places = _Sort([s.place for s in at], truth.places)
@@ -312,37 +347,37 @@ def _evaluated(ssh_map: SSHMap, truth: _Truth) -> MapEvaluation:
 
 
 class _Sort:
-    """One sort of thing, such as places, in a map and in the truth.
+    """One sort of thing (dstates, places, paths or courses) in a map and in the truth.
 
     Args:
-        said: What the map says each step is at; None for nothing.
-        true: What each step truly is at; None if unknown.
+        said: The thing that the map has for each step; None for nothing.
+        true: The true thing of each step; None if unknown.
     """
 
     def __init__(self, said: Sequence[Hashable], true: Sequence[Hashable]) -> None:
         self.said, self.true = said, true
-        # How many steps are at x in the map and truly at y. They are in the order of the trace, so
-        # that names make no difference.
+        # The number of steps that are at x in the map and truly at y. The pairs are in the order of
+        # the trace, so that results do not depend on names.
         self.steps = Counter((x, y) for x, y in zip(said, true, strict=True) if y is not None)
         self.of_map = list(dict.fromkeys(x for x, _ in self.steps if x is not None))
         self.of_truth = list(dict.fromkeys(y for _, y in self.steps))
 
     @property
     def right(self) -> bool | None:
-        """Whether map and truth distinguish the same steps; None if either says nothing."""
+        """Whether map and truth distinguish the same steps; None if the map has no such thing."""
         if not self.of_map:
             return None
-        # A step that is at nothing in the map makes a pair too many.
+        # A step for which the map has nothing adds a pair, so that the numbers differ.
         return len(self.steps) == len(self.of_map) == len(self.of_truth)
 
     @property
     def count(self) -> int | None:
-        """How many things the map has at the counted steps."""
+        """The number of things that the map has at the counted steps; None if it has none."""
         return len(self.of_map) or None
 
     @cached_property
     def assignment(self) -> dict[Hashable, Hashable]:
-        """The one-to-one assignment of the map's things to true ones that suits most steps."""
+        """The one-to-one assignment of things to true things under which most steps are right."""
         rows, columns = (
             {name: i for i, name in enumerate(names)} for names in (self.of_map, self.of_truth)
         )
@@ -357,13 +392,13 @@ class _Sort:
 
     @property
     def accuracy(self) -> float | None:
-        """The share of steps that are right under the assignment."""
+        """The share of steps that are right under the assignment; None if the map has no things."""
         if not self.of_map:
             return None
         return _share(sum(self.steps[pair] for pair in self.assignment.items()), self.steps.total())
 
     def pairs(self) -> tuple[float | None, float | None]:
-        """Precision and recall of pairs of steps at one thing."""
+        """Compute the precision and recall of pairs of steps at the same thing."""
         if not self.of_map:
             return None, None
         said, true = Counter[Hashable](), Counter[Hashable]()
@@ -378,15 +413,17 @@ class _Sort:
     def edges(
         self, hops: Iterable[int], edge: Callable[[int, Hashable, Hashable], Hashable]
     ) -> tuple[float | None, float | None]:
-        """Precision and recall of edges, under the assignment.
+        """Compute the precision and recall of edges, under the assignment.
 
         Args:
-            hops: The steps before an edge.
-            edge: Makes an edge of a step and the things at its ends. Equal edges count once.
+            hops: The steps t such that an edge leads from step t to step t + 1.
+            edge: A function that makes an edge of such a step and the things at both ends. Equal
+                edges count once.
         """
         if not self.of_map:
             return None, None
-        said: dict[Hashable, Hashable] = {}  # an edge of the map: the edge that it is assigned to
+        # from each edge of the map to the edge between the assigned true things
+        said: dict[Hashable, Hashable] = {}
         true = set()
         for t in hops:
             here, there = self.said[t], self.said[t + 1]
@@ -407,7 +444,7 @@ def _share(part: int, whole: int) -> float | None:
 
 
 def _ambiguity(views: Sequence[View | None], dstates: Sequence[Hashable]) -> float | None:
-    """The share of pairs of visited dstates that have the same view."""
+    """Compute the share of pairs of visited true dstates that have a view in common."""
     seen: dict[Hashable, set[View]] = {}
     for view, dstate in zip(views, dstates, strict=True):
         if view is not None and dstate is not None:

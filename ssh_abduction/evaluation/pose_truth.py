@@ -1,4 +1,4 @@
-"""The accuracy of maps by true poses: are visits at one place of the map truly at one?
+"""Measure the accuracy of maps by true poses: are visits at one place of a map truly at one place?
 
 >>> from dataclasses import replace
 >>> from ssh_abduction import Theory, Trace, solve
@@ -11,15 +11,16 @@
 >>> found.dstates.judged, found.dstates.returns, found.maps[0].dstates
 (6, 1, MapPairs(things=2, joined=2, right=1, returns=1))
 
-The minimal map rightly has steps 0 and 2 at one dstate, half a metre apart, and wrongly steps 1 and
-3. The truth has no names here, as nobody can say where a place ends. It has the poses at which the
-robot passed, and two poses are taken for one place if they are near each other.
+In this example steps 0 and 2 are half a metre apart, and the minimal map rightly has them at one
+dstate. It wrongly has steps 1 and 3 at one dstate. The truth names no places here, because real
+places have no clear border. It has the poses at which the robot passed, and two poses that are near
+each other count as one place.
 
-*What is counted.* A visit is the steps between two travels, which turns join. Pairs of visits are
-counted for places, and pairs of steps of different visits for dstates. A pair is a true *return* if
-both are near each other and the robot was farther away at some visit in between. If it merely went
-on to the next door, it did not return, but both may be near each other. Nobody can say whether
-such a pair is one place, so it is left out and counted as `stayed`.
+*What is counted.* A visit is the steps between two travels. For places, pairs of visits are
+counted. For dstates, pairs of steps of different visits are counted. A pair is a true *return* if
+both are near each other and the robot was farther away at some visit in between. If the robot only
+went on to the next door, it may be near without having returned. It is not clear whether such a
+pair is one place, so it is left out and counted as `stayed`.
 """
 
 from __future__ import annotations
@@ -45,18 +46,18 @@ from ssh_abduction.evaluation.trajectory import checked_pose, checked_time
 
 # By default two poses within this many metres are one place.
 NEAR = 2.0
-# They are one dstate if their headings also differ by at most this many degrees: half of a right
-# angle distinguishes the directions of a corridor, and lets a robot swerve.
+# They are one dstate if their headings also differ by at most this many degrees. Half of a right
+# angle distinguishes the directions of a corridor, and still lets a robot swerve.
 TURNED = 45.0
-# A distance by composed relations is in doubt by this many metres, and by this share of the way
-# along which they were composed. Relations and corrected poses of Freiburg differ by at most that
-# at 998 of 1,000 pairs of scans.
+# A distance from composed relations may be wrong by DOUBT metres, plus DOUBT_OF_WAY times the
+# length of the relations that were composed. For the Freiburg log, relations and corrected poses
+# differ by no more at 998 of 1,000 pairs of scans.
 DOUBT, DOUBT_OF_WAY = 0.2, 0.01
 
 Array: TypeAlias = NDArray[np.float64]
 Steps: TypeAlias = NDArray[np.int_]
 Verdicts: TypeAlias = NDArray[np.uint8]
-# The truth about a pair: unknown; distinct places; a return; or near each other, but the robot was
+# The truth about a pair: unknown; different places; a return; or near each other, but the robot was
 # not away in between.
 UNKNOWN, APART, RETURN, STAYED = range(4)
 JUDGED = APART, RETURN
@@ -64,14 +65,14 @@ JUDGED = APART, RETURN
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """How many pairs are judged, and how many are left out.
+    """The numbers of pairs of visits (or steps) that are judged, and that are left out.
 
     Attributes:
-        judged: Pairs that are known to be one place (or dstate), or not.
-        returns: The judged pairs that are one.
-        stayed: Pairs left out because they are near each other, but the robot was not farther away
-            in between.
-        unknown: Pairs left out because the truth does not say how far apart they are.
+        judged: The number of pairs for which the truth is known: one place (or dstate), or not.
+        returns: The number of judged pairs that are truly at one place (or dstate).
+        stayed: The number of pairs left out because they are near each other, but the robot was not
+            farther away in between.
+        unknown: The number of pairs left out because their distance is not known well enough.
     """
 
     judged: int
@@ -82,13 +83,13 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True)
 class MapPairs:
-    """What a map says of the judged pairs.
+    """The accuracy of a map for the judged pairs of visits (or steps).
 
     Attributes:
-        things: How many places (or dstates) the map has at the steps of the trace.
-        joined: How many of the judged pairs it has at one place (or dstate).
-        right: How many of the joined pairs truly are at one.
-        returns: How many of the judged pairs truly are at one, joined or not.
+        things: The number of places (or dstates) of the map.
+        joined: The number of judged pairs that the map has at one place (or dstate).
+        right: The number of joined pairs that are truly at one.
+        returns: The number of judged pairs that are truly at one, joined or not.
     """
 
     things: int
@@ -98,16 +99,16 @@ class MapPairs:
 
     @property
     def precision(self) -> float | None:
-        """Of the pairs that the map joins, the share that truly is one; None if it joins none."""
+        """The share of joined pairs that are truly at one place; None if no pairs are joined."""
         return self.right / self.joined if self.joined else None
 
     @property
     def recall(self) -> float | None:
-        """Of the pairs that truly are one, the share that the map joins; None if there are none."""
+        """The share of pairs truly at one place that the map joins; None if there are none."""
         return self.right / self.returns if self.returns else None
 
     def to_dict(self) -> dict[str, Any]:
-        """The counts, precision and recall under their names."""
+        """Return a dict with counts, precision and recall."""
         return {
             "things": self.things,
             "joined": self.joined,
@@ -122,8 +123,8 @@ class MapVisits:
     """The accuracy of one map, by pairs.
 
     Attributes:
-        places: Pairs of visits; None for a map without places, as of a causal theory.
-        dstates: Pairs of steps of different visits.
+        places: The accuracy for pairs of visits; None if the map has no places (causal theories).
+        dstates: The accuracy for pairs of steps of different visits.
     """
 
     places: MapPairs | None
@@ -135,15 +136,15 @@ class VisitsEvaluation:
     """The accuracy of maps of one trace, judged by poses.
 
     Attributes:
-        judge: Where the truth is from: "poses" of the trace, or "relations".
-        near: Metres within which two poses are one place.
-        turned: Degrees by which the headings of one dstate differ at most.
-        visits: Number of visits of the trace.
-        places: Pairs of visits.
-        dstates: Pairs of steps of different visits.
-        maps: Each map, in the order given.
-        by_both: The number of pairs of visits that relations and poses both judge, and the number
-            that they judge alike. None if only poses judge.
+        judge: The source of the truth: "poses" (of the trace), or "relations".
+        near: The greatest distance of two poses at one place in metres.
+        turned: The greatest difference of two headings at one dstate in degrees.
+        visits: The number of visits of the trace.
+        places: The numbers of pairs of visits.
+        dstates: The numbers of pairs of steps of different visits.
+        maps: The accuracy of each map, in the given order.
+        by_both: The number of pairs of visits that both relations and poses judge, and the number
+            of these on which they agree. None without relations, or if the trace has no poses.
     """
 
     judge: str
@@ -161,7 +162,7 @@ class VisitsEvaluation:
         return f"<VisitsEvaluation: {maps} of {visits}, {returns} by {self.judge}>"
 
     def to_dict(self) -> dict[str, Any]:
-        """The values under their names, as `evaluate --json` prints them, with shares."""
+        """Return a dict from names to values, as `evaluate --json` prints it."""
         own: dict[str, Any] = {
             "near": self.near,
             "turned": self.turned,
@@ -186,18 +187,25 @@ def evaluate_visits(
     turned: float = TURNED,
     relations: Relations | None = None,
 ) -> VisitsEvaluation:
-    """The accuracy of maps of a trace, by the pairs that they have at one place, and at one dstate.
+    """Measure the accuracy of maps of a trace by true poses, or by relations.
+
+    Pairs of visits that a map has at one place, and pairs of steps that it has at one dstate, are
+    compared with the truth.
 
     Args:
         maps: Maps of the trace.
-        trace: A trace whose steps have true poses; with relations, times.
-        near: Metres within which two poses are one place.
-        turned: Degrees by which the headings of one dstate differ at most.
-        relations: Judge by them, at the `time` of the steps, in place of the poses of the trace.
+        trace: A trace whose steps have true poses. With relations, steps need times instead.
+        near: The greatest distance of two poses at one place in metres.
+        turned: The greatest difference of two headings at one dstate in degrees.
+        relations: Hand-checked relative poses. If given, they are the truth at the `time` of each
+            step, instead of the poses of the trace.
+
+    Returns:
+        The accuracy of each map, and the numbers of pairs that are judged.
 
     Raises:
-        TraceError: No step has a pose (with relations: a time), or one is malformed.
-        MapError: A map is of other steps.
+        TraceError: No step has a pose (or a time near those of relations), or one is malformed.
+        MapError: A map is not of the steps of this trace.
     """
     checked_trace(trace)
     for name, value in (("near", near), ("turned", turned)):
@@ -241,9 +249,13 @@ def evaluate_visits(
 
 
 def told_poses(trace: Trace) -> list[Pose | None]:
-    """The true pose of each step, (x, y, heading) in metres and radians; None if unknown.
+    """Read the true pose of each step.
 
-    Raises TraceError for one that is malformed.
+    Returns:
+        For each step (x, y, heading) in metres and radians; None if unknown.
+
+    Raises:
+        TraceError: A pose is malformed.
     """
     told = [
         step.truth.get("pose") if isinstance(step.truth, Mapping) else None for step in trace.steps
@@ -252,7 +264,7 @@ def told_poses(trace: Trace) -> list[Pose | None]:
 
 
 def _pose(value: Any, where: str) -> Pose | None:
-    """A pose from JSON; None if there is none. Raises TraceError for anything else."""
+    """Read a pose from JSON; None if the value is None. Raise TraceError if it is malformed."""
     if value is None:
         return None
     if (
@@ -268,7 +280,11 @@ def _pose(value: Any, where: str) -> Pose | None:
 
 
 class _Poses:
-    """Judges by the poses of a trace."""
+    """The truth by the poses of a trace.
+
+    Attributes:
+        told: For each step, whether its pose is known, (n,).
+    """
 
     name = "poses"
 
@@ -284,18 +300,22 @@ class _Poses:
         self._poses = np.array([(math.nan,) * 3 if pose is None else pose for pose in poses])
 
     def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """Each step as seen from one.
+        """Compare the poses of all steps with the pose of one step.
 
         Returns:
-            Distances in metres, (n,), differences of headings in degrees, (n,), and the doubt of
-            the distances in metres, (n,). NaN if a pose is unknown.
+            Distances in metres, (n,), differences of headings in degrees, (n,), and the possible
+            errors of the distances in metres, (n,). Values are NaN if a pose is unknown.
         """
         dx, dy, turned = (self._poses - self._poses[step]).T
         return np.hypot(dx, dy), _degrees(turned), np.zeros(len(dx))
 
 
 class _Related:
-    """Judges by relations, at the times of a trace."""
+    """The truth by relations, at the times of the steps of a trace.
+
+    Attributes:
+        told: For each step, whether its time is near related times, (n,).
+    """
 
     name = "relations"
 
@@ -317,7 +337,11 @@ class _Related:
             )
 
     def seen_from(self, step: int) -> tuple[Array, Array, Array]:
-        """As `_Poses.seen_from`, by the robot's relative poses and its sightings of dstates."""
+        """Compare all steps with one step, as `_Poses.seen_from` does.
+
+        The relations give the pose of the robot. `seen` of a step gives the pose of the dstate as
+        the robot saw it.
+        """
         robots = self._relations.between(self._times, step)
         origin = self._seen[step]
         dx, dy, turned, way = np.array(
@@ -332,22 +356,24 @@ class _Related:
 
 
 def _degrees(radians: Array) -> Array:
-    """The sizes of turns, from 0 to 180 degrees."""
+    """Convert angles in radians to the sizes of turns in degrees, 0 to 180."""
     return np.abs(np.degrees((radians + math.pi) % math.tau - math.pi))
 
 
 def _verdicts(
     truth: _Poses | _Related, visit: Steps, near: float, turned: float
 ) -> tuple[Verdicts, Verdicts]:
-    """The verdict on each pair of visits, (v, v), and on each pair of steps, (n, n).
-
-    The earlier one of a pair comes first. Other entries are UNKNOWN.
+    """Judge each pair of visits, and each pair of steps of different visits.
 
     Args:
-        truth: Has the distances.
+        truth: The source of distances.
         visit: The visit of each step, (n,), counted from 0.
-        near: Metres within which two poses are one place.
-        turned: Degrees by which the headings of one dstate differ at most.
+        near: The greatest distance of two poses at one place in metres.
+        turned: The greatest difference of two headings at one dstate in degrees.
+
+    Returns:
+        The verdicts UNKNOWN, APART, RETURN or STAYED on pairs of visits, (v, v), and on pairs of
+        steps, (n, n). The row is the earlier one of a pair. All other entries are UNKNOWN.
     """
     steps = np.arange(len(visit))
     # A visit has the pose of the first of its steps whose pose is known.
@@ -359,7 +385,7 @@ def _verdicts(
     for v, first in enumerate(at):
         distance, _, doubt = truth.seen_from(first)
         far, unknown = distance[at] > near, ~(np.abs(distance[at] - near) >= doubt[at])
-        # For each later visit, whether the robot was away at one before.
+        # For each later visit, whether the robot was away at some visit before it.
         left = np.cumsum((far & ~unknown)[v:-1]) > 0
         places[v, v + 1 :] = np.where(unknown, UNKNOWN, np.where(far, APART, STAYED))[v + 1 :]
         places[v, v + 1 :][left & (places[v, v + 1 :] == STAYED)] = RETURN
@@ -375,25 +401,32 @@ def _verdicts(
 
 
 def _pairs(verdicts: Verdicts, visit: Steps) -> Pairs:
-    """The number of pairs of different visits with each verdict.
+    """Count the pairs of different visits by verdict.
 
     Args:
-        verdicts: What is true of each pair.
-        visit: The visit of each row.
+        verdicts: The verdict on each pair, (n, n).
+        visit: The visit of each row, (n,).
     """
     told = Counter(verdicts[visit[:, None] < visit].tolist())
     return Pairs(told[APART] + told[RETURN], told[RETURN], told[STAYED], told[UNKNOWN])
 
 
 def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdicts) -> MapVisits:
-    """What a map says of the judged pairs."""
+    """Measure the accuracy of a map.
+
+    Args:
+        ssh_map: The map.
+        visit: The visit of each step, (n,).
+        places: The verdicts on pairs of visits, (v, v).
+        dstates: The verdicts on pairs of steps, (n, n).
+    """
     at = [ssh_map.dstates[label] for label in ssh_map.labels]
     one = np.equal.outer(*[[s.id for s in at]] * 2)
     if not ssh_map.places:
         return MapVisits(None, _joined(one, dstates, len(ssh_map.dstates)))
-    # A step without a place is at no place with any other: NaN is not equal to itself.
+    # A step without a place is NaN, which is not equal to itself. So it shares no place.
     own = np.array([math.nan if s.place is None else s.place for s in at])
-    # Two visits are at one place if some steps of them are.
+    # Two visits are at one place if a step of one and a step of the other are.
     starts = np.flatnonzero(np.diff(visit, prepend=-1))
     together = np.logical_or.reduceat(
         np.logical_or.reduceat(np.equal.outer(own, own), starts, axis=0), starts, axis=1
@@ -404,12 +437,12 @@ def _evaluated(ssh_map: SSHMap, visit: Steps, places: Verdicts, dstates: Verdict
 
 
 def _joined(one: NDArray[np.bool_], verdicts: Verdicts, things: int) -> MapPairs:
-    """What a map says of the judged pairs.
+    """Count the judged pairs that a map has at one place (or dstate).
 
     Args:
-        one: Whether the map has each pair as one.
-        verdicts: What is true of each pair; UNKNOWN for what is no pair, so that it does not count.
-        things: How many places (or dstates) the map has.
+        one: For each pair, whether the map has both at one place (or dstate), (n, n).
+        verdicts: The verdict on each pair, (n, n). Entries that are UNKNOWN do not count.
+        things: The number of places (or dstates) of the map.
     """
     right = int((one & (verdicts == RETURN)).sum())
     return MapPairs(

@@ -1,9 +1,9 @@
 """Hand-checked relative poses between the scans of a log.
 
-They judge independently whether the robot was at one place at two times. A file of relations
-(Kümmerle et al. 2009, "On measuring the accuracy of SLAM algorithms") has a line for each:
-time1 time2 x y z roll pitch yaw, in seconds, metres and radians. The pose is that of the robot at
-the second time, in the frame of its first pose.
+A relation is the pose of the robot at a second time, in the frame of its pose at a first time.
+Relations are an independent truth about whether the robot was at one place at two times. A file of
+relations (Kümmerle et al. 2009, "On measuring the accuracy of SLAM algorithms") has a line for each
+relation: time1 time2 x y z roll pitch yaw, in seconds, metres and radians.
 
 >>> from ssh_abduction.evaluation.relations import Relation, Relations
 >>> quarter = 1.5707963
@@ -12,10 +12,10 @@ the second time, in the frame of its first pose.
 >>> [(round(dx, 1), round(dy, 1), round(way)) for (dx, dy, _), way in seen]
 [(0.0, 0.0, 0), (4.0, 2.0, 6), (0.0, 4.0, 12)]
 
-The relations are the edges of a graph whose nodes are times. They are followed either way. At a
-moment between two times that a relation joins, the robot is on the way from the one to the other.
-From one moment to another, relations are composed along the shortest way. The longer that way is,
-the larger is the error of the result.
+The relations are the edges of a graph whose nodes are times. An edge can be followed in both
+directions. The pose at a moment between two related times is interpolated. To find the pose at one
+moment relative to another, relations are composed along the shortest way in the graph. The longer
+this way is, the larger is the error of the result.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from ssh_abduction.data.files import read_at_most
 from ssh_abduction.data.odometry import Displacement
 from ssh_abduction.evaluation.trajectory import is_trajectory
 
-# A file of more bytes than this holds no relations.
+# Files of more bytes than this are rejected.
 LARGEST = 2**28
 FIELDS = ("time1", "time2", "x", "y", "z", "roll", "pitch", "yaw")
-# A moment that is not between two related times may be this many seconds from one, as robots that
-# map buildings drive at most a metre a second.
+# A moment that is not between two related times may be this many seconds from the nearest time.
+# Robots that map buildings drive at most a metre a second.
 NEAREST = 0.5
-# Each relation counts as this many metres more than its length, as short ones also have errors.
+# Each relation makes a way this many metres longer, as short relations also have errors.
 EACH = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """The robot's pose at a second time, in the frame of its pose at a first.
+    """The pose of the robot at a second time, in the frame of its pose at a first time.
 
     Attributes:
         first: The first time in seconds.
@@ -62,13 +62,13 @@ class Relation:
 
 
 class Relations:
-    """Relations as a graph of times.
+    """Relations as a graph whose nodes are times.
 
     Args:
-        relations: One or more.
+        relations: One or more relations.
 
     Raises:
-        TraceError: There are none.
+        TraceError: There are no relations.
 
     Attributes:
         times: The related times in seconds, sorted.
@@ -89,7 +89,7 @@ class Relations:
             a, b = number[relation.first], number[relation.second]
             self._to[a, b] = relation.displacement
             self._to[b, a] = between(relation.displacement, (0.0, 0.0, 0.0))
-        # An edge is as long as the way that its relation spans.
+        # The length of an edge is the distance of its relation in metres, plus EACH.
         ends = np.array(list(self._to)).T
         metres = [math.hypot(x, y) + EACH for x, y, _ in self._to.values()]
         self._graph = coo_array(
@@ -130,21 +130,21 @@ class Relations:
         return Relations(found)
 
     def covers(self, time: float | None) -> bool:
-        """Whether a moment is between related times, or near one."""
+        """Tell whether a moment, in seconds, is between two related times or near one."""
         return self._near(time) is not None
 
     def between(
         self, times: Sequence[float | None], origin: int
     ) -> list[tuple[Pose, float] | None]:
-        """The pose of the robot at each moment, in the frame of its pose at one of them.
+        """Find the pose of the robot at each moment, in the frame of its pose at one of them.
 
         Args:
-            times: The moments in seconds; None for one without a time.
-            origin: The index of the moment that the others are seen from.
+            times: The moments in seconds; None for a step without a time.
+            origin: The index of the moment whose pose is the frame.
 
         Returns:
-            For each moment the pose, and the metres of relations that were composed for it. None if
-            relations do not lead there, or the moment is not near related times.
+            For each moment the pose, and the length in metres of the way along which relations were
+            composed. None if relations do not lead there, or the moment is not near related times.
         """
         moments = [self._near(time) for time in times]
         start = moments[origin]
@@ -167,7 +167,13 @@ class Relations:
         return found
 
     def _composed(self, node: int, before: Sequence[int], poses: dict[int, Pose]) -> Pose:
-        """The pose at a node, composed along the shortest way. It notes poses on the way."""
+        """Compose the pose at a node along the shortest way.
+
+        Args:
+            node: The node.
+            before: For each node, the node before it on its shortest way.
+            poses: The poses of nodes found so far. Poses of nodes on the way are added.
+        """
         way = []
         while node not in poses:
             way.append(node)
@@ -178,9 +184,10 @@ class Relations:
         return poses[node]
 
     def _near(self, time: float | None) -> tuple[int, Displacement] | None:
-        """The node nearest to a moment, and the displacement from there.
+        """Find the node nearest to a moment, and the displacement from the node to the moment.
 
-        It is a share of the relation to the node on the other side of the moment.
+        The displacement is a share of the relation to the node on the other side of the moment. It
+        is zero if there is no such relation but the node is near in time. None if no node is near.
         """
         if time is None:
             return None
@@ -199,7 +206,7 @@ class Relations:
 
 
 def _relation(fields: Sequence[str], where: str) -> Relation:
-    """A relation from the fields of its line. Raises TraceError for a malformed one."""
+    """Read a relation from the fields of its line. Raise TraceError if it is malformed."""
     try:
         first, second, x, y, _, _, _, yaw = (float(field) for field in fields)
     except ValueError:

@@ -1,8 +1,8 @@
-"""The true trajectory of a robot, as truth for the steps of a trace.
+"""Read the true trajectory of a robot, and use it as the truth of the steps of a trace.
 
 Files are in the format of the TUM RGB-D benchmark, which evo and many SLAM programs write. A line
-has `timestamp tx ty tz qx qy qz qw`: seconds, metres, and the orientation as a quaternion. Lines
-that begin with # are comments.
+has the fields `timestamp tx ty tz qx qy qz qw`: seconds, metres, and the orientation as a
+quaternion. Lines that begin with # are comments.
 
 >>> from ssh_abduction.evaluation.trajectory import Trajectory
 >>> poses = [(0.0, 0.0, 0.0), (1.0, 0.0, 1.0), (5.0, 0.0, 0.0)]
@@ -28,16 +28,17 @@ from ssh_abduction.data.odometry import Pose, between, moved
 from ssh_abduction.data.trace import Step, Trace
 
 FIELDS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-# A file of more bytes than this is no trajectory.
+# Files of more bytes than this are rejected.
 LARGEST = 2**28
 # A step may be this many seconds from the nearest pose, as robots that map buildings drive at most
-# a metre a second. Poses twice as far apart are not joined by a line.
+# a metre a second. Between two poses that are more than twice this time apart, poses are not
+# interpolated.
 NEAREST = 0.5
 # The length of a quaternion may differ from 1 by this much, as numbers in files are rounded.
 ROUNDED = 0.01
-# A way on one floor rises by at most this many metres.
+# A trajectory on one floor rises by at most this many metres.
 FLAT = 1.0
-# Its poses lean by at most 30 degrees, as a cosine.
+# The poses of a robot on a floor lean by at most 30 degrees. This is the cosine of that angle.
 UPRIGHT = math.cos(math.radians(30))
 # Times in nanoseconds since 1970 are above this.
 NANOSECONDS = 1e15
@@ -48,17 +49,23 @@ class TrajectoryWarning(UserWarning):
 
 
 class Trajectory:
-    """Where a robot truly was, at which times."""
+    """The true poses of a robot over time.
+
+    Attributes:
+        source: The name of the trajectory, for messages.
+        times: The times in seconds, sorted.
+        poses: The pose (x, y, heading) at each time, in metres and radians.
+    """
 
     def __init__(self, poses: Iterable[tuple[float, Pose]], source: str = "trajectory") -> None:
         """Take poses at times.
 
         Args:
-            poses: Times in seconds, each with (x, y, heading) in metres and radians.
-            source: What messages call the trajectory.
+            poses: Pairs of a time in seconds and a pose (x, y, heading) in metres and radians.
+            source: The name of the trajectory, for messages.
 
         Raises:
-            TraceError: There are no poses, or two different ones at one time.
+            TraceError: There are no poses, or two different poses at one time.
         """
         self.source = source
         found = sorted(dict.fromkeys(poses))
@@ -79,10 +86,14 @@ class Trajectory:
     def load(path: str | os.PathLike[str]) -> Trajectory:
         """Read a trajectory in TUM format.
 
-        Numbers are separated by spaces, tabs or commas.
+        Numbers are separated by spaces, tabs, commas or semicolons. Names of columns before the
+        first pose are skipped.
+
+        Args:
+            path: The file.
 
         Raises:
-            TraceError: A line is malformed. The message names it.
+            TraceError: A line is malformed. The message names the line.
             OSError: The file cannot be read.
         """
         source = os.fspath(path)
@@ -109,9 +120,16 @@ class Trajectory:
         return trajectory
 
     def at(self, time: float | None) -> Pose | None:
-        """Where the robot was at a time in seconds; None if no pose is near in time.
+        """Find the pose of the robot at a time.
 
-        It is interpolated between two poses that are near enough in time, or else the nearest one.
+        The pose is interpolated between the poses before and after if these are at most a second
+        apart in time. Otherwise it is the pose nearest in time.
+
+        Args:
+            time: The time in seconds, or None.
+
+        Returns:
+            The pose. None if no pose is within half a second, or `time` is None.
         """
         if time is None:
             return None
@@ -137,13 +155,14 @@ class Trajectory:
         )
 
     def told_to(self, trace: Trace) -> Trace:
-        """The trace with the poses of this trajectory as the truth of its steps.
+        """Copy a trace, with the poses of this trajectory as the truth of its steps.
 
-        They replace other true poses. The rest of the truth is kept. As in imported logs, `time` of
-        a step says when the robot passed, and `seen` where from there it saw the dstate.
+        These poses replace any other true poses. The rest of the truth is kept. As in imported
+        logs, `time` of a step is the time in seconds at which the robot passed, and `seen` is the
+        pose of the dstate in the frame of the robot.
 
         Raises:
-            TraceError: No step has a time, or none is near a time of this trajectory.
+            TraceError: No step has a time, or no step is near in time to this trajectory.
         """
         times = [
             checked_time(step.extra.get("time"), trace.at(t)) for t, step in enumerate(trace.steps)
@@ -160,7 +179,7 @@ class Trajectory:
                 TrajectoryWarning,
                 stacklevel=2,
             )
-        # The pose of a dstate is seen from the pose of the robot.
+        # The pose of the dstate is given in the frame of the robot.
         steps = []
         for t, (step, robot) in enumerate(zip(trace.steps, robots, strict=True)):
             pose = None
@@ -170,7 +189,7 @@ class Trajectory:
         return replace(trace, steps=tuple(steps))
 
     def _no_match(self, trace: Trace, times: Sequence[float]) -> str:
-        """Why no step of a trace has a pose, and what to do."""
+        """Write why no step of a trace gets a pose, and what to do."""
         where = named(trace.source or "trace")
         if not times:
             return (
@@ -191,9 +210,11 @@ class Trajectory:
 
 
 def is_trajectory(lines: Iterable[Sequence[str]]) -> bool:
-    """Whether lines of eight numbers are poses in TUM format.
+    """Tell whether lines of eight numbers are poses in TUM format, and not relations.
 
-    Then the last four numbers of each line are a quaternion, and not merely a turn by a radian.
+    In TUM format the last four numbers of each line are a quaternion, which has length 1. In a file
+    of relations they are z, roll, pitch and yaw. On a floor these also have length 1 if each yaw is
+    about 1 radian. So if all lines have only a last number, it must be exactly 1 or -1.
     """
     try:
         tails = [[float(field) for field in fields[4:8]] for fields in lines]
@@ -208,7 +229,7 @@ def is_trajectory(lines: Iterable[Sequence[str]]) -> bool:
 
 
 def checked_time(value: Any, where: str) -> float | None:
-    """The time of a step in seconds. Raises TraceError for anything else."""
+    """Return the time of a step in seconds, or None. Raise TraceError for anything else."""
     if value is not None and not is_finite(value):
         raise TraceError(
             f"{where}: time: expected seconds, got {brief(value)}; mend it, or leave it out"
@@ -217,9 +238,14 @@ def checked_time(value: Any, where: str) -> float | None:
 
 
 def checked_pose(value: Any, where: str) -> Pose:
-    """The pose at which a robot saw a dstate, as JSON has it; by default its own pose.
+    """Read from JSON the pose of a dstate in the frame of the robot that saw it.
 
-    Raises TraceError for anything else.
+    Args:
+        value: A list of x, y and heading; None if the dstate is at the pose of the robot.
+        where: The name of the step, for messages.
+
+    Raises:
+        TraceError: The value is malformed.
     """
     if value is None:
         return 0.0, 0.0, 0.0
@@ -237,7 +263,7 @@ def checked_pose(value: Any, where: str) -> Pose:
 
 
 def _truth(step: Step, pose: Pose | None) -> Any:
-    """The truth of a step with this pose in place of another one."""
+    """Return the truth of a step with its pose replaced; None if nothing is left."""
     told: dict[str, Any] = {}
     if isinstance(step.truth, Mapping):
         told = {name: value for name, value in step.truth.items() if name != "pose"}
@@ -259,7 +285,8 @@ def _pose(fields: Sequence[str], where: str) -> tuple[float, Pose, float, float]
     """Read a line.
 
     Returns:
-        The time, the pose on the floor, the height, and the cosine of the lean.
+        The time in seconds, the pose (x, y, heading) on the floor, the height in metres, and the
+        cosine of the angle by which the pose leans.
 
     Raises:
         TraceError: The line is malformed.
@@ -287,7 +314,14 @@ def _pose(fields: Sequence[str], where: str) -> tuple[float, Pose, float, float]
 
 
 def _warn_of_space(source: str, rise: float, leaning: int, count: int) -> None:
-    """Warn if a way is not on a floor. A camera's z axis looks ahead, for example."""
+    """Warn if a trajectory is not on a floor, for example because it is that of a camera.
+
+    Args:
+        source: The name of the trajectory, for messages.
+        rise: The difference between the greatest and the least height in metres.
+        leaning: The number of poses that lean by more than 30 degrees.
+        count: The number of poses.
+    """
     if rise > FLAT or 2 * leaning > count:
         warnings.warn(
             f"{named(source)}: expected a way on a floor, x and y in metres, got one that rises by "

@@ -1,4 +1,8 @@
-"""What the paper claims of its two experiments, and whether a run shows it."""
+"""The claims of the paper about its two experiments, each with a test on our runs.
+
+M measures how well clusters of images are separated. U measures how well the dstate determines the
+view: it is 1 if all images of a dstate have one view.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +17,15 @@ from ssh_abduction.evaluation.paper.experiments import EXPERIMENTS, FoundMaps, R
 
 @dataclass(frozen=True)
 class Claim:
-    """Something that the paper says of an experiment.
+    """A claim about an experiment.
 
     Attributes:
         text: The claim.
-        paper: The paper's figure.
-        here: The figure of a run.
-        holds: Whether a run shows the claim.
-        ours: Whether the paper does not say it: it follows from the paper's argument, or it is
-            asked of this robot alone.
+        paper: The value in the paper.
+        here: A function that writes the value of a run.
+        holds: A function that tells whether the claim holds in a run.
+        ours: Whether the claim is not in the paper. Then it follows from the argument of the paper,
+            or it is about this robot alone.
     """
 
     text: str
@@ -32,7 +36,11 @@ class Claim:
 
 
 def claims(name: str) -> list[Claim]:
-    """What the paper claims of an experiment, and what follows from its argument."""
+    """List the claims of the paper about an experiment, and our own.
+
+    Args:
+        name: The name of the experiment: "notched-rectangle" or "taylor-hall".
+    """
     e = EXPERIMENTS[name]
     triple = f"{e.dstates}, {e.places}, {e.paths}"
     counts = {"dstates": e.dstates, "places": e.places, "paths": e.paths}
@@ -151,17 +159,17 @@ def claims(name: str) -> list[Claim]:
 
 
 def _quality(run: Run) -> float:
-    """M at the chosen number of views."""
+    """Return M at the chosen number of views."""
     return run.clustering.quality[run.clustering.k]
 
 
 def _uncertainty(run: Run) -> float:
-    """U at the chosen number of views."""
+    """Return U at the chosen number of views."""
     return run.clustering.uncertainty[run.clustering.k]
 
 
 def _triple(found: FoundMaps) -> str:
-    """The numbers of dstates, places and paths, and of maps if there are several."""
+    """Write the numbers of dstates, places and paths, and the number of maps if it is not 1."""
     cost = found.cost
     if cost is None:
         return "no map"
@@ -170,9 +178,10 @@ def _triple(found: FoundMaps) -> str:
 
 
 def _trend(run: Run) -> float:
-    """Growth of the offset over the whole run, as a share of its mean.
+    """Compute how much the largest offset grows over the whole run, as a share of its mean.
 
-    It is the slope of a straight line, times the number of tours.
+    The growth is the slope of a straight line through the offsets of the tours, times the number of
+    tours.
     """
     largest = np.array([max(row[:2]) for row in run.spread])
     slope = np.polyfit(np.arange(len(largest)), largest, 1)[0]
@@ -180,7 +189,16 @@ def _trend(run: Run) -> float:
 
 
 def summary(name: str, runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Each claim as a row: the paper's value, the result by seed, and how often it holds."""
+    """Make a table of the claims about an experiment.
+
+    Args:
+        name: The name of the experiment.
+        runs: The runs, one for each seed.
+
+    Returns:
+        A row for each claim, as a dict: the value in the paper, the value for each seed, and the
+        number of runs in which the claim holds.
+    """
     return [
         {
             "claim": claim.text,

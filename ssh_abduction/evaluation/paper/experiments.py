@@ -1,6 +1,8 @@
-"""The two experiments of Kuipers & Beeson (2002), measured: simulate, cluster, abduce, learn.
+"""Run the two experiments of Kuipers & Beeson (2002): simulate, cluster, find maps, learn.
 
-Worlds, robot and laser are fixed in `simulator/`. Runs differ only in the seed of all noise.
+Worlds, robot and laser are fixed in `simulator/`. Runs differ only in the seed of all noise. M
+measures how well clusters of images are separated. U measures how well the dstate determines the
+view: it is 1 if all images of a dstate have one view.
 """
 
 from __future__ import annotations
@@ -34,12 +36,12 @@ class Experiment:
 
     Attributes:
         world: The name of the world.
-        tours: How many tours the robot drives.
-        k_max: The largest number of views that is tried.
-        views: Number of views in the paper.
-        dstates: Number of dstates in the paper.
-        places: Number of places in the paper.
-        paths: Number of paths in the paper.
+        tours: The number of tours that the robot drives.
+        k_max: The largest number of views (clusters of images) that is tried.
+        views: The number of views in the paper.
+        dstates: The number of dstates in the paper.
+        places: The number of places in the paper.
+        paths: The number of paths in the paper.
     """
 
     world: str
@@ -66,13 +68,13 @@ WITH_STARS = Theory.topological().replace(displacement="none")
 
 @dataclass(frozen=True)
 class Clustering:
-    """The views of one seed.
+    """The views (clusters of images) of one seed.
 
     Attributes:
         k: The chosen number of views.
-        quality: M for each k.
-        uncertainty: U for each k.
-        largest_k: The largest k with U = 1.
+        quality: M for each number of views that was tried.
+        uncertainty: U for each number of views that was tried.
+        largest_k: The largest number of views with U = 1.
     """
 
     k: int
@@ -86,8 +88,8 @@ class FoundMaps:
     """The minimal maps of one seed.
 
     Attributes:
-        cost: How many dstates, places and paths a minimal map has; None if none was found.
-        maps: Number of minimal maps.
+        cost: The numbers of dstates, places and paths of a minimal map; None if no map was found.
+        maps: The number of minimal maps.
     """
 
     cost: dict[str, int] | None
@@ -95,7 +97,7 @@ class FoundMaps:
 
     @classmethod
     def of(cls, solution: Solution) -> FoundMaps:
-        """The counts of a solution."""
+        """Read the counts of a solution."""
         cost = solution.cost
         if cost is None:
             return cls(None, solution.count)
@@ -105,12 +107,12 @@ class FoundMaps:
 
 @dataclass(frozen=True)
 class Labelling:
-    """The labels from the views alone.
+    """The labels of steps in the map from the views alone, compared with the true dstates.
 
     Attributes:
-        right: Whether they are the true dstates, one to one.
-        aliased: How many pairs of true dstates share a view.
-        told_apart: How many of these pairs have labels of their own.
+        right: Whether the labels are the true dstates, one to one.
+        aliased: The number of pairs of true dstates that share a view.
+        told_apart: The number of these pairs that share no label.
     """
 
     right: bool
@@ -120,15 +122,16 @@ class Labelling:
 
 @dataclass(frozen=True)
 class Contrast:
-    """The result without two parts of the paper's method.
+    """Results without a part of the paper's method.
 
-    Images are clustered without aggregating dstates, or are taken along the way and not at dstates.
+    Two parts are left out, one at a time. First there are no maps: images are clustered into as
+    many views as there are dstates. Second, images are taken at equal distances, not at dstates.
 
     Attributes:
-        alone_uncertainty: U for one cluster per dstate.
-        alone_distinct: How many dstates have a cluster of their own then, of all dstates.
-        even_quality: M at the chosen k, for images taken at equal distances along the way.
-        even_uncertainty: U at the chosen k, for the same images.
+        alone_uncertainty: U if there is one cluster per dstate.
+        alone_distinct: The number of dstates that then share no cluster with another dstate.
+        even_quality: M at the chosen number of views, for images taken at equal distances.
+        even_uncertainty: U at the chosen number of views, for the same images.
     """
 
     alone_uncertainty: float
@@ -139,21 +142,21 @@ class Contrast:
 
 @dataclass(frozen=True)
 class Run:
-    """What one seed gave.
+    """The results of an experiment for one seed.
 
     Attributes:
         seed: The seed of all noise.
-        images: Number of images.
+        images: The number of images.
         clustering: The views.
         by_views: The minimal maps from the views alone.
         by_stars: The minimal maps from the views and the openings that the robot saw.
-        labelling: The labels from the views alone.
+        labelling: The labels of the first minimal map from the views alone.
         curve: The learning curve on these labels.
-        rates: Recognition of the true dstate by labels from clustering alone, from the map, and
-            from the truth.
-        contrast: The result if the method is not followed.
-        spread: The largest distance of a pose from its dstate's mean, (circuits, 3), in x and y
-            (metres) and heading (radians).
+        rates: The rates at which the true dstate is recognised from an image, by what is learnt
+            from: labels of "clustering alone", of the "map", and of the "truth".
+        contrast: Results without a part of the method.
+        spread: For each tour, the largest offset of a pose from the mean pose of its dstate, in x
+            and y (metres) and heading (radians), (tours, 3).
     """
 
     seed: int
@@ -169,7 +172,12 @@ class Run:
 
 
 def measure(name: str, seed: int) -> Run:
-    """Run an experiment from simulation to recognition rates."""
+    """Run an experiment from simulation to recognition rates.
+
+    Args:
+        name: The name of the experiment: "notched-rectangle" or "taylor-hall".
+        seed: The seed of all noise.
+    """
     warnings.simplefilter("ignore", ImageWarning)
     e = EXPERIMENTS[name]
 
@@ -182,7 +190,7 @@ def measure(name: str, seed: int) -> Run:
     # The maps, with the openings that the robot saw.
     starred = solve(trace.with_views(learner.views_.tolist()), WITH_STARS, time_limit=60)
 
-    # Recognition by the abduced labels, beside clusters alone and the truth.
+    # Recognition by labels of the map, compared with clusters alone and with the truth.
     alone = learner.clusterer_.labels_by_k_[e.dstates]
     kinds = {
         "clustering alone": alone,
@@ -206,12 +214,12 @@ def measure(name: str, seed: int) -> Run:
 
 
 def true_dstates(trace: Trace) -> NDArray[Any]:
-    """The true dstate of each step, (n,), for evaluation only."""
+    """Read the name of the true dstate of each step, (n,). This is for evaluation only."""
     return np.array([step.truth["dstate"] for step in trace.steps])
 
 
 def one_to_one(labels: NDArray[Any], truth: NDArray[Any]) -> bool:
-    """Whether labels and true dstates are the same partition of the steps."""
+    """Tell whether labels and true dstates, both (n,), are equal up to renaming."""
     return bool((labels >= 0).all()) and len(set(zip(labels, truth, strict=True))) == len(
         set(labels)
     ) == len(set(truth))
@@ -220,10 +228,19 @@ def one_to_one(labels: NDArray[Any], truth: NDArray[Any]) -> bool:
 def rate(
     ranges: NDArray[np.float64], labels: NDArray[Any], truth: NDArray[Any], seed: int
 ) -> float:
-    """The rate at which a recogniser that learns these labels recognises the true dstate.
+    """Measure how often a recogniser that learns labels recognises the true dstate.
 
-    It is cross-validated, in ten folds. Each label stands for the dstate that it goes with most
-    often in the training part.
+    The rate is cross-validated in ten folds. A recognised label counts as the true dstate that has
+    this label most often in the training part.
+
+    Args:
+        ranges: The images: ranges in metres, (n, d).
+        labels: The label of each image to learn, (n,).
+        truth: The true dstate of each image, (n,).
+        seed: The seed of the folds.
+
+    Returns:
+        The share of images that are recognised, from 0 to 1.
     """
     found = []
     for train, test in StratifiedKFold(10, shuffle=True, random_state=seed).split(ranges, truth):
@@ -237,14 +254,14 @@ def rate(
 
 
 def _aliased(views: NDArray[Any], truth: NDArray[Any]) -> list[tuple[str, str]]:
-    """Pairs of dstates that share a view."""
+    """List the pairs of true dstates that share a view."""
     names = sorted(set(truth))
     seen = {name: set(views[truth == name]) for name in names}
     return [(a, b) for i, a in enumerate(names) for b in names[i + 1 :] if seen[a] & seen[b]]
 
 
 def _clustering(learner: BootstrapLearner, truth: NDArray[Any]) -> Clustering:
-    """The views that a learner has made."""
+    """Measure the views of a learner for each number of views that was tried."""
     clusterer = learner.clusterer_
     uncertainty = {
         k: uncertainty_coefficient(labels, truth) for k, labels in clusterer.labels_by_k_.items()
@@ -254,7 +271,7 @@ def _clustering(learner: BootstrapLearner, truth: NDArray[Any]) -> Clustering:
 
 
 def _labelling(learner: BootstrapLearner, truth: NDArray[Any]) -> Labelling:
-    """The labels that a learner has abduced."""
+    """Compare the labels of a learner's map with the true dstates."""
     labels = learner.labels_
     pairs = _aliased(learner.views_, truth)
     told_apart = sum(not set(labels[truth == a]) & set(labels[truth == b]) for a, b in pairs)
@@ -262,14 +279,14 @@ def _labelling(learner: BootstrapLearner, truth: NDArray[Any]) -> Labelling:
 
 
 def _contrast(e: Experiment, seed: int, trace: Trace, alone: NDArray[Any], k: int) -> Contrast:
-    """Cluster into one view per dstate, and cluster images at even distances.
+    """Measure the results without a part of the method.
 
     Args:
         e: The experiment.
         seed: The seed of all noise.
-        trace: The trace at dstates.
-        alone: The clusters of its images, one per dstate.
-        k: The chosen number of views.
+        trace: The trace, with images at dstates.
+        alone: The cluster of each image of the trace, with as many clusters as dstates.
+        k: The chosen number of views. Images at equal distances are clustered into as many.
     """
     truth = true_dstates(trace)
     shared = {name for pair in _aliased(alone, truth) for name in pair}
@@ -286,13 +303,16 @@ def _contrast(e: Experiment, seed: int, trace: Trace, alone: NDArray[Any], k: in
 
 
 def _step(trace: Trace) -> float:
-    """Metres between two dstates on average, for one image per dstate at even distances."""
+    """Compute the distance between images that gives about one image per step of a trace.
+
+    It is the length of the way, measured along x and y, divided by the number of steps, in metres.
+    """
     poses = np.array([step.truth["pose"][:2] for step in trace.steps])
     return round(float(np.abs(np.diff(poses, axis=0)).sum() / len(poses)), 2)
 
 
 def _spread(trace: Trace, truth: NDArray[Any], tours: int) -> list[list[float]]:
-    """The largest distance of a pose from its dstate's mean, circuit by circuit."""
+    """Compute `Run.spread`: the largest offset of a pose from the mean of its dstate, by tour."""
     poses = np.array([step.truth["pose"] for step in trace.steps])
     off = np.zeros_like(poses)
     for name in set(truth):

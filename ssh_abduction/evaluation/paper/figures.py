@@ -1,4 +1,4 @@
-"""Draws figures with matplotlib (the extra `plot`): those of a reproduction, and of verbs."""
+"""Draw figures of experiments and of commands with matplotlib (the extra `plot`)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#888888"
 
 
 def require_matplotlib() -> None:
-    """Raise AbductionError if nothing can be drawn. Call it before hours of work, not after."""
+    """Raise AbductionError if matplotlib cannot be loaded. Call this before hours of work."""
     try:
         importlib.import_module("matplotlib")
     except ImportError:
@@ -41,7 +41,7 @@ def require_matplotlib() -> None:
 
 
 def _pyplot() -> Any:
-    """matplotlib.pyplot, with the style of all figures."""
+    """Load matplotlib.pyplot and set the style of all figures."""
     require_matplotlib()
     import matplotlib
 
@@ -64,7 +64,14 @@ def _save(figure: Any, path: str | Path) -> None:
 def draw_quality(
     path: str | Path, quality: Mapping[int, float], uncertainty: Mapping[int, float], chosen: int
 ) -> None:
-    """M, and U if it is known, against the number of clusters k."""
+    """Draw M, and U if it is known, against the number of clusters k.
+
+    Args:
+        path: The file to write.
+        quality: M (separation of clusters) for each k.
+        uncertainty: U (how well the dstate determines the view) for each k; empty if unknown.
+        chosen: The chosen k, which is marked.
+    """
     # M on the left axis, U on the right one.
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
     axes.plot(list(quality), list(quality.values()), "o-", color=BLUE, label="M")
@@ -87,7 +94,12 @@ def draw_quality(
 
 
 def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None:
-    """Recognition rate, mean and range over the folds, against the number of images."""
+    """Draw the recognition rate against the number of images: mean and range over the folds.
+
+    Args:
+        path: The file to write.
+        curves: Learning curves by name, three at most.
+    """
     figure, axes = _pyplot().subplots(figsize=(5.5, 3.2))
     for (name, curve), colour in zip(curves.items(), (BLUE, ORANGE, GREEN), strict=False):
         axes.fill_between(
@@ -100,13 +112,13 @@ def draw_learning(path: str | Path, curves: Mapping[str, LearningCurve]) -> None
 
 
 def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None:
-    """The entropy of each belief, and the probability that the robot is nowhere.
+    """Draw the entropy of each belief, and the probability that the robot is nowhere on the map.
 
     Steps at which the robot was lost or nowhere are shaded.
 
     Args:
         path: The file to write.
-        beliefs: As `Belief.to_dict` gives them.
+        beliefs: The belief after each step, as `Belief.to_dict` returns it.
     """
     pyplot = _pyplot()
     figure, (upper, lower) = pyplot.subplots(
@@ -154,7 +166,13 @@ def draw_beliefs(path: str | Path, beliefs: Sequence[Mapping[str, Any]]) -> None
 
 
 def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]]) -> None:
-    """The walls, the clutter, the true dstates, and the poses at which images were taken."""
+    """Draw the walls, the clutter, the true dstates, and the poses at which images were taken.
+
+    Args:
+        path: The file to write.
+        world: The world.
+        poses: The poses (x, y, …) in metres.
+    """
     figure, axes = _pyplot().subplots(figsize=(7, 4))
     for x1, y1, x2, y2 in world.segments:
         axes.plot([x1, x2], [y1, y2], color="black", linewidth=1.5)
@@ -163,7 +181,8 @@ def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]])
             axes.plot([x1, x2], [y1, y2], color=ORANGE, linewidth=1)
     at = np.array(poses)
     axes.plot(at[:, 0], at[:, 1], ".", color=BLUE, markersize=3, alpha=0.5)
-    # An arrow for each dstate; few have their names at the tips, many only those of their places.
+    # Each dstate has an arrow. Up to eight dstates are named at the tips. If there are more, only
+    # places are named.
     size = 0.05 * max(world.bounds[2] - world.bounds[0], world.bounds[3] - world.bounds[1])
     for s in world.dstates:
         x, y, heading = s.pose
@@ -192,7 +211,7 @@ def draw_world(path: str | Path, world: World, poses: Sequence[Sequence[float]])
 def draw_views(
     path: str | Path, images: NDArray[np.float64], views: NDArray[Any], truth: NDArray[Any]
 ) -> None:
-    """The images of each view on top of each other, as the robot sees them.
+    """Draw the images of each view on top of each other, as the robot sees them.
 
     Args:
         path: The file to write.
@@ -208,7 +227,7 @@ def draw_views(
     )
     for axes in grid.flat:
         axes.axis("off")
-    # All panels have one scale, which leaves a few outliers out.
+    # All panels have the same scale, at which a few outliers are cut off.
     far = min(8.4, 1.05 * float(np.percentile(images, 98)))
     for axes, name in zip(grid.flat, names, strict=False):
         for image in images[views == name][:60]:
@@ -233,15 +252,16 @@ def draw_telling(
     labels: NDArray[Any],
     found: Mapping[tuple[int, int], TellingFeatures],
 ) -> None:
-    """Which beams distinguish pairs of dstates, over the median scan of each of the two.
+    """Draw which beams of the laser distinguish pairs of dstates.
 
-    Each pair has a row, and each method a column.
+    Each panel shows the median scans of the two dstates. Each pair has a row, and each method a
+    column.
 
     Args:
         path: The file to write.
         ranges: Ranges in metres, (n, d), over the half circle ahead, the first at the right.
         labels: The dstate of each scan, (n,).
-        found: For each pair what distinguishes it.
+        found: For each pair of dstates, how much each beam helps to distinguish them.
     """
     methods = list(next(iter(found.values())).methods)
     figure, grid = _pyplot().subplots(
@@ -279,14 +299,26 @@ def draw_telling(
 
 
 def draw_map(path: str | Path, ssh_map: SSHMap) -> None:
-    """Places, and paths as streets through them, at the poses of the map or in a layout."""
+    """Draw the places of a map, and its paths as lines through them.
+
+    Places are at the poses of the map if it has poses. Otherwise a layout is computed.
+
+    Args:
+        path: The file to write.
+        ssh_map: The map.
+    """
     _pyplot()
     figure = plot(ssh_map).figure
     _save(figure, path)
 
 
 def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
-    """The largest offset from a dstate, tour by tour."""
+    """Draw the largest offset of a pose from the mean pose of its dstate, tour by tour.
+
+    Args:
+        path: The file to write.
+        spread: For each tour the largest offsets in x and y (metres) and heading (radians).
+    """
     # Positions on the left axis, headings on the right one.
     table = np.array(spread)
     figure, axes = _pyplot().subplots(figsize=(5.5, 2.8))
@@ -315,12 +347,12 @@ def draw_spread(path: str | Path, spread: Sequence[Sequence[float]]) -> None:
 
 
 def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[float, float]) -> None:
-    """k, U, map and recognition rate over notch and spread of poses.
+    """Draw k, U, the map and the recognition rate over the notch and the spread of poses.
 
     Args:
         path: The file to write.
-        outcomes: One for each notch and spread. Frames mark those that are as in the paper.
-        here: The notch and the scale of this world and robot. A cross marks them.
+        outcomes: One for each pair of notch and scale. Results as in the paper get a frame.
+        here: The depth of the notch in metres and the scale in the experiment. A cross marks them.
     """
     notches = sorted({o.notch for o in outcomes})
     scales = sorted({o.scale for o in outcomes})
@@ -340,7 +372,7 @@ def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[flo
         "recognition rate (true labels)": 0.4,
         "k chosen by M": 2,
     }
-    # A panel a figure, a cell a notch and spread; text is dark on light cells.
+    # One panel for each value. Each cell of a panel is one notch and spread.
     for axes, (title, value, colours) in zip(grid.flat, panels, strict=True):
         table = np.round([[value(cell[n, t]) for t in scales] for n in notches], 3)
         axes.imshow(table, origin="lower", cmap=colours, aspect="auto", vmin=lowest[title])
@@ -391,5 +423,5 @@ def draw_outcomes(path: str | Path, outcomes: Sequence[Outcome], here: tuple[flo
 
 
 def as_in_paper(o: Outcome) -> bool:
-    """Whether there are four views, U = 1, the right map, and full recognition."""
+    """Tell whether an outcome has four views, U = 1, the right map, and full recognition."""
     return o.k == 4 and o.uncertainty > 1 - 1e-9 and o.right and o.rate > 0.999

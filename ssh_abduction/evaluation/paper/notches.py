@@ -1,4 +1,7 @@
-"""Where the method works: the notched rectangle with other notches and other spreads of poses."""
+"""Run the method in the notched rectangle with other notches and other spreads of poses.
+
+This shows how large the notch must be, and how small the spread of poses, for the method to work.
+"""
 
 from __future__ import annotations
 
@@ -31,17 +34,19 @@ from ssh_abduction.solver import solve
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the method gives for one notch and one spread of poses.
+    """The result of the method for one notch and one spread of poses.
+
+    The offset of a pose is its difference from the mean pose at its dstate.
 
     Attributes:
         notch: The depth of the notch in metres.
-        scale: The offsets of poses from their dstate's mean, as a multiple of those that
-            hill-climbing left.
-        spread: The root mean square of the offsets of positions in metres.
+        scale: The factor by which the offsets that the robot left are multiplied.
+        spread: The root mean square of the multiplied offsets of positions in metres.
         k: The chosen number of views.
-        uncertainty: U at that k.
-        right: Whether the labels of the only minimal map are the true dstates, one to one.
-        rate: The recognition rate by the true labels.
+        uncertainty: U at that number of views (1 if all images of a dstate have one view).
+        right: Whether there is only one minimal map, and its labels are the true dstates, one to
+            one.
+        rate: The rate, 0 to 1, at which the true dstate is recognised after learning true labels.
     """
 
     notch: float
@@ -58,7 +63,7 @@ def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
 
     Args:
         notch: The depth of the notch in metres.
-        scale: Multiplies the offsets of the robot's poses from their dstate's mean.
+        scale: The factor for the offsets of the robot's poses from the mean pose at their dstate.
         seed: The seed of all noise.
     """
     warnings.simplefilter("ignore", ImageWarning)
@@ -87,7 +92,7 @@ def outcome(notch: float, scale: float, seed: int = 0) -> Outcome:
 
 
 def notched(depth: float) -> World:
-    """The notched rectangle with a notch of another depth, in metres."""
+    """Make the notched rectangle with a notch of this depth in metres."""
     world = World.named("notched-rectangle")
     segments = world.segments.copy()
     segments[:, 1::2] = np.where(segments[:, 1::2] < 0, -depth, segments[:, 1::2])
@@ -98,11 +103,11 @@ def notched(depth: float) -> World:
 def _driven(
     notch: float, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
-    """Drive 50 circuits.
+    """Drive all tours of the experiment.
 
     Returns:
-        For each pose the mean pose at its dstate, (n, 3), the offset from it, (n, 3), and the
-        dstate, (n,).
+        For each pose (x, y, heading) the mean pose at its dstate, (n, 3), the offset from this
+        mean, (n, 3), and the true dstate, (n,).
     """
     trace = simulate(notched(notch), EXPERIMENTS["notched-rectangle"].tours, seed)
     truth = true_dstates(trace)

@@ -1,4 +1,4 @@
-"""Writes a reproduction of the paper as a folder: figures, a page, data, and what made them."""
+"""Write a reproduction of the paper into a folder: figures, a page, data, and the configuration."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from ssh_abduction.solver import workers
 
 # Depths of the notch in metres.
 NOTCHES = (0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2)
-# Multiples of the spread of poses that hill-climbing leaves.
+# Factors for the spread of poses that the robot leaves.
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
 
@@ -58,15 +58,16 @@ def reproduce(
     Args:
         name: The name of the experiment.
         seeds: The seeds of all noise.
-        folder: Where to write. It is made if it does not exist.
-        jobs: How many processes work at once; -1 for one a processor.
-        outcomes: Whether to run other notches and spreads of the notched rectangle.
-        on_done: Called with a sentence after each of the `steps`.
-        on_table: Called with the table once all data is written, before anything is drawn. So a
-            picture that fails loses nothing.
+        folder: The folder to write into. It is made if it does not exist.
+        jobs: The number of processes that work at once; -1 for one per processor.
+        outcomes: Whether to also run other notches and other spreads of poses. This is only for the
+            notched rectangle.
+        on_done: Called with a sentence after each part of the work. `steps` counts the parts.
+        on_table: Called with the table once all data is written, before anything is drawn. So no
+            data is lost if a figure fails.
 
     Returns:
-        The table of claims.
+        The table of claims, as `claim_table.summary` makes it.
 
     Raises:
         AbductionError: There is no such experiment, no seed, or no matplotlib, or a process died.
@@ -104,15 +105,15 @@ def reproduce(
 
 
 def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
-    """The results of `work` for these tasks, in their order, from `jobs` processes.
+    """Yield the results of `work` for these tasks, in their order, from `jobs` processes.
 
-    Raises what `work` raises, and KeyboardInterrupt.
+    Exceptions of `work` are raised here, and KeyboardInterrupt if the user interrupts.
     """
     processes = min(effective_n_jobs(jobs), len(tasks))
     if processes == 1:
         for task in tasks:
             result = work(*task)
-            # An interrupted search returns its best answer, which says nothing of the claims.
+            # An interrupted search returns its best answer, which is no evidence for the claims.
             if program.raised:
                 raise KeyboardInterrupt
             yield result
@@ -138,7 +139,11 @@ def _each(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], jobs: int)
 def _done(
     number: int, work: Callable[..., Any], task: tuple[Any, ...], _: Callable[[], bool]
 ) -> tuple[int, Any]:
-    """The result of `work`, or what it raised, in a process of its own."""
+    """Call `work` in a worker process.
+
+    Returns:
+        The number of the task, and the result, or the exception that `work` raised.
+    """
     try:
         return number, work(*task)
     except Exception as error:
@@ -146,13 +151,13 @@ def _done(
 
 
 def steps(name: str, seeds: Sequence[int], outcomes: bool) -> int:
-    """The number of calls of `on_done`, for a progress bar."""
+    """Count the calls of `on_done` by `reproduce` with these arguments, for a progress bar."""
     has_outcomes = outcomes and name == "notched-rectangle"
     return len(seeds) + 1 + (len(NOTCHES) * len(SCALES) if has_outcomes else 0)
 
 
 def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> None:
-    """Draw the figures of one run."""
+    """Draw the figures of one run, and write its trace."""
     e = EXPERIMENTS[name]
     world = World.named(e.world)
     trace = simulate(world, e.tours, run.seed)
@@ -173,7 +178,7 @@ def _draw(name: str, run: Run, folder: Path, on_done: Callable[[str], None]) -> 
 
 
 def _configuration(name: str, seeds: Sequence[int], outcomes: bool) -> dict[str, Any]:
-    """What makes the reproduction again."""
+    """List everything that is needed to repeat the reproduction: command, settings, versions."""
     packages = ("ssh-abduction", "clingo", "numpy", "scipy", "scikit-learn", "networkx")
     return {
         "experiment": name,
@@ -276,7 +281,7 @@ FIGURES = {
 
 
 def _page(name: str, runs: Sequence[Run], table: Sequence[dict[str, Any]], folder: Path) -> str:
-    """The page, with the figures that are in the folder."""
+    """Write the HTML page, with the figures that are already in the folder."""
     rows = "\n".join(
         f"<tr class='{'ours' if row['ours'] else 'paper'}'><td>{escape(claimed(row))}</td>"
         f"<td>{escape(row['paper'])}</td><td>{escape(spread_of(row))}</td>"
@@ -323,12 +328,12 @@ All can be made again: <code>configuration.json</code> says with what.</p>
 
 
 def claimed(row: dict[str, Any]) -> str:
-    """A claim, marked if the paper does not make it."""
+    """Return the text of a claim, marked if it is not in the paper."""
     return f"ours: {row['claim']}" if row["ours"] else str(row["claim"])
 
 
 def spread_of(row: dict[str, Any]) -> str:
-    """The result: one text if the seeds agree, else the commonest texts."""
+    """Write the values of all seeds: one text if they agree, else the three most frequent ones."""
     values = list(row["here"].values())
     counted = sorted(set(values), key=values.count, reverse=True)
     if len(counted) == 1:
