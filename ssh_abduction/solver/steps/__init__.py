@@ -1,1 +1,1 @@
-"""A trace as integers, and facts about its steps that hold in every map."""
+"""Turn a trace into integers, and find facts about its steps that hold in every map."""

@@ -1,23 +1,23 @@
 """Find steps that are different dstates in every map, and a clique of them as a lower bound.
 
 Two steps are *apart* if the same actions, done from both, lead to different views. As a dstate has
-one view and actions are deterministic, such steps are different dstates. In a trace, what was done
-from a step is how the trace continues. So two steps are apart if their continuations differ first
-in a view, not in an action. A *clique* is a set of steps that are pairwise apart. It needs as many
-dstates as it has steps, in every theory with the axioms functional_view and deterministic. A
-`Certificate` contains such a clique.
+one view and actions are deterministic, such steps are different dstates. The *continuation* of a
+step is the sequence of views and actions of the trace from this step on. So two steps are apart if
+their continuations differ first in a view, not in an action. A *clique* is a set of steps that are
+pairwise apart. A map has at least one dstate for each step of a clique, in every theory with the
+axioms functional_view and deterministic. A `Certificate` contains such a clique.
 
 *Claim.* The graph of steps that are apart is a cograph (Corneil, Lerchs, Stewart Burlingham 1981),
 so a largest clique is found without search.
-*Proof.* Write the continuation of each step as a sequence of views and actions in turn. Group the
-steps by common prefixes. If the steps of a group next differ in views, then all steps of different
-subgroups are apart, and the union of largest cliques of the subgroups is a largest clique. If they
-next differ in actions, then no steps of different subgroups are apart, and the largest clique of
-any subgroup is a largest clique. ∎
+*Proof.* Group the steps by common prefixes of their continuations. If the continuations of a group
+next differ in views, all steps of different subgroups are apart. Then the union of largest cliques
+of the subgroups is a largest clique. If the continuations of a group next differ in actions, no
+steps of different subgroups are apart. Then the largest among the cliques of the subgroups is a
+largest clique. ∎
 
 The steps are sorted by their continuations, as in a suffix array. The groups of the proof are then
-intervals of the sorted order. No matrix of all pairs is needed: one row takes a pass over the
-sorted steps.
+intervals of the sorted order. So no matrix of all pairs is needed: one pass over the sorted steps
+finds all steps that are apart from a given step.
 
 >>> from ssh_abduction.solver.steps.apart import Continuations
 >>> Continuations([0, 1, 0, 2, 0], [0, 0, 0, 0]).clique()
@@ -32,22 +32,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-# Up to this many steps, excluded pairs are spread to earlier steps in a matrix of steps x steps, of
-# 64 MB at most. In longer traces, only the pairs that evidence names are excluded.
+# If the same actions lead from two steps to an excluded pair, these two are excluded, too. This is
+# computed in a matrix of steps x steps (64 MB at most) for at most this many steps. In longer
+# traces, only the pairs that evidence names are excluded.
 COMPARED = 8000
-# The most swaps to improve the greedy clique of one view; an eighth of the steps with the view, if
-# that is less. A swap takes as long as growing a clique, and clingo has to wait for the clique.
+# Improve the greedy clique of one view by at most this many swaps, or by an eighth of the steps
+# with the view if that is less. A swap takes as long as growing a clique, and clingo has to wait.
 SWAPS = 60
 
 Matrix = NDArray[np.bool_]
 
 
 class Continuations:
-    """How a trace continues from each of its steps.
+    """Compares the continuations of steps: the views and actions of the trace from each step on.
 
-    Steps are sorted by their continuations, as in a suffix array (Manber, Myers 1993), in
-    n log² n. The common prefix of two steps is the shortest common prefix of neighbours between
-    them.
+    The steps are sorted by their continuations, as in a suffix array (Manber, Myers 1993). This
+    takes n log² n for n steps. The common prefix of two steps is as long as the shortest common
+    prefix of two neighbours between them in the sorted order.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class Continuations:
             seen: The view at each step, as a number.
             actions: The action after each step but the last, numbered from 0.
             excluded: Pairs of steps that evidence says are different dstates. If the same actions
-                lead from two steps to such a pair, then these two are different dstates, too.
+                lead from two steps to such a pair, these two are different dstates, too.
         """
         shown, done = np.asarray(seen), np.append(np.asarray(actions, dtype=int), -1) + 1
         steps = len(shown)
@@ -73,7 +74,7 @@ class Continuations:
         for i, j in excluded if self._excluded is None else ():
             self._partners.setdefault(i, []).append(j)
             self._partners.setdefault(j, []).append(i)
-        # The order of the steps by their first 1, 2, 4, … views and actions.
+        # Rank the steps by the first 1, 2, 4, … views and actions of their continuations.
         ranks = [_ranked(shown * (done.max() + 1) + done)]
         while ranks[-1].max() < steps - 1:
             then = np.zeros(steps, dtype=int)
@@ -83,7 +84,7 @@ class Continuations:
         self._place = ranks[-1]  # the position of each step in the sorted order
         self._sorted = np.argsort(self._place)
         here, there = self._sorted[:-1], self._sorted[1:]
-        # Advance both neighbours by halving strides to where they differ.
+        # Follow the continuations of both neighbours, by halving strides, to where they differ.
         for level in range(len(ranks) - 2, -1, -1):
             ahead = (ranks[level][here] == ranks[level][there]) * (1 << level)
             here, there = here + ahead, there + ahead
@@ -91,11 +92,11 @@ class Continuations:
         self._shared = 2 * (here - self._sorted[:-1]) + (shown[here] == shown[there])
 
     def apart_from(self, step: int, actions: int = 0) -> Matrix:
-        """The steps that are apart from this one, as a row of `apart`.
+        """The steps that are apart from one step, as a row of `apart`: a flag for each step.
 
         Args:
             step: The step.
-            actions: Only the steps whose views differ after at least this many actions.
+            actions: Count only views that differ after at least this many actions.
         """
         place, steps = self._place[step], len(self._place)
         shared = np.empty(steps, dtype=int)
@@ -108,7 +109,7 @@ class Continuations:
         return row
 
     def excluded_from(self, step: int) -> Matrix:
-        """The steps that evidence says are apart from this one."""
+        """The steps that evidence excludes from being one dstate with a step: a flag for each."""
         if self._excluded is not None:
             row: Matrix = self._excluded[step]
             return row
@@ -117,7 +118,7 @@ class Continuations:
         return row
 
     def apart(self) -> Matrix:
-        """The pairs of steps that are apart, as a matrix of steps x steps."""
+        """The pairs of steps that are apart, as a matrix of flags, steps x steps."""
         steps = len(self._place)
         apart = np.empty((steps, steps), dtype=bool)
         for step in range(steps):
@@ -125,14 +126,14 @@ class Continuations:
         return apart
 
     def clique(self) -> list[int]:
-        """A largest clique of steps, in order.
+        """A largest clique: a sorted list of steps that are pairwise apart.
 
-        Of several largest cliques, this is one whose steps are apart from the most others. With
-        evidence, the graph is no cograph any more. Then the result is the larger of that clique and
-        a greedily grown one.
+        Of several largest cliques, take one whose steps are apart from the most other steps. With
+        evidence, the graph is no longer a cograph. Then also grow a clique greedily, and return the
+        larger one, which need not be a largest clique.
         """
-        # The nested groups that the current step is in: the length of the common prefix of their
-        # steps, and a largest clique so far.
+        # The nested groups that the current step is in. Each has the length of the common prefix of
+        # its steps, and a largest clique so far.
         begun: list[tuple[int, _Clique]] = []
         for step, shared in zip(self._sorted.tolist(), [*self._shared.tolist(), -1], strict=True):
             so_far = _Clique((step,), 0, 1)
@@ -147,7 +148,10 @@ class Continuations:
 
 
 def _spread(excluded: Collection[tuple[int, int]], done: NDArray[np.int_]) -> Matrix:
-    """Excluded pairs, and pairs from which the same actions lead to them, as steps x steps."""
+    """The matrix of pairs of steps that are different dstates by evidence, steps x steps.
+
+    These are the excluded pairs, and the pairs from which the same actions lead to these.
+    """
     found = np.zeros((len(done), len(done)), dtype=bool)
     first, second = np.array(list(excluded)).T
     found[first, second] = found[second, first] = True
@@ -161,8 +165,8 @@ class _Clique:
     """A largest clique of a group of steps.
 
     Attributes:
-        steps: The clique.
-        apart: The sum, over the steps of the clique, of the steps of the group apart from each.
+        steps: The steps of the clique.
+        apart: The number of pairs of a step of the clique and a step of the group that are apart.
         group: The number of steps in the group.
     """
 
@@ -174,8 +178,9 @@ class _Clique:
         """A largest clique of the union of two groups.
 
         Args:
-            other: The clique of the other group.
-            apart: Whether all steps of one group are apart from all of the other; else none are.
+            other: A largest clique of the other group.
+            apart: Whether each step of one group is apart from each step of the other. If False, no
+                such pair is apart.
         """
         group = self.group + other.group
         if apart:
@@ -188,14 +193,18 @@ class _Clique:
 
 
 def _ranked(keys: NDArray[np.int_]) -> NDArray[np.int_]:
-    """The rank of each key. Equal keys share a rank."""
+    """The rank of each key, from 0. Equal keys have the same rank."""
     return np.unique(keys, return_inverse=True)[1]
 
 
 def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
-    """A large clique of nodes, in order.
+    """A large clique of nodes, found greedily: a sorted list of nodes that are pairwise apart.
 
-    Nodes with different views are always apart, so this is the union of one clique per view.
+    Nodes with different views are always apart. So grow a clique for each view and join them.
+
+    Args:
+        apart: Which nodes are apart, as a matrix of nodes x nodes.
+        seen: The view of each node, as a number.
     """
     shown = np.asarray(seen)
     found: list[int] = []
@@ -206,7 +215,10 @@ def clique(apart: Matrix, seen: Sequence[int]) -> list[int]:
 
 
 def large_clique(apart: Matrix) -> list[int]:
-    """The largest of the cliques that grow greedily from each node; for few nodes."""
+    """Grow a clique greedily from each node, and return the largest one, sorted.
+
+    This is for few nodes. `apart` is a matrix of nodes x nodes.
+    """
     random = np.random.default_rng(0)
     found = [_grown(apart, [node], random) for node in range(len(apart))]
     largest: list[int] = max(found, key=len, default=[])
@@ -214,9 +226,9 @@ def large_clique(apart: Matrix) -> list[int]:
 
 
 def _greedy_clique(apart: Matrix) -> list[int]:
-    """A greedy clique, improved by swaps.
+    """Grow a clique greedily, and improve it by swaps.
 
-    A swap removes some nodes and grows the clique again. It is kept unless the clique is smaller.
+    A swap removes some nodes and grows the clique again. Keep the result unless it is smaller.
     """
     random = np.random.default_rng(0)
     best = _grown(apart, [], random)
@@ -228,20 +240,26 @@ def _greedy_clique(apart: Matrix) -> list[int]:
 
 
 def _grown(apart: Matrix, kept: list[int], random: np.random.Generator) -> list[int]:
-    """A maximal clique that contains these nodes.
+    """Grow a clique from some nodes until no node can be added.
 
-    The next node is always one of those that are apart from the most candidates left.
+    Each time add a node that is apart from the most of the remaining candidates. Break ties by
+    chance.
+
+    Args:
+        apart: Which nodes are apart, as a matrix of nodes x nodes.
+        kept: The nodes to begin with, which are pairwise apart.
+        random: Breaks ties.
     """
     left = np.flatnonzero(apart[kept].all(axis=0)) if kept else np.arange(len(apart))
     found = list(kept)
     inner = apart[np.ix_(left, left)]
     degree = inner.sum(axis=0)
-    free = np.arange(len(left))  # nodes that are apart from all nodes of the clique
+    free = np.arange(len(left))  # candidates: nodes that are apart from all nodes of the clique
     while len(free):
         best = free[int((degree[free] + random.random(len(free))).argmax())]
         found.append(int(left[best]))
         stay = inner[best, free]
-        # Each node drops out once, so all updates take no longer than to read the matrix.
+        # Each candidate drops out only once. So all updates together read the matrix once.
         degree -= inner[free[~stay]].sum(axis=0)
         free = free[stay]
     return found

@@ -1,4 +1,4 @@
-"""A certificate that no map has fewer dstates; `checker/proof.py` checks it without a solver.
+"""A certificate that proves a lower bound on dstates. `checker/proof.py` checks it by itself.
 
 >>> from ssh_abduction import Trace, solve
 >>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])
@@ -22,21 +22,22 @@ from ssh_abduction.data.trace import Trace, View, checked_trace
 from ssh_abduction.data.words import counted
 from ssh_abduction.solver.steps.noise import Noise, noise_in
 
-# The axioms by which steps that are apart are different dstates.
+# Steps that are apart (the same actions lead from them to different views) are different dstates
+# by these axioms.
 RESTS_ON = frozenset({"functional_view", "deterministic"})
-# A certificate is written with its words only if they have at most this many actions, which take
-# some megabytes. Words may grow with the cube of the trace, and a checker can compute them again.
+# Write a certificate with its words only if these have at most this many actions, some megabytes.
+# The size of all words may grow with the cube of the trace, and a checker can compute them again.
 WRITTEN = 500_000
 
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """A certificate that no map has fewer dstates.
+    """A certificate that no map has fewer than `bound` dstates.
 
     Attributes:
         clique: Steps that are pairwise distinct, so each is a dstate of its own.
-        refuted: Numbers of dstates, from the size of the clique upwards, for which clingo found
-            that there is no map.
+        refuted: The numbers of dstates for which clingo has proven that there is no map. They begin
+            at the size of the clique and have no gap.
     """
 
     clique: tuple[int, ...]
@@ -51,26 +52,29 @@ class Certificate:
 
     @property
     def bound(self) -> int:
-        """The least number of dstates that a map can have."""
+        """The proven lower bound on the number of dstates of a map."""
         return len(self.clique) + len(self.refuted)
 
     def words(self, trace: Trace) -> dict[tuple[int, int], tuple[str, ...]]:
         """The words that distinguish the steps of the clique.
 
+        The word of two steps is the sequence of actions that leads from both to different views. It
+        is empty if their own views differ.
+
         Returns:
-            For each pair of steps, the common actions that lead from them to different views.
+            For each pair of steps (the earlier one first) the names of the actions.
 
         Raises:
-            SolverError: If two steps of the clique are not apart in this trace.
+            SolverError: Two steps of the clique are not distinguished in this trace.
         """
         checked_trace(trace)
         return {pair: _word(trace, *pair) for pair in combinations(self.clique, 2)}
 
     def to_dict(self, trace: Trace | None) -> dict[str, Any]:
-        """The certificate as plain data.
+        """The certificate as plain data: "clique", "refuted", and perhaps "words".
 
-        Words are left out for pairs of steps with different views, which need none; for all pairs,
-        if there are more than WRITTEN actions in them; and if there is no trace.
+        Pairs of steps with different views need no word, so they are left out. There are no words
+        at all if the trace is None, or if they have more than WRITTEN actions together.
         """
         if trace is None:
             return {"clique": list(self.clique), "refuted": list(self.refuted)}
@@ -86,9 +90,9 @@ class Certificate:
         return {"clique": list(self.clique), "words": words, "refuted": list(self.refuted)}
 
     def _pairs_alike(self, trace: Trace) -> Iterator[tuple[int, int]]:
-        """The pairs of steps of the clique that show one view, in order.
+        """Yield the pairs of steps of the clique that show the same view, in order.
 
-        All other pairs need no word. There may be millions of them.
+        This does not visit the other pairs, as there may be millions of them.
         """
         alike: dict[View | None, list[int]] = {}
         for step in self.clique:
@@ -100,14 +104,14 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Basis:
-    """The data for a certificate, which is made when it is first used.
+    """The data for a certificate. The certificate itself is made when it is first used.
 
     To make a certificate takes as long as to solve a short trace.
 
     Attributes:
-        views: The views of the first steps of the trace, as numbers.
-        actions: The actions there, as numbers.
-        bound: The proven lower bound on dstates.
+        views: The view of each of the first steps of the trace, as a number.
+        actions: The action after each of these steps but the last, as a number.
+        bound: The proven lower bound on dstates; 0 if none is proven.
     """
 
     views: tuple[int, ...]
@@ -128,7 +132,7 @@ class Basis:
 
 
 def _word(trace: Trace, i: int, j: int) -> tuple[str, ...]:
-    """The common actions that lead from steps i and j to different views."""
+    """The names of the actions that lead from both steps i and j to different views."""
     word: list[str] = []
     while True:
         here, there = trace.steps[i + len(word)], trace.steps[j + len(word)]

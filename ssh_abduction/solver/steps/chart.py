@@ -1,10 +1,11 @@
-"""The graph of a trace: nodes, links between them, and which nodes are apart.
+"""Chart a trace: make its graph of nodes and links, and find which nodes are apart.
 
-Engines that find dstates before places work on it. In the causal theory each step is a node, and
-each action is a link to the next node. With frames (star=frame), a turn rotates the robot by known
-quarters. So the steps between two travels, a *visit*, are at one place. The steps of a visit that
-face the same way are one node, and rotations link the nodes of a visit both ways. Nodes are apart
-if what was seen and done shows that they are different dstates, as in `steps/apart.py`.
+Engines that find dstates before places work on a chart. In the causal theory each step is a node,
+and each action is a link to the next node. With frames (star=frame), a turn rotates the robot by a
+known number of quarters (right angles), and the steps between two travels are at one place. They
+are called a *visit*. The steps of a visit that face the same way are one node. Rotations link the
+nodes of a visit in both directions. Two nodes are *apart* if the views and actions of the trace
+show that they are different dstates, as in `steps/apart.py`.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.solver.steps.chart import Chart
@@ -41,13 +42,14 @@ QUARTERS: dict[TurnDirection | None, int] = {"right": 1, "around": 2, "left": 3}
 
 @dataclass(frozen=True)
 class Chart:
-    """Nodes, numbered by their first steps, and links between them.
+    """Nodes and the links between them. Nodes are numbered in the order of their first steps.
 
     Attributes:
-        seen: The observation at each node.
-        links: Triples (node, action, node). A rotation by J quarters is the action -J.
+        seen: The observation (view, and perhaps star) at each node, as a number.
+        links: Triples (node, action, node), with actions as numbers from 0. A rotation by J
+            quarters is the action -J.
         node_of: The node of each step.
-        excluded: Pairs of nodes that evidence says are different dstates.
+        excluded: Pairs of nodes that are different dstates by evidence.
     """
 
     seen: tuple[int, ...]
@@ -57,7 +59,7 @@ class Chart:
 
     @staticmethod
     def of_steps(log: Log, size: int) -> Chart:
-        """The chart of the first `size` steps, each of them a node."""
+        """The chart of the first `size` steps in which each step is a node."""
         links = tuple((t, log.actions[t], t + 1) for t in range(size - 1))
         return Chart(
             tuple(log.seen[:size]),
@@ -67,21 +69,24 @@ class Chart:
         )
 
     def apart(self) -> NDArray[np.bool_]:
-        """The pairs of nodes that are apart, as a matrix of nodes x nodes."""
+        """The pairs of nodes that are apart, as a matrix of flags, nodes x nodes."""
         return self.continuations.apart()
 
     @cached_property
     def continuations(self) -> Continuations:
-        """How the trace continues from each node."""
+        """The views and actions that follow each node. Only for a chart made by `of_steps`."""
         from ssh_abduction.solver.steps.apart import Continuations  # loads numpy
 
         return Continuations(self.seen, [action for _, action, _ in self.links], self.excluded)
 
     def is_map(self, labels: Sequence[int]) -> bool:
-        """Whether the labels of all nodes make a map.
+        """Whether labels make a causal map.
 
-        Each dstate has to show one view, each action has to lead to one dstate, and no excluded
-        pair may have one label.
+        Each dstate must have one observation, each action at a dstate must lead to one dstate, and
+        the nodes of an excluded pair must have different labels.
+
+        Args:
+            labels: The dstate of each node; a negative number if it is unknown, which is no map.
         """
         view: dict[int, int] = {}
         leads: dict[tuple[int, int], int] = {}
@@ -102,23 +107,25 @@ class Chart:
     def turned(trace: Trace, log: Log, size: int) -> FramedChart | None:
         """The chart of the first `size` steps, as if places had frames.
 
-        The views ahead, right, back and left replace the star. This is a guess, as in the causal
-        theory turns need not rotate.
+        The views ahead, right, back and left take the place of a star (the openings seen). This is
+        a guess, as turns need not rotate the robot in the causal theory.
 
         Returns:
-            The chart; None if some action is neither turn nor travel, or if the view after a turn
-            does not follow from the view before it.
+            The chart; None if `around` finds no views, or if some visit contradicts them.
         """
         around = Chart.around(trace, log, size)
         return None if around is None else Chart.framed(trace, log, size, around)
 
     @staticmethod
     def around(trace: Trace, log: Log, size: int) -> dict[int, list[int]] | None:
-        """What each observation has ahead, right, back and left of it.
+        """The four observations around each observation, as seen by turning there.
 
-        None under the conditions that `turned` names.
+        Returns:
+            For each observation, the ones seen ahead, right, back and left. None if some action is
+            neither turn nor travel, if the observation after a turn does not follow from the one
+            before it, or if some of the four were never seen.
         """
-        # The observation after a turn, by the one before it and the quarters clockwise.
+        # For an observation and a number of quarters clockwise: the observation after that turn.
         after: dict[tuple[int, int], int] = {}
         for action, before, then in zip(
             trace.actions[: size - 1], log.seen, log.seen[1:], strict=False
@@ -147,17 +154,17 @@ class Chart:
         size: int | None = None,
         around: Mapping[int, Sequence[int]] | None = None,
     ) -> FramedChart | None:
-        """The chart of the first steps, where places have frames.
+        """The chart of the first steps for places with frames.
 
         Args:
             trace: The trace.
             log: The same trace as integers.
             size: The number of steps; all by default.
-            around: For each observation, the ones seen ahead, right, back and left of where it is
-                seen ahead. They replace the stars of the trace.
+            around: For each observation, the four seen ahead, right, back and left when facing it.
+                They replace the stars of the trace. None to use the stars.
 
         Returns:
-            The chart; None if some visit contradicts every frame, so that there is no map.
+            The chart; None if some visit contradicts itself, so that there is no map with frames.
         """
         size = len(trace) if size is None else size
         node: dict[tuple[int, int], int] = {}
@@ -168,7 +175,7 @@ class Chart:
         visit = slot = 0
         for t in range(size):
             if t and (action := trace.actions[t - 1]).kind != "turn":
-                # A travel, or an action of which it is not known where it led.
+                # A travel, or an action that may have led anywhere.
                 visit, slot = visit + 1, 0
             elif t:
                 slot = (slot + QUARTERS[action.turn]) % 4
@@ -212,16 +219,16 @@ class Chart:
 
 @dataclass(frozen=True)
 class FramedChart(Chart):
-    """A chart of visits.
+    """A chart of visits to places with frames. A visit is the steps between two travels.
 
     Attributes:
-        facing: The visit and the slot of each node. Slots count quarters clockwise from the
-            heading in which the robot arrived.
-        stars: The openings of each visit by slot, or the observations by slot.
+        facing: The visit and the slot of each node. Slot K of a visit is K quarters clockwise of
+            the heading in which the robot arrived.
+        stars: For each visit, which of the four slots are open (1 or 0), or the observations there.
         travels: The links that are travels, in order: travel V leads from visit V to visit V + 1.
-            An action that slipped is among them, as an action that occurs only once.
+            An action that slipped counts as a travel by an action that occurs only once.
         elsewhere: Pairs of nodes that are known to be at different places.
-        away: Those of these pairs that evidence names.
+        away: The pairs of `elsewhere` that evidence names.
     """
 
     facing: tuple[tuple[int, int], ...]
@@ -231,22 +238,22 @@ class FramedChart(Chart):
     away: frozenset[tuple[int, int]] = frozenset()
 
     def with_elsewhere(self, more: Iterable[tuple[int, int]]) -> FramedChart:
-        """The same chart, with more pairs of nodes known to be at different places."""
+        """The same chart with more pairs of nodes in `elsewhere`."""
         return replace(self, elsewhere=self.elsewhere | frozenset(more))
 
     def __getstate__(self) -> dict[str, object]:
-        """The fields, without the large arrays computed from them, to send to another process."""
+        """The fields, for sending the chart to another process without the large cached arrays."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def apart(
         self, most: int | None = None, others: Sequence[int] | None = None
     ) -> NDArray[np.bool_]:
-        """The pairs of nodes that are apart, as a matrix of nodes x others.
+        """The pairs of nodes that are apart, as a matrix of flags, nodes x others.
 
-        Two nodes are apart if their visits misfit when both nodes face one slot.
+        Two nodes are apart if their visits cannot be at one place with both nodes facing one slot.
 
         Args:
-            most: Only the first `most` nodes; all by default.
+            most: Compare only the first `most` nodes; all by default.
             others: The nodes to compare them with; the same nodes by default.
         """
         import numpy as np
@@ -267,7 +274,7 @@ class FramedChart(Chart):
 
     @cached_property
     def leaves(self) -> dict[int, tuple[int, int]]:
-        """The slot and action at which each visit but the last ends."""
+        """For each visit but the last, the slot that it leaves through, and the action."""
         return {
             visit: (self.facing[node][1], action)
             for visit, (node, action, _) in enumerate(self.travels)
@@ -306,30 +313,30 @@ class FramedChart(Chart):
         )
 
     def visits_with(self, pairs: int) -> int:
-        """The most first visits among which at most `pairs` pairs may be at one place."""
+        """The most first visits of which at most `pairs` pairs may be at one place: a number."""
         import numpy as np
 
         return int(np.searchsorted(self.fitting, pairs, side="right")) - 1
 
     @cached_property
     def fitting(self) -> NDArray[np.int_]:
-        """The number of pairs that `fits` would list, for each number of first visits.
+        """For each number of first visits, from 0, the number of triples that `fits` would list.
 
-        There may be too many pairs to list them.
+        There may be too many triples to list them.
         """
         import numpy as np
 
         return np.cumsum([0, *np.count_nonzero(np.triu(~self.misfits, 1), axis=(0, 1))])
 
     def fits(self, visits: Sequence[int]) -> list[tuple[int, int, int]]:
-        """The pairs of these visits that may be at one place.
+        """List the pairs of some visits that may be at one place.
 
         Args:
-            visits: Visits, in order.
+            visits: The visits, in order.
 
         Returns:
-            Triples (I, J, R) with I < J: visits I and J may be at one place, with slot 0 of I at
-            slot R of J.
+            Triples (I, J, R) with I < J: visits I and J may be at one place, and then slot 0 of I
+            is slot R of J.
         """
         import numpy as np
 
@@ -339,12 +346,12 @@ class FramedChart(Chart):
 
     @cached_property
     def misfits(self) -> NDArray[np.bool_]:
-        """Which visits cannot be at one place, as an array of R x I x J.
+        """Which pairs of visits misfit, as an array of flags, 4 x visits x visits.
 
-        True if visits I and J cannot be at one place with slot 0 of I at slot R of J, for R from 0
-        to 3. Two visits misfit if they show different things, if evidence says so, or if one
-        action, done facing the same way, leads to visits that misfit as they arrive. So visits are
-        compared from the last to the first.
+        The flag [R, I, J] is True if visits I and J cannot be at one place such that slot 0 of I is
+        slot R of J. The reason is that they show different things, that evidence says so, or that
+        both leave by one action in the same direction to visits that misfit in turn. For this last
+        reason, the visits are compared from the last to the first.
         """
         import numpy as np
 
@@ -353,7 +360,7 @@ class FramedChart(Chart):
         for (visit, slot), seen in zip(self.facing, self.seen, strict=True):
             views[visit, slot] = seen
         number: dict[tuple[int, ...], int] = {}
-        # stars[r] has the star of each visit as seen from its slot r, as a number.
+        # stars[r] has, for each visit, a number for its star as seen when facing slot r.
         stars = [
             np.array([number.setdefault(star[r:] + star[:r], len(number)) for star in self.stars])
             for r in range(4)
@@ -385,25 +392,26 @@ class FramedChart(Chart):
 
 
 def _pairs_within(earlier: Earlier, size: int) -> list[tuple[int, int]]:
-    """The pairs of steps among the first `size`, the earlier step first."""
+    """The pairs of steps in which both are among the first `size`, the earlier step first."""
     return [(i, t) for t, others in earlier.items() if t < size for i in others]
 
 
 def numbered(labels: Iterable[Hashable]) -> list[int]:
-    """Labels renumbered in the order in which they first occur."""
+    """Renumber labels from 0 in the order in which they first occur."""
     number: dict[Hashable, int] = {}
     return [number.setdefault(label, len(number)) for label in labels]
 
 
 def _views_around(seen: int, after: Mapping[tuple[int, int], int]) -> list[int] | None:
-    """The observations ahead, right, back and left of where `seen` is seen ahead.
+    """The observations ahead, right, back and left of a robot that faces `seen`.
 
     Args:
         seen: An observation.
-        after: The observation after a turn, by the one before it and the quarters clockwise.
+        after: For an observation and a number of quarters clockwise, the observation after that
+            turn.
 
     Returns:
-        Four observations; None if turns do not tell them all, or contradict each other.
+        Four observations; None if some of them is not known, or if turns contradict each other.
     """
     views = {0: seen}
     waiting = [0]

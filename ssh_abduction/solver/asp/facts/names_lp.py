@@ -1,4 +1,9 @@
-"""Facts for `fast/names.lp`, which gives dstates names before the search, and its answers."""
+"""Write facts for `fast/names.lp`, and read its answers.
+
+In that encoding, dstates have *names* (numbers) before the search. A *spare* name is one at which
+no step is known to be; to use it costs a dstate. The last spare name of a view is its *rest*: one
+name for all dstates of the view that have no name of their own.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +23,15 @@ def name_facts(
     choices: Sequence[Sequence[int]],
     ordered: bool = True,
 ) -> str:
-    """The facts of names.lp that hold for all batches.
+    """The facts that hold for all batches.
 
     Args:
-        names: Each name with its view.
+        names: Pairs of a name and its view.
         spares: For each view its spare names; the last one is the rest.
-        links: Links of the nodes, with their actions.
+        links: Triples of a node, an action, and the node that the action leads to.
         choices: For each node, the names that it can have.
-        ordered: Whether spare names are used in the order of nodes. If not, a question may
-            assume so.
+        ordered: Whether nodes use the spare names of a view in order, which spares clingo
+            equivalent answers. If False, a single search can still assume it by `ordered()`.
     """
     view_of = dict(names)
     rests = {spare[-1] for spare in spares}
@@ -59,14 +64,14 @@ def batch_facts(
     links: Iterable[tuple[int, int, int]],
     apart: Iterable[tuple[int, int]],
 ) -> str:
-    """The facts of names.lp for one batch.
+    """The facts for one batch of nodes.
 
     Args:
         batch: The number of the batch.
-        nodes: Each node with its view, the names that it can have, and the node of that view
-            that was given before it.
-        links: Links with their actions.
-        apart: Pairs of nodes that are not one dstate.
+        nodes: For each node, its number, its view, the names that it can have, and the last node of
+            that view that was given before; None if there is no such node.
+        links: Triples of a node, an action, and the node that the action leads to.
+        apart: Pairs of nodes that are different dstates.
     """
     facts = []
     for t, view, names, before in nodes:
@@ -79,33 +84,33 @@ def batch_facts(
 
 
 def resting(batch: int) -> Symbol:
-    """The atom that some step of the batches up to this one is at the rest of its view."""
+    """The atom that says that some step of the batches up to this one is at a rest."""
     return Function("resting", numbers(batch))
 
 
 def ordered() -> Symbol:
-    """The atom that steps are at spare names in the order of the names."""
+    """The atom that says that steps use the spare names of a view in the order of the names."""
     return Function("ordered")
 
 
 def named(t: int, name: int) -> Symbol:
-    """The atom that step t is at the dstate of that name."""
+    """The atom that says that step t is at the dstate of that name."""
     return Function("is", numbers(t, name))
 
 
 def used(name: int) -> Symbol:
-    """The atom that a spare name is used."""
+    """The atom that says that a spare name is used."""
     return Function("used", numbers(name))
 
 
 def read_names(model: Model) -> dict[int, int]:
-    """The name of each step that an answer set of names.lp speaks of."""
+    """Read an answer: a dict from the steps that clingo was given to their names."""
     return dict(map(_named, model.symbols(shown=True)))
 
 
 @lru_cache(maxsize=2**16)
 def _named(symbol: Symbol) -> tuple[int, int]:
-    """A step and its name.
+    """Read a step and its name from an atom.
 
     Results are cached, as successive answers share most atoms.
     """
@@ -114,21 +119,25 @@ def _named(symbol: Symbol) -> tuple[int, int]:
 
 
 class NameReader:
-    """Reads answers of names.lp that was given all links of a trace.
+    """Reads answers of names.lp, if clingo was given all links of a trace.
 
-    The name of each step follows from where actions lead, which takes fewer calls to clingo.
-    `actions` has the action after each step but the last, as numbers. `choices` has the names
-    that each step can have.
+    It reads only where actions lead, and follows the trace along these links. This takes fewer
+    calls of clingo than reading the name of each step.
+
+    Args:
+        actions: The action after each step but the last, as a number.
+        choices: For each step, the names that it can have.
     """
 
     def __init__(self, actions: Sequence[int], choices: Sequence[Sequence[int]]) -> None:
         self._actions = actions
         self._choices = choices
-        # Where an action at a name led in the last answer, and the literal that says so.
+        # For a name and an action: the name that it led to in the last answer, and the literal of
+        # that atom.
         self._last: dict[tuple[int, int], tuple[int, int]] = {}
 
     def read(self, model: Model) -> dict[int, int]:
-        """The name of each step, in an answer that uses no rest."""
+        """Read the name of each step from an answer in which no step is at a rest."""
         atoms = model.context.symbolic_atoms
         leads: dict[tuple[int, int], int] = {}
         name = next(
@@ -157,11 +166,11 @@ class NameReader:
 
 
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
-    """The rule that these pairs of steps are not all one dstate, unless they are at a rest.
+    """The rules that, of some pairs of steps, not each pair is at one dstate, rests aside.
 
     Args:
-        number: A new number for each such rule.
-        pairs: Pairs of steps with names.
+        number: A number that no other such rule has.
+        pairs: Pairs of steps that clingo was given.
     """
     together = [
         f"together({number},{k}) :- is({i},S), is({j},S), not rest(S)."
@@ -175,6 +184,11 @@ def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
 def forbidden_links(
     links: Iterable[tuple[int, int, int]], placed: Iterable[tuple[int, int]] = ()
 ) -> str:
-    """The rule that these links do not all hold while these steps are at these dstates."""
+    """The rule that some links do not all hold while some steps are at certain dstates.
+
+    Args:
+        links: Triples of a name, an action, and the name that it leads to.
+        placed: Pairs of a step and the name of its dstate.
+    """
     body = [f"goes({s},{a},{x})" for s, a, x in links] + [f"is({t},{s})" for t, s in placed]
     return f":- {', '.join(body)}."

@@ -1,4 +1,9 @@
-"""Reads maps from answers of `fast/paths_framed.lp` and `fast/paths_frameless.lp`."""
+"""Read maps from answers of `fast/paths_framed.lp` and `fast/paths_frameless.lp`.
+
+These encodings get dstates and links as input, and find places and paths for them. A *segment* is a
+part of a path that travels and turns around join. Several segments may be one path. In the same way
+turns join dstates to small places, and several of these may be one place of the map.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +28,12 @@ _Ahead: TypeAlias = tuple[
 
 @dataclass(frozen=True, slots=True)
 class PathAnswer:
-    """An answer of paths_framed.lp or paths_frameless.lp.
+    """The places and paths in an answer of paths_framed.lp or paths_frameless.lp.
 
     Attributes:
-        at: For each place of the turns, the place of the map, and the turn between the two.
-        part: For each segment, its path, and its direction on the path.
+        at: For each place that turns join, the place of the map, and by how many quarters the frame
+            of one is turned against that of the other.
+        part: For each segment, its path, and its direction on the path (1 or -1).
         order: For each path, its places in order.
     """
 
@@ -39,8 +45,9 @@ class PathAnswer:
 class PathReader:
     """Reads maps from answers of paths_framed.lp or paths_frameless.lp, for fixed labels.
 
-    It asks whether an atom is in the answer, atoms of the last answer first. That takes a third of
-    the time of reading all atoms. What follows from the labels is computed once.
+    It asks clingo whether single atoms are in an answer, beginning with the atoms of the last
+    answer. That takes a third of the time of reading all atoms. Whatever follows from the labels is
+    computed once.
     """
 
     def __init__(
@@ -82,7 +89,16 @@ class PathReader:
         ] = {}  # dstates made so far, as most of them are in most maps
 
     def condition(self, sort: str, i: int, j: int) -> str | None:
-        """The condition that two dstates share a place, path or course; None if they never do."""
+        """The body of a rule that holds if two dstates share a place, path or course.
+
+        Args:
+            sort: What they share: "places", "paths" or "courses".
+            i: The number of one dstate.
+            j: The number of the other.
+
+        Returns:
+            The body; None if they never share one, as a dstate is along no path.
+        """
         if sort == "places":
             return f"at({self._dstates[i][1]},P,_), at({self._dstates[j][1]},P,_)"
         runs = {
@@ -97,7 +113,7 @@ class PathReader:
         return f"course({g},H,D), course({h},H,E){same_way}"
 
     def read(self, model: Model) -> PathAnswer:
-        """The values that map_of needs of an answer."""
+        """Read the values of an answer that `map_of` needs. clingo may then change the answer."""
         at, part = self._at.made_in(model), self._part.made_in(model)
         on: dict[int, dict[int, None]] = {}  # for each path, the places on it
         for segment, component in self._passes:
@@ -107,7 +123,7 @@ class PathReader:
         )
 
     def _ordered(self, model: Model, path: int, places: Collection[int]) -> list[int]:
-        """The places of a path in order, sorted from their order in the last answer."""
+        """Sort the places of a path. Begin with their order in the last answer, to ask less."""
         order = list(
             dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places])
         )
@@ -135,7 +151,7 @@ class PathReader:
         return literal != 0 and model.is_true(literal)
 
     def map_of(self, answer: PathAnswer) -> SSHMap:
-        """The map that an answer describes."""
+        """Make the map that an answer describes."""
         placed = self._placed
         if placed is None or placed.at != answer.at:
             placed = self._placed = self._placed_at(answer.at)
@@ -165,7 +181,7 @@ class PathReader:
         )
 
     def _placed_at(self, at: dict[int, tuple[int, int]]) -> _Placed:
-        """Read the place of each dstate from `at`."""
+        """Make the dstates with their places and headings from `at`, without paths."""
         arrived: dict[
             int, tuple[int, int]
         ] = {}  # for each place, its number in the map, and the slot that is faced first
@@ -177,7 +193,7 @@ class PathReader:
         return _Placed(at, {p: number for p, (number, _) in arrived.items()}, dstates, {})
 
     def _dstate(self, placed: DState, path: int, direction: int) -> DState:
-        """A dstate, with its path and direction."""
+        """Return a dstate with a path and a direction added. Dstates made before are reused."""
         key = placed.id, placed.place, placed.heading, path, direction
         if key not in self._made:
             self._made[key] = replace(placed, path=path, direction=direction)
@@ -186,13 +202,14 @@ class PathReader:
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """The part of a map that the places of an answer determine.
+    """The part of a map that does not depend on paths: places and dstates.
 
     Attributes:
         at: As in PathAnswer.
         number: For each place, its number in the map.
         dstates: The dstates of the map, without paths.
-        along: The dstates of a segment with their paths, by segment, path and direction.
+        along: For a segment, a path and a direction: the dstates of the segment, with this path and
+            direction, and their numbers. Filled as maps need them.
     """
 
     at: dict[int, tuple[int, int]]
@@ -202,7 +219,10 @@ class _Placed:
 
 
 class _Choices:
-    """The atoms of a predicate whose first argument has exactly one atom in each answer."""
+    """Reads the atoms of a predicate that chooses, for each first argument, the other two.
+
+    In each answer there is exactly one atom for each first argument.
+    """
 
     def __init__(self, control: Control, name: str) -> None:
         self._among: dict[
@@ -212,7 +232,7 @@ class _Choices:
             self._among.setdefault(a, []).append((literal, (b, c)))
 
     def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
-        """The other two arguments that an answer chooses for each first argument."""
+        """The other two arguments that an answer chooses, by the first argument."""
         made = {}
         for a, among in self._among.items():  # ask first for the choices of the last answer
             if len(among) > 1 and not model.is_true(among[0][0]):
@@ -223,7 +243,7 @@ class _Choices:
 
 
 def _literals(control: Control, name: str) -> dict[tuple[int, int, int], int]:
-    """The literals of the atoms of a predicate with three arguments, by these."""
+    """The literals of all atoms of a predicate with three arguments, by its arguments."""
     found = {}
     for atom in control.symbolic_atoms.by_signature(name, 3):
         a, b, c = read_atom(atom.symbol)[1]

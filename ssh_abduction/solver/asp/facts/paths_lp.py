@@ -1,4 +1,9 @@
-"""Facts for `fast/paths*.lp`, which find places and paths for fixed labels, and their answers."""
+"""Write facts for `fast/paths_framed.lp` and `fast/paths_frameless.lp`, and read their answers.
+
+These encodings find places and paths for fixed labels (the dstate of each step or node). A *node*
+is the steps of one visit that face the same way. A *segment* is a part of a path that travels and
+turns around join. Several segments may be one path.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +24,14 @@ from ssh_abduction.theory.theory import Theory
 def paths_framed_facts(
     trace: Trace, theory: Theory, chart: FramedChart, forbidden: Sequence[Collection[Equality]] = ()
 ) -> str:
-    """What happened at the nodes of a chart, as facts for paths_framed.lp.
+    """The facts for paths_framed.lp about the nodes of a chart: turns, travels and evidence.
 
-    forbidden  sets of equalities of steps that do not all hold
+    Args:
+        trace: The trace.
+        theory: The theory, without `auto`.
+        chart: The chart of the trace or of its first steps.
+        forbidden: Sets of equalities of steps. Evidence says that the equalities of a set do not
+            all hold.
     """
     slipped = {
         chart.node_of[t]
@@ -54,15 +64,16 @@ def paths_frameless_facts(
     *,
     single: bool = False,
 ) -> str:
-    """Dstates and their links, as facts for paths_frameless.lp.
+    """The facts for paths_frameless.lp about dstates and their links.
 
     Args:
-        theory: The theory.
-        dstates: The dstates.
-        links: Links with actions as numbers.
+        theory: The theory, without `auto`.
+        dstates: The numbers of the dstates.
+        links: Triples of a dstate, the number of an action, and the dstate that it leads to.
         actions: The actions by number.
-        far: Sets of pairs of dstates. In each set some pair is not at one place.
-        single: Merge no places or segments unless they have to be one.
+        far: Sets of pairs of dstates. In each set, at least one pair is at different places.
+        single: Whether to merge only places and segments that have to be one. This is solved
+            faster.
     """
     facts = [
         sides_framed_facts(theory),
@@ -84,11 +95,11 @@ def paths_frameless_facts(
 
 
 def read_contrary(model: Model) -> tuple[list[int], list[int]]:
-    """Dstates that show that there are no places and paths.
+    """Read the dstates that show that the labels have no places and paths.
 
     Returns:
-        The dstates of contrary segments, short ones first; and dstates whose paths seem to
-        cross twice.
+        A dstate of each segment that shows it, the shortest segment first; and the dstates at which
+        two paths cross that seem to meet again.
     """
     atoms = list(map(read_atom, model.symbols(shown=True)))
     contrary = sorted((args[1], args[0]) for name, args in atoms if name == "contrary")
@@ -105,14 +116,15 @@ def settled_facts(
     *,
     single: bool = False,
 ) -> str:
-    """The labels of these nodes, as facts for paths_framed.lp.
+    """The facts for paths_framed.lp about the labels of some nodes.
 
     Args:
-        theory: The theory.
+        theory: The theory, without `auto`.
         chart: The chart of the nodes.
         labels: The dstate of each node.
-        nodes: The nodes to use.
-        single: Merge no places or segments unless they have to be one.
+        nodes: The nodes whose labels to use.
+        single: Whether to merge only places and segments that have to be one. This is solved
+            faster.
     """
     facts = [
         settled_labels((node, labels[node]) for node in nodes),
@@ -128,7 +140,7 @@ def settled_facts(
 
 
 def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
-    """All segments, and the pairs of them that cannot be one path in either direction."""
+    """Read all segments, and the pairs of segments that cannot be one path, from a control."""
     segments = sorted(
         read_atom(atom.symbol)[1][0] for atom in control.symbolic_atoms.by_signature("segment", 1)
     )
@@ -143,14 +155,15 @@ def read_rivals(control: Control) -> tuple[list[int], list[tuple[int, int]]]:
 
 @dataclass(frozen=True)
 class Segments:
-    """What paths_frameless.lp derives about segments and places before merging any.
+    """What paths_frameless.lp derives about places and segments before it merges any.
 
     Attributes:
-        places: The places that turns distinguish.
-        elsewhere: Pairs of places that are not one.
-        travels: A segment, and two places that a travel along it leads between, in its direction.
+        places: The places that turns join. Several of them may be one place of a map.
+        elsewhere: Pairs of these places that are different places of every map.
+        travels: Triples of a segment and two places: in the direction of the segment, a travel
+            leads from the first place to the second.
         segments: All segments.
-        distinct: Pairs of segments that are not one path.
+        distinct: Pairs of segments that cannot be one path.
     """
 
     places: list[int]
@@ -161,7 +174,7 @@ class Segments:
 
     @classmethod
     def read(cls, control: Control) -> Segments:
-        """Read a control in which the parts base and segments are grounded."""
+        """Read them from a control in which the parts base and segments are grounded."""
         symbols = control.symbolic_atoms
 
         def atoms(name: str, arity: int) -> list[tuple[int, ...]]:
@@ -176,23 +189,26 @@ class Segments:
 
 
 def tight_facts(homes: Mapping[int, Iterable[int]]) -> str:
-    """For each place the fixed places that it may be, as facts for paths_frameless.lp."""
+    """The facts for paths_frameless.lp that say which fixed places each place may be.
+
+    Fixed places are pairwise different, and with these facts there are no other places.
+    """
     return "tight.\n" + "\n".join(
         f"fixed({place},{home})." for place, found in homes.items() for home in found
     )
 
 
 def pinned_facts(segments: Iterable[int]) -> str:
-    """Segments no two of which can be one path, as facts for paths_framed.lp."""
+    """The facts for paths_framed.lp that name segments which are pairwise different paths."""
     return " ".join(f"pinned({segment})." for segment in segments)
 
 
 def read_told(model: Model) -> tuple[bool, list[tuple[int, int]], list[tuple[int, int]]]:
-    """Read what follows from labels of nodes.
+    """Read the conclusions that paths_framed.lp draws from the labels of nodes.
 
     Returns:
-        Whether the labels have no places and paths. If they may have some: the pairs of dstates
-        at different places, and the pairs that are one.
+        True if no places and paths fit the labels, and two empty lists. Else False, the pairs of
+        dstates that are at different places, and the pairs of labels that must be one dstate.
     """
     found: dict[str, list[tuple[int, int]]] = {"elsewhere": [], "one": []}
     for name, args in map(read_atom, model.symbols(shown=True)):
@@ -208,17 +224,21 @@ def is_violated(control: Control) -> bool:
 
 
 def loose(labels: Iterable[int]) -> str:
-    """Dstates whose labels may be wrong, as facts."""
+    """The facts that name labels which may still be merged with other labels."""
     return "\n".join(f"loose({label})." for label in labels)
 
 
 def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
-    """Nodes and their dstates, as facts."""
+    """The facts that give some nodes their dstates. `labels` has pairs of a node and its dstate."""
     return "\n".join(f"is({node},{label})." for node, label in labels)
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """Labels of nodes. clingo chooses some that have no places and paths."""
+    """The rules by which clingo chooses nodes whose labels already have no places and paths.
+
+    Args:
+        labels: The dstate of each node.
+    """
     return "\n".join(
         [
             *(f"{{ is({node},{label}) }}." for node, label in enumerate(labels)),
@@ -229,7 +249,7 @@ def open_labels(labels: Sequence[int]) -> str:
 
 
 def read_contraries(model: Model) -> list[int]:
-    """Dstates whose paths show that there are no places and paths for them."""
+    """Read the dstates whose segments show that the labels have no places and paths."""
     return sorted(
         args[0] for name, args in map(read_atom, model.symbols(shown=True)) if name == "contrary"
     )

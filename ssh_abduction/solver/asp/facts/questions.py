@@ -1,4 +1,9 @@
-"""Rules for questions about known maps: other maps, maps of given size, forbidden equalities."""
+"""Write further rules for the readable encodings (`encodings/*.lp`) and for doubts.
+
+They ask for maps that differ from known ones, ask for maps of a given size, and forbid equalities.
+A *doubt* is a possibility: two things that are one in all known maps differ in an unknown one, or
+the other way round.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +18,20 @@ from ssh_abduction.theory.fields import Count
 
 
 def are_one(first: int, second: int) -> Symbol:
-    """The atom of the readable encodings that two steps, the earlier one first, are one dstate."""
+    """The atom that says that two steps are one dstate. The first step must be the earlier one."""
     return Function("same", numbers(first, second))
 
 
 def forbidden_equalities(
     equalities: Iterable[Equality], where: Symbol | None = None, excusable: bool = False
 ) -> str:
-    """The rule that these equalities of steps do not all hold.
+    """The rule that some equalities of steps do not all hold.
 
     Args:
         equalities: The equalities.
-        where: An atom; the rule holds only if the atom does. None for always.
-        excusable: The rule does not hold where a displacement between the steps is ignored.
+        where: The rule applies only if this atom is true. None if it always applies.
+        excusable: Whether the rule does not apply if a displacement between two of these steps is
+            treated as wrong.
     """
     atoms = [str(where)] if where else []
     if excusable:
@@ -37,18 +43,20 @@ def forbidden_equalities(
 
 
 def rests_on(axiom: str, t: int, other: str) -> str:
-    """The rule that if an axiom is active at step t, another one holds at every step."""
+    """The rule that if an axiom is active at step t, another axiom holds at every step."""
     return f":- {active(axiom, t)}, violation({other},T)."
 
 
 def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
-    """The rules that make a doubt hold if it is open and two things are one, or are not.
+    """The rules for a doubt about two things, such as two steps.
+
+    If the doubt is open and true in an answer, `some_doubt` is true.
 
     Args:
         number: The number of the doubt.
-        part: The program part.
-        condition: The condition that the two things are one; None if they never are.
-        one: Whether the doubt is that they are one.
+        part: The number of the program part that the rules are for.
+        condition: The body of a rule that holds if the two things are one; None if they never are.
+        one: Whether the doubt is that the two things are one. If False, that they are not.
     """
     rules = [f"#external {open_doubt(number)}."]
     rules += (
@@ -66,7 +74,7 @@ def doubt(number: int, part: int, condition: str | None, *, one: bool) -> str:
 
 
 def doubts_before(part: int) -> str:
-    """The rule that some doubt holds if some doubt of an earlier part does."""
+    """The rule that some doubt of the parts up to this one holds if one of an earlier part does."""
     return (
         f"{some_doubt(part)} :- {some_doubt(part - 1)}."
         if part > 1
@@ -75,9 +83,13 @@ def doubts_before(part: int) -> str:
 
 
 def steps_are_one(sort: str, i: int, j: int) -> str:
-    """The condition that two steps, the earlier first, share a dstate, place, path or course.
+    """The body of a rule that holds if two steps share a dstate, place, path or course.
 
-    For a step and itself: the condition that it is along a path.
+    Args:
+        sort: What they share: "dstates", "places", "paths" or "courses".
+        i: The earlier step.
+        j: The later step. For "paths" it may be the same step: then the body holds if the step is
+            along a path.
     """
     return {
         "dstates": f"same({i},{j})",
@@ -88,17 +100,22 @@ def steps_are_one(sort: str, i: int, j: int) -> str:
 
 
 def open_doubt(number: int) -> Symbol:
-    """The external atom that a doubt is open."""
+    """The external atom that says that a doubt is open: an answer may make it true."""
     return Function("open_doubt", numbers(number))
 
 
 def some_doubt(part: int) -> Symbol:
-    """The atom that some open doubt of this part of a program or of an earlier one holds."""
+    """The atom that says that an open doubt of this program part or of an earlier one holds."""
     return Function("some_doubt", numbers(part))
 
 
 def exactly(number: int, count: Count) -> str:
-    """The rule that a map has this many dstates, places or paths, while `of_number` is true."""
+    """The rule that a map has this many dstates, places or paths, if `of_number` is true.
+
+    Args:
+        number: The number.
+        count: What is counted: "dstates", "places" or "paths".
+    """
     counted = {
         "dstates": "T : is(T,T)",
         "places": "T : at(T,T)",
@@ -109,5 +126,5 @@ def exactly(number: int, count: Count) -> str:
 
 
 def of_number(number: int, count: Count) -> Symbol:
-    """The external atom that fixes the number of dstates, places or paths of maps."""
+    """The external atom that switches the rule of `exactly` on."""
     return Function("of_number", [Function(count), *numbers(number)])

@@ -1,4 +1,8 @@
-"""Facts for `fast/sides_*.lp`, the axioms that the sides of paths impose."""
+"""Write facts for `fast/sides_framed.lp` and `fast/sides_frameless.lp`.
+
+These encodings have rules about the order of places on a path and about its sides. They are added
+to a search for dstates.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,19 @@ from ssh_abduction.theory.theory import Theory
 
 
 def sides_framed_facts(theory: Theory) -> str:
-    """Which axioms of the sides of paths hold in a theory, as facts."""
+    """The facts that say which axioms about the sides of paths a theory has."""
     facts = ["sided."] if theory.boundary != "none" else []
     facts += ["symmetric."] if theory.symmetric_sides else []
     return "\n".join(facts)
 
 
 def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
-    """Kinds of actions, and the axioms of sides, as facts for sides_frameless.lp."""
+    """The facts for sides_frameless.lp: the kind of each action, and the axioms about sides.
+
+    Args:
+        theory: The theory.
+        actions: The actions by number.
+    """
     kinds = [
         f"turns({a},{action.turn})." if action.turn else f"travels({a})."
         for a, action in actions.items()
@@ -29,7 +38,14 @@ def sides_frameless_facts(theory: Theory, actions: Mapping[int, Action]) -> str:
 def turn_facts(
     batch: int, chart: FramedChart, visits: Iterable[int], turns: Iterable[tuple[int, str, int]]
 ) -> str:
-    """New visits, and new turns on a visit, from slot to slot, as facts for sides_framed.lp."""
+    """The facts for sides_framed.lp about the visits and the turns of one batch.
+
+    Args:
+        batch: The number of the batch.
+        chart: The chart of the visits.
+        visits: The new visits.
+        turns: The new turns: triples of a node, the direction of the turn, and the node after it.
+    """
     facts = [f"visit({batch},{visit})." for visit in visits]
     for s, turn, x in turns:
         (visit, slot), (_, faced) = chart.facing[s], chart.facing[x]

@@ -1,4 +1,8 @@
-"""Facts for `fast/visits.lp`, which says which visits are at one place, and its answers."""
+"""Write facts for `fast/visits.lp`, and read its answers.
+
+That encoding finds which visits are at one place. A *pair* of visits is a triple (I, J, R) with
+I < J. It means that I and J are at one place, and slot 0 of I is slot R of J.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +21,15 @@ def visit_facts(
     fits: Iterable[tuple[int, int, int]],
     unfit: Iterable[tuple[int, int, int]] = (),
 ) -> str:
-    """The facts of visits.lp for one batch.
+    """The facts for one batch.
 
     Args:
         batch: The number of the batch.
-        nodes: Number, visit and slot of each node.
-        leaves: Visits that end: the visit, the slot and the action.
-        fits: Pairs of visits that may be at one place, and how they are turned.
-        unfit: Pairs of earlier batches that may no longer be.
+        nodes: For each node (the steps of a visit that face one slot), its number, visit and slot.
+        leaves: For each visit that ends, the visit, the slot that it leaves through, and the
+            action.
+        fits: Pairs of visits (I, J, R) that may be at one place.
+        unfit: Pairs (I, J, R) of earlier batches that turned out not to be at one place.
     """
     new = {"node": nodes, "leaves": leaves, "fits": fits, "unfit": unfit}
     return "\n".join(
@@ -35,12 +40,12 @@ def visit_facts(
 
 
 def same(pair: tuple[int, int, int]) -> Symbol:
-    """The atom that two visits are at one place, and how they are turned to each other."""
+    """The atom that says that a pair of visits (I, J, R) is at one place."""
     return Function("same", numbers(*pair))
 
 
 def read_same(atom: Symbol) -> tuple[int, int, int]:
-    """The two visits of such an atom, and how they are turned to each other."""
+    """Read the pair of visits (I, J, R) from an atom of `same`."""
     first, second, turned = (argument.number for argument in atom.arguments)
     return first, second, turned
 
@@ -51,29 +56,39 @@ def listed(batch: int) -> Symbol:
 
 
 def first(place: int) -> Symbol:
-    """The atom that the node at this position of the order is the first at its dstate."""
+    """The atom that says that a node is the first at its dstate.
+
+    Args:
+        place: The number of the node, which is its position in the order of nodes.
+    """
     return Function("first", numbers(place))
 
 
 def over(core: int, count: int) -> Symbol:
-    """The atom that at least `count` members of a core are true."""
+    """The atom that says that at least `count` members of an unsat core are true."""
     return Function("over", numbers(core, count))
 
 
 def read_over(member: Symbol) -> tuple[int, int] | None:
-    """The core and the count of such an atom; None for another atom."""
+    """Read the core and the count from an atom of `over`; None for another atom."""
     return (
         (member.arguments[0].number, member.arguments[1].number) if member.name == "over" else None
     )
 
 
 def core_facts(core: int, members: Iterable[Symbol]) -> str:
-    """The members of a core."""
+    """The facts that name the members of an unsat core: atoms that cannot all be false."""
     return "\n".join(f"member({core},{member})." for member in members)
 
 
 def three_facts(batch: int, threes: Iterable[tuple[int, ...]]) -> str:
-    """Threes of visits for which "is at one place" has to be transitive."""
+    """The facts for triples of visits for which "is at one place" has to be transitive.
+
+    Args:
+        batch: The number of the program part. Each call has a new one.
+        threes: Tuples (I, J, J2, R, Q): the pairs (I, J, R) and (J, J2, Q) imply that I and J2 are
+            at one place.
+    """
     return "\n".join(f"via({batch},{','.join(map(str, three))})." for three in threes)
 
 
@@ -82,12 +97,12 @@ def forbidden_pairs(
     different: Iterable[tuple[int, int, int]] = (),
     listed: int | None = None,
 ) -> str:
-    """The rule that not all `pairs` of visits are at one place while no `different` pair is.
+    """The rule that forbids answers with all of some pairs of visits and none of some others.
 
     Args:
-        pairs: Pairs of visits, and how they are turned.
-        different: The same.
-        listed: The rule holds only while answers up to this batch are listed; None for always.
+        pairs: Pairs (I, J, R) that are all at one place in the forbidden answers.
+        different: Pairs (I, J, R) that are not at one place in the forbidden answers.
+        listed: The rule applies only while answers up to this batch are listed; None for always.
     """
     body = [
         *(f"same({i},{j},{r})" for i, j, r in pairs),
@@ -97,5 +112,10 @@ def forbidden_pairs(
 
 
 def forbidden_places(equalities: Sequence[Sequence[tuple[int, int, int]]]) -> str:
-    """The rules that not all equalities hold. An equality is that one of its pairs is one place."""
+    """The rules that some equalities do not all hold.
+
+    Args:
+        equalities: For each equality, pairs of visits (I, J, R). The equality holds if one of its
+            pairs is at one place.
+    """
     return "\n".join(forbidden_pairs(pairs) for pairs in product(*equalities))
