@@ -88,12 +88,13 @@ class Blocks:
         return bound
 
     def least_faults(self, most: int) -> int:
-        """Compute the least cost of faults in maps with at most `most` dstates.
+        """Compute a lower bound on the cost of faults in maps with at most `most` dstates.
 
-        Blocks are cut off from the left, each as short as possible, and their costs added up.
+        Blocks are cut off from the left, each as short as possible, and the least costs of their
+        faults are added up.
 
         Returns:
-            A lower bound in tenths of dstates.
+            The bound in tenths of dstates.
         """
         total = begin = 0
         steps, places = (
@@ -103,7 +104,7 @@ class Blocks:
         reach = 0  # how many steps after a fault the last block ended
         while begin < steps:
             following = begin
-            if most >= self.dstates:  # a block needs a fault of the known map, too
+            if most >= self.dstates:  # then a block without faults of the known map needs none
                 number = bisect_left(places, begin)
                 if number == len(places):
                     return total
@@ -155,7 +156,13 @@ class Blocks:
         return end > low and not self._takes_fault(begin, end, most)
 
     def _takes_fault(self, begin: int, end: int, most: int) -> bool:
-        """Whether the steps from `begin` up to `end` need a fault in a map of `most` dstates."""
+        """Whether a block needs a fault, as without one it has a clique of more than `most` steps.
+
+        Args:
+            begin: The first step of the block.
+            end: The step after the last one.
+            most: The number of dstates that a map may have.
+        """
         self.watch.check()
         return (
             end - begin > most

@@ -1,10 +1,10 @@
 """The engine for the causal theory with faults: it finds all maps of least cost.
 
-A view may be misread, and an action may slip. A map costs its dstates and its faults. Clingo is
-given only some steps of the trace (`faulty_control.py`). Fewer steps are fewer constraints, so
-their cost is a lower bound for the whole trace. A map of the given steps is then followed through
-all other steps. If it predicts all views there, it is a minimal map of the whole trace. If not,
-clingo gets more steps.
+A view may be misread, and an action may slip. The cost of a map is that of its dstates and its
+faults. Clingo gets only some steps of the trace (`faulty_control.py`), the *given* ones. Fewer
+steps are fewer constraints, so their cost is a lower bound for the whole trace. A map of the given
+steps is then followed through all other steps. If it predicts all views there, it is a minimal map
+of the whole trace. If not, clingo gets more steps.
 
 A Viterbi pass chooses the further steps (Viterbi 1967). It explains the whole trace by the links
 that clingo found, with the cheapest faults. Clingo gets the steps at fault and those around them.
@@ -32,7 +32,7 @@ from ssh_abduction.theory.evidence import Equality
 FEW = 80  # make no guess for a trace of at most this many steps, as clingo is fast
 AT_FIRST = 1000  # clingo gets this many first steps at the beginning
 PLACES = 12  # after a Viterbi pass, clingo gets the steps around at most this many faults
-SPARE = 3  # names of each view beyond those of the best guess; 1 would be too few for most views
+SPARE = 3  # names of each view beyond those of the best guess; with 1, answers use the rests
 # Begin no start of EM after this many seconds, or after this share of the time left.
 GUESSING = 5.0
 GUESSING_SHARE = 0.1
@@ -93,7 +93,7 @@ class FaultyEngine:
             self._control.given = set(range(min(size, AT_FIRST)))
             for t, others in self._task.log.pairs.one.items():
                 self._control.given |= {t, *others}
-                self._control.full |= {t, *others}  # also misread steps must be equal
+                self._control.full |= {t, *others}  # these equalities hold even for misread steps
 
     def improving_maps(self, most: tuple[int, ...] = ()) -> Iterator[Found]:
         best = self._best = self._known = None
@@ -210,7 +210,8 @@ class FaultyEngine:
         """Make a machine, which is dstates and links, from an answer.
 
         Returns:
-            The number of each name of a dstate, in the order of first visits; and the machine.
+            A dict from the name of each dstate to its number, in the order of first visits; and
+            the machine.
         """
         number: dict[int, int] = {}
         for t in sorted(answer.where):
@@ -309,8 +310,8 @@ class FaultyEngine:
         Args:
             labels: The dstate of each step.
             slips: The steps whose action slipped.
-            number: The names of dstates, in the order of their numbers. Used if `shows` is None.
-            shows: The view of each dstate.
+            number: A dict from the name of each dstate to its number. Used if `shows` is None.
+            shows: The view of each dstate; None to derive it from its name.
         """
         view_of = dict(faulty_lp.faulty_names(self._control.names))
         shown = self._shown_somewhere(labels, shows or [view_of[name] for name in number])
@@ -322,13 +323,13 @@ class FaultyEngine:
         )
 
     def _shown_somewhere(self, labels: Sequence[int], shown: Sequence[int]) -> list[int]:
-        """Return the view of each dstate, corrected if it is never seen there.
+        """Return the views of dstates, so that each dstate has a view that is seen there.
 
-        Such a dstate gets the view that is seen there most often.
+        A dstate whose view is always misread gets the view that is seen there most often.
 
         Args:
             labels: The dstate of each step.
-            shown: The view of each dstate so far.
+            shown: The view of each dstate before.
         """
         views = list(shown)
         for s in set(labels) - {s for t, s in enumerate(labels) if shown[s] == self._seen[t]}:

@@ -211,7 +211,8 @@ class FramedEngine:
         """Make a map of the whole trace from guessed labels, without a search for the fewest.
 
         Returns:
-            The map; None if the steps fit no frames, or no separate paths fit the guess.
+            The map; None if the steps fit no frames, or no paths fit the guess. Paths are only
+            merged if they must be one.
         """
         chart = self._charted(len(self._task.trace), None)
         if chart is None:
@@ -228,7 +229,8 @@ class FramedEngine:
             known: The dstates of the first steps.
 
         Returns:
-            The map; None if the steps fit no frames, or no separate paths fit.
+            The map; None if the steps fit no frames, or no paths fit. Paths are only merged if they
+            must be one.
         """
         chart = Chart.framed(self._task.trace, self._task.log, around=self._around)
         if chart is None:
@@ -270,7 +272,12 @@ class FramedEngine:
         return self._all_with_paths(cost[0])
 
     def _all_with_paths(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[Naming]:
-        """Yield all labels with this many dstates that paths fit, each once, except `besides`."""
+        """Yield all labels with this many dstates that paths fit, each once.
+
+        Args:
+            dstates: The number of dstates.
+            besides: Labels to leave out: the dstate of each node.
+        """
         known: set[Hashable] = {tuple(besides)}
         if search := self._beside.proved(dstates):
             # This search lists all labels, so it need not learn why some of them have no paths.

@@ -1,7 +1,9 @@
 """Finds places and paths for given dstates. The engine with frames uses it.
 
-The input is a label, the number of a dstate, for each node of a chart. paths_framed.lp finds the
-fewest places and paths that fit the labels. If none fit, it finds the labels that clash.
+The input is a label, the number of a dstate, for each node. A node is the steps of a visit that
+face one direction. paths_framed.lp finds the fewest places and paths that fit the labels. If none
+fit, it finds clashes: minimal sets of nodes whose labels no paths fit. Paths are *separate* if they
+are only merged when they must be one.
 
 Reading answers would take most of the time of a long list. So the reader starts from the atoms of
 the answer before, and clingo searches for the next answer while a map is made from the present one.
@@ -90,7 +92,7 @@ class FramedPaths:
 
     @property
     def preparing(self) -> float:
-        """About how many seconds clingo cannot be stopped, when it is asked for all paths."""
+        """An estimate of the seconds for which clingo cannot be stopped, if asked for all paths."""
         return PREPARED * self._seconds
 
     def forget_time(self) -> None:
@@ -102,9 +104,11 @@ class FramedPaths:
         return self.found_soon(chart, labels) or self.any(chart, labels)
 
     def found_soon(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
-        """Find a map with these dstates and separate paths, if there are many dstates; else None.
+        """Find a map with these dstates and separate paths, if there are many dstates.
 
-        With few dstates `any` is fast enough. It may find a map if this returns None.
+        Returns:
+            The map; None if there are few dstates, or no separate paths fit. Then `any` may still
+            find a map.
         """
         found = self.separate(chart, labels) if len(set(labels)) > MANY_DSTATES else None
         return Fitted(found, Naming(chart, list(labels))) if found else None

@@ -156,7 +156,12 @@ class FramelessEngine:
                 yield settled
 
     def _all_that_fit(self, dstates: int, besides: Sequence[int] = ()) -> Iterator[list[int]]:
-        """Yield all labels with this many dstates that places and paths fit, except `besides`."""
+        """Yield all labels with this many dstates that places and paths fit, each once.
+
+        Args:
+            dstates: The number of dstates.
+            besides: Labels to leave out: the dstate of each node.
+        """
         return all_accepted(
             ask=lambda: self._named.all_of(dstates, 0),
             refuse=self._fitting.why_not,

@@ -38,8 +38,8 @@ def homes_of(told: Segments) -> Mapping[int, list[int]] | None:
         told: The places and segments, and which of them are known to be different.
 
     Returns:
-        For each place, the fixed places that it may be the same as. None if some place can be the
-        same as no fixed one.
+        For each place, the fixed places that it may be. None if some place can be none of them, or
+        no places fit these dstates at all.
     """
     if any(c == p for c, p in told.elsewhere):
         return None  # the segments contradict each other: no places fit these dstates

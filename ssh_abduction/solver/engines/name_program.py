@@ -46,7 +46,7 @@ class Fitting(Protocol):
         ...
 
     def tell_again(self) -> None:
-        """Give a new control the rules of the one before."""
+        """Give a new control the rules that the one before had."""
         ...
 
 

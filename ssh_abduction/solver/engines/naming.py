@@ -221,7 +221,12 @@ class NamedLabels:
             )
 
     def _listed(self, dstates: int, enough: int) -> Iterator[list[int]]:
-        """Yield the same labels as `all_of`, in the order in which clingo lists them."""
+        """Yield labels with this many dstates, in the order in which clingo lists them.
+
+        Args:
+            dstates: The number of dstates.
+            enough: Stop after this many labels; 0 for all.
+        """
         program, spares = self.program, dstates - len(self.clique)
         if spares < 0:
             return

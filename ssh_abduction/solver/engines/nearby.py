@@ -88,7 +88,7 @@ class _Names:
         rests: The rests of all views.
         choices: For each node, the names that it may have.
         used: For each spare name, the literal that some node has it.
-        ordered: The literal that spare names occur in their order, for the first time each.
+        ordered: The literal that the spare names of each view first occur in their order.
     """
 
     spare: Mapping[int, range]
@@ -120,8 +120,8 @@ class NearbySearch:
             watch: The limits.
             speedups: The speed-ups that are on.
             pinned: The nodes, their links, and the clique of nodes that have names of their own.
-            far: Returns, for a node, a row of flags: the nodes at other dstates. Clingo gets
-                these pairs. None to give it none.
+            far: Returns, for a node, a row of flags that mark nodes at other dstates, which clingo
+                has to keep different. None if there are no such pairs to give to clingo.
             configuration: A configuration of clasp; None for its default.
         """
         self.bound: int | None = None
@@ -333,7 +333,10 @@ class NearbySearch:
                 free |= {stay[literal] for literal in moving}
 
     def _literals(self) -> list[int]:
-        """Return the literal that each node has its label; 0 if it has no choice, or no label."""
+        """For each node, return the literal that it has its label.
+
+        The literal is 0 for a node that can only have one name, or has no label.
+        """
         return [
             0
             if name < 0 or len(self._names.choices[t]) == 1 or name not in self._names.choices[t]
@@ -475,6 +478,10 @@ class NearbySearch:
     def _asked(self, allowed: Collection[int], conflicts: int) -> Generator[Labels, None, _Verdict]:
         """Ask for labels with fewer dstates that may also use these names.
 
+        Args:
+            allowed: Spare names besides those in use.
+            conflicts: Give up after this many conflicts.
+
         Yields and returns the same as `_widened`.
         """
         answer, core = self._with_fewer(
@@ -504,7 +511,11 @@ class NearbySearch:
         return self._asker.verdict(names_lp.read_names, assumed, conflicts, f"enum,{cost},{cost}")
 
     def _name_more(self, resting: Collection[int]) -> None:
-        """Make a new control with more names for the views of these rests."""
+        """Make a new control with more names for some views, and rename the labels accordingly.
+
+        Args:
+            resting: The rests of these views, as names.
+        """
         before, taken = self._names.spare, set(self._labels)
         used = {view: [name for name in spare if name in taken] for view, spare in before.items()}
         self._fewest |= {

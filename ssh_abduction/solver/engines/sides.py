@@ -30,7 +30,7 @@ class FramedSides:
         self._batch = -1
 
     def begin(self) -> None:
-        """Start over with a new control."""
+        """Forget which axioms were added, as there is a new control."""
         self._said = {}
         self._batch = -1
 

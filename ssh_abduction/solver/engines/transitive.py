@@ -17,8 +17,8 @@ import numpy as np
 from ssh_abduction.solver.asp.facts import visits_lp
 from ssh_abduction.solver.steps.chart import FramedChart
 
-# Give clingo about this many triples of visits at once at most. Grounding them takes longer than
-# finding them.
+# Stop looking for triples of visits after this many, and give them to clingo. Grounding them takes
+# longer than finding them.
 AT_A_TIME = 20_000
 
 # (I, J, R): visits I < J are at one place, and slot (direction) 0 of I is slot R of J.
@@ -177,9 +177,9 @@ def apart_yet_joined(
         turned: All pairs that are known.
 
     Returns:
-        Triples (first, (middle, slot), (last, slot)). The middle visit is at the place of each of
-        the others, but these two are not known to be at one place, turned accordingly. Each slot
-        is the one of its visit that is slot 0 of the first visit.
+        Triples (first, (middle, slot), (last, slot)). The middle visit is at one place with each of
+        the others. The pair of the first and the last visit is missing, or differs in its slot.
+        A slot is the one of its visit that is slot 0 of the first visit.
     """
     i, j, r = pair
     of_i, of_j = turned[i], turned[j]
@@ -204,7 +204,7 @@ def _in_order(*visits: tuple[int, int]) -> Three:
     """Make a triple of three visits at one place, in their order.
 
     Args:
-        *visits: Each visit, with its slot that is slot 0 of the first argument.
+        *visits: Each visit, and the slot there that is slot 0 of the first of them.
     """
     (i, a), (j, b), (k, c) = sorted(visits)
     return i, j, k, (b - a) % 4, (c - b) % 4

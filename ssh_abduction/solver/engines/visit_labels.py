@@ -58,8 +58,8 @@ from ssh_abduction.solver.steps.apart import clique
 from ssh_abduction.solver.steps.chart import FramedChart, numbered
 from ssh_abduction.solver.steps.localising import Located, states_of
 
-# Give clingo as many first visits as have at most this many pairs that may be at one place. It gets
-# others if answers need them.
+# At first, give clingo the first visits up to where this many pairs of them may be at one place. It
+# gets other visits if answers need them.
 FIRST_PAIRS = 10_000
 # To shrink a set of places that clash, ask whether fewer of them still clash. Give up each question
 # after this many conflicts, and the shrinking after FAILED_TRIES failed questions.
@@ -244,7 +244,7 @@ class VisitLabels:
         return list(self._found[0])
 
     def _tell_why(self, reason: Refusal) -> None:
-        """Give clingo the rules or the visits whose lack made it find a rejected answer."""
+        """Give clingo what it lacked when it found a rejected answer: rules or visits."""
         if reason.threes:
             self.program.close(reason.threes)
         else:

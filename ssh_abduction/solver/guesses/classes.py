@@ -232,8 +232,8 @@ class Classes:
         """Merge two classes, and all classes that have to be merged with them.
 
         Args:
-            a: A root.
-            b: Another root.
+            a: The root of a class, the step that represents it.
+            b: The root of another class.
             forced: Whether two known dstates may be merged.
 
         Returns:

@@ -292,10 +292,10 @@ class Explainer:
         return best
 
     def _told(self, machine: Machine, labels: Sequence[int]) -> Explained:
-        """Make the explanation that these labels are, with its faults and its cost.
+        """Find the faults and the cost of given labels, as an explanation.
 
         Args:
-            machine: The machine.
+            machine: The machine, with all dstates of the labels.
             labels: The dstate of each step.
         """
         # A step is at fault if its view, or where its action leads, differs from the machine.

@@ -74,7 +74,11 @@ class _Group:
 
     @staticmethod
     def joined(parts: Iterable[tuple[_Group, int]]) -> _Group:
-        """Make the union of groups, each turned by further quarters."""
+        """Make the union of groups.
+
+        Args:
+            parts: Each group, and the further quarters by which to turn its visits.
+        """
         members: dict[int, int] = {}
         views: dict[int, Counter[View]] = {}
         stars: Counter[Openings] = Counter()
