@@ -313,7 +313,7 @@ class FramedChart(Chart):
         )
 
     def visits_with(self, pairs: int) -> int:
-        """The most first visits of which at most `pairs` pairs may be at one place: a number."""
+        """The largest n for which at most `pairs` pairs of n first visits may be at one place."""
         import numpy as np
 
         return int(np.searchsorted(self.fitting, pairs, side="right")) - 1

@@ -1,10 +1,12 @@
-"""How the stars of a trace fit each other when turned: the input of gateways.lp.
+"""Find how the stars of a trace fit each other when they are turned. gateways.lp reads this.
 
-A star is the gateways that a step sees. A *frame* is a star in which each unobserved gateway has
-been decided to exist or not. All frames at a place have the same number N of slots. Slot K of a
-frame is slot (K+C) mod N of an earlier frame, for some *shift* C. The shift and the spreads of the
-bearings limit how far the robot has turned: a set of rotations in whole degrees. If the set is
-empty, the two frames are not seen at one place with this shift.
+A star is the gateways that a step sees. Some of these may be unobserved. A *frame* is a star after
+it is decided which unobserved gateways exist. The gateways of a frame are numbered clockwise; these
+numbers are its *slots*. All frames at a place have the same number N of slots. Slot K of a frame is
+slot (K+C) mod N of an earlier frame, for some *shift* C. A gateway is seen at some bearing, give or
+take a spread in degrees. So the shift limits by which rotations the robot can have turned between
+the two frames. A set of rotations has whole degrees clockwise. If it is empty, the two frames are
+not seen at one place with this shift.
 
 >>> from ssh_abduction.data.star import Star
 >>> from ssh_abduction.solver.steps.frames import members, rotations
@@ -25,19 +27,23 @@ from ssh_abduction.data.trace import Action, Trace
 
 # A set of rotations is an integer: bit R is 1 if R degrees clockwise are in the set.
 FULL = (1 << 360) - 1
-# The least degrees of a turn right or left, and by how much it has to fall short of a turn around:
-# bearings that differ by less may belong to one gateway.
+# A turn right or left is by more degrees than this, and falls short of a turn around by more than
+# this. Bearings that differ by less may belong to one gateway.
 LEAST_TURN = int(2 * SPREAD)
 WAYS = {"alike": 0, "opposite": 180}  # the rotation of each way, in degrees
 
 
 class Frames:
-    """The frames of a trace, numbered by the first step that may see them.
+    """The stars and frames of a trace, numbered in the order of the first steps that see them.
+
+    Args:
+        trace: The trace.
+        stop: Use only this many first steps; None for all.
 
     Attributes:
         stars: The number of the star of each step.
-        looks: The frames that each star may be.
-        frames: All frames.
+        looks: For each star, the numbers of the frames that it may be.
+        frames: All frames, by number.
     """
 
     def __init__(self, trace: Trace, stop: int | None = None) -> None:
@@ -54,7 +60,7 @@ class Frames:
         self.frames: tuple[Frame, ...] = tuple(numbers)
 
     def fits(self, x: int, y: int) -> Iterator[int]:
-        """The shifts with which frame y, seen later, may be frame x."""
+        """Yield the shifts with which frames x and y may be at one place; y is the later one."""
         first, then = self.frames[x], self.frames[y]
         if first.slots == then.slots:
             yield from (
@@ -64,15 +70,15 @@ class Frames:
 
 @lru_cache(maxsize=2**16)
 def rotations(first: Frame, then: Frame, shift: int) -> int:
-    """The rotations by which the robot may have turned between two frames.
+    """The rotations by which the robot may have turned between two frames at one place.
 
     Args:
         first: The earlier frame.
-        then: The later frame, with as many slots.
+        then: The later frame, with the same number of slots.
         shift: Slot K of `then` is slot K + shift of `first`.
 
     Returns:
-        A set of rotations.
+        A set of rotations as an integer: bit R is 1 if R degrees clockwise are in the set.
     """
     n = first.slots
     found = FULL
@@ -86,9 +92,13 @@ def rotations(first: Frame, then: Frame, shift: int) -> int:
 
 
 def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
-    """The ways that the robot may face in the later frame: alike, opposite, or both.
+    """The ways that the robot may face in the later frame, compared to the earlier one.
 
-    It may also leave along the same path in this direction.
+    Arguments are as for `rotations`.
+
+    Returns:
+        "alike" if it may face the same way, "opposite" if it may face the opposite way; or both,
+        or none. The robot may also face along one path by slots declared opposite.
     """
     found = rotations(first, then, shift)
     return [
@@ -99,7 +109,7 @@ def may_face(first: Frame, then: Frame, shift: int) -> list[str]:
 
 
 def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
-    """The ways that the robot has to face in the later frame, by bearings."""
+    """The ways ("alike", "opposite") that the robot must face, as `may_face`: at most one."""
     found = rotations(first, then, shift)
     return [
         way
@@ -109,14 +119,15 @@ def must_face(first: Frame, then: Frame, shift: int) -> list[str]:
 
 
 def may_turn(action: Action, first: Frame, then: Frame, shift: int) -> bool:
-    """Whether a turn may lead from one frame to the other."""
+    """Whether a turn may lead from the first frame to the other one with this shift."""
     return bool(rotations(first, then, shift) & _turned_by(action, first))
 
 
 def ends(frame: Frame) -> list[str]:
-    """The directions in which no gateway continues the robot's path: ahead, behind.
+    """The directions in which the path of the robot ends at this place: "ahead", "behind".
 
-    A gateway continues the path if it is straight ahead, or behind, within twice its spread.
+    A path ends if no gateway is straight ahead (or straight behind) within twice its spread. It
+    ends in neither direction if it leads through gateways declared opposite.
     """
     if _way(frame) is not None:
         return []
@@ -133,13 +144,13 @@ def ends(frame: Frame) -> list[str]:
 def heading(first: Frame, then: Frame, shift: int) -> int:
     """The heading in the later frame, in whole degrees clockwise from the heading in the first.
 
-    0 if bearings leave it open.
+    It is the middle of the possible rotations; 0 if any rotation is possible, or none.
     """
     return middle(rotations(first, then, shift)) if first.slots == then.slots else 0
 
 
 def middle(found: int) -> int:
-    """The middle of the longest interval of a set of rotations; 0 if the set is full or empty."""
+    """The middle of the longest interval in a set of rotations; 0 if the set is full or empty."""
     starts = [r for r in members(found) if not found >> (r - 1) % 360 & 1]
     lengths = {
         start: next(length for length in range(1, 361) if not found >> (start + length) % 360 & 1)
@@ -150,12 +161,12 @@ def middle(found: int) -> int:
 
 
 def members(found: int) -> list[int]:
-    """The rotations in a set, in degrees."""
+    """List the rotations in a set, in degrees."""
     return [r for r in range(360) if found >> r & 1]
 
 
 def _turned_by(action: Action, first: Frame) -> int:
-    """The rotations that a turn may make, from a frame."""
+    """The set of rotations that a turn from a frame may make."""
     if action.bearing is not None:
         return _about(round(action.bearing), int(SPREAD))
     if action.gateway is not None:
@@ -176,9 +187,11 @@ def _turned_by(action: Action, first: Frame) -> int:
 
 
 def _declared(first: Frame, then: Frame, shift: int) -> str | None:
-    """The direction along the robot's path in the later frame, by slots declared opposite.
+    """Say how the robot faces along its path in the later frame, by slots declared opposite.
 
-    "alike", "opposite", or None if these leave it open.
+    Returns:
+        "alike" if it faces the same direction of the path as in the first frame, "opposite" if the
+        opposite one; None if declared slots do not decide this.
     """
     here, there = _way(first), _way(then)
     if here is None or there is None or not rotations(first, then, shift):
@@ -188,7 +201,10 @@ def _declared(first: Frame, then: Frame, shift: int) -> str | None:
 
 
 def _way(frame: Frame) -> tuple[int, int] | None:
-    """The slots ahead and behind on the robot's path, if it leads through declared opposites."""
+    """The slots ahead and behind of a robot whose path leads through slots declared opposite.
+
+    None if its path does not.
+    """
     for ahead, behind in enumerate(frame.opposite):
         if behind is not None and (frame.faces(ahead) or frame.has_behind(behind)):
             return ahead, behind
@@ -196,26 +212,26 @@ def _way(frame: Frame) -> tuple[int, int] | None:
 
 
 def _surely(found: int, towards: int) -> bool:
-    """Whether a set of rotations is narrow and contains this direction.
+    """Whether a set of rotations contains a direction, but neither 90 nor 270 degrees.
 
-    Stars without known gateways leave nearly all rotations open.
+    Stars without known gateways allow nearly all rotations. Then no direction is sure.
     """
     return bool(found >> towards & 1) and not found >> 90 & 1 and not found >> 270 & 1
 
 
 @lru_cache(maxsize=2**14)
 def _about(degrees: int, spread: int) -> int:
-    """The rotations within a spread of some degrees."""
+    """The set of rotations that differ from `degrees` by at most `spread`."""
     return _of((degrees + d) % 360 for d in range(-spread, spread + 1))
 
 
 def _between(least: int, most: int) -> int:
-    """The rotations in a closed interval of degrees."""
+    """The set of rotations from `least` to `most` degrees, both included."""
     return _of(range(least, most + 1))
 
 
 def _of(degrees: Iterable[int]) -> int:
-    """The set of these rotations."""
+    """Make a set of rotations from a list of degrees."""
     found = 0
     for r in degrees:
         found |= 1 << r

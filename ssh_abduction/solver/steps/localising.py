@@ -1,11 +1,13 @@
-"""Localise the visits of a trace in a map of some of them.
+"""Localise all visits of a trace in a map that was made from some of them.
 
-For a long trace in a small world, clingo does not need every visit: a map of some visits locates
-the others. This is Markov localisation with beliefs that are sets of states. From all possible
-states of a visit, the map says where its action leads. These are the possible states of the next.
-A visit is *missed* if no such state fits it, if the map does not know the action, or if the visit
-faces a slot that no visit of the map faced. The map then needs to know this visit, and as many
-visits before it as it takes to localise it.
+A *visit* is the steps between two travels, in a chart for places with frames. For a long trace in a
+small world, clingo does not need every visit: a map of some visits locates the others. This is
+Markov localisation in which a belief is the set of possible *states* of a visit (its place, and how
+it is turned there). The map says where the action of a visit leads from each possible state. That
+gives the possible states of the next visit. A visit is *missed* if none of its possible states
+fits what it shows, if the map does not know the action that leads to it, or if it faces a slot that
+no visit of the map faced. Then the map needs this visit, and enough visits before it to localise
+it.
 """
 
 from __future__ import annotations
@@ -19,22 +21,22 @@ from numpy.typing import NDArray
 
 from ssh_abduction.solver.steps.chart import FramedChart
 
-# The most stretches of missed visits to find before clingo is given them and solves again. Its
-# answer may explain later stretches, and each further visit makes the problem larger.
+# Find at most this many stretches of missed visits before clingo solves again with these. Its next
+# map may explain later stretches, and each further visit makes the problem larger.
 STRETCHES = 10
 
-# 4 times the number of a place, plus the slot of the place that is slot 0 of the visit. Places are
-# numbered from 0 without gaps.
+# The state of a visit: 4 times the number of its place, plus the slot of the place that is slot 0
+# of the visit. Places are numbered from 0 without gaps.
 State: TypeAlias = int
 
 
 @dataclass(frozen=True)
 class Located:
-    """The result of localising.
+    """The result of localising all visits.
 
     Attributes:
         states: The state of each visit; empty if the map does not locate all of them.
-        missed: If so, the visits that the map needs first.
+        missed: The visits that the map needs to locate more of them; empty if it locates all.
     """
 
     states: tuple[State, ...]
@@ -42,12 +44,13 @@ class Located:
 
 
 def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
-    """Localise all visits by the states of some.
+    """Localise all visits by the states of some of them.
 
     Args:
         chart: The visits.
-        states: The states of some visits, the first visit among them. Visits at one state are not
-            apart, and an action leads from it to one state.
+        states: The states of some visits, among them the first visit. They must make a map: visits
+            at one place do not contradict each other, and an action leads from a state to one
+            state.
     """
     if len(states) == len(chart.stars):
         return Located(tuple(states[visit] for visit in range(len(states))))
@@ -55,12 +58,24 @@ def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
 
 
 def tracked(chart: FramedChart, states: Mapping[int, State]) -> list[State]:
-    """The state of each visit; -1 if the map leaves it open."""
+    """Localise each visit by the visits before it. Arguments are as for `located`.
+
+    Returns:
+        The state of each visit; -1 if several states are possible.
+    """
     return _Localiser(chart, states).tracked()
 
 
 def states_of(chart: FramedChart, labels: Sequence[int]) -> list[State]:
-    """The state of each visit, if visits that share a label are at one place."""
+    """Turn labels into states: visits are at one place if nodes of theirs have the same label.
+
+    Args:
+        chart: The visits.
+        labels: The dstate of each node.
+
+    Returns:
+        The state of each visit.
+    """
     at: dict[int, list[tuple[int, int]]] = {}  # the visits and slots that have each label
     labelled: dict[int, list[tuple[int, int]]] = {}  # the slots of each visit and their labels
     for (visit, slot), label in zip(chart.facing, labels, strict=True):
@@ -84,7 +99,7 @@ def states_of(chart: FramedChart, labels: Sequence[int]) -> list[State]:
 
 
 class _Localiser:
-    """Localises visits in the map that the states of some visits make."""
+    """Localises visits in the map that the known states of some visits make."""
 
     def __init__(self, chart: FramedChart, states: Mapping[int, State]) -> None:
         self._leaves = chart.leaves
@@ -103,7 +118,7 @@ class _Localiser:
         self._fits = _fitting(chart, states)
 
     def tracked(self) -> list[State]:
-        """The state of each visit; -1 where it is ambiguous."""
+        """The state of each visit; -1 if several states are possible."""
         possible = self._anywhere(0)
         found = [possible]
         for visit in range(1, len(self._slots)):
@@ -112,14 +127,14 @@ class _Localiser:
         return [next(iter(states)) if len(states) == 1 else -1 for states in found]
 
     def located(self) -> Located:
-        """The states of all visits, or the visits that are missed."""
+        """Find the states of all visits, or the visits that are missed."""
         possible = self._anywhere(0)
         found = [possible]
         missed: set[int] = set()
         stretches = 0
         for visit in range(1, len(self._slots)):
             before, possible = possible, self._after(possible, visit - 1)
-            # The three cases in which a visit is missed.
+            # The visit is missed: no state fits, its action is unknown, or it faces a new slot.
             if not possible or self._is_unknown(before, visit - 1) or self._is_new(possible, visit):
                 missed.update(self._stretch_up_to(visit))
                 stretches += 1
@@ -134,9 +149,10 @@ class _Localiser:
         )
 
     def _stretch_up_to(self, visit: int) -> Iterable[int]:
-        """The shortest tried stretch of visits up to this one that the map cannot explain.
+        """The shortest tried stretch of visits, ending at this one, that the map cannot explain.
 
-        The map cannot explain it from any state of its first visit.
+        The map explains the stretch from no state of its first visit. The stretches that are tried
+        double in length.
         """
         back = 1
         while True:
@@ -151,13 +167,14 @@ class _Localiser:
             back *= 2
 
     def _anywhere(self, visit: int) -> set[State]:
-        """The states that a visit may be at if the visits before it are unknown."""
+        """The possible states of a visit by itself, without the visits before it."""
         return set(np.flatnonzero(self._fits[visit]).tolist())
 
     def _after(self, possible: set[State], visit: int) -> set[State]:
-        """The states that the next visit may be at, if this one is at one of `possible`.
+        """The possible states of the next visit, if this one has one of the states `possible`.
 
-        These are all states that fit, if the map does not know the action from each possible state.
+        If the map does not know from each of these states where the action leads, any state that
+        fits the next visit is possible.
         """
         slot, action = self._leaves[visit]
         there = {self._leads.get((faced(state, slot), action)) for state in possible}
@@ -166,14 +183,14 @@ class _Localiser:
         return {state for state in there if state is not None and self._fits[visit + 1, state]}
 
     def _is_unknown(self, possible: set[State], visit: int) -> bool:
-        """Whether the state of a visit is known, but not where its action leads."""
+        """Whether a visit has a single possible state from which its action is not known."""
         slot, action = self._leaves[visit]
         return len(possible) == 1 and not any(
             (faced(state, slot), action) in self._leads for state in possible
         )
 
     def _is_new(self, possible: set[State], visit: int) -> bool:
-        """Whether the state of a visit is known, and no visit of the map faced one of its slots."""
+        """Whether a visit has a single possible state and faces a slot that is new to the map."""
         return len(possible) == 1 and any(
             faced(state, slot) not in self._faced
             for state in possible
@@ -182,22 +199,23 @@ class _Localiser:
 
 
 def faced(state: State, slot: int) -> State:
-    """The slot of its place that a visit faces.
+    """Convert a slot of a visit into a slot of its place.
 
     Args:
         state: The state of the visit.
-        slot: The slot of the visit that it faces.
+        slot: The slot, as the visit numbers it.
 
     Returns:
-        4 times the number of the place, plus the slot.
+        4 times the number of the place, plus the slot, as the place numbers it.
     """
     return state - state % 4 + (state + slot) % 4
 
 
 def _fitting(chart: FramedChart, states: Mapping[int, State]) -> NDArray[np.bool_]:
-    """Whether each visit may be at each state, as a matrix of visits x states.
+    """Say which visits may have which states, as a matrix of flags, visits x states.
 
-    A visit may not be at a place if it is apart from a visit known to be there.
+    A visit cannot have a state if it contradicts a visit known to be at that place. A visit of
+    known state has only this state.
     """
     fits = np.empty((len(chart.stars), 4 * (max(states.values()) // 4 + 1)), dtype=bool)
     at: dict[int, list[int]] = {}

@@ -1,9 +1,9 @@
-"""A trace as integers, replayed over maps in linear time.
+"""Turn a trace into integers, and replay it over maps in linear time.
 
 A map of the first steps of a trace says where each tried action leads, and what was seen at each
-dstate. A replay follows the rest of the trace along these links. It checks no axioms: it stops at
-an action that was not tried in a dstate, or at an observation that was not made there, and leaves
-the decision to the solver.
+dstate. A *replay* follows the rest of the trace along these links. It stops at an action that was
+not tried in a dstate, or at an observation that was not made there. It checks no axioms; the solver
+does that.
 """
 
 from __future__ import annotations
@@ -17,31 +17,32 @@ from ssh_abduction.theory.evidence import pairs_of
 from ssh_abduction.theory.pairs import Pairs
 from ssh_abduction.theory.theory import Theory
 
-# The most dstates to try as the end of an unknown action, first ones first. So a view that is seen
-# nearly everywhere does not use up all predictions.
+# For the end of an unknown action, try at most this many dstates, the earliest ones first. So a
+# view that is seen nearly everywhere does not use up all predictions.
 TRIED = 100
-# The most steps to predict for a greedy map, which takes about a second. Then unknown actions lead
-# to new dstates: a map that needs more predictions is large anyway.
+# For a greedy map, predict at most this many steps, which takes about a second. After that, unknown
+# actions lead to new dstates: a map that needs more predictions is large anyway.
 STEPS_TRIED = 3_000_000
-# For long traces, this many predictions for each step instead.
+# For long traces, predict this many steps for each step of the trace, if that is more.
 EACH = 20
 
 
 class Outcome(Enum):
-    """How a replay ended."""
+    """How a replay of a trace over a map ended."""
 
     PREDICTED = "predicted"  # the map explains every step
-    CONTRADICTED = "contradicted"  # the observation or evidence contradicts the dstate reached
-    UNKNOWN = "unknown"  # the action was never tried in the dstate
+    CONTRADICTED = "contradicted"  # a step contradicts the dstate that the map predicts for it
+    UNKNOWN = "unknown"  # an action was never tried in its dstate
 
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """The result of a replay.
+    """The result of a replay of a trace over a map.
 
     Attributes:
-        labels: The dstates of the steps that the map explains.
-        outcome: How the replay ended. Unless it is PREDICTED, step len(labels) failed.
+        labels: The dstate of each first step that the map explains.
+        outcome: How the replay ended. Unless it is PREDICTED, the map does not explain step
+            len(labels).
     """
 
     labels: tuple[int, ...]
@@ -49,11 +50,11 @@ class Replay:
 
 
 def observation(step: Step, theory: Theory) -> tuple[object, object]:
-    """What the axioms read at a step: the view, and the star if the theory uses stars.
+    """What the axioms read at a step: its view, and its star (the openings seen there) or None.
 
-    By functional_view and the axioms of stars, a dstate has one observation. If the theory does not
-    say how stars are turned (star=pattern), all four rotations of a star are one observation. If
-    stars need to agree only within tolerance (star=gateways), they are left out.
+    Two steps at one dstate have equal observations, by functional_view and the axioms of stars. If
+    only the pattern of a star matters (star=pattern), its four rotations are one observation. If
+    stars are not used, or agree only within tolerance (star=alike or gateways), the star is None.
     """
     star = step.openings if theory.star in ("pattern", "frame") else None
     if star is None or theory.star == "frame":
@@ -64,9 +65,11 @@ def observation(step: Step, theory: Theory) -> tuple[object, object]:
 class Log:
     """A trace as integers, to be replayed over many maps.
 
+    Actions and observations are numbered from 0 in the order in which they first occur.
+
     Attributes:
-        actions: The action at each step.
-        seen: The observation at each step.
+        actions: The action after each step but the last.
+        seen: The observation (view, and perhaps star) at each step.
         pairs: Evidence about pairs of steps.
     """
 
@@ -87,9 +90,12 @@ class Log:
 
         Args:
             labels: The dstate of each of the first steps.
-            known: The number of these steps whose links make the map; all by default.
-            place_of: The place of each dstate, if the map has places. Evidence may say that two
-                steps are at different places.
+            known: Make the map only from this many first steps; from all labels by default.
+            place_of: The place of each dstate, to check evidence about places. None if the map has
+                no places.
+
+        Returns:
+            The labels of all steps that the map explains, and how the replay ended.
         """
         actions, seen = self.actions, self.seen
         known = len(labels) if known is None else known
@@ -110,7 +116,7 @@ class Log:
                 break
             label = following
             found.append(label)
-            # Evidence can contradict the dstate, too.
+            # Evidence about pairs of steps can contradict the dstate, too.
             if t in self.pairs.asked_for and not self.pairs.allow(t, found, place_of):
                 found.pop()
                 outcome = Outcome.CONTRADICTED
@@ -118,13 +124,16 @@ class Log:
         return Replay(tuple(found), outcome)
 
     def merged(self) -> tuple[int, ...]:
-        """Labels of a consistent map of the whole trace, found greedily. It need not be minimal.
+        """Label all steps greedily, so that the labels make a causal map. It need not be minimal.
 
-        If the map does not know an action, each known dstate with the next observation is tried as
-        its end. The map then predicts the trace up to the next unknown action, or is contradicted
-        before. The action leads to the dstate that predicts the most steps without contradiction,
-        or else to a new one. So a link never has to be taken back. After STEPS_TRIED predictions,
-        all unknown actions lead to new dstates.
+        If an action is unknown in a dstate, try each known dstate with the next observation as its
+        end. From there the map predicts the trace up to the next unknown action, unless a step
+        contradicts it earlier. Let the action lead to the dstate that predicts the most steps
+        without contradiction, or else to a new dstate. So no link has to be taken back. After
+        STEPS_TRIED predictions, let all unknown actions lead to new dstates.
+
+        Returns:
+            The dstate of each step.
         """
         actions, seen = self.actions, self.seen
         shows = [seen[0]]

@@ -2,10 +2,13 @@
 
 A robot that goes round in circles finds no new dstates. But after one wrong view, or one missing
 step in the log, each earlier step differs from all others by its distance to that step. The axioms
-then allow no map with fewer dstates than the trace has steps. The largest clique of steps that are
-apart (apart.py) shows this without a map. It is small before the noisy step. With it, it has nearly
-all steps, or two thirds of them if a circuit shows the same in several places where different
-actions follow. When a robot explores, the clique grows by one with each new dstate.
+then allow no map with fewer dstates than the trace has steps.
+
+The largest *clique* (set of steps that are different dstates in every map, see `apart.py`) shows
+this without a map. The clique of the steps before the noisy step is small. The clique with the
+noisy step has nearly all steps. It has two thirds of them if several places of a circuit look the
+same and different actions follow there. When a robot only explores, the clique grows by one with
+each new dstate.
 
 >>> from ssh_abduction.solver.steps.noise import noise_in
 >>> circuits = [0, 1, 2, 3] * 8
@@ -21,12 +24,13 @@ from dataclasses import dataclass
 
 from ssh_abduction.data.trace import Trace
 
-# No step is noise among this many first steps, as a robot may begin with a new dstate at each step.
+# None of this many first steps is noise, as a robot may begin with a new dstate at each step.
 LEAST = 20
-# A step is noise only if it makes at least this share of the steps up to it dstates of their own.
+# A step is noise only if at least this share of the steps up to it are dstates of their own.
 MOST = 0.5
-# The steps before it, and the whole trace without it, must need at most this share of those
-# dstates. A step that doubles the dstates is no exploration, where each step adds one at most.
+# A step is noise only if the clique of the steps before it, and the clique of the whole trace
+# without it, have at most this share of the clique with it. A step that doubles the clique is no
+# exploration, as exploring adds at most one dstate a step.
 FALL = 0.5
 
 
@@ -36,9 +40,9 @@ class Noise:
 
     Attributes:
         step: The number of the step.
-        told_apart: The number of steps up to this one that it makes dstates of their own.
-        without: The number of steps of the whole trace that are dstates of their own if this
-            step is ignored.
+        told_apart: The number of steps up to this one that must be different dstates.
+        without: The number of steps of the whole trace that must be different dstates if this step
+            is ignored.
     """
 
     step: int
@@ -46,7 +50,7 @@ class Noise:
     without: int
 
     def sentence(self, trace: Trace) -> str:
-        """The warning for a user."""
+        """The warning for a user, as a sentence."""
         return (
             f"{trace.at(self.step)}: view {trace.steps[self.step].view!r} looks like noise at step "
             f"{self.step}: because of it {self.told_apart} of the {self.step + 1} steps up to there"
@@ -56,7 +60,7 @@ class Noise:
 
 
 def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
-    """The step that looks like noise, or None. Takes n log³ n for n steps.
+    """Find the step that looks like noise; None if there is none. Takes n log³ n for n steps.
 
     Args:
         views: The view at each step, as a number.
@@ -65,8 +69,8 @@ def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
     if len(views) <= LEAST:
         return None
     fewest = len(_clique(views, actions, len(views))) / 2
-    # The clique grows with the prefix. Bisect for the step that takes it past half of its final
-    # size.
+    # The clique grows with the number of first steps. Bisect for the step at which it passes half
+    # of its final size.
     short, long = 0, len(views)
     while long - short > 1:
         middle = (short + long) // 2
@@ -84,7 +88,7 @@ def noise_in(views: Sequence[int], actions: Sequence[int]) -> Noise | None:
 
 
 def _clique(views: Sequence[int], actions: Sequence[int], steps: int) -> list[int]:
-    """A largest clique among the first steps."""
+    """A largest clique of the first `steps` steps: these are different dstates in every map."""
     # Imported here, as loading numpy takes longer than solving a short trace.
     from ssh_abduction.solver.steps.apart import Continuations
 
@@ -92,9 +96,9 @@ def _clique(views: Sequence[int], actions: Sequence[int], steps: int) -> list[in
 
 
 def _cut_off(actions: Sequence[int], step: int) -> list[int]:
-    """The actions, with those to and from one step replaced by unique ones.
+    """Replace the actions to and from one step by actions that occur only once.
 
-    So the view at that step, and the steps after it, distinguish no earlier steps.
+    Then neither the view of that step nor any later step distinguishes earlier steps.
     """
     other = max(actions, default=0) + 1
     return [other + t if t in (step - 1, step) else action for t, action in enumerate(actions)]
