@@ -114,7 +114,7 @@ class FramedPaths:
         return Fitted(found, Naming(chart, list(labels))) if found else None
 
     def any(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
-        """Find a map with these dstates by a control for all ways to merge paths.
+        """Find a map with these dstates, with a control for all ways to merge segments to paths.
 
         Returns:
             The map and the labels with that control; None if no paths fit.

@@ -345,7 +345,11 @@ class NearbySearch:
         ]
 
     def _keep(self, answer: Mapping[int, int]) -> None:
-        """Take over the labels of an answer, renamed so that each view uses its first names."""
+        """Take over the labels of an answer, with names changed to the first ones of each view.
+
+        Args:
+            answer: The name of each node.
+        """
         taken = set(answer.values())
         name_of = {name: name for name in range(len(self._pinned.clique))}
         for spare in self._names.spare.values():

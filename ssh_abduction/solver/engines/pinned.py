@@ -29,12 +29,12 @@ class Pinned:
 
     @classmethod
     def of_steps(cls, log: Log, steps: int, *, largest: bool = True) -> Pinned:
-        """Chart the first steps and pin a clique of them.
+        """Chart the first steps, and give each step of a clique a name of its own.
 
         Args:
             log: The trace as integers.
             steps: The number of steps.
-            largest: Pin a largest clique; if False, only the first step.
+            largest: Take a largest clique; if False, take only the first step.
         """
         chart = Chart.of_steps(log, steps)
         clique = chart.continuations.clique() if largest else [0]
@@ -43,7 +43,7 @@ class Pinned:
 
     @classmethod
     def framed(cls, chart: FramedChart, clique: Sequence[int]) -> Pinned:
-        """Pin a clique of nodes of a chart with frames.
+        """Give each node of a clique a name of its own, in a chart with frames.
 
         Args:
             chart: The nodes.

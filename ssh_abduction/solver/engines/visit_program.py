@@ -207,7 +207,7 @@ class VisitProgram:
 
     @property
     def nodes(self) -> Iterable[int]:
-        """The nodes that clingo has, in the order of choice."""
+        """The nodes that clingo has, in the order by which a node is the first at its dstate."""
         return self._known.place_of
 
     def give(

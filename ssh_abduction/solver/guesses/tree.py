@@ -73,7 +73,7 @@ class _Known:
 
 
 class Sketch:
-    """A map of the steps so far, which grows with each step.
+    """A map of the steps so far, made without a search, which grows with each step.
 
     Args:
         first: The first step.
