@@ -83,7 +83,10 @@ def contradictions(
 
 
 class _Claims:
-    """The claims of an answer. Each method yields a sentence for each false claim."""
+    """The claims of an answer. Each method yields a sentence for each false claim.
+
+    Parameters as in `false_claims`.
+    """
 
     def __init__(
         self,

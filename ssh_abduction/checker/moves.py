@@ -49,7 +49,7 @@ def opposite(course: Course) -> Course:
 
 
 def along(course: Course) -> str:
-    """Describe a course in words, as "path 2+"."""
+    """Describe a course in words: "path 2+" is path 2 in direction +1."""
     return f"path {course[0]}{'+' if course[1] == 1 else '-'}"
 
 

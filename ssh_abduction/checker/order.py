@@ -1,4 +1,4 @@
-"""The order of the places along one path of a map."""
+"""The order of the places along one path, from the list in a map and from travels."""
 
 from __future__ import annotations
 

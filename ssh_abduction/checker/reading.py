@@ -90,12 +90,12 @@ class Reading:
 
     @cached_property
     def travels(self) -> list[Move]:
-        """The moves that are travels."""
+        """The links of `moves` whose action is a travel."""
         return [m for m in self.moves if m.action.kind == "travel"]
 
     @cached_property
     def turns(self) -> list[Move]:
-        """The moves that are turns."""
+        """The links of `moves` whose action is a turn."""
         return [m for m in self.moves if m.action.kind == "turn"]
 
     @cached_property

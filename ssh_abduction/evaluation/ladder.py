@@ -99,7 +99,7 @@ class UnderWay:
     def solve(
         self, trace: Trace, theory: Theory, *, time_limit: float | None, max_maps: int | None
     ) -> Solution:
-        """Solve as `ssh_abduction.solve` does. Ctrl-C ends this search and the later ones."""
+        """Solve a trace as `ssh_abduction.solve` does. Ctrl-C ends this and all later searches."""
         theory.check_steps(trace)
         self.search = Search(trace, theory, time_limit=time_limit, max_maps=max_maps)
         if self.interrupted:  # perhaps before there was a search

@@ -45,7 +45,7 @@ NANOSECONDS = 1e15
 
 
 class TrajectoryWarning(UserWarning):
-    """A trajectory was read, but may not be the intended one. The text says why."""
+    """A warning that a trajectory does not fit well and may not be the intended one."""
 
 
 class Trajectory:

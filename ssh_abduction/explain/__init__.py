@@ -1,4 +1,4 @@
-"""Explain whether two steps are one dstate, why a trace has no map, and what would mend it."""
+"""Explain why two steps are one dstate or not, and why a trace has no map and what mends it."""
 
 from ssh_abduction import lazy_names
 

@@ -28,7 +28,7 @@ Refusal: TypeAlias = frozenset[Equality]
 
 
 class Interrupted(Exception):  # noqa: N818 - not an error
-    """The caller's `stop` returned True."""
+    """Raised to end the work because the caller's function `stop` returned True."""
 
 
 class _Answer(NamedTuple):

@@ -95,7 +95,7 @@ class Derivation:
 
     @property
     def axioms(self) -> tuple[str, ...]:
-        """The names of the axioms, in the order of the argument."""
+        """The names of the axioms in `clashes`, in the order of the argument."""
         return tuple(clash.axiom for clash in self.clashes)
 
     def __str__(self) -> str:

@@ -334,7 +334,7 @@ class PairQuestion(Question[PairExplanation]):
         self._ended(search)
 
     def _settle_minimum(self) -> None:
-        """Note the minimum, once the best maps of both sides are known."""
+        """Store the minimal cost, and which sides have it, once both best maps are known."""
         costs = {
             one: side.cost.preferred_by(self.theory)
             for one, side in self._sides.items()

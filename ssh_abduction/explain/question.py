@@ -1,4 +1,4 @@
-"""Questions about a trace under limits of time and memory."""
+"""The base class of questions about a trace, with limits of time and memory."""
 
 from __future__ import annotations
 

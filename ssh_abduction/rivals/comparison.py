@@ -181,7 +181,7 @@ class Comparison:
 
     @property
     def sentence(self) -> str:
-        """What the maps share and where they differ, in one sentence."""
+        """A sentence: the number of maps, what they share, and where they differ."""
         count = len(self.ids) if self.minimal is None else self.minimal
         is_partial = self.complete is False
         told = f"{count} {'minimal ' if self.minimal is not None else ''}map{'s' * (count != 1)}"
@@ -211,9 +211,9 @@ class Comparison:
 
     @property
     def product(self) -> str:
-        """The number of maps as a product of numbers of options: 780 = 195 x 2 x 2.
+        """The number of maps as a product of the numbers of options, as "780 = 195 x 2 x 2".
 
-        Empty if there are fewer than two choices.
+        An empty text if there are fewer than two choices.
         """
         if len(self.choices) < 2:
             return ""
@@ -416,6 +416,9 @@ def _check_backbone(shared: Backbone, listed: Backbone, listing: Listing) -> Non
 
 def _contradiction(told: Shared, seen: Shared, in_one: Sequence[int]) -> tuple[int, int] | None:
     """Find two steps about which the backbone is wrong.
+
+    Two steps are *one* if they are at one dstate (or one place, along one path or one course,
+    depending on the sort).
 
     Args:
         told: The backbone for one sort: the steps that are one in all maps, or in some.

@@ -190,7 +190,7 @@ class Experiment:
 
     @property
     def sentence(self) -> str:
-        """The experiment in a sentence."""
+        """A sentence that describes the experiment and how many rivals it leaves."""
         return _sentence(self)
 
     @property

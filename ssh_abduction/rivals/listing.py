@@ -27,7 +27,7 @@ from ssh_abduction.theory.theory import Theory
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """Maps of one trace, and what is known about the maps that are not listed.
+    """A list of maps of one trace, with what is known about the maps that are not listed.
 
     Attributes:
         maps: The maps.
@@ -206,7 +206,7 @@ class Listing:
         return self
 
     def check_same_trace(self, other: Listing) -> None:
-        """Raise MapError if the maps of another listing are of another trace."""
+        """Raise MapError if the maps of another listing have other numbers of steps or views."""
         an_instance(
             "other", other, Listing, MapError, mend="make one with Listing.of or Listing.load"
         )

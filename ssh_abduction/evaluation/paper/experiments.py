@@ -107,7 +107,7 @@ class FoundMaps:
 
 @dataclass(frozen=True)
 class Labelling:
-    """The labels of steps in the map from the views alone, compared with the true dstates.
+    """The labels of steps that follow from the views alone, compared with the true dstates.
 
     Attributes:
         right: Whether the labels are the true dstates, one to one.
@@ -150,10 +150,10 @@ class Run:
         clustering: The views.
         by_views: The minimal maps from the views alone.
         by_stars: The minimal maps from the views and the openings that the robot saw.
-        labelling: The labels of the first minimal map from the views alone.
+        labelling: The labels of steps that follow from the views alone.
         curve: The learning curve on these labels.
-        rates: The rates at which the true dstate is recognised from an image, by what is learnt
-            from: labels of "clustering alone", of the "map", and of the "truth".
+        rates: The rates, 0 to 1, at which the true dstate of an image is recognised after learning
+            labels. The keys are the sources of the labels: "clustering alone", "map", "truth".
         contrast: Results without a part of the method.
         spread: For each tour, the largest offset of a pose from the mean pose of its dstate, in x
             and y (metres) and heading (radians), (tours, 3).
@@ -271,7 +271,7 @@ def _clustering(learner: BootstrapLearner, truth: NDArray[Any]) -> Clustering:
 
 
 def _labelling(learner: BootstrapLearner, truth: NDArray[Any]) -> Labelling:
-    """Compare the labels of a learner's map with the true dstates."""
+    """Compare the labels of a learner with the true dstates."""
     labels = learner.labels_
     pairs = _aliased(learner.views_, truth)
     told_apart = sum(not set(labels[truth == a]) & set(labels[truth == b]) for a, b in pairs)
