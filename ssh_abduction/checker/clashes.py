@@ -32,8 +32,8 @@ class Clash:
     Attributes:
         place: The place.
         steps: The first step of each sight.
-        axioms: The axioms that forbid the set. Leaving out any one of them lets a frame fit. All
-            axioms that hold if no single one suffices.
+        axioms: The axioms that forbid the set. Leaving out any one of them lets a frame fit. If
+            there is no such axiom, these are all axioms about gateways that hold.
     """
 
     place: int
@@ -42,7 +42,7 @@ class Clash:
 
 
 def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> Iterator[Clash]:
-    """Find the places whose sights (dstate and star) fit no frame.
+    """Find the places whose sights (dstate and star) fit no frame (numbering of gateways).
 
     Args:
         sights: The sights of a map, sorted by first step.
@@ -50,7 +50,7 @@ def clashes(sights: Sequence[Sight], turns: Turns, axioms: Collection[str]) -> I
         axioms: Names of the axioms that hold.
 
     Yields:
-        One clash for each such place.
+        For each such place, a smallest set of its sights that fits no frame.
     """
     hard = [name for name in NAMES if name in axioms]
     for place, seen in by_place(sights).items():

@@ -70,6 +70,9 @@ class Closing:
 class Refused:
     """One return or two returns of a map that the displacements reject.
 
+    A return is a pair of steps that the map has at one dstate or at one place. Its loop is the way
+    between these steps.
+
     Attributes:
         returns: For each return, its two steps and its degrees of freedom (2 for a place, 3 for a
             dstate).
@@ -106,6 +109,8 @@ class Refused:
 
 def refused_returns(trace: Trace, ssh_map: SSHMap, theory: Theory) -> Iterator[Refused]:
     """Find the single returns and the pair of returns that displacements reject most clearly.
+
+    A return is a pair of steps that the map has at one dstate or at one place.
 
     Args:
         trace: The whole trace.

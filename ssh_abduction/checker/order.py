@@ -74,7 +74,7 @@ class Order:
         return not self._asymmetric or (not self._transitive and len(ring) > 2)
 
     def after(self, p: int, direction: int) -> Iterable[int]:
-        """Find the places after p in this direction (+1 or -1)."""
+        """Find the places after p on the path, in this direction (+1 or -1)."""
         if self._is_listed:
             return self._later(p, direction)
         follows = self._follows(p, direction)
@@ -89,7 +89,7 @@ class Order:
         return reached
 
     def between(self, p: int, q: int, direction: int) -> set[int]:
-        """Find the places after p and before q in this direction (+1 or -1)."""
+        """Find the places after p and before q on the path, in this direction (+1 or -1)."""
         i, j = self.position.get(p), self.position.get(q)
         agrees = self._is_listed or not self.backward
         if agrees and i is not None and j is not None and abs(i - j) <= 1:

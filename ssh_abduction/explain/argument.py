@@ -397,9 +397,10 @@ class Argument:
     # Is each link needed?
 
     def _checked_links(self) -> Iterable[Link]:
-        """Yield the links in the order of the argument, each with a map that shows it is needed.
+        """Yield the links (an axiom at a step) in the order of the argument.
 
-        The map satisfies all other links but not the conclusion of the argument.
+        Each link comes with a map that satisfies all other links, but not the conclusion of the
+        argument. The map shows that the link is needed.
         """
         theory = self._piece.theory
         names = {axiom for axiom, _ in self._links} | set(unchecked(theory))
