@@ -3,9 +3,9 @@
     python examples/adventure.py            solves the logged game, and compares map and maze
     python examples/adventure.py --play F   plays the game again, and writes its trace to F
 
-All rooms look alike, and passages twist: north and then south does not lead back. The player has
-dropped three things to tell rooms apart. The same solver finds the smallest maze that explains
-what the player typed and read.
+All rooms look alike, and passages twist: going north and then south does not lead back. The player
+has dropped three things to distinguish rooms. The solver for maps of robots also finds the smallest
+maze that explains what the player typed and read.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ssh_abduction.output import to_networkx
 HERE = Path(__file__).parent
 COMPASS = ("north", "south", "east", "west")
 ALIKE = "You are in a maze of twisty little passages, all alike."
-ROOMS = {  # the thing in each room, and the rooms that its passages lead to
+ROOMS = {  # the thing in each room, and the rooms to the north, south, east and west
     0: ("A lantern is here.", (1, 3, 2, 0)),
     1: ("", (4, 0, 1, 5)),
     2: ("A sword is here.", (3, 5, 0, 2)),
@@ -33,7 +33,15 @@ ROOMS = {  # the thing in each room, and the rooms that its passages lead to
 
 
 def play(commands: int, seed: int) -> Trace:
-    """Play a game: the player wanders at random."""
+    """Play a game in which the player wanders at random.
+
+    Args:
+        commands: Number of commands.
+        seed: Seed of the random choices.
+
+    Returns:
+        A trace whose views are the texts that were read, and whose actions are the commands.
+    """
     choose = random.Random(seed)
     room, read, typed = 0, [], []
     for i in range(commands + 1):
@@ -45,7 +53,7 @@ def play(commands: int, seed: int) -> Trace:
 
 
 def maze() -> nx.MultiDiGraph:
-    """The maze as the graph that its map should be."""
+    """Make the graph of the maze: rooms as nodes with views, passages as edges with actions."""
     graph = nx.MultiDiGraph()
     for room, (thing, exits) in ROOMS.items():
         graph.add_node(room, view=f"{ALIKE} {thing}".strip())

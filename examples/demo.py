@@ -2,7 +2,8 @@
 
     python examples/demo.py [FOLDER]
 
-Prints the minimal maps of the route and what tells them apart, and draws one of them.
+The script prints the minimal maps of the route and in what they differ, and draws one of them.
+Files are written to FOLDER (default: out).
 """
 
 from __future__ import annotations

@@ -3,22 +3,25 @@
     python examples/sweep.py out --worlds doors curved --seeds 2
     python examples/sweep.py out --worlds plans/*.xml --seeds 5 --scheduler tcp://host:8786
 
-The sweep covers worlds or floor plans x drives x theories x rungs of the ladder. Each drive is
-simulated once, as a log. For each theory one call of `ssh-abduction map` maps all logs. It can use
-the workers of a Dask cluster, and it does not repeat finished runs. So start a stopped sweep again.
-rows.jsonl gets a line for each solve: the maps, and each rung of the ladder. Then a table is
-printed. It counts the drives that have a map, and those that have only one. It gives precision and
-recall of pairs of visits that the first maps have at one place.
+The sweep maps several drives through each world or floor plan, under each theory. Each drive is
+simulated once, as a log. For each theory, one call of `ssh-abduction map` maps all logs. The call
+also solves a ladder for each log: a series of theories with more and more evidence. A theory of the
+ladder is a rung. The call can use the workers of a Dask cluster, and it does not repeat finished
+runs. So a sweep that was stopped can be started again.
 
-*A hundred machines*, a plan that nobody has run yet: 17 floor plans x 5 drives x 9 theories x 5
-rungs are 3,825 solves in 765 runs. A drive of 200 m through a plan takes 28 s of CPU time, for a
-log of 1.0 to 1.7 MB, nearly all of it for perception (8 runs, two plans). It takes two minutes if
-all solves use their time limit. That is 6 to 25 hours on one processor, and two to eight minutes on
-a hundred machines with two. One machine runs the scheduler (`dask scheduler`), and each other one
-runs `dask worker tcp://host:8786 --nworkers 2 --nthreads 1 --memory-limit 8GiB`. Logs travel to the
-workers, and folders come back, so no disk is shared. If a worker is killed, another one does its
-run. A run that kills two workers becomes an error on its line. A run returns 130 kB on average (31
-runs of six worlds and plans; 370 kB at most), so 100 MB in all.
+The file rows.jsonl gets a line for each solve: one for the maps of a log, and one for each rung.
+Then a table is printed. It counts the drives that have a map, and those that have only one. It
+gives precision and recall of the pairs of visits that the first map has at one place.
+
+*A hundred machines*, a plan that nobody has run yet: 17 floor plans x 5 drives x 9 theories are 765
+runs, with 5 rungs each 3,825 solves. Mapping a drive of 200 m through a plan takes 28 s of CPU
+time, nearly all of it for perception (8 runs, two plans; the log has 1.0 to 1.7 MB). It takes two
+minutes if all solves use their time limit. That is 6 to 25 hours on one processor, and two to eight
+minutes on a hundred machines with two. One machine runs the scheduler (`dask scheduler`). Each
+other machine runs `dask worker tcp://host:8786 --nworkers 2 --nthreads 1 --memory-limit 8GiB`. Logs
+are sent to the workers, and folders are sent back, so no disk is shared. If a worker is killed,
+another one does its run. A run that kills two workers becomes an error on its line. A run returns
+130 kB on average (31 runs of six worlds and plans; 370 kB at most), so 100 MB in all.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ from ssh_abduction.solver import Solution
 
 Row = dict[str, Any]
 
-# The rung of a row; None if the drive could not be mapped.
+# The solve of a row: the maps, or a rung of the ladder; None if the drive could not be mapped.
 RUNGS = ("maps", "views", "+ star", "+ pairs", "+ geometry", "+ planarity", None)
 INTERRUPTED = 130  # the exit code after Ctrl-C
 # The options of each theory. Without --theory they change the theory that suits the building.
@@ -121,9 +124,15 @@ def main() -> None:
 
 
 def drive(world: str, seed: int, folder: Path) -> Path:
-    """The path of the log of a drive, which is simulated unless it is there.
+    """Simulate a drive, unless its log exists.
 
-    There is no such file if the robot cannot drive in this world.
+    Args:
+        world: Name or file of a world, or file of a floor plan.
+        seed: Seed of the drive.
+        folder: Folder of the sweep.
+
+    Returns:
+        The path of the log. The file does not exist if the robot cannot drive in this world.
     """
     log = folder / "logs" / f"{Path(world).name.partition('.')[0]}-{seed}.log"
     if not log.exists():
@@ -133,7 +142,16 @@ def drive(world: str, seed: int, folder: Path) -> Path:
 
 
 def rows_of(theory: str, run: Path) -> list[Row]:
-    """A row for the first map of a run, and one for each rung of its ladder."""
+    """Make a row for the maps of a run, and one for each rung of its ladder.
+
+    Args:
+        theory: Name of the theory.
+        run: Folder of the run of a log.
+
+    Returns:
+        Rows with log, theory, rung and results. A run that failed has a single row, with the status
+        "error".
+    """
     if not (run / "run.json").exists():
         return [{"log": run.name, "theory": theory, "rung": None, "status": "error"}]
     told = json.loads((run / "run.json").read_text(encoding="utf-8"))
@@ -155,9 +173,11 @@ def rows_of(theory: str, run: Path) -> list[Row]:
 
 
 def pairs_of(run: Path) -> dict[str, int] | None:
-    """Counts of pairs of visits at one place: in the first map, right ones, and true ones.
+    """Count pairs of visits at one place in the first map of a run.
 
-    None if the run has no map.
+    Returns:
+        Dict with the number of pairs in the map ("joined"), of those that are right ("right"), and
+        of all true pairs ("returns"). None if the run has no map.
     """
     maps = Solution.load(run / "maps.json").maps[:1]
     places = evaluate_visits(maps, Trace.load(run / "trace.jsonl")).maps[0].places if maps else None
@@ -167,7 +187,7 @@ def pairs_of(run: Path) -> dict[str, int] | None:
 
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
-    """A line for each theory and rung."""
+    """Make the lines of the table: a head, and a line for each theory and rung."""
     yield (
         f"{'theory':<22}{'rung':<14}{'drives':>7}{'mapped':>8}{'unique':>8}{'places':>8}{'precision':>11}{'recall':>8}"
     )

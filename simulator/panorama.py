@@ -1,8 +1,8 @@
 """A panoramic camera in a world with painted walls, in the light of any hour of the day.
 
-A panorama is computed like a laser scan, with a ray for each column. The height of the wall in the
-column follows from its distance. The image is a cylinder around the robot: columns are bearings,
-rows are slopes.
+A panorama is computed like a laser scan, with rays in each column. The distance of the wall in a
+column determines at which height each pixel meets the wall. The image is a cylinder around the
+robot: columns are bearings, rows are slopes.
 
 >>> from simulator.world import World
 >>> world = World.named("notched-rectangle")
@@ -41,8 +41,8 @@ LAMPS, LAMPLIGHT = 0.3, np.array([1.15, 1.0, 0.7])
 DAYLIGHT, SUNRISE = np.array([0.95, 1.0, 1.1]), np.array([1.3, 0.95, 0.6])
 # Share by which a wall is brighter facing the sun at noon, and darker facing away.
 SIDEWAYS = 0.35
-# Value of a wall of albedo 1 at noon without adaptation, and the mean to which a camera adapts: a
-# grey wall at noon.
+# Pixel value of a wall of albedo 1 at noon without adaptation, and mean value to which a camera
+# adapts, which is that of a grey wall at noon.
 WHITE_VALUE, GREY_VALUE = 330.0, 120.0
 # Number of waves in the pattern of a texture.
 WAVES = 6
@@ -50,12 +50,12 @@ WAVES = 6
 
 @dataclass(frozen=True)
 class Light:
-    """The light of an hour.
+    """The light at an hour of the day.
 
     Attributes:
-        colour: Brightness as (red, green, blue).
+        colour: Brightness of red, green and blue, (3,).
         azimuth: Direction of the sun in the world, in radians.
-        share: Share by which the sun changes the brightness of a wall.
+        share: Share by which a wall that faces the sun is brighter, and one that faces away darker.
     """
 
     colour: Array = field(repr=False)
@@ -64,7 +64,7 @@ class Light:
 
     @classmethod
     def at(cls, hour: float) -> Self:
-        """The light at an hour, 0 to 24. Lamps are always on.
+        """Make the light at an hour, 0 to 24. Lamps are always on.
 
         The sun rises in the east (+x) at 6, is in the south at 12, and sets in the west at 18.
         """
@@ -75,7 +75,14 @@ class Light:
         )
 
     def on(self, normals: Array) -> Array:
-        """Brightness of walls that face these directions, in radians; 1 sideways to the sun."""
+        """Compute the relative brightness of walls.
+
+        Args:
+            normals: Directions that the walls face, in radians.
+
+        Returns:
+            Factors; 1 for a wall at a right angle to the direction of the sun.
+        """
         return 1 + self.share * np.cos(normals - self.azimuth)
 
 
@@ -88,8 +95,8 @@ class Paint:
 
     Attributes:
         seed: Seed of all textures.
-        repeated: Whether parallel walls share a texture, so that places look alike. Otherwise each
-            line of walls has its own.
+        repeated: Whether parallel walls share a texture, so that places look alike. Otherwise, only
+            walls on one line share a texture.
     """
 
     seed: int = 0
@@ -100,11 +107,14 @@ class Paint:
         a_flag("paint.repeated", self.repeated, SimulatorError)
 
     def keys(self, segments: Array, walls: int) -> list[tuple[Any, ...]]:
-        """Name of the texture of each segment.
+        """Name the texture of each segment.
 
         Args:
-            segments: (n, 4) metres.
-            walls: Number of first segments that are walls. The others are clutter, which moves.
+            segments: (n, 4) metres, walls before clutter.
+            walls: Number of segments that are walls. The others are clutter, which moves.
+
+        Returns:
+            A key for `texture` for each segment. Segments with equal keys share a texture.
         """
         checked_segments("segments", segments)
         a_whole_number("walls", walls, SimulatorError)
@@ -126,7 +136,14 @@ class Paint:
         return found
 
     def texture(self, key: tuple[Any, ...]) -> Array:
-        """The numbers of a texture, (13 + 6 WAVES,), as in `_albedo`."""
+        """Draw the random numbers of a texture.
+
+        Args:
+            key: Name of the texture, from `keys`.
+
+        Returns:
+            (13 + 6 WAVES,): three colours, four numbers for stripes and skirting board, and waves.
+        """
         an_instance("key", key, tuple, SimulatorError, mend="take one of Paint.keys")
         # A checksum of the key as seed gives the same texture in each process.
         rng = np.random.default_rng([self.seed, zlib.crc32(repr(key).encode())])
@@ -154,13 +171,14 @@ class Camera:
     """A panoramic camera. The defaults give 24 rows, 180 columns and 3 colours.
 
     Attributes:
-        rows: Rows of a panorama, from top to bottom.
-        columns: Columns of a panorama. The first is behind the robot at the left, the middle one
-            ahead.
+        rows: Number of rows of a panorama.
+        columns: Number of columns of a panorama. The first column is behind the robot on the left,
+            the middle one ahead.
         paint: Paint of the walls.
-        hours: Hours of the day, from 0 to 24, at which a run begins and ends.
-        noise: Standard deviation of a value, which is at most 255.
-        exposure: Share of a change of brightness that the camera compensates, from 0 to 1.
+        hours: Hours of the day, from 0 to 24, at which a drive begins and ends.
+        noise: Standard deviation of the noise of a pixel; pixels have values from 0 to 255.
+        exposure: How much of a change of brightness the camera compensates, from 0 (nothing) to 1
+            (all).
 
     Raises:
         SimulatorError: A number is out of range.
@@ -210,11 +228,11 @@ class Camera:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Rows, columns and colours of a panorama."""
+        """The numbers of rows, columns and colours of a panorama."""
         return self.rows, self.columns, 3
 
     def hour(self, share: float) -> float:
-        """The hour when this share of the run is over."""
+        """Compute the hour of the day when a share of the drive, from 0 to 1, is over."""
         a_number("share", share, SimulatorError, 0, 1, what="a share")
         return self.hours[0] + share * (self.hours[1] - self.hours[0])
 
@@ -230,13 +248,14 @@ class Camera:
 
         Args:
             world: The world.
-            pose: Pose of the robot.
+            pose: Pose of the robot: x and y in metres, heading in radians.
             rng: Source of noise.
-            hour: Hour of the day.
-            walls: Number of first segments that are walls; the others are clutter. None means all.
+            hour: Hour of the day, from 0 to 24.
+            walls: Number of segments of the world that are walls. Those after them are clutter.
+                None means that all are walls.
 
         Returns:
-            (rows, columns, 3) values from 0 to 255.
+            (rows, columns, 3) pixels with values from 0 to 255.
         """
         an_instance(
             "rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)"
@@ -253,7 +272,14 @@ class Camera:
         return pixels
 
     def scene(self, world: World, pose: Pose, light: Light, walls: int | None = None) -> Array:
-        """Light from each point, (DOWN rows, ACROSS columns, 3), before exposure and noise."""
+        """Compute the light that reaches the camera, before exposure and noise.
+
+        Arguments are those of `shot`.
+
+        Returns:
+            (DOWN * rows, ACROSS * columns, 3) brightness; a pixel is the mean of DOWN x ACROSS
+            points.
+        """
         an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
         an_instance("light", light, Light, SimulatorError, mend="take Light.at(12)")
         pose = pose_of("pose", pose)
@@ -293,9 +319,9 @@ class Camera:
 
 
 def _beginnings(segments: Array) -> Array:
-    """Beginning of the line of each segment, in metres along its direction.
+    """Where the line on which a segment lies begins, in metres along its direction, (n,).
 
-    So a texture goes on behind a gap in a wall.
+    Textures are measured from there, so that a texture continues behind a gap in a wall.
     """
     ways = segments[:, 2:] - segments[:, :2]
     ways = ways / np.maximum(np.hypot(*ways.T), 1e-9)[:, None]
@@ -310,7 +336,7 @@ def _beginnings(segments: Array) -> Array:
 
 
 def _albedo(textures: Array, along: Array, height: Array) -> Array:
-    """Share of light that points of walls reflect, (r, c, 3).
+    """The share of light that points of walls reflect, (r, c, 3).
 
     Args:
         textures: (c, 13 + 6 WAVES) texture of the wall of each column.

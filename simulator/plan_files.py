@@ -1,6 +1,6 @@
 """Reads floor plans from XML files, as in M. Luperto's data set of school plans.
 
-A file has rooms as polygons in pixels, doors as `portal`, and the size of a pixel.
+A file has rooms (`space`) as polygons in pixels, doors (`portal`), and the size of a pixel.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class Room:
     """A room.
 
     Attributes:
-        name: Its name in the file.
-        use: Its purpose.
-        centre: (x, y) of its middle in metres.
-        polygon: Its corners in metres.
+        name: Name in the file, which no other room has.
+        use: Purpose of the room; empty if the file does not say it.
+        centre: (x, y) of the middle in metres.
+        polygon: (x, y) of each corner in metres; empty if unknown.
     """
 
     name: str
@@ -49,8 +49,8 @@ class Door:
     """A door between two rooms.
 
     Attributes:
-        rooms: Indices of the rooms in the plan.
-        position: (x, y) in metres.
+        rooms: Indices of the two rooms in the plan.
+        position: (x, y) of the middle in metres.
     """
 
     rooms: tuple[int, int]
@@ -58,7 +58,14 @@ class Door:
 
 
 def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tuple[Door, ...]]:
-    """Read the name, the rooms and the doors of a plan. Raises SimulatorError."""
+    """Read a plan from an XML file.
+
+    Returns:
+        The name of the plan, which is that of the file; its rooms; and its doors.
+
+    Raises:
+        SimulatorError: The file cannot be read, or a part of the plan is wrong.
+    """
     path = a_path("path", path, SimulatorError)
     try:
         data = read_at_most(path, LARGEST)
@@ -85,7 +92,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[str, tuple[Room, ...], tupl
 
 
 class _Reader:
-    """Reads the XML of a plan, and reports its faults.
+    """Reads the XML of a plan. All methods but `wrong` raise SimulatorError for wrong parts.
 
     Args:
         where: Name of the file, for errors.
@@ -95,7 +102,7 @@ class _Reader:
         self.where = where
 
     def plan(self, building: Element) -> tuple[tuple[Room, ...], tuple[Door, ...]]:
-        """Make the rooms and doors of a plan."""
+        """Read the rooms and doors of a plan."""
         scale = self.scale(building)
         spaces = building.findall("floor/spaces/space")
         if not spaces:
@@ -123,14 +130,14 @@ class _Reader:
         return rooms, doors
 
     def wrong(self, name: str, expected: str, value: object) -> SimulatorError:
-        """The error that a part of the plan is wrong."""
+        """Make the error that a part of the plan is wrong."""
         return SimulatorError(
             f"{self.where}: {name}: expected {expected}, got "
             f"{'none' if value is None else brief(value)}; mend it"
         )
 
     def scale(self, building: Element) -> float:
-        """Metres a pixel."""
+        """Read the size of a pixel in metres."""
         pixels = self.number(
             building.findtext("scale/represented_distance/value"), "scale/represented_distance"
         )
@@ -143,7 +150,7 @@ class _Reader:
         return METRES[unit] * length / pixels
 
     def room(self, space: Element, where: str, scale: float) -> Room:
-        """The room of a space."""
+        """Read a room."""
         if not (name := space.get("id")):
             raise self.wrong(f"{where}.id", "a text", name)
         corners = tuple(
@@ -155,7 +162,14 @@ class _Reader:
     def pair(
         self, portal: Element, numbers: Mapping[str, int], here: int, where: str
     ) -> tuple[int, int]:
-        """The two rooms of a portal, in ascending order."""
+        """Read the indices of the two rooms of a door, in ascending order.
+
+        Args:
+            portal: The door.
+            numbers: Index of each room, by name.
+            here: Index of the room in which the door is listed.
+            where: Name of the door, for errors.
+        """
         names = [target.text or "" for target in portal.findall("target/id")]
         rooms = sorted({numbers[name] for name in names if name in numbers})
         if len(names) != 2 or len(rooms) != 2 or here not in rooms:
@@ -163,14 +177,14 @@ class _Reader:
         return rooms[0], rooms[1]
 
     def middle(self, line: Element, scale: float) -> Point:
-        """The middle of a line."""
+        """Read a line, and return its middle in metres."""
         ends = [self.point(point, "linesegment", scale) for point in line.findall("point")]
         if not ends:
             raise self.wrong("linesegment", "points", None)
         return _mean(ends)
 
     def point(self, point: Element | None, where: str, scale: float) -> Point:
-        """A point in metres. In drawings y points down; here it points north."""
+        """Read a point, and convert it to metres. In drawings y points down; here it points up."""
         if point is None:
             raise self.wrong(f"{where}.point", "x and y", None)
         return scale * self.number(point.get("x"), f"{where}.x"), -scale * self.number(
@@ -178,7 +192,7 @@ class _Reader:
         )
 
     def number(self, text: str | None, where: str) -> float:
-        """A number of at most a million."""
+        """Read a number of at most a million."""
         try:
             value = float(text or "")
         except ValueError:
@@ -189,7 +203,15 @@ class _Reader:
 
 
 def _matched(here: Sequence[Point], there: Sequence[Point]) -> Iterator[Point]:
-    """The doors between two rooms, each drawn on both sides of the wall or on one side only."""
+    """Match the doors between two rooms, each of which may be drawn on both sides of the wall.
+
+    Args:
+        here: Positions of the doors that one room lists.
+        there: Positions of the doors that the other room lists.
+
+    Yields:
+        The position of each door: the mean of two matched positions, or a position without a match.
+    """
     distances = np.array([[math.dist(a, b) for b in there] for a in here]).reshape(
         len(here), len(there)
     )

@@ -1,4 +1,7 @@
-"""Simulates drives from room to room of a floor plan."""
+"""Simulates drives from room to room of a floor plan.
+
+Rooms are places, and their doors are gateways.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +32,12 @@ MOST_STEPS = 10_000_000
 
 @dataclass(frozen=True)
 class Stand:
-    """State of the robot on a tour.
+    """The distinctive state of the robot: a room and a heading.
 
     Attributes:
-        room: The room.
-        gateway: The gateway that it faces, or has behind it.
-        faces: Whether it faces the gateway.
+        room: Index of the room.
+        gateway: Index of the gateway of the room that the robot faces or has behind it.
+        faces: Whether the robot faces the gateway. Otherwise, the gateway is behind it.
     """
 
     room: int
@@ -52,26 +55,29 @@ def tour(
     bend: float = 0.0,
     apart: float = APART,
 ) -> Trace:
-    """Simulate a drive from room to room: views, stars (openings seen), displacements.
+    """Simulate a drive from room to room, with views, stars and displacements.
 
-    The robot turns to the door of the room that it has passed least often and travels through it.
-    Ties are broken at random. It goes back through the same door only in a dead end. A turn is
-    named by its side and by the number of gateways passed on that side. A turn is "around" if it
-    ends where the robot came from, or goes from a door to the opposite one. A view is the number of
-    doors and their rough directions, so many rooms look alike.
+    In each room, the robot turns to the door that it has passed least often, and travels through
+    it. Ties are broken at random. It goes back through the same door only in a dead end. A view is
+    the number of doors and their rough directions, so many rooms look alike. A star is the bearings
+    of all doors. A turn has a side and a number: "left to gateway 2" ends at the second gateway on
+    the left. A turn to the door by which the robot came, or to the door opposite the one that it
+    faces, is "around".
 
     Args:
         plan: The plan.
         steps: Number of actions.
         seed: Seed of the drive and of the noise.
-        odometry: Noise of the displacements, stored in the trace; None makes them exact.
-        scale: Systematic error of distances, as in simulator.motion.reported.
-        bend: Systematic error of headings, as in simulator.motion.reported.
-        apart: Least degrees between doors, as in Plan.told_apart. Bearings are off by at most a
-            quarter of this, so that two doors never look like one.
+        odometry: Noise of the displacements, which the trace also states; None for exact
+            displacements.
+        scale: Share by which reported distances are too long.
+        bend: Radians a metre by which the reported heading drifts to the left.
+        apart: Smallest angle between two doors of a room in degrees. Doors that are closer together
+            are removed (`Plan.told_apart`). Bearings of doors are off by at most a quarter of this
+            angle, so that two doors never look like one.
 
     Returns:
-        A trace whose truth has dstate, place, path and pose.
+        A trace. The truth of each step has dstate, place, path, direction and pose.
 
     Raises:
         SimulatorError: No two rooms are connected.
@@ -113,7 +119,7 @@ def tour(
 
 @dataclass(frozen=True)
 class Floor:
-    """A plan as a world in which a robot is driven action by action.
+    """A plan as a world in which a program can drive a robot action by action.
 
     >>> from simulator.plans import Door, Plan, Room
     >>> from simulator.plan_tours import Floor
@@ -123,9 +129,8 @@ class Floor:
     ('1 door: 0', ['travel'])
 
     Attributes:
-        plan: The plan, as returned by Plan.told_apart.
-        spread: The error in degrees that a star states for its bearings. The simulated bearings
-            are exact.
+        plan: The plan. It should come from `Plan.told_apart`, so that doors can be distinguished.
+        spread: Error of bearings that stars state, in degrees. The bearings themselves are exact.
     """
 
     plan: Plan
@@ -133,30 +138,43 @@ class Floor:
 
     @property
     def start(self) -> Stand:
-        """At the first gateway of the first connected room."""
+        """The state in which the robot begins: it faces the first gateway of a connected room."""
         return Stand(self.plan.connected[0], 0)
 
     def sight(self, stand: Stand) -> Step:
-        """What the robot sees: a step with view and star, without truth."""
+        """Make a step with what the robot sees in a state: view and star, without truth."""
         bearings = _bearings(self.plan, stand)
         return Step(_view(bearings), star=_star(self.plan, stand, bearings, self.spread))
 
     def ends(self, stand: Stand) -> dict[Action, Stand]:
-        """The possible actions with their results: turns to other gateways, and travels."""
+        """List what the robot can do in a state.
+
+        Returns:
+            Dict from each action to the state that it leads to. An action is a turn to another
+            gateway, or a travel through the gateway ahead.
+        """
         return dict(
             next(self.way_through(stand, goal))
             for goal in range(len(self.plan.gateways[stand.room]))
         )
 
     def way_through(self, stand: Stand, goal: int) -> Iterator[tuple[Action, Stand]]:
-        """The actions that lead through a gateway of the room, with their results."""
+        """List the actions that lead through a gateway: a turn, unless it is ahead, and a travel.
+
+        Args:
+            stand: State of the robot.
+            goal: Index of the gateway of the room.
+
+        Yields:
+            Each action, and the state that it leads to.
+        """
         return _way_through(self.plan, stand, goal)
 
 
 def _drive(
     plan: Plan, steps: int, chance: np.random.Generator
 ) -> Iterator[tuple[Stand, Action | None]]:
-    """The states of a drive with the next actions, which end with None."""
+    """Drive at random; yield each state and the next action, which is None for the last state."""
     room = int(chance.choice(plan.connected))
     stand = Stand(room, int(chance.integers(len(plan.gateways[room]))))
     came_by: int | None = None
@@ -178,7 +196,7 @@ def _drive(
 
 
 def _way_through(plan: Plan, stand: Stand, goal: int) -> Iterator[tuple[Action, Stand]]:
-    """The actions that lead through a gateway of a room, with their results."""
+    """The actions that lead through a gateway of the room, each with the state it leads to."""
     if stand != (turned := Stand(stand.room, goal)):
         yield _turn(plan, stand, goal), turned
     gateway = plan.gateways[stand.room][goal]
@@ -191,7 +209,10 @@ def _way_through(plan: Plan, stand: Stand, goal: int) -> Iterator[tuple[Action, 
 
 
 def _turn(plan: Plan, stand: Stand, goal: int) -> Action:
-    """The turn to a gateway, numbered on its side without the gateway that the robot faces."""
+    """The turn to a gateway of the room.
+
+    Its number counts the gateways on its side. The gateway that the robot faces is not counted.
+    """
     found = plan.gateways[stand.room]
     if goal == (found[stand.gateway].opposite if stand.faces else stand.gateway):
         return Action.of("around")
@@ -205,14 +226,14 @@ def _turn(plan: Plan, stand: Stand, goal: int) -> Action:
 
 
 def _heading(plan: Plan, stand: Stand) -> float:
-    """Heading in degrees clockwise from north."""
+    """The heading of the robot in degrees clockwise from north."""
     return plan.gateways[stand.room][stand.gateway].bearing + (0 if stand.faces else 180)
 
 
 def _bearings(plan: Plan, stand: Stand) -> tuple[float, ...]:
-    """Bearing of each gateway of the room, in degrees clockwise from ahead.
+    """The bearing of each gateway of the room, in degrees clockwise from straight ahead.
 
-    Stars are sorted, as this order reveals the heading.
+    The order is that of the gateways. It reveals the heading, so stars must be sorted.
     """
     heading = _heading(plan, stand)
     return tuple(
@@ -223,7 +244,7 @@ def _bearings(plan: Plan, stand: Stand) -> tuple[float, ...]:
 def _sighted(
     plan: Plan, stand: Stand, spread: float, chance: np.random.Generator
 ) -> tuple[Sighted, ...]:
-    """The star with errors: each bearing is off by at most `spread` degrees."""
+    """The star with random errors: each bearing is off by at most `spread` degrees."""
     found = plan.gateways[stand.room]
     off = chance.uniform(-spread, spread, len(found)).tolist()
     bearings = [
@@ -234,7 +255,7 @@ def _sighted(
 
 
 def _view(bearings: Sequence[float]) -> str:
-    """The number of doors and their rough directions."""
+    """The view: a text with the number of doors and their rough directions."""
     rough = sorted({round(bearing / COARSE) * COARSE % 360 for bearing in bearings})
     return f"{len(bearings)} door{'s' * (len(bearings) > 1)}: {' '.join(map(str, rough))}"
 
@@ -242,7 +263,14 @@ def _view(bearings: Sequence[float]) -> str:
 def _star(
     plan: Plan, stand: Stand, bearings: Sequence[float], spread: float
 ) -> tuple[Sighted, ...]:
-    """The star of gateways at these bearings, sorted, with opposite doors marked."""
+    """The star of a room: its gateways, sorted by bearing, each with its opposite gateway.
+
+    Args:
+        plan: The plan.
+        stand: State of the robot.
+        bearings: Bearing of each gateway in degrees, in the order of the plan.
+        spread: Error of the bearings that the star states, in degrees.
+    """
     found = plan.gateways[stand.room]
     order = sorted(range(len(found)), key=lambda k: bearings[k])
     opposite = [found[k].opposite for k in order]

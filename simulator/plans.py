@@ -1,12 +1,12 @@
 """Floor plans of real buildings as graphs of rooms, whose gateways are doors.
 
-A place is a room, and the robot stands in its middle. A gateway is a door, in the direction in
-which the robot sees it from there.
+A place is a room, and the robot stands in its middle. A gateway is a door as seen from there.
 
 The robot leaves a room through the door that it faces, and enters the next room with that door
-behind it. If another door is straight ahead then, to within STRAIGHT, it faces that door: the two
-are opposite, and the path goes on through both. Otherwise it faces no door, and the path ends. So a
-distinctive state is a room with a door that the robot faces, or with a door behind it.
+behind it. If another door is then straight ahead, to within STRAIGHT degrees, the two doors are
+opposite. The robot faces that door, and the path goes on through both. Otherwise the robot faces no
+door, and the path ends. So a distinctive state (dstate) is a room with a door that the robot faces,
+or with a door behind it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Leg = tuple[int, int]  # A room that the robot leaves, and the door that it goes
 # Two doors of a room are opposite if the path through its middle bends by at most this many
 # degrees.
 STRAIGHT = 20.0
-# The robot cannot distinguish doors within this many degrees. Only one is open on a tour.
+# The robot cannot distinguish doors within this many degrees. On a tour, only one of them is open.
 APART = 3.0
 
 
@@ -43,9 +43,9 @@ class Gateway:
 
     Attributes:
         door: Index of the door in the plan.
-        to: Room behind it.
-        bearing: Degrees clockwise from north, which is +y.
-        opposite: Index of the opposite gateway of the same room, or None.
+        to: Index of the room behind the door.
+        bearing: Direction from the middle of the room, in degrees clockwise from north (+y).
+        opposite: Index of the opposite gateway among those of the same room; None without one.
     """
 
     door: int
@@ -56,12 +56,12 @@ class Gateway:
 
 @dataclass(frozen=True)
 class Plan:
-    """Rooms, and the doors between them. North is up in the drawing.
+    """A floor plan: rooms, and the doors between them. North (+y) is up in the drawing.
 
     Attributes:
         name: Name of the plan.
         rooms: The rooms.
-        doors: The doors.
+        doors: The doors, which refer to rooms by their indices.
     """
 
     name: str
@@ -83,7 +83,11 @@ class Plan:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
-        """Load a plan from an XML file. Raises SimulatorError that says where it is wrong."""
+        """Load a plan from an XML file.
+
+        Raises:
+            SimulatorError: The plan is wrong. The text names the part that is wrong.
+        """
         return cls(*read_plan(path))
 
     @cached_property
@@ -107,7 +111,7 @@ class Plan:
 
     @cached_property
     def connected(self) -> tuple[int, ...]:
-        """The largest set of rooms that can be reached from each other."""
+        """The indices of the rooms in the largest part of the plan that doors connect."""
         parts: list[list[int]] = sorted(
             (sorted(part) for part in nx.connected_components(self.graph)),
             key=lambda part: (-len(part), part),
@@ -116,7 +120,11 @@ class Plan:
 
     @cached_property
     def paths(self) -> tuple[tuple[Leg, ...], ...]:
-        """The paths from end to end. Opposite doors of a room continue a path."""
+        """The paths of the plan. A path goes straight on through opposite doors of a room.
+
+        A path is its legs from end to end: pairs of a room that the robot leaves, and the door that
+        it leaves by.
+        """
         found: list[tuple[Leg, ...]] = []
         taken: set[int] = set()
         for number, door in enumerate(self.doors):
@@ -129,12 +137,12 @@ class Plan:
         return tuple(found)
 
     def _behind(self, room: int, door: int) -> int:
-        """The room behind a door of a room."""
+        """The room on the other side of a door of a room."""
         one, other = self.doors[door].rooms
         return other if room == one else one
 
     def _straight_on(self, leg: Leg) -> tuple[Leg, ...]:
-        """A leg and all legs straight ahead of it; a circle is followed once."""
+        """A leg and all legs straight ahead of it. A path that is a circle is followed once."""
         legs = [leg]
         while True:
             room = self._behind(*legs[-1])
@@ -145,7 +153,11 @@ class Plan:
 
     @cached_property
     def courses(self) -> dict[Leg, tuple[int, int]]:
-        """For each exit of a room, its path, and its direction on the path: 1 or -1."""
+        """Dict from each room and door of that room to the path through the door.
+
+        A path is given by its index in `paths`, and by the direction in which the robot is on the
+        path when it leaves the room: 1 or -1.
+        """
         return {
             leg: (number, direction)
             for number, path in enumerate(self.paths)
@@ -154,9 +166,12 @@ class Plan:
         }
 
     def told_apart(self, degrees: float = APART) -> Plan:
-        """Remove doors until each room's doors differ by at least this many degrees.
+        """Copy the plan without doors that look too close together from the middle of a room.
 
-        The doors nearest to the middles of their rooms stay.
+        The doors nearest to the middles of their rooms are kept.
+
+        Args:
+            degrees: Smallest angle between two doors of a room.
         """
 
         a_number("degrees", degrees, SimulatorError, 0, 180, what="degrees")
@@ -185,12 +200,15 @@ class Plan:
 
 
 def _apart(one: float, other: float) -> float:
-    """Degrees between two directions."""
+    """The angle between two directions in degrees, from 0 to 180."""
     return abs(math.remainder(one - other, 360))
 
 
 def _with_opposites(found: Sequence[Gateway]) -> tuple[Gateway, ...]:
-    """Pair the gateways of a room that are nearest to being opposite each other."""
+    """Set `opposite` for two gateways of a room if each is the best opposite of the other.
+
+    They may differ from exactly opposite by at most STRAIGHT degrees.
+    """
 
     def nearest(k: int) -> int:
         return min(

@@ -13,8 +13,8 @@ from simulator.motion import Pose, between
 from ssh_abduction.data.errors import brief, is_finite
 from ssh_abduction.data.odometry import Displacement
 
-# Largest systematic errors, as a share and in radians a metre. Beyond them, the robot does not
-# notice that it left a place.
+# Largest errors of odometry, as a share and in radians a metre. With larger ones, the robot does
+# not notice that it left a place.
 WORST = 0.5
 # Options of `simulate` for these errors.
 OPTIONS = {"odometry": "odometry-noise", "scale": "scale-error", "bend": "bend-error"}
@@ -22,12 +22,12 @@ OPTIONS = {"odometry": "odometry-noise", "scale": "scale-error", "bend": "bend-e
 
 @dataclass(frozen=True)
 class Body:
-    """Errors of a robot's motions and odometry.
+    """The size of a robot, and the errors of its motions and its odometry.
 
     Attributes:
-        radius: Radius in metres; a wall nearer than this is a collision.
+        radius: Radius in metres. The robot collides with a wall that is nearer to its middle.
         slip: Standard deviation of the actual motion, as a share of the commanded motion.
-        wander: Standard deviation of the heading, in radians for each metre driven.
+        wander: Standard deviation of the heading, in radians for each metre of a motion.
         odometry: Standard deviation of the reported motion, as a share of the actual motion.
         scale: Share by which reported distances are too long, as with worn wheels.
         bend: Radians a metre by which the reported heading drifts to the left, as with wheels of
@@ -61,12 +61,12 @@ class Body:
 
 @dataclass(frozen=True)
 class Report:
-    """Odometry since the last report.
+    """The motion of a robot by odometry since the last report.
 
     Attributes:
-        displacement: (dx, dy, dtheta) in the frame of the robot at the last report, in metres and
-            radians.
-        covariance: (3, 3) covariance of its noise, without systematic errors.
+        displacement: Metres ahead, metres to the left, and radians turned, in the frame of the
+            robot at the last report.
+        covariance: (3, 3) covariance of the noise of the displacement, without systematic errors.
     """
 
     displacement: Displacement
@@ -74,16 +74,18 @@ class Report:
 
 
 class Robot:
-    """The true pose of a robot, which only the simulator knows, and its odometry.
+    """A robot with its true pose, which only the simulator knows, and its odometry.
 
     Args:
-        body: Errors of its motions.
-        pose: Start pose.
+        body: Errors of its motions and its odometry.
+        pose: Start pose: x and y in metres, heading in radians.
         rng: Source of the errors.
 
     Attributes:
-        driven: Metres driven, by odometry.
-        odometry: Pose relative to the start, by odometry.
+        body: Errors of its motions and its odometry.
+        pose: True pose.
+        driven: Metres driven, forward or back, by odometry.
+        odometry: Pose by odometry, which starts at (0, 0, 0).
     """
 
     def __init__(self, body: Body, pose: Pose, rng: np.random.Generator) -> None:
@@ -101,7 +103,12 @@ class Robot:
         self._covariance = np.zeros((3, 3))
 
     def move(self, forward: float, turn: float) -> None:
-        """Command a motion: metres forward (back if negative), and radians of turn on the way."""
+        """Drive and turn at once.
+
+        Args:
+            forward: Metres to drive forward; negative for back.
+            turn: Radians to turn on the way, counterclockwise.
+        """
         e = self._rng.normal(size=5)
         body = self.body
         forward_done = forward * (1 + body.slip * e[0])
@@ -114,7 +121,7 @@ class Robot:
         self.driven += abs(forward_told)
 
     def report(self) -> Report:
-        """The motion by odometry since the last report, or since the start."""
+        """Return the motion by odometry since the last call, or since the start."""
         cos, sin = math.cos(self._reported[2]), math.sin(self._reported[2])
         into = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
         said = Report(between(self._reported, self.odometry), into @ self._covariance @ into.T)
@@ -122,7 +129,7 @@ class Robot:
         return said
 
     def _add_covariance(self, forward: float, turn: float) -> None:
-        """Add the covariance of a motion, to first order."""
+        """Add the covariance of a reported motion (metres, radians), to first order."""
         middle = self.odometry[2] + turn / 2
         cos, sin = math.cos(middle), math.sin(middle)
         by_pose = np.array([[1.0, 0.0, -forward * sin], [0.0, 1.0, forward * cos], [0.0, 0.0, 1.0]])

@@ -1,8 +1,9 @@
 """Simulates rounds through buildings: a robot drives from room to room and logs scans.
 
-It leaves each room by the door that it has passed least often, as in plan_tours.tour, until the
-round is long enough. Then it goes home through as few doors as possible. In a room with one door it
-drives to the middle and turns back. From door to door it takes the direct route.
+A round begins and ends in one room, the robot's home. The robot leaves each room by the door that
+it has passed least often, until the round is long enough. Then it goes home through as few doors as
+possible. In a room with one door, it drives to the middle and turns back. In other rooms, it takes
+the direct route from door to door.
 """
 
 from __future__ import annotations
@@ -32,29 +33,33 @@ from ssh_abduction.data.words import counted
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]
-# A room and two of its doors; None stands for its middle.
+# A room, and the doors by which the robot enters and leaves. None instead of a door means the
+# middle of the room.
 Within = tuple[int, int | None, int | None]
 # Length of a round in metres before the robot goes home.
 METRES = 200.0
 # Metres from the wall at which a passage through a door begins and ends.
 APPROACH = 0.45
-# Distance from walls of the middle of a room in metres, if there is enough room.
+# The middle of a room is at least this many metres from walls, if the room is large enough.
 MIDDLE = 0.8
 # The scanner in buildings, with the reach of those in recorded logs.
 LASER = Laser(noise=0.01, reach=30.0)
 
 
 class Rooms:
-    """Plans routes: free-space paths inside each room, straight lines through doorways.
+    """Plans routes in a building: through free space in each room, and straight through doors.
 
     Args:
         building: The building.
         radius: Radius of the robot in metres.
 
     Attributes:
-        space: Free space with open doors.
-        graph: Rooms as nodes, and doors that fit the robot and can be reached as edges, by index.
-        middles: The point in each room of the graph that the robot uses as its middle.
+        building: The building.
+        space: Free space of the building, in which doors are open.
+        graph: Rooms as nodes, and doors as edges, both by index. It has the doors that are wide
+            enough for the robot and can be reached in both rooms.
+        middles: Dict from the index of a room to the point (x, y) that the robot uses as its
+            middle, in metres.
     """
 
     def __init__(self, building: Building, radius: float) -> None:
@@ -66,7 +71,7 @@ class Rooms:
         self._sides = [_sides(building, number) for number in range(len(building.openings))]
         self._ways: dict[Within, Array] = {}
         self.middles: dict[int, Point] = {}
-        # A door becomes an edge if it can be reached in the main region of both of its rooms.
+        # A door becomes an edge if it is in the main connected region of both of its rooms.
         fits = [number for number in range(len(building.openings)) if self._fits(number)]
         reached: Counter[int] = Counter()
         for room in range(len(building.plan.rooms)):
@@ -87,7 +92,16 @@ class Rooms:
         )
 
     def way(self, room: int, start: int | None, goal: int | None) -> Array:
-        """The route within a room between two doors, (n, 2) metres; None stands for its middle."""
+        """Plan the route within a room from one door to another.
+
+        Args:
+            room: Index of the room.
+            start: Index of the first door; None for the middle of the room.
+            goal: Index of the last door; None for the middle of the room.
+
+        Returns:
+            (n, 2) metres.
+        """
         if (room, start, goal) not in self._ways:
             ends = [
                 self.middles[room] if door is None else self._sides[door][room]
@@ -99,15 +113,15 @@ class Rooms:
         return self._ways[room, start, goal]
 
     def behind(self, room: int, door: int) -> int:
-        """The room behind a door of a room."""
+        """Find the room on the other side of a door of a room."""
         return next(other for other in self._sides[door] if other != room)
 
     def through(self, door: int, room: int) -> Array:
-        """The route through a door from a room, (n, 2) metres, over the middle of the door."""
+        """Plan the straight route from a room through the middle of a door: (n, 2), metres."""
         return _line(self._sides[door][room], self._sides[door][self.behind(room, door)])
 
     def _fits(self, door: int) -> bool:
-        """Whether the robot fits straight through a door."""
+        """Whether the robot can drive straight through a door."""
         line = (
             _line(*self._sides[door].values()) if len(self._sides[door]) == 2 else np.empty((0, 2))
         )
@@ -122,9 +136,11 @@ class Rooms:
 
 
 def _sides(building: Building, number: int) -> dict[int, Point]:
-    """For both rooms of a door, the points where a passage begins and ends.
+    """The points at which the robot begins and ends to drive through a door.
 
-    Empty if it is unclear which room is on which side.
+    Returns:
+        Dict from each of the two rooms to the point (x, y) on its side of the door, in metres.
+        Empty if it is unclear which room is on which side.
     """
     opening, door = building.openings[number], building.plan.doors[number]
     sides = [opening.point(0.0, side * (opening.depth / 2 + APPROACH)) for side in (-1, 1)]
@@ -138,7 +154,10 @@ def _sides(building: Building, number: int) -> dict[int, Point]:
 
 
 def holds(polygon: Sequence[Point], point: Point) -> bool:
-    """Whether a polygon contains a point: a ray crosses its outline an odd number of times."""
+    """Check whether a polygon contains a point.
+
+    If it does, a ray from the point crosses its outline an odd number of times.
+    """
     x, y = point
     crossings = sum(
         (y1 > y) != (y2 > y) and x < x1 + (y - y1) * (x2 - x1) / (y2 - y1)
@@ -148,7 +167,7 @@ def holds(polygon: Sequence[Point], point: Point) -> bool:
 
 
 def _line(start: Point, goal: Point) -> Array:
-    """A straight route, (n, 2) metres."""
+    """A straight route from start to goal: (n, 2), metres."""
     line: Array = np.linspace(start, goal, 1 + math.ceil(math.dist(start, goal) / CELL))
     return line
 
@@ -158,9 +177,10 @@ class Round:
     """A round through rooms, which ends where it began.
 
     Attributes:
-        way: (n, 2) route in metres.
-        rooms: Room of each point of the route.
-        doors: For each passage, the index of its point in `way`, and the door.
+        way: (n, 2) points of the route in metres.
+        rooms: (n,) index of the room of each point of the route.
+        doors: For each passage through a door, in order: the index in `way` of the point in the
+            door, and the index of the door.
     """
 
     way: Array = field(repr=False)
@@ -170,6 +190,11 @@ class Round:
     @classmethod
     def drawn(cls, rooms: Rooms, metres: float, chance: np.random.Generator) -> Round:
         """Draw a round at random.
+
+        Args:
+            rooms: Rooms and routes of the building.
+            metres: Length after which the robot goes home.
+            chance: Source of random choices.
 
         Raises:
             SimulatorError: No two rooms are connected by doors that fit the robot.
@@ -192,7 +217,7 @@ class Round:
             ways.append(within)
             labels += [room] * len(within)
             if goal is not None:
-                # The middle of a passage is in the door; the room changes there.
+                # Half of the points of a passage are before the door, half behind it.
                 through = rooms.through(goal, room)
                 middle = len(through) // 2
                 doors.append((len(labels) + middle, goal))
@@ -202,7 +227,12 @@ class Round:
 
 
 def _legs(rooms: Rooms, home: int, metres: float, chance: np.random.Generator) -> Iterator[Within]:
-    """The legs of a round: room, entry door and exit door; None stands for its middle."""
+    """Draw the legs of a round at random.
+
+    Yields:
+        For each room: its index, the door by which the robot enters, and the door by which it
+        leaves. None instead of a door means the middle of the room.
+    """
     passed: Counter[int] = Counter()
     room, came, done = home, None, 0.0
     while True:
@@ -247,9 +277,9 @@ def record_plan(
 
     Args:
         plan: The plan of the building.
-        tours: Number of times that the round is driven.
+        tours: Number of times that the same round is driven.
         seed: Seed of the round and of the noise.
-        metres: Length of a round before the robot goes home.
+        metres: Length of the round after which the robot goes home.
         laser: The scanner.
         body: Errors of the robot.
         odometer: Noise of the odometry in the log.
@@ -274,7 +304,8 @@ def record_plan(
     robot = Robot(body, (x, y, float(chance.uniform(-math.pi, math.pi))), motion)
     driver = Driver(world, robot, laser, motion, recorder=recorder)
     recorder.note(world, robot.pose)
-    # The point of the round reached at each scan, counted on from round to round.
+    # For each scan, the point of the round that was reached. Points are counted on from one round
+    # to the next.
     come = [0]
     for number in range(tours):
         for at in follow(driver, rooms.space, tour.way):
@@ -304,5 +335,5 @@ def record_plan(
 
 
 def _name(room: int) -> str:
-    """The name of a room, as in the truth of plan_tours.tour."""
+    """The name of a room in the truth, the same as in `plan_tours.tour`."""
     return f"room {room}"

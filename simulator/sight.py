@@ -1,4 +1,4 @@
-"""Finds the walls around the robot in one laser image. It does not know the true pose.
+"""Finds the walls around the robot in one laser image, without knowing the true pose.
 
 Walls are assumed to meet at right angles. The points of the image are rotated until the walls are
 parallel to the axes. The wall ahead, the walls alongside, and the far walls of side streets are
@@ -31,8 +31,8 @@ class Sight:
         front: Distance to the wall ahead.
         left: Distance to the wall on the left.
         right: Distance to the wall on the right.
-        left_street: Distance ahead of the far wall of a street that opens to the left.
-        right_street: The same on the right.
+        left_street: Distance ahead to the far wall of a street that opens to the left.
+        right_street: Distance ahead to the far wall of a street that opens to the right.
     """
 
     tilt: float
@@ -43,13 +43,18 @@ class Sight:
     right_street: float | None
 
     def to_go(self, reach: float, streets: bool = True) -> float | None:
-        """Metres to the point `reach` before the wall ahead, or in the middle of a side street.
+        """Measure how far ahead the fixed point of the next place is.
 
-        The nearer point counts; None if there is neither.
+        The fixed point is `reach` before the wall ahead, or in the middle of a side street,
+        whichever is nearer.
 
         Args:
             reach: Half the width of a corridor in metres.
             streets: Whether side streets count.
+
+        Returns:
+            Metres ahead; negative if the robot is beyond the point. None if neither a wall nor a
+            side street is near.
         """
         marks = [self.front] if self.front is not None and self.front < 2.5 * reach else []
         if streets:
@@ -61,7 +66,16 @@ class Sight:
         return None if not marks else min(marks) - reach
 
     def offset(self, reach: float) -> float | None:
-        """Metres to the left of the midline, or of the line `reach` away from the only wall."""
+        """Measure how far the robot is to the left of the line that it should follow.
+
+        The line is the midline between two walls, or is `reach` away from the only wall.
+
+        Args:
+            reach: Half the width of a corridor in metres.
+
+        Returns:
+            Metres; negative if the robot is to the right. None without a wall on either side.
+        """
         near = 1.5 * reach
         left = self.left if self.left is not None and self.left < near else None
         right = self.right if self.right is not None and self.right < near else None
@@ -76,9 +90,9 @@ def sight(image: Array, reach: float, farthest: float) -> Sight:
     """Find the walls in an image.
 
     Args:
-        image: (180,) metres.
+        image: (180,) ranges in metres, from right to left.
         reach: Half the width of a corridor in metres.
-        farthest: Range from which nothing was seen.
+        farthest: Range in metres that means that nothing was seen.
     """
     seen = image < farthest - 0.02
     bearings, ranges = BEARINGS[seen], image[seen]
@@ -113,7 +127,7 @@ def _turned(points: Array, angle: float) -> Array:
 def _axis(points: Array) -> float:
     """The direction of the walls between -45 and 45 degrees, in radians.
 
-    It is the mean direction, modulo a right angle, of lines between near points.
+    It is the mean direction, modulo a right angle, of the lines between points close together.
     """
     chords = points[8:] - points[:-8]
     length = np.hypot(chords[:, 0], chords[:, 1])
@@ -131,7 +145,10 @@ def _axis(points: Array) -> float:
 
 
 def _finer(points: Array, reach: float) -> float:
-    """The remaining angle between walls and axes: the mean slope of the best lines, by length."""
+    """The remaining angle between walls and axes, in radians.
+
+    It is the mean slope of the walls ahead, behind, left and right, weighted by their length.
+    """
     slopes, weights = [], []
     for u, v in ((0, 1), (1, 0)):
         inside = np.abs(points[:, v]) < 3 * reach
@@ -140,7 +157,8 @@ def _finer(points: Array, reach: float) -> float:
             line = _line(points[:, v], _spacing(points[:, u]), chosen)
             if line is None:
                 continue
-            # Slope of the points on the line; slopes of both axes must have one sign.
+            # Fit a slope to the points on the line. The sign must mean the same rotation for both
+            # axes.
             on = chosen & (np.abs(points[:, v] - line) < THICK)
             a, b = points[on, u], points[on, v]
             spread = float(((a - a.mean()) ** 2).sum())
@@ -152,14 +170,17 @@ def _finer(points: Array, reach: float) -> float:
 
 
 def _spacing(values: Array) -> Array:
-    """Metres of wall along this axis that each point represents."""
+    """How many metres of wall along this axis each point represents, (n,)."""
     return np.minimum(np.abs(np.gradient(values)), 0.3)
 
 
 def _line(values: Array, weights: Array, chosen: NDArray[np.bool_]) -> float | None:
-    """The value that most of the chosen points share, weighted in metres of wall.
+    """The coordinate of the longest wall across an axis; None if no wall is LONG enough.
 
-    None if no wall is LONG enough.
+    Args:
+        values: (n,) coordinate of each point on the axis, in metres.
+        weights: (n,) metres of wall that each point represents.
+        chosen: (n,) mask of the points that are searched.
     """
     picked, length = values[chosen], weights[chosen]
     if len(picked) < 5:

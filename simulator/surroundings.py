@@ -1,12 +1,12 @@
-"""Finds walls, streets and places in laser images; streets meet at any angles.
+"""Finds walls, streets and places in laser images, if streets meet at any angles.
 
-It does not know the true pose. A wall is a straight stretch of points. A street lies between two
-walls that face each other, about twice `reach` apart. The fixed point of a place is where the
-midlines of its streets meet; at a dead end it is `reach` before the wall.
+The true pose is not used. A wall is a straight stretch of points. A street lies between two walls
+that face each other, about twice `reach` apart. The fixed point of a place is where the midlines of
+its streets meet. At a dead end, it is `reach` before the wall.
 
-An image shows half a circle. A robot that turns on the spot sees the same walls rotated, so images
-overlap, and the rotation with the best agreement is its turn: a visual compass. So images of a
-turning robot add up to a panorama of the whole circle.
+An image shows half a circle. If a robot turns on the spot, consecutive images overlap, and show the
+same walls rotated. The rotation with the best agreement is the turn of the robot; this is a visual
+compass. So the images of a turning robot can be joined to a panorama of the whole circle.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ OFF = 0.15
 AROUND: Array = np.radians(np.arange(360.0))
 # Largest angle in radians between two walls of a street.
 PARALLEL = math.radians(8)
-# Width of a street in multiples of the reach, and the length of its walls; a shorter one is a
-# recess of the place.
+# In multiples of the reach: smallest and largest width of a street, and distance from the robot to
+# which its walls reach at least. Something shorter is a recess of the place.
 WIDTHS = (1.2, 3.0)
 FAR = 2.0
 # Directions within this many radians are the same: a street that bends by less goes straight on.
@@ -46,13 +46,14 @@ STRAIGHT = math.radians(20)
 
 @dataclass(frozen=True)
 class Wall:
-    """A straight wall, seen counterclockwise from start to end, so that its inside is at its left.
+    """A straight wall. The robot is on its left, looking from start to end.
 
-    Points and directions are complex numbers: metres ahead of the robot, and metres to its left.
+    Points and directions are complex numbers: metres ahead of the robot (real part), and metres to
+    its left (imaginary part).
 
     Attributes:
-        start: The first end.
-        end: The last end.
+        start: The end that the robot sees first, counterclockwise.
+        end: The other end.
     """
 
     start: complex
@@ -60,7 +61,7 @@ class Wall:
 
     @property
     def way(self) -> complex:
-        """Vector from the start to the end."""
+        """The vector from the start to the end."""
         return self.end - self.start
 
 
@@ -69,9 +70,10 @@ class Street:
     """A street that leads away from the robot.
 
     Attributes:
-        bearing: Radians, counterclockwise from straight ahead.
-        middle: Point of its midline nearest to the robot.
-        length: Visible metres of it between two walls.
+        bearing: Direction in radians, counterclockwise from straight ahead.
+        middle: Point of the street's midline that is nearest to the robot, as a complex number in
+            metres.
+        length: Metres for which walls are visible on both sides.
     """
 
     bearing: float
@@ -80,20 +82,34 @@ class Street:
 
     @property
     def offset(self) -> float:
-        """Metres that the robot is left of the midline, looking along the street."""
+        """How far the robot is to the left of the midline, looking along the street, in metres."""
         return -(self.middle * cmath.rect(1, -self.bearing)).imag
 
 
 def points_of(
     ranges: Array, bearings: Array, farthest: float
 ) -> tuple[NDArray[np.complex128], NDArray[np.intp]]:
-    """The points of an image, and the indices of their beams; `farthest` means unseen."""
+    """Compute the points that the beams of an image hit.
+
+    Args:
+        ranges: (b,) metres.
+        bearings: (b,) radians.
+        farthest: Range in metres that means that nothing was seen.
+
+    Returns:
+        (n,) points as complex numbers in metres, and (n,) indices of their beams.
+    """
     seen = np.flatnonzero(ranges < farthest - 0.02)
     return ranges[seen] * np.exp(1j * bearings[seen]), seen
 
 
 def walls_of(points: NDArray[np.complex128], beams: NDArray[np.intp]) -> list[Wall]:
-    """The walls in points that are given counterclockwise."""
+    """Find the walls in points.
+
+    Args:
+        points: (n,) points as complex numbers, counterclockwise.
+        beams: (n,) index of the beam of each point. Missing beams end a wall.
+    """
     breaks = np.flatnonzero(np.diff(beams) > GAP) + 1
     return [wall for stretch in np.split(points, breaks) for wall in _straight(stretch)]
 
@@ -101,13 +117,17 @@ def walls_of(points: NDArray[np.complex128], beams: NDArray[np.intp]) -> list[Wa
 def streets_of(
     walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float
 ) -> list[Street]:
-    """The streets between walls, one for each direction, clockwise from straight behind.
+    """Find the streets between walls.
 
     Args:
         walls: The walls.
-        points: All points of the image.
+        points: All points of the image. A street must be free of points near its midline.
         reach: Half the width of a street in metres.
-        farther: Metres from the robot that a street has to go on.
+        farther: Smallest distance from the robot to which a street must reach, in metres.
+
+    Returns:
+        Streets in different directions, clockwise from straight behind. Of streets in about the
+        same direction, the longest is taken.
     """
     found: list[Street] = []
     for street in sorted(
@@ -119,14 +139,15 @@ def streets_of(
 
 
 def apart(one: float, other: float) -> float:
-    """Radians between two directions."""
+    """Compute the angle between two directions in radians, from 0 to pi."""
     return abs(math.remainder(one - other, math.tau))
 
 
 def _straight(points: NDArray[np.complex128]) -> Iterator[Wall]:
-    """Split points into walls, at the point farthest from the line of both ends.
+    """Split points into walls by the algorithm of Douglas and Peucker.
 
-    This is the algorithm of Douglas and Peucker.
+    Points that do not lie on one line are split at the point farthest from the line between their
+    ends.
     """
     if len(points) < 5:
         return
@@ -141,7 +162,10 @@ def _straight(points: NDArray[np.complex128]) -> Iterator[Wall]:
 
 
 def _fitted(points: NDArray[np.complex128]) -> Wall:
-    """The least-squares line. Its direction is half the angle of the second moment."""
+    """The wall on the least-squares line through points.
+
+    Its direction is half the angle of the second moment of the points.
+    """
     middle = points.mean()
     direction = np.sqrt(((points - middle) ** 2).sum())
     direction /= abs(direction)
@@ -153,7 +177,10 @@ def _fitted(points: NDArray[np.complex128]) -> Wall:
 def _between(
     walls: Sequence[Wall], points: NDArray[np.complex128], reach: float, farther: float
 ) -> Iterator[Street]:
-    """The streets between any two walls, one on the right and one on the left."""
+    """The streets between any two walls, one on the right of the street and one on the left.
+
+    Arguments are those of `streets_of`.
+    """
     # Rotate both walls so that the street points along the real axis.
     for right, left in permutations(walls, 2):
         if apart(cmath.phase(right.way), cmath.phase(-left.way)) > PARALLEL:
@@ -186,7 +213,8 @@ class Place:
 
     Attributes:
         streets: Streets that lead away, clockwise from straight behind the robot.
-        fixed: Fixed point; None if a single street goes straight on, as this is no place.
+        fixed: Fixed point as a complex number: metres ahead, and metres to the left. None if a
+            street just goes straight on, or no wall ends it; then this is no place.
     """
 
     streets: tuple[Street, ...]
@@ -194,7 +222,13 @@ class Place:
 
     @classmethod
     def of(cls, ranges: Array, reach: float, farthest: float) -> Place:
-        """Find the place in a panorama, (360,) metres."""
+        """Find the place in a panorama.
+
+        Args:
+            ranges: (360,) range at each degree in metres; NaN if unknown.
+            reach: Half the width of a street in metres.
+            farthest: Range in metres that means that nothing was seen.
+        """
         points, beams = points_of(np.nan_to_num(ranges, nan=farthest), AROUND, farthest)
         if not len(points):
             return cls((), None)
@@ -208,7 +242,11 @@ class Place:
 
     @property
     def headings(self) -> list[float]:
-        """Headings of dstates, radians: along each street, and opposite if no street is there."""
+        """The headings of the dstates of this place, in radians.
+
+        There is one along each street, and one opposite to each street, unless another street is
+        there.
+        """
         out = [street.bearing for street in self.streets]
         return out + [
             bearing + math.pi
@@ -217,11 +255,19 @@ class Place:
         ]
 
     def heading(self, about: float) -> float:
-        """The heading of a dstate that is nearest to this one."""
+        """Find the heading of a dstate that is nearest to a heading, both in radians."""
         return min(self.headings, key=lambda heading: apart(heading, about))
 
     def beside(self, heading: float, side: int) -> float | None:
-        """Radians to the next street at the left (side=1) or right (-1); None without one."""
+        """Measure the turn to the next street on a side.
+
+        Args:
+            heading: Heading of the robot in radians.
+            side: 1 for the left, -1 for the right.
+
+        Returns:
+            Radians, negative to the right; None if no street is on that side.
+        """
         turns = [side * (street.bearing - heading) % math.tau for street in self.streets]
         return min(
             (side * turn for turn in turns if STRAIGHT < turn < math.pi - STRAIGHT),
@@ -230,12 +276,15 @@ class Place:
         )
 
     def faces(self, heading: float) -> bool:
-        """Whether a street is straight ahead."""
+        """Check whether a street is straight ahead, with a heading in radians."""
         return any(apart(street.bearing, heading) <= STRAIGHT for street in self.streets)
 
 
 def _meeting(streets: Sequence[Street]) -> complex | None:
-    """The point with the least squared distances to all midlines."""
+    """The point with the least sum of squared distances to all midlines.
+
+    None if two streets are one that goes straight on.
+    """
     if len(streets) == 2 and apart(streets[0].bearing, streets[1].bearing + math.pi) <= STRAIGHT:
         return None
     across = np.array([1j * cmath.rect(1, street.bearing) for street in streets])
@@ -246,7 +295,10 @@ def _meeting(streets: Sequence[Street]) -> complex | None:
 
 
 def _end(streets: Sequence[Street], points: NDArray[np.complex128], reach: float) -> complex | None:
-    """The point on the midline of the only street, `reach` before the wall at its end."""
+    """The fixed point of a dead end: on the midline of the only street, `reach` before the wall.
+
+    None if there is no wall.
+    """
     for street in streets:
         along = cmath.rect(1, street.bearing)
         seen = (points - street.middle) / along
@@ -257,27 +309,27 @@ def _end(streets: Sequence[Street], points: NDArray[np.complex128], reach: float
 
 
 class Panorama:
-    """Ranges all around, one a degree, collected from images of a turning robot.
+    """Ranges in all directions, one a degree, collected from images of a turning robot.
 
-    Straight ahead is the heading at the first image.
+    The panorama is in the frame of the robot at the first image.
 
     Args:
-        image: The first image.
+        image: The first image, (180,) metres.
 
     Attributes:
-        headings: Heading of the robot at each image, in radians.
+        headings: Heading of the robot at each image in radians, 0 at the first.
     """
 
     def __init__(self, image: Array) -> None:
         self.headings = [0.0]
         self._rows = [_around(image, 0.0)]
-        self._first = self._rows[0]  # First value of each degree.
+        self._first = self._rows[0]  # For each degree, the first range that was seen.
 
     @property
     def ranges(self) -> Array:
-        """(360,) metres, counterclockwise; NaN if unknown.
+        """The range at each degree, counterclockwise: (360,), metres; NaN if unknown.
 
-        The median over images ignores a beam that is lost in one of them.
+        It is the median over all images, so that a beam that is lost in one image does not matter.
         """
         rows = np.array(self._rows)
         shown = ~np.isnan(rows).all(axis=0)
@@ -286,7 +338,7 @@ class Panorama:
         return ranges
 
     def add(self, image: Array, turned: float) -> None:
-        """Add an image after a turn of about this many radians."""
+        """Add an image, (180,) metres, after a turn that odometry measured in radians."""
         heading = compass(self._first, image, self.headings[-1] + turned, turned)
         self.headings.append(heading)
         self._rows.append(_around(image, heading))
@@ -294,13 +346,17 @@ class Panorama:
 
 
 def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
-    """The heading in radians at which an image agrees best with known ranges.
+    """Find the heading at which an image agrees best with known ranges.
 
     Args:
-        ranges: (360,) known ranges in metres.
-        image: The image.
-        about: Expected heading.
-        turned: Turn by odometry since the last known heading. Its error is relative.
+        ranges: (360,) known ranges in metres; NaN if unknown.
+        image: (180,) ranges in metres.
+        about: Expected heading in radians.
+        turned: Turn by odometry since the last known heading, in radians. After a larger turn, more
+            headings are tried, since the error of odometry is relative.
+
+    Returns:
+        Radians.
     """
     best = about
     for window, step in ((2 + OFF * math.degrees(abs(turned)), 0.5), (0.5, 0.05)):
@@ -315,7 +371,7 @@ def compass(ranges: Array, image: Array, about: float, turned: float) -> float:
 
 
 def _around(image: Array, heading: float) -> Array:
-    """An image as ranges all around, (360,) metres; NaN in unseen directions."""
+    """Turn an image to ranges at each degree, (360,) metres; NaN in unseen directions."""
     bearings = np.angle(np.exp(1j * (AROUND - heading)))
     ranges: Array = np.interp(bearings, BEARINGS, image, left=np.nan, right=np.nan)
     return ranges

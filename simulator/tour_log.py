@@ -1,4 +1,4 @@
-"""What a robot logs on a tour: images, openings of places, and displacements with their noise."""
+"""Makes what a robot logs on a tour: images, and displacements with their noise."""
 
 from __future__ import annotations
 
@@ -21,7 +21,17 @@ Array = NDArray[np.float64]
 
 
 def noise_of(log: Log, world: World, body: Body, tolerance: Tolerance | None) -> Noise:
-    """Noise of displacements; only systematic errors if each displacement has a covariance."""
+    """Make the noise model that a trace states for its displacements.
+
+    If streets meet at any angles, and images are at dstates, each displacement has a covariance of
+    its own. Then the model has only systematic errors.
+
+    Args:
+        log: The log of the drive.
+        world: The world.
+        body: Errors of the robot.
+        tolerance: Precision of hill-climbing; None if images are not at dstates.
+    """
     if world.angles == "any" and tolerance is not None:
         return Noise(scale=abs(body.scale), bend=abs(body.bend))
     return noise_model(log.reports, body, tolerance)
@@ -32,10 +42,11 @@ class Eye:
     """Makes the logged image of a step: ranges of the laser, or a panorama.
 
     Attributes:
-        camera: The camera, or None for ranges.
+        camera: The camera; None to log ranges.
         walls: Number of segments of the world without clutter.
         rng: Source of noise of the camera.
-        actions: Number of actions of the run, to find the hour.
+        actions: Number of actions of the whole drive. The hour of the day follows from the share
+            that is done.
     """
 
     camera: Camera | None
@@ -44,7 +55,16 @@ class Eye:
     actions: int
 
     def image(self, driver: Driver, ranges: Array, done: int) -> tuple[float, ...]:
-        """The image after this many actions."""
+        """Make the image of a step.
+
+        Args:
+            driver: The robot.
+            ranges: Ranges of the laser in metres.
+            done: Number of actions that are done.
+
+        Returns:
+            Ranges in metres, or the pixels of a panorama, row by row.
+        """
         if self.camera is None:
             return tuple(round(float(r), 4) for r in ranges)
         hour = self.camera.hour(done / max(self.actions - 1, 1))
@@ -57,11 +77,11 @@ class Eye:
 
 @dataclass
 class Log:
-    """Odometry between the logged steps.
+    """Collects the odometry between the logged steps.
 
     Attributes:
         robot: The robot.
-        reports: Reports of its odometry between steps.
+        reports: Motion by odometry from each step to the next.
         begun: Whether a step was logged already.
     """
 
@@ -70,7 +90,11 @@ class Log:
     begun: bool = False
 
     def displacement(self) -> Displacement | None:
-        """Displacement from the last step, rounded; None for the first step."""
+        """Return the displacement from the last step by odometry; None for the first step.
+
+        Returns:
+            Metres ahead, metres to the left, and radians turned, rounded.
+        """
         report = self.robot.report()
         if not self.begun:
             self.begun = True
@@ -81,19 +105,20 @@ class Log:
 
 
 def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | None = None) -> Noise:
-    """The noise of the displacements between dstates, from odometry and hill-climbing.
+    """Make a noise model of displacements between dstates, from odometry and hill-climbing.
 
-    Each reported motion has an error proportional to it, so the relative error of many motions
-    together is smaller. The shares here reproduce the mean covariance of the reports.
+    The error of each small motion is proportional to the motion, so the relative error of many
+    motions together is smaller. The relative errors of the model are chosen so that they reproduce
+    the mean covariance of the reports.
 
-    A map describes fixed points. At both ends of a step, hill-climbing ends near them, within its
-    tolerance; the model assumes a uniform distribution. A wrong heading at the beginning also moves
-    the end sideways.
+    A map describes fixed points. Hill-climbing ends only within its tolerance of the fixed points
+    at both ends of a displacement. The model assumes a uniform distribution of this error. A wrong
+    heading at the beginning also moves the end sideways.
 
     Args:
-        reports: Reports between steps.
+        reports: Motion by odometry from each step to the next.
         body: Errors of the robot.
-        tolerance: Precision of hill-climbing; None for displacements between poses themselves.
+        tolerance: Precision of hill-climbing; None if displacements are not between fixed points.
     """
     ways = math.fsum(math.hypot(*r.displacement[:2]) ** 2 for r in reports)
     turns = math.fsum(r.displacement[2] ** 2 for r in reports)
@@ -121,9 +146,16 @@ def noise_model(reports: Sequence[Report], body: Body, tolerance: Tolerance | No
 
 
 def covariance_of(report: Report, tolerance: Tolerance, action: str) -> Covariance:
-    """Covariance of a displacement between fixed points, from odometry and hill-climbing.
+    """Compute the covariance of a displacement between fixed points.
 
-    Hill-climbing ends anywhere within its tolerance. A turn stays at one point, to a millimetre.
+    It includes the errors of odometry and of hill-climbing, which ends anywhere within its
+    tolerance.
+
+    Args:
+        report: The displacement by odometry, with its covariance.
+        tolerance: Precision of hill-climbing.
+        action: The action of the displacement. If it is a turn, both fixed points are the same, to
+            a millimetre.
     """
     dx, dy, _ = report.displacement
     near = tolerance.close / math.sqrt(3) if action == "travel" else 0.001

@@ -44,11 +44,10 @@ def simulate(
     every: float | None = None,
     camera: Camera | None = None,
 ) -> Trace:
-    """Drive tours of a world, and log an image at each dstate.
+    """Drive tours of a world, and log an image at each dstate (a place and a heading there).
 
-    A trace has tours x actions steps, and its last step has no action. The displacement of a step
-    is the odometry of all motions since the last step, also those of hill-climbing; `odometry` of
-    the trace is their noise model. `truth` has dstate, place, path and pose, for evaluation only.
+    The displacement of a step is the odometry of all motions since the last step, including those
+    of hill-climbing.
 
     Args:
         world: The world.
@@ -57,12 +56,17 @@ def simulate(
         laser: The scanner.
         body: Errors of the robot.
         tolerance: Precision of hill-climbing.
-        stars: Whether to log the openings seen at each place since arrival.
-        every: Metres of odometry between images, wherever the robot is; the trace then has travels
-            only. None logs at dstates.
+        stars: Whether to log a star at each step: the openings seen at the place since arrival.
+        every: Log images at this distance by odometry, in metres, instead of at dstates. Then all
+            actions of the trace are travels. None logs at dstates.
         camera: A camera whose panoramas are logged instead of ranges, row by row, as whole numbers;
             `panorama` in the header is their shape. The robot still drives by its laser, so with
-            the same seed both drives are the same.
+            the same seed the drive is the same.
+
+    Returns:
+        A trace with tours x actions steps at dstates; its last step has no action. Its `odometry`
+        is the noise model of the displacements. The truth of each step has dstate, place, path and
+        pose, for evaluation only.
 
     Raises:
         SimulatorError: The route cannot be driven.
@@ -124,9 +128,10 @@ def record(
     odometer: Odometer | None = None,
     every: float = EVERY,
 ) -> Drive:
-    """Drive tours as `simulate` does, and log scans.
+    """Drive tours as `simulate` does, or to the places of a route, and log scans.
 
-    The odometer of the log differs from that of control: it is as noisy as in recorded logs.
+    The odometry in the log is not the odometry that the robot drives by. It is as noisy as that of
+    recorded logs.
 
     Args:
         world: The world.
@@ -156,14 +161,18 @@ def record(
 
 
 def _place(world: World, pose: Array) -> str | None:
-    """The nearest place of a robot if it is within `reach`; None between places."""
+    """The name of the nearest place of a robot, if it is within `reach`; None between places."""
     far = {name: math.dist(at, pose[:2]) for name, at in world.places.items()}
     nearest = min(far, key=far.__getitem__, default=None)
     return nearest if nearest is not None and far[nearest] <= world.reach else None
 
 
 def _stops(driver: Driver, world: World, tours: int) -> Iterator[tuple[int, str]]:
-    """Drive to the places of all tours; yield number and name of each place before it."""
+    """Drive to the places of all tours.
+
+    Yields:
+        Before each place: its number, counted on from tour to tour, and its name.
+    """
     for tour in range(tours):
         if tour:
             driver.world = world.arranged(driver.rng)
@@ -196,7 +205,11 @@ def _driver(
     body: Body | None,
     tolerance: Tolerance | None,
 ) -> Driver:
-    """A robot at the start of a world. Raises SimulatorError if no tour can begin."""
+    """Make a robot at the start of a world.
+
+    Raises:
+        SimulatorError: An argument is invalid, there is no route, or the robot has no room.
+    """
     an_instance("world", world, World, SimulatorError, mend="take World.named or World.load")
     a_whole_number("tours", tours, SimulatorError, 1, MOST_TOURS)
     a_whole_number("seed", seed, SimulatorError)
@@ -264,9 +277,10 @@ def _at_dstates(
 def _evenly(
     driver: Driver, log: Log, world: World, tours: int, every: float, eye: Eye
 ) -> list[Step]:
-    """Log images every `every` metres of odometry.
+    """Drive all tours, and make a step every `every` metres of odometry.
 
-    Points within this distance along the route are one spot on all tours.
+    In the truth, the route is divided into pieces of this length. Steps in one piece have one
+    dstate on all tours.
     """
     logged: list[Step] = []
     leg_began = due = 0.0
@@ -301,7 +315,11 @@ def _evenly(
 def _legs(
     driver: Driver, world: World, tours: int, pilot: Corridors | Pilot | None = None
 ) -> Iterator[tuple[int, str]]:
-    """Drive all tours; yield the number and name of each action before it."""
+    """Drive all tours.
+
+    Yields:
+        Before each action: its number, counted on from tour to tour, and its name.
+    """
     pilot = pilot or (Pilot(driver) if world.angles == "any" else Corridors(driver))
     watch = Watch(world, driver, tours)
     with watch.start():
@@ -316,7 +334,7 @@ def _legs(
 
 
 def _truth(world: World, pose: Sequence[float]) -> dict[str, object]:
-    """The truth about a pose: the nearest true dstate, if the world has any."""
+    """The truth about a pose: the pose, and the nearest true dstate if the world has any."""
     found = world.nearest(pose)
     where = {"pose": [round(float(v), 5) for v in pose]}
     return (

@@ -1,8 +1,8 @@
 """Checks that each action ends at the expected place, and each tour at its start.
 
-The control laws see images only and do not notice when they confuse places. This module compares
-the true pose with the true dstates of the world, if it has any. Errors name the action and the
-likely cause.
+The control laws see only images, so they do not notice when they confuse places. This module
+compares the true pose with the true dstates of the world, if the world has any. Errors name the
+action and the likely cause.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from simulator.motion import Pose, between
 from simulator.world import World
 from simulator.world_files import are_square
 
-# Largest distance from the expected place in metres, or `reach` if that is more, and largest
+# Largest distance from the expected place in metres (`reach` if that is larger), and largest
 # difference of heading in radians.
 NEAR, FACING = 0.5, math.radians(45)
 # Largest sideways distance of the next place on a path, as a share of the distance.
 STRAIGHT = 0.2
-# Relative errors of motions and odometry, and errors of ranges in metres, from which the control
-# laws may fail.
+# With larger errors, the control laws may fail: relative errors of motions and odometry, and errors
+# of ranges in metres.
 NOISY, BLURRED = 0.1, 0.03
 
 
 @dataclass
 class Watch:
-    """Watches a driver on its tours.
+    """Checks the drive of a robot. Its methods are used as `with` blocks around motions.
 
     Attributes:
         world: The world as in its file.
         driver: The robot.
-        tours: Number of tours.
+        tours: Number of tours that are driven.
     """
 
     world: World
@@ -49,7 +49,11 @@ class Watch:
 
     @contextmanager
     def start(self) -> Iterator[None]:
-        """Watch how the robot reaches its first dstate."""
+        """Watch the robot on its way to its first dstate. Errors then name likely causes.
+
+        Raises:
+            SimulatorError: The robot does not reach a dstate.
+        """
         try:
             yield
         except SimulatorError as error:
@@ -89,7 +93,10 @@ class Watch:
             self._ended(tour, after)
 
     def _ended(self, tour: int, pose: Pose) -> None:
-        """Compare the end of a tour with the beginning of the first one."""
+        """Check that a tour ended where the first one began.
+
+        Warn if it did not, or raise SimulatorError if other tours would follow.
+        """
         assert self._home is not None
         if (
             math.dist(pose[:2], self._home[:2]) <= self._near
@@ -113,12 +120,12 @@ class Watch:
         return max(NEAR, self.world.reach)
 
     def _is_elsewhere(self, place: str, pose: Pose) -> bool:
-        """Whether a pose is nearer to another place, or far from all places."""
+        """Whether a pose is not at a place: it is nearer to another place, or far from this one."""
         far = {name: math.dist(at, pose[:2]) for name, at in self.world.places.items()}
         return far[place] > min(2 * self._near, *far.values())
 
     def _expected(self, action: str, pose: Pose) -> str | None:
-        """The place where an action from a pose should end; None if the world does not say."""
+        """The name of the place where an action from a pose should end; None if unknown."""
         here = self.world.nearest(pose)
         if (
             here is None
@@ -141,10 +148,10 @@ class Watch:
         return min(ahead)[1] if ahead else None
 
     def _because(self, before: Pose | None = None) -> str:
-        """The likely causes of an error as the end of a message, empty if there are none.
+        """The likely causes of an error, as the end of a message; empty if there are none.
 
         Args:
-            before: Pose where the action began.
+            before: Pose where the action began; None for the current pose.
         """
         found = list(self._causes(before or self.driver.robot.pose))
         return f". Likely cause: {'; or '.join(found)}" if found else ""
@@ -193,9 +200,9 @@ class Watch:
             yield f"the start heads {math.degrees(off):.0f} degrees off the walls (turn the start)"
 
     def _half_width(self, before: Pose) -> float | None:
-        """Half the width of the street in metres, without clutter, or None without walls.
+        """Half the width of the street in metres, without clutter; None without walls.
 
-        It is measured halfway between the pose before and the current one, in the narrowest
+        It is measured halfway between a previous pose and the current one, in the narrowest
         direction.
         """
         angles = np.radians(np.arange(360.0))
@@ -206,7 +213,10 @@ class Watch:
 
 
 def _off_axis(world: World) -> float:
-    """Radians between the heading of the start and the nearest direction of the longest wall."""
+    """The smallest angle between the start heading and walls, in radians.
+
+    Walls are assumed to be parallel or at right angles to the longest one.
+    """
     ways = world.segments[:, 2:] - world.segments[:, :2]
     longest = ways[int(np.hypot(*ways.T).argmax())]
     return abs(math.remainder(world.start[2] - math.atan2(longest[1], longest[0]), math.pi / 2))

@@ -1,4 +1,6 @@
-"""Worlds: walls, clutter that may move between tours, and the true dstates if known.
+"""Worlds in which simulated robots drive: walls, clutter that may move between tours, and a route.
+
+A world may also state its true dstates (distinctive states: places, each with a heading).
 
 A world is a JSON file that a user can write (docs/reference/worlds.md), or an occupancy map of ROS
 (YAML file and image).
@@ -52,7 +54,15 @@ LARGEST = 64 * 2**20
 
 
 def checked_segments(name: str, value: object) -> Array:
-    """Check an array of segments, (n, 4), in metres. Raises SimulatorError."""
+    """Check that a value is an array of segments, (n, 4), and return it.
+
+    Args:
+        name: Name of the value, for errors.
+        value: The value.
+
+    Raises:
+        SimulatorError: The value is something else, is empty, or has numbers that are not finite.
+    """
     if (
         isinstance(value, np.ndarray)
         and value.dtype.kind in "fiu"
@@ -68,7 +78,15 @@ def checked_segments(name: str, value: object) -> Array:
 
 
 def pose_of(name: str, value: object) -> tuple[float, float, float]:
-    """Check a pose (x, y, heading) in metres and radians. Raises SimulatorError."""
+    """Check that a value is a pose (x, y, heading), and return it.
+
+    Args:
+        name: Name of the value, for errors.
+        value: The value, in metres and radians.
+
+    Raises:
+        SimulatorError: The value is something else.
+    """
     x, y, heading = numbers(
         name, value, SimulatorError, 3, "x, y and heading, in metres and radians"
     )
@@ -76,7 +94,7 @@ def pose_of(name: str, value: object) -> tuple[float, float, float]:
 
 
 def distances_to(walls: Array, point: Point) -> Array:
-    """Metres from a point to each wall, (n,)."""
+    """Measure the distance from a point to each of n walls: (n,), metres."""
     starts, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
     squares = np.maximum((along**2).sum(1), 1e-12)
     share = np.clip(((np.array(point) - starts) * along).sum(1) / squares, 0, 1)
@@ -85,20 +103,22 @@ def distances_to(walls: Array, point: Point) -> Array:
 
 @dataclass(frozen=True)
 class World:
-    """Walls and clutter; start and route of a robot.
+    """A world: walls and clutter, and the start and route of a robot.
 
     Attributes:
         name: Name of the world.
         segments: (n, 4) walls: x1, y1, x2, y2 in metres.
         clutter: Polygons that may move between tours.
         start: Start pose (x, y, heading) in metres and radians.
-        route: Actions, or places to drive to, of one tour. A tour ends at its start.
+        route: Actions of one tour, or places to drive to. A tour ends at its start.
         reach: Distance in metres at which the robot follows a wall: half the width of a corridor.
-        dstates: The truth, for evaluation only.
-        angles: How streets meet, "right" or "any"; it selects the control laws.
-        places: (x, y) of places in metres by name: those of the dstates, or of a route of places.
-        via: (x, y) by name of points that are no places, through which a route of places may lead.
-        own_reach: The file's reach in metres if `reach` replaces it.
+        dstates: The true dstates, for evaluation only; empty if unknown.
+        angles: How streets meet: "right" for right angles, or "any". It selects the control laws.
+        places: Dict from the name of each place to its (x, y) in metres. They are the places of the
+            dstates, and those that a route may lead to.
+        via: Dict from a name to (x, y) in metres, for points that are no places but that a route of
+            places may lead through.
+        own_reach: The reach of the world's file in metres, if `reach` replaces it; otherwise None.
     """
 
     name: str
@@ -143,29 +163,29 @@ class World:
 
     @property
     def by_places(self) -> bool:
-        """Whether the route consists of places."""
+        """Whether the route consists of places, instead of actions."""
         return bool(self.route) and not set(self.route) <= set(ACTIONS)
 
     @property
     def stops(self) -> dict[str, Point]:
-        """All points that a route of places may lead to."""
+        """All points that a route of places may lead to: `places` and `via`."""
         return {**self.via, **self.places}
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """Smallest x, smallest y, largest x, largest y of the walls."""
+        """The smallest x, smallest y, largest x and largest y of the walls, in metres."""
         xs, ys = self.segments[:, ::2], self.segments[:, 1::2]
         return float(xs.min()), float(ys.min()), float(xs.max()), float(ys.max())
 
     def holds(self, x: float, y: float) -> bool:
-        """Whether a point is within the bounds of the walls."""
+        """Check whether a point, in metres, is within the bounds of the walls."""
         a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")
         a_number("y", y, SimulatorError, -FARTHEST, FARTHEST, what="metres")
         left, bottom, right, top = self.bounds
         return left < x < right and bottom < y < top
 
     def arranged(self, rng: np.random.Generator) -> World:
-        """Make the world of one tour: move the clutter at random, and add it to the walls."""
+        """Make the world of one tour: move the clutter at random, and turn it into walls."""
         an_instance(
             "rng", rng, np.random.Generator, SimulatorError, mend="take numpy.random.default_rng(0)"
         )
@@ -177,15 +197,16 @@ class World:
         return replace(self, segments=np.vstack(parts), clutter=())
 
     def clearance(self, x: float, y: float) -> float:
-        """Metres from a point to the nearest wall."""
+        """Measure the distance from a point to the nearest wall, in metres."""
         a_number("x", x, SimulatorError, -FARTHEST, FARTHEST, what="metres")
         a_number("y", y, SimulatorError, -FARTHEST, FARTHEST, what="metres")
         return float(distances_to(self.segments, (x, y)).min())
 
     def nearest(self, pose: Sequence[float]) -> TrueDState | None:
-        """The true dstate nearest to a pose; a radian counts as a metre.
+        """Find the true dstate nearest to a pose; None if the world states no dstates.
 
-        None if the world has no true dstates.
+        Args:
+            pose: x and y in metres, heading in radians. A radian of difference counts as a metre.
         """
         x, y, heading = pose_of("pose", pose)
         if not self.dstates:
@@ -201,12 +222,12 @@ class World:
     def with_choices(
         self, start: str | None = None, route: str | None = None, reach: float | None = None
     ) -> World:
-        """Change the start, route or reach.
+        """Copy the world with another start, route or reach. None keeps what the world has.
 
         Args:
-            start: "x,y,degrees" in metres and degrees.
-            route: "travel,right,…", or names of places.
-            reach: Metres.
+            start: Text "x,y,degrees", with x and y in metres.
+            route: Text "travel,right,…", or names of places with commas between.
+            reach: Half the width of a corridor in metres.
 
         Raises:
             SimulatorError: An argument is malformed.
@@ -232,13 +253,14 @@ class World:
 
     @classmethod
     def named(cls, name: str) -> World:
-        """Load a world by name, such as notched-rectangle or triangle, or from a file.
+        """Load a world of the package by name, or a world from a file.
 
         Args:
-            name: Name of a world of the package, or a file: .json, or .yaml for an occupancy map.
+            name: Name of a world of the package, such as notched-rectangle; or the path of a file:
+                .json, or .yaml for an occupancy map.
 
         Raises:
-            SimulatorError: There is no such world.
+            SimulatorError: There is no such world, or the file is wrong.
         """
         shipped = {
             path.stem: path for path in (Path(str(files("simulator"))) / "worlds").glob("*.json")
@@ -256,7 +278,11 @@ class World:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> World:
-        """Load a world from a JSON file. Raises SimulatorError that names the field."""
+        """Load a world from a JSON file.
+
+        Raises:
+            SimulatorError: The file cannot be read, or a field is wrong. The text names the field.
+        """
         path = a_path("path", path, SimulatorError)
         try:
             data = parse_json(read_at_most(path, LARGEST).decode("utf-8"))
@@ -276,7 +302,13 @@ class World:
     def from_occupancy(cls, path: str | os.PathLike[str]) -> World:
         """Make a world from an occupancy map of ROS (docs/reference/worlds.md).
 
-        The map is a YAML file and its image. The robot starts in the mean of the ends of all walls.
+        The world has no route. The robot starts at the mean of the ends of all walls.
+
+        Args:
+            path: The YAML file of the map, which names the image.
+
+        Raises:
+            SimulatorError: The map cannot be read, or has no walls.
         """
         name, segments = read_occupancy(Path(a_path("path", path, SimulatorError)))
         middle = segments.reshape(-1, 2).mean(0)

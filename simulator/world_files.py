@@ -1,4 +1,7 @@
-"""Reads the fields of world files: walls, clutter, places, routes and true dstates."""
+"""Reads the fields of world files: walls, clutter, places, routes and true dstates.
+
+A dstate (distinctive state) is a place with a heading.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,9 @@ ACTIONS = ("travel", "right", "left", "around")
 ARC, RAGGED = 5.0, 0.3
 # Largest total length of ragged walls, in metres.
 LONGEST = 20_000
-# A wall is square if it is within SQUARE radians of a right angle to the others. A right-angled
-# world has at most a share OBLIQUE of other walls, by length: a column or a cut corner.
+# A wall is oblique if it is more than SQUARE radians off the two main directions. In a world with
+# right angles, at most the share OBLIQUE of the walls, by length, is oblique, such as a column or a
+# cut corner.
 SQUARE, OBLIQUE = math.radians(5), 0.1
 # Smallest `reach` of a world in metres: a laser reports no smaller range.
 NEAREST = 0.01
@@ -39,7 +43,7 @@ class TrueDState:
         name: Name of the dstate.
         place: Name of its place.
         path: Name of its path.
-        direction: 1 along the path, or -1.
+        direction: 1 if the heading is along the path, -1 if it is against it.
         pose: (x, y, heading) in metres and radians.
     """
 
@@ -52,12 +56,12 @@ class TrueDState:
 
 @dataclass(frozen=True)
 class Clutter:
-    """A closed polygon that may be elsewhere, or absent, on each tour.
+    """A closed polygon that may be moved or absent on each tour, such as a piece of furniture.
 
     Attributes:
-        segments: (n, 4) walls in metres, as in the file.
-        moves: Largest shift in x and y for a tour, in metres.
-        present: Probability that it is there on a tour.
+        segments: (n, 4) sides of the polygon in metres, as in the file.
+        moves: Largest shift in x and in y on a tour, in metres.
+        present: Probability that the polygon is there on a tour.
     """
 
     segments: Array = field(repr=False)
@@ -66,7 +70,11 @@ class Clutter:
 
 
 def are_square(walls: Array) -> bool:
-    """Whether nearly all walls, by length, have one of two perpendicular directions."""
+    """Check whether nearly all walls, by length, have one of two perpendicular directions.
+
+    Args:
+        walls: (n, 4) metres.
+    """
     ways = (walls[:, 2] - walls[:, 0]) + 1j * (walls[:, 3] - walls[:, 1])
     lengths = np.abs(ways)
     directions = np.angle(ways) * 4  # Makes perpendicular directions equal.
@@ -76,7 +84,10 @@ def are_square(walls: Array) -> bool:
 
 
 class WorldReader:
-    """Checks the fields of a world; errors name the field.
+    """Reads and checks the fields of a world file.
+
+    All methods but `wrong` raise SimulatorError if a value is invalid. `name` is the name of the
+    field, for that error.
 
     Args:
         where: Name of the file, for errors.
@@ -86,7 +97,11 @@ class WorldReader:
         self.where = where
 
     def fields(self, data: Any) -> dict[str, Any]:
-        """The fields of a World from a JSON object."""
+        """Read all fields of a world from a JSON object.
+
+        Returns:
+            The arguments of `World`, by name.
+        """
         if (
             not isinstance(data, Mapping)
             or data.get("format") != FORMAT
@@ -135,43 +150,46 @@ class WorldReader:
         }
 
     def name(self, value: Any) -> str:
-        """A text."""
+        """Check the name of a world."""
         if not isinstance(value, str):
             raise self.wrong("name", "a text", value)
         return value
 
     def wrong(self, name: str, expected: str, value: Any) -> SimulatorError:
-        """The error that a field is wrong."""
+        """Make the error that a field is wrong."""
         return SimulatorError(
             f"{self.where}: {name}: expected {expected}, got {brief(value)}; mend it "
             "(docs/reference/worlds.md)"
         )
 
     def list(self, data: Mapping[str, Any], name: str) -> list[Any]:
-        """A field that is a list; empty if it is missing."""
+        """Read a field that is a list. The list is empty if the field is missing."""
         value = data.get(name, [])
         if not isinstance(value, list):
             raise self.wrong(name, "a list", value)
         return value
 
     def numbers(self, value: Any, count: int, name: str) -> Array:
-        """An array of this many finite numbers."""
+        """Read a list of `count` finite numbers: (count,)."""
         good = isinstance(value, list) and len(value) == count
         if not good or not all(is_finite(x) and abs(x) <= FARTHEST for x in value):
             raise self.wrong(name, f"{count} finite numbers, of at most {FARTHEST:,.0f}", value)
         return np.array(value, dtype=float)
 
     def loop(self, value: Any, name: str) -> Array:
-        """Segments of a closed polygon."""
+        """Read a list of points, and make the sides of the closed polygon: (n, 4), metres."""
         if not isinstance(value, list) or len(value) < 3:
             raise self.wrong(name, "at least three points [x, y]", value)
         points = np.array([self.numbers(p, 2, f"{name}[{i}]") for i, p in enumerate(value)])
         return np.hstack([points, np.roll(points, -1, axis=0)])
 
     def arc(self, value: Any, name: str) -> Array:
-        """Segments of an arc: x and y of the centre, radius, first and last direction.
+        """Read an arc, and approximate it by segments: (n, 4), metres.
 
-        Directions are degrees, counterclockwise.
+        Args:
+            value: List of x and y of the centre, radius, and first and last direction. Directions
+                are degrees, counterclockwise.
+            name: Name of the field.
         """
         x, y, radius, first, last = self.numbers(value, 5, name)
         if not radius > 0 or not 0 < last - first <= 360:
@@ -185,15 +203,23 @@ class WorldReader:
         return np.hstack([points[:-1], points[1:]])
 
     def occupancy(self, value: Any) -> Array:
-        """Walls of an occupancy map, named relative to the folder of the world."""
+        """Read the walls of an occupancy map: (n, 4), metres.
+
+        Args:
+            value: Path of the YAML file, relative to the folder of the world file.
+        """
         if not isinstance(value, str):
             raise self.wrong("occupancy", "the name of a YAML file", value)
         return read_occupancy(Path(self.where).parent / value)[1]
 
     def ragged(self, walls: Array, value: Any) -> Array:
-        """Cut walls into pieces, and shift their ends by Gaussian noise in metres.
+        """Make walls uneven: cut them into pieces, and shift the ends of the pieces at random.
 
-        The noise is always the same, so that a world looks the same on each drive.
+        The shifts are always the same, so that a world looks the same on each drive.
+
+        Args:
+            walls: (n, 4) metres.
+            value: Standard deviation of the shifts in metres; 0 changes nothing.
         """
         if not is_finite(value) or not 0 <= value <= 1:
             raise self.wrong("ragged", "metres by which walls are uneven, 0 to 1", value)
@@ -211,7 +237,7 @@ class WorldReader:
                 (x1, y1), (x2, y2), 1 + math.ceil(math.hypot(x2 - x1, y2 - y1) / RAGGED)
             )
             pieces.append(np.hstack([line[:-1], line[1:]]))
-        # Walls that meet still meet.
+        # Shift equal ends equally, so that walls that meet still meet.
         ends, which = np.unique(
             np.vstack(pieces).reshape(-1, 2).round(6), axis=0, return_inverse=True
         )
@@ -221,7 +247,7 @@ class WorldReader:
         return moved
 
     def points(self, value: Any, name: str) -> dict[str, Point]:
-        """Points by name."""
+        """Read an object of points: a dict from name to (x, y) in metres."""
         if not isinstance(value, Mapping):
             raise self.wrong(name, "an object of names and points [x, y]", value)
         if clash := next((text for text in value if text in ACTIONS or "," in text), None):
@@ -232,7 +258,7 @@ class WorldReader:
         return {text: (x, y) for text, (x, y) in found.items()}
 
     def route(self, value: Sequence[Any], stops: Mapping[str, Point]) -> tuple[str, ...]:
-        """Check a route of actions or of places."""
+        """Check a route, which consists of actions only or of the names of `stops` only."""
         by_places = any(isinstance(stop, str) and stop in stops for stop in value)
         for i, stop in enumerate(value):
             if by_places and not (isinstance(stop, str) and stop in stops):
@@ -250,25 +276,25 @@ class WorldReader:
         return tuple(value)
 
     def reach(self, value: Any) -> float:
-        """The reach in metres."""
+        """Check the reach, in metres."""
         if not is_finite(value) or not NEAREST <= value <= FARTHEST:
             raise self.wrong("reach", f"metres above 0, {NEAREST} to {FARTHEST:,.0f}", value)
         return float(value)
 
     def angles(self, value: Any, walls: Array) -> Angles:
-        """The angles of streets, by default from the walls."""
+        """Check how streets meet, "right" or "any". If the file does not say it, walls decide."""
         if value not in (None, "right", "any"):
             raise self.wrong("angles", '"right" or "any"', value)
         chosen: Angles = value or ("right" if are_square(walls) else "any")
         return chosen
 
     def pose(self, value: Any, name: str) -> tuple[float, float, float]:
-        """A pose, whose heading is in degrees in the file."""
+        """Read a pose. Its heading is in degrees in the file, and in radians in the result."""
         x, y, degrees = self.numbers(value, 3, name)
         return float(x), float(y), math.radians(degrees)
 
     def clutter(self, value: Any, name: str) -> Clutter:
-        """A movable polygon."""
+        """Read a polygon that may move."""
         if not isinstance(value, Mapping):
             raise self.wrong(name, "an object with a polygon", value)
         moves = self.numbers(value.get("moves", [0, 0]), 2, f"{name}.moves")
@@ -282,7 +308,7 @@ class WorldReader:
         )
 
     def dstate(self, value: Any, name: str) -> TrueDState:
-        """A true dstate."""
+        """Read a true dstate."""
         if not isinstance(value, Mapping) or value.get("direction") not in (1, -1):
             raise self.wrong(
                 name, "an object with name, place, path, direction 1 or -1, pose", value
