@@ -68,9 +68,10 @@ def _numbered(what: str, ids: Sequence[int], visits: Iterable[tuple[int, int | N
 
 
 def dstates_look_as_seen(m: Reading) -> Found:
-    """Check that each dstate has the first view seen there, without unknown and ignored views.
+    """Check that the view of each dstate is the first view seen there.
 
-    The axiom functional_view covers the views of the later steps at the dstate.
+    Unknown views, and views that the map treats as wrong, do not count. The axiom functional_view
+    covers the views of later steps.
     """
     shown: dict[int, tuple[View | None, int]] = {}
     for (label, view), i in m.views.items():
