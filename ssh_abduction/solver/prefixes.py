@@ -141,7 +141,7 @@ class Prefixes:
                 self._known.keep(
                     replace(minimal, map=self._whole(minimal.map, replayed)), replayed.labels
                 )
-            # The best map of the whole trace is as cheap as any map of the prefix.
+            # If the best map of the whole trace is as cheap as this minimal map, it is minimal.
             if self._known.best is not None and self._known.cost <= minimal.cost:
                 self._known.status = Status.OPTIMAL
                 return

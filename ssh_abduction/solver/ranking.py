@@ -23,8 +23,8 @@ RANKED = 1000
 # Warn about the noise of the odometry only if the chi-square of the best map is so high, or so low,
 # that its probability is at most this.
 DOUBTED = 1e-3
-# Warn, besides, only if standard deviations are too small by the first of these factors, or too
-# large by the second. Smaller errors change no answer.
+# Also warn only if standard deviations are too small by the first of these factors, or too large by
+# the second. Smaller errors change no answer.
 TOO_SMALL, TOO_LARGE = 1.5, 2.0
 # With a displacement of at most this many standard deviations, the robot may have stood still.
 STANDING = 2.0

@@ -112,9 +112,10 @@ def _shown(trace: Trace, ssh_map: SSHMap) -> Iterator[str]:
     """
     first: dict[int, int] = {}
     place: dict[int, int] = {}
-    # For each path, its number, and the direction that is faced first.
+    # For each path, its number, and the direction that the first step along it faces.
     path: dict[int, tuple[int, int]] = {}
-    before: dict[int, list[int]] = {}  # for each dstate, and place, and course, its steps so far
+    # The steps so far at each dstate, at each place, and along each course.
+    before: dict[int, list[int]] = {}
     here: dict[int, list[int]] = {}
     along: dict[tuple[int, int], list[int]] = {}
     for t, label in enumerate(ssh_map.labels):

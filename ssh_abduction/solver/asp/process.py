@@ -103,7 +103,7 @@ def serve() -> None:
     threading.Thread(target=_end_with_input, daemon=True).start()
     watch = Watch(memory=memory)
     with os.fdopen(os.dup(1), "wb") as output:
-        os.dup2(2, 1)  # nothing else is written there
+        os.dup2(2, 1)  # what the work prints goes to stderr
         try:
             answer: tuple[object, Exception | None] = work(*arguments, watch), None
         except Exception as error:

@@ -149,7 +149,7 @@ def answers(
         waiting.put(task)
     ready = queue.SimpleQueue[Any]()  # answers, and None for each thread that ends
     workers: list[Worker | None] = [None] * processes
-    over = threading.Event()  # nobody waits for answers any more
+    over = threading.Event()  # set when nobody waits for answers any more
     folder = tempfile.TemporaryDirectory(prefix="ssh-abduction-", ignore_cleanup_errors=True)
 
     def run(place: int) -> None:
@@ -267,12 +267,11 @@ def serves() -> bool:
 
 def serve() -> None:
     """Run in a worker process: do the tasks that stdin brings, and write the answers to stdout."""
+    # The parent process handles these signals, and decides when this process ends.
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(
-            number, signal.SIG_IGN
-        )  # the parent process handles these signals, and decides when this one ends
+        signal.signal(number, signal.SIG_IGN)
     output = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # nothing else is written there
+    os.dup2(2, 1)  # what the work prints goes to stderr
     output.write(_BEGIN)
     output.flush()
     _outputs.append(output)

@@ -170,7 +170,7 @@ class Chart:
         node: dict[tuple[int, int], int] = {}
         seen: list[int] = []
         node_of: list[int] = []
-        stars: list[tuple[int, ...]] = []  # of each visit, from the heading of its arrival
+        stars: list[tuple[int, ...]] = []  # the star of each visit, beginning ahead at arrival
         travels: list[tuple[int, int, int]] = []
         visit = slot = 0
         for t in range(size):

@@ -21,9 +21,8 @@ from ssh_abduction.solver.asp.facts.atoms import numbers, read_atom
 from ssh_abduction.solver.steps.chart import Chart
 from ssh_abduction.theory.theory import Theory
 
-_Ahead: TypeAlias = tuple[
-    int, int, int
-]  # a path, and two places of which the first comes before the second on it
+# A path and two of its places, the earlier one first.
+_Ahead: TypeAlias = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +62,8 @@ class PathReader:
         self._labels = tuple(number[labels[node]] for node in chart.node_of)
         self._links = links_of(self._labels, trace)
         self._dstates = [(view_at(trace, t), *stands[label]) for label, t in first.items()]
-        self._runs: dict[
-            int, list[tuple[int, int]]
-        ] = {}  # for each segment, the dstates on it, and whether they face its direction
+        # For each segment, the dstates on it, and whether they face its direction (1) or not (-1).
+        self._runs: dict[int, list[tuple[int, int]]] = {}
         for i, label in enumerate(first):
             if label in runs:
                 segment, direction = runs[label]
@@ -77,16 +75,14 @@ class PathReader:
         }
         self._at, self._part = _Choices(control, "at"), _Choices(control, "course")
         self._total = theory.path_order == "total"
-        self._before: dict[_Ahead, int] = {}  # its literal; 0 if it is never true
-        self._order: dict[
-            int, list[int]
-        ] = {}  # for each path, its places in the answer that was read last
-        self._placed: _Placed | None = (
-            None  # the dstates of the last map by place: mostly the same in the next map
-        )
-        self._made: dict[
-            tuple[object, ...], DState
-        ] = {}  # dstates made so far, as most of them are in most maps
+        # The literals of atoms of `before`; 0 if an atom is never true.
+        self._before: dict[_Ahead, int] = {}
+        # For each path, its places in order in the answer that was read last.
+        self._order: dict[int, list[int]] = {}
+        # The places and dstates of the last map. Mostly the next map has the same.
+        self._placed: _Placed | None = None
+        # The dstates made so far. Most of them are in most maps.
+        self._made: dict[tuple[object, ...], DState] = {}
 
     def condition(self, sort: str, i: int, j: int) -> str | None:
         """The body of a rule that holds if two dstates share a place, path or course.
@@ -128,9 +124,8 @@ class PathReader:
             dict.fromkeys([*(p for p in self._order.get(path, ()) if p in places), *places])
         )
         if self._total:
-            for i, place in enumerate(
-                order
-            ):  # insertion sort asks few questions if places are nearly in order
+            # Insertion sort compares few pairs if the places are nearly in order.
+            for i, place in enumerate(order):
                 to = i
                 while to and not self._is_before(model, (path, order[to - 1], place)):
                     to -= 1
@@ -155,9 +150,8 @@ class PathReader:
         placed = self._placed
         if placed is None or placed.at != answer.at:
             placed = self._placed = self._placed_at(answer.at)
-        faced: dict[
-            int, tuple[int, int]
-        ] = {}  # for each path, its number in the map, and the direction that is faced first
+        # For each path, its number in the map, and the direction that its first dstate faces.
+        faced: dict[int, tuple[int, int]] = {}
         dstates = list(placed.dstates)
         for segment, members in self._runs.items():
             h, ahead = answer.part[segment]
@@ -182,9 +176,8 @@ class PathReader:
 
     def _placed_at(self, at: dict[int, tuple[int, int]]) -> _Placed:
         """Make the dstates with their places and headings from `at`, without paths."""
-        arrived: dict[
-            int, tuple[int, int]
-        ] = {}  # for each place, its number in the map, and the slot that is faced first
+        # For each place, its number in the map, and the slot that its first dstate faces.
+        arrived: dict[int, tuple[int, int]] = {}
         dstates: list[DState] = []
         for view, component, slot in self._dstates:
             p, turned = at[component]
@@ -225,16 +218,16 @@ class _Choices:
     """
 
     def __init__(self, control: Control, name: str) -> None:
-        self._among: dict[
-            int, list[tuple[int, tuple[int, int]]]
-        ] = {}  # for each first argument, the literals of its atoms, and their other arguments
+        # For each first argument, the literals of its atoms, and their other arguments.
+        self._among: dict[int, list[tuple[int, tuple[int, int]]]] = {}
         for (a, b, c), literal in _literals(control, name).items():
             self._among.setdefault(a, []).append((literal, (b, c)))
 
     def made_in(self, model: Model) -> dict[int, tuple[int, int]]:
         """The other two arguments that an answer chooses, by the first argument."""
         made = {}
-        for a, among in self._among.items():  # ask first for the choices of the last answer
+        # Ask first whether the choices are those of the last answer.
+        for a, among in self._among.items():
             if len(among) > 1 and not model.is_true(among[0][0]):
                 taken = next(i for i, (literal, _) in enumerate(among) if model.is_true(literal))
                 among.insert(0, among.pop(taken))

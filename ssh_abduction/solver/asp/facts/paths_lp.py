@@ -130,9 +130,8 @@ def settled_facts(
         settled_labels((node, labels[node]) for node in nodes),
         *(["single."] if single else []),
     ]
-    for label, node in {
-        label: node for node, label in enumerate(labels)
-    }.items():  # all nodes of a dstate see one star (its openings)
+    # All nodes of a dstate see the same star (openings), so take any of them.
+    for label, node in {label: node for node, label in enumerate(labels)}.items():
         visit, slot = chart.facing[node]
         star = chart.stars[visit]
         facts += [f"open({label},{k})." for k in range(4) if star[(slot + k) % 4]]
