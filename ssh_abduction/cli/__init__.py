@@ -1,13 +1,14 @@
-"""The command line: one module per verb.
+"""The command line, with one module for each verb.
 
 Exit codes:
     0: Success, or a map that is proven minimal.
-    1: A known error, one line on stderr.
+    1: A known error, with one line on stderr.
     2: Wrong usage.
     10: A map that is not proven minimal.
-    20: No map satisfies the axioms, or a checked map breaks one.
-    30: No map in time.
-    130, 143: Interrupted; ended by SIGTERM.
+    20: No map satisfies the axioms, or a checked map breaks an axiom.
+    30: No map was found in time.
+    130: Interrupted by Ctrl-C.
+    143: Ended by SIGTERM.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ MENDS = {
     errno.EISDIR: "take another name",
     errno.ENOTDIR: "take another name",
 }
-# The verbs by what they are for, as the help lists them.
+# The verbs, grouped by purpose as the help lists them.
 VERBS: Mapping[str, tuple[ModuleType, ...]] = {
     "map: find the maps of a trace or a log": (solve, map_logs, import_log, cluster),
     "ask: judge, compare and explain maps": (
@@ -109,11 +110,11 @@ def parser() -> Parser:
 
 
 def unwritten(error: OSError, output: object) -> str:
-    """The message for a file that cannot be written.
+    """Make the message for a file that cannot be written.
 
     Args:
-        error: What the system says.
-        output: The file, for errors that name none.
+        error: The error of the system.
+        output: The file, in case the error names none.
     """
     mend = MENDS.get(error.errno or 0, "check the path")
     return (
@@ -125,10 +126,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
 
     Args:
-        arguments: The words behind the program's name; those of the process by default.
+        arguments: The words behind the program's name; None takes those of this process.
 
     Raises:
-        SystemExit: With code 2 for wrong usage.
+        SystemExit: The usage is wrong (code 2), or help was asked for (code 0).
     """
     try:
         code = _main(arguments)
@@ -139,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parse the options, and reject `--map=--`, which argparse reads as an empty list."""
+    """Parse the options. Reject a value "--", which argparse would read as an empty list."""
     top = parser()
     options: argparse.Namespace = top.parse_args(arguments)
     for name, value in vars(options).items():

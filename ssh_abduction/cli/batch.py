@@ -1,7 +1,7 @@
 """ssh-abduction solve TRACE TRACE …: solve many traces, here or on a Dask cluster.
 
-Each result is one line. Lines are printed in the order of the traces, as soon as they are ready.
-An error is the result of its trace, and the other traces go on.
+The result of each trace is one line. Lines are printed in the order of the traces, as soon as
+possible. If a trace fails, its line says why, and the other traces are still solved.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ KILLED = (
     "process: expected an answer, got killed, as happens when memory runs out; set "
     "--memory-limit, or solve fewer traces at a time"
 )
-# A process is lost if it has no answer after GUARDED times its time limit and OVERDUE seconds, or
-# OVERDUE seconds after Ctrl-C. Its own guard ends it earlier, so this is a last resort.
+# A process is lost if it has no answer after GUARDED times its time limit plus OVERDUE seconds, or
+# OVERDUE seconds after Ctrl-C. This is a last resort, as its own guard should end it earlier.
 GUARDED, OVERDUE = 1.2, 3.0
 LATE = (
     "process: expected an answer in time, got none, as happens when memory is swapped; set "
@@ -59,13 +59,13 @@ LATE = (
 
 
 class Answer(NamedTuple):
-    """The result of one trace.
+    """The result of one trace, as plain data.
 
     Attributes:
-        number: The number of the trace.
+        number: The index of the trace, from 0.
         line: The line to print.
         code: The exit code.
-        warnings: Messages for stderr.
+        warnings: Warnings to print on stderr.
     """
 
     number: int
@@ -76,16 +76,16 @@ class Answer(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What to find out about each trace. It implements `jobs.Asked`.
+    """The settings for solving each of many traces. It implements `jobs.Asked`.
 
     Attributes:
         theory: The theory.
         limit: Seconds for each trace; None for no limit.
-        maps: The number of maps to list at most; 0 for all.
-        memory: MiB for the process; None for no limit.
+        maps: The largest number of maps to list; 0 for all.
+        memory: MiB that the process may use; None for no limit.
         speedups: The speed-ups that are on.
-        json: Whether the line is JSON.
-        within: Number of dstates by which a listed map may exceed the minimum.
+        json: Whether lines are JSON.
+        within: The number of dstates by which a listed map may exceed the minimum.
     """
 
     theory: Theory
@@ -98,11 +98,11 @@ class Question:
 
     @property
     def has_limits(self) -> bool:
-        """Whether each answer needs a process of its own, which can be killed."""
+        """Whether each answer needs its own process, which can be killed at a limit."""
         return self.limit is not None or self.memory is not None
 
     def load(self, path: str) -> Trace:
-        """The trace, for a worker that does not share the disk."""
+        """Load a trace, to send it to a worker without this disk."""
         return Trace.load(path)
 
     def answer(
@@ -112,13 +112,13 @@ class Question:
         trace: Trace | None = None,
         given_up: Callable[[], bool] = lambda: False,
     ) -> Answer:
-        """Solve one trace. An error becomes the answer.
+        """Solve one trace. If that fails, the answer says why.
 
         Args:
-            number: The number of the trace, which the answer repeats.
+            number: The index of the trace, which the answer repeats.
             path: The file of the trace.
-            trace: The trace, if it was sent along.
-            given_up: Whether nobody wants the answer any more.
+            trace: The trace if it was sent along; None to load it from the file.
+            given_up: Returns whether the answer is not needed any more.
         """
         try:
             return self._solved(number, path, trace or Trace.load(path), given_up)
@@ -163,7 +163,17 @@ class Question:
         maps: list[Given],
         given_up: Callable[[], bool],
     ) -> contextlib.AbstractContextManager[object]:
-        """A guard that ends this process in time, if the process does nothing else."""
+        """Make a guard that ends this process at its limits, if it only solves this trace.
+
+        Otherwise return a context manager that does nothing.
+
+        Args:
+            number: The index of the trace.
+            path: The file of the trace.
+            search: The search.
+            maps: The list of maps found so far.
+            given_up: Returns whether the answer is not needed any more.
+        """
 
         def last_words(why: Stop) -> tuple[Answer, int]:
             solution = search.snapshot(why)
@@ -210,20 +220,20 @@ class Question:
 
     @property
     def overdue(self) -> float | None:
-        """Seconds after which a process without an answer counts as lost; None without a limit."""
+        """The seconds after which a process without an answer is given up; None for no limit."""
         return None if self.limit is None else GUARDED * self.limit + OVERDUE
 
     @property
     def patience(self) -> float:
-        """Seconds to wait for the answers under way when all work is to stop."""
+        """The seconds to wait for unfinished answers after Ctrl-C."""
         return OVERDUE
 
     def lost(self, lost: workers.Lost, path: str) -> Answer:
-        """The answer for a trace whose process ended without an answer."""
+        """Make the answer for a trace whose process ended without an answer."""
         return self.failed(lost.number, path, SolverError(LATE if lost.late else KILLED))
 
     def failed(self, number: int, path: str, error: Exception) -> Answer:
-        """The answer for a trace that was not solved."""
+        """Make the answer for a trace that could not be solved because of an error."""
         message = in_a_line(error)
         line = (
             dump({"trace": path, "status": "error", "error": message})
@@ -267,7 +277,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _printed(answers: Generator[Answer], total: int, stop: StopFlag) -> list[int]:
-    """Print all lines in the order of the traces. Returns the exit codes of the answers."""
+    """Print all lines in the order of the traces, and return the exit codes of the answers.
+
+    Args:
+        answers: The answers in any order.
+        total: The number of traces.
+        stop: Is set after Ctrl-C.
+    """
     lines: dict[int, str] = {}  # the lines that wait for an earlier trace
     codes: list[int] = []
     turn = 0
@@ -292,7 +308,7 @@ def _printed(answers: Generator[Answer], total: int, stop: StopFlag) -> list[int
 
 
 def _forget_memory() -> None:
-    """Free the memory of earlier traces and reset the peak. Only Linux can reset it."""
+    """Free the memory of earlier traces. On Linux, also reset the measured peak."""
     gc.collect()
     with contextlib.suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
@@ -302,7 +318,11 @@ def _forget_memory() -> None:
 
 @contextlib.contextmanager
 def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], None]]]:
-    """A function that prints a line, and one that moves the progress bar on stderr, if any."""
+    """Show a progress bar on stderr, if it is a terminal, while the block runs.
+
+    Yields:
+        A function that prints a line, and a function that moves the bar on by one trace.
+    """
     if not sys.stderr.isatty():
         yield partial(print, flush=True), lambda: None
         return
@@ -320,7 +340,7 @@ def _progress(total: int) -> Iterator[tuple[Callable[[str], None], Callable[[], 
         task = progress.add_task("traces", total=total)
 
         def say(line: str) -> None:
-            """Print a line above the bar. rich would wrap it to the width of the terminal."""
+            """Print a line above the bar, without the line breaks that rich would add."""
             progress.live.transient = True
             progress.stop()
             print(line, flush=True)

@@ -108,18 +108,19 @@ def _bound(
     solved: Theory,
     broken: bool,
 ) -> bool:
-    """Check the certificate and the other claims of the file, and print the result.
+    """Check the lower bound and the other claims in a file of maps, and print the result.
 
     Args:
         trace: The trace.
-        data: The JSON of the file.
+        data: The content of the file.
         theory: The theory to check by.
-        doubt: Why clingo's verdict does not count for this trace and theory; None if it does.
-        solved: The theory of the file.
+        maps: The maps in the file.
+        doubt: Why what clingo proved does not hold for this trace and theory; None if it does.
+        solved: The theory in the file, without `auto`.
         broken: Whether some maps break axioms.
 
     Returns:
-        Whether all claims hold.
+        Whether all claims hold, and no map has fewer dstates than proven.
     """
     fewest = min((len(m.dstates) for m in maps), default=None)
     if RESTS_ON - set(theory.axioms):
@@ -179,7 +180,7 @@ def _bound(
 
 
 def _false_of_maps(data: Mapping[str, Any], maps: Sequence[SSHMap], trace: Trace) -> Iterator[str]:
-    """The false claims of the file about single maps: their ids, and how well they close."""
+    """Yield a sentence for each false claim of the file about one map: its id, fit and poses."""
     ranking = Ranking(trace)
     for i, (said, ssh_map) in enumerate(zip(data.get("maps", ()), maps, strict=False)):
         if "id" in said and said["id"] != ssh_map.id:
@@ -205,7 +206,10 @@ def _false_of_maps(data: Mapping[str, Any], maps: Sequence[SSHMap], trace: Trace
 
 
 def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
-    """The false claims of the file about what its maps share, if its other claims hold."""
+    """Yield a sentence for each false claim of the file about all maps: what they share.
+
+    Call it only if all other claims hold.
+    """
     try:
         solution = Solution.from_dict(data, "the file", trace)
     except MapError as error:
@@ -231,7 +235,7 @@ def _false_of_all(data: Mapping[str, Any], trace: Trace) -> Iterator[str]:
 
 
 def _is_near(said: Any, right: Any) -> bool:
-    """Whether nested numbers are almost equal: machines round differently."""
+    """Whether all numbers in two nested values are almost equal, as machines round differently."""
     if isinstance(right, Mapping):
         return (
             isinstance(said, Mapping)

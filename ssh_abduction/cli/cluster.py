@@ -118,9 +118,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def doubts(trace: Trace) -> list[str]:
-    """Warnings if the runner-up's views give another map.
+    """Find out whether the second best number of views (the runner-up) gives another map.
 
-    The theory is the default one, or the causal one if actions have no kind.
+    Maps are found by the topological theory, or by the causal one if some action has no kind.
+
+    Returns:
+        One warning if the maps differ; an empty list otherwise.
     """
     theory = (
         Theory.topological() if all(action.kind for action in trace.actions) else Theory.causal()
@@ -137,7 +140,7 @@ def doubts(trace: Trace) -> list[str]:
 
 
 def true_dstates(trace: Trace) -> list[str] | None:
-    """The true dstates; None unless every step has one."""
+    """The name of the true dstate of each step; None if some step has none."""
     found = [
         step.truth.get("dstate") if isinstance(step.truth, dict) else None for step in trace.steps
     ]

@@ -1,4 +1,4 @@
-"""Answer a question about many files on the workers of a Dask scheduler."""
+"""Answer the same question about many files, on the workers of a Dask scheduler."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ LOST = (
 def answers_on_cluster(
     question: Asked, paths: Sequence[str], address: str, jobs: int | None, stop: StopFlag
 ) -> Generator[Any]:
-    """Yield answers from the workers of a Dask scheduler, as they are ready.
+    """Yield answers from the workers of a Dask scheduler, in the order in which they are ready.
 
     Args:
         question: The question.
         paths: The files.
         address: The address of the scheduler, with a port.
-        jobs: The number of files that are sent at a time; None or -1 for twice the number of
-            cores of the cluster.
-        stop: Set to stop early.
+        jobs: The largest number of files on the cluster at a time; None or -1 for twice the number
+            of its cores.
+        stop: Ends the work early when it is set.
 
     Raises:
         AbductionError: The package `distributed`, the scheduler or its workers are missing.
@@ -91,10 +91,16 @@ def _answers(
     paths: Sequence[str],
     attempt: Callable[[list[Task], list[Task]], Iterator[Any]],
 ) -> Iterator[Any]:
-    """Yield answers in any order, and find out which file kills its worker.
+    """Yield answers in any order, and find out which files kill their workers.
 
-    If a worker is killed, `attempt` puts all files that were under way there into its second list.
-    Each of them is then solved again alone. A file is to blame if its worker is killed again.
+    When a worker is killed, all files that it was working on are suspects. Try each suspect again
+    alone. If its worker is killed again, the file is to blame and gets a lost answer.
+
+    Args:
+        question: The question.
+        paths: The files.
+        attempt: Takes a list of files to work on, and a list to which it appends the files whose
+            worker was killed. Yields the answers for all other files.
     """
     suspects: list[Task] = []
     yield from attempt([*enumerate(paths)], suspects)
@@ -106,16 +112,16 @@ def _answers(
 
 
 class Absence:
-    """How long a cluster has had no worker. Dask itself would wait for ever.
+    """Measures how long a cluster has had no worker, because Dask itself would wait for ever.
 
-    A warning comes after PATIENCE seconds. With a time limit, the wait ends after that limit, but
-    not before PATIENCE seconds.
+    It warns after PATIENCE seconds. If there is a time limit, waiting should end after this limit,
+    but not before PATIENCE seconds.
 
     Args:
-        workers: Counts the workers.
+        workers: Returns the number of workers.
         limit: The time limit in seconds; None for no limit.
         address: The address of the scheduler, for messages.
-        clock: The time in seconds.
+        clock: Returns the time in seconds.
     """
 
     def __init__(
@@ -131,7 +137,7 @@ class Absence:
 
     @property
     def sentence(self) -> str:
-        """The message about the absence."""
+        """A message that says for how long there was no worker, and what to do."""
         seconds = self._clock() - self._last_seen
         return (
             f"scheduler: expected a worker, got none for {seconds:.0f} s; start one with: dask "
@@ -139,7 +145,7 @@ class Absence:
         )
 
     def is_too_long(self) -> bool:
-        """Check for workers now and then. Returns whether to stop waiting."""
+        """Check for workers, at most once in LOOK seconds. Return whether to stop waiting."""
         now = self._clock()
         if now >= self._looks_at:
             self._looks_at = now + LOOK
@@ -161,11 +167,18 @@ def _on_workers(
     tasks: list[Task],
     killed: list[Task],
 ) -> Iterator[Any]:
-    """Yield the answers for some tasks, with at most `most` of them on the cluster at a time.
+    """Yield the answers for some files from the workers of a cluster.
 
-    Files are read here, so that workers need not share the disk. Tasks whose worker was killed
-    are appended to `killed`. This uses Dask directly, because joblib's backend for Dask hangs when
-    a worker is killed.
+    Files are read here, so that workers need not share the disk. This uses Dask directly, because
+    joblib's backend for Dask hangs when a worker is killed.
+
+    Args:
+        question: The question.
+        client: The connection to the scheduler.
+        most: The largest number of files on the cluster at a time.
+        absence: Says when to stop waiting for a worker.
+        tasks: The files.
+        killed: The list to which files are appended whose worker was killed.
     """
     from distributed import KilledWorker, as_completed
 
@@ -173,7 +186,7 @@ def _on_workers(
     ready = as_completed(loop=client.loop)
 
     def received(left: int) -> Iterator[Any]:
-        """Yield answers until at most `left` tasks are under way."""
+        """Yield answers until at most `left` files are on the cluster."""
         while len(sent) > left:
             if ready.is_empty():  # the scheduler is gone
                 return
@@ -224,7 +237,7 @@ def _on_workers(
 
 
 def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
-    """Answer on a Dask worker; stop if the client disconnects."""
+    """Answer the question about one file on a Dask worker. Stop if the client disconnects."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -235,8 +248,8 @@ def _on_worker(question: Asked, number: int, path: str, content: Any) -> Any:
 
     if not question.has_limits:
         return question.answer(number, path, content, given_up)
-    # A task that breaks its limits is killed with its process. So it gets a process of its own:
-    # other tasks may run in this one.
+    # A task that exceeds its limits is killed together with its process. So it gets its own
+    # process, as other tasks may run in this one.
     work = [(number, path, question, content)]
     answer: Any = next(
         workers.answers(_solved_for_cluster, work, 1, given_up, question.overdue, question.patience)

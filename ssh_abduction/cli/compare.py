@@ -16,7 +16,7 @@ from ssh_abduction.data.map_file import read_json
 if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison
 
-# Figures of a run that change each time, even if nothing else does.
+# Values in run.json that differ between runs even if all settings and results are the same.
 UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
 
 
@@ -91,12 +91,20 @@ def run(options: argparse.Namespace) -> int:
 
 
 def within(name: str) -> str:
-    """The file of maps in the folder of a run; any other name as it is."""
+    """Return the file of maps in the folder of a run. Return any other name unchanged."""
     return str(Path(name) / "maps.json") if (Path(name) / "run.json").is_file() else name
 
 
 def differences(first: str, other: str) -> dict[str, tuple[Any, Any]]:
-    """The settings and figures that differ between two runs of `map`, with both values."""
+    """Find the settings and results that differ between two runs of the verb `map`.
+
+    Args:
+        first: The folder of one run.
+        other: The folder of the other run.
+
+    Returns:
+        For each of these, by name, both values.
+    """
     here, there = (_flat(read_json(Path(folder) / "run.json")) for folder in (first, other))
     names = {**here, **there}
     return {
@@ -107,7 +115,7 @@ def differences(first: str, other: str) -> dict[str, tuple[Any, Any]]:
 
 
 def _runs(differing: dict[str, tuple[Any, Any]], first: str, other: str) -> Iterator[str]:
-    """One line for each setting and figure that differs between two runs."""
+    """Yield a line for each setting and result that differs between two runs."""
     yield from (
         f"{name}: {brief(a)} in {named(first)}, {brief(b)} in {named(other)}"
         for name, (a, b) in differing.items()
@@ -117,12 +125,12 @@ def _runs(differing: dict[str, tuple[Any, Any]], first: str, other: str) -> Iter
 
 
 def of_one_trace(first: str, other: str) -> bool:
-    """Whether two runs have the same steps."""
+    """Whether the traces in the folders of two runs are the same."""
     return (Path(first) / "trace.jsonl").read_bytes() == (Path(other) / "trace.jsonl").read_bytes()
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """The values of nested objects, by their joined names."""
+    """Flatten nested dicts: return each value by its keys, joined with dots."""
     if not isinstance(value, dict):
         return {name: value}
     return {

@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _all_actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    """The arguments of a parser and of all verbs below it."""
+    """List the arguments of a parser and of all its verbs."""
     found = list(parser._actions)  # argparse has no public name for these
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -60,9 +60,12 @@ def _all_actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:
 
 
 def _file_kind(action: argparse.Action) -> str | None:
-    """Whether an argument is a file or a folder, by its metavar.
+    """Find out from its metavar whether an argument names a file or a folder.
 
-    A positional argument is a file unless it is a number or has choices.
+    A positional argument names a file, unless it is a number or has choices.
+
+    Returns:
+        "file", "folder", or None for neither.
     """
     if action.nargs == 0 or action.choices is not None:
         return None

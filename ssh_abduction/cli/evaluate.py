@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from ssh_abduction.evaluation import Evaluation, MapEvaluation, MapPairs, VisitsEvaluation
 
 UNKNOWN = "–"
-# Poses and relations of one log agree on at least this share of the pairs. If they agree on fewer,
-# they are of different logs, or one of them is wrong.
+# If poses and relations agree on less than this share of the pairs of visits, they belong to
+# different logs, or one of them is wrong.
 ALIKE = 0.9
 PAIRS = (
     "map",
@@ -158,7 +158,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _nothing_judged(found: VisitsEvaluation) -> str:
-    """Why no pair of visits was judged."""
+    """Explain why no pair of visits was judged."""
     why = f"the trace has {counted(found.visits, 'visits')}"
     if found.places.stayed:
         why += (

@@ -1,6 +1,6 @@
 """ssh-abduction explain TRACE [STEP STEP]: why two steps are one dstate or not.
 
-Without steps: why the trace has no map.
+Without steps, it explains why the trace has no map.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""ssh-abduction solve TRACE --front K: the fewest dstates for 0, 1, … K faults."""
+"""ssh-abduction solve TRACE --front K: the fewest dstates for 0, 1, … K faults.
+
+A fault is an observation or action that the map treats as wrong.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,11 @@ from ssh_abduction.theory.theory import Theory
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the front.
+    """Print the front: the fewest dstates for each number of faults.
 
     Returns:
-        0 if all of it is proven; 20 if it is proven that there is no map; else 10.
+        The exit code: 0 if the search was completed; 20 if no map has so few faults; 10 if the
+        search was stopped.
     """
     if len(options.traces) > 1 or options.jobs is not None or options.scheduler is not None:
         raise AbductionError(

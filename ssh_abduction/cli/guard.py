@@ -1,8 +1,8 @@
-"""A last resort that keeps the limits: it ends the process with what is known so far.
+"""End the process with what is known so far, as a last resort to keep its limits.
 
-Python runs signal handlers in the main thread only, and only after a call of clingo has returned.
-So a second thread watches the clock and the memory, and the system reports signals to it through a
-socket. If a limit is about to be broken, this thread prints what is known and ends the process.
+Python runs signal handlers only in the main thread, and only after a call of clingo has returned.
+So a second thread watches the clock and the memory. It learns of signals through a socket. If a
+limit is exceeded, this thread prints what is known and ends the process.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from typing import Any, NoReturn, Self
 from ssh_abduction.runtime import program
 from ssh_abduction.solver import POLL, Stop, end_all, resident_memory
 
-# A search is ended after this many times its time limit, and this many seconds more.
+# A search is ended after the first number times its time limit, plus the second in seconds.
 LATE = 1.1, 0.8
-# A search is ended at this many times its memory limit, and this many MiB more.
+# A search is ended at the first number times its memory limit, plus the second in MiB.
 LARGE = 1.1, 100.0
 # A search must end within this many seconds after Ctrl-C.
 DEAF = 1.5
@@ -32,16 +32,18 @@ PIECE = 2**16
 
 
 class Guard:
-    """A context manager that ends the process if the code inside breaks a limit.
+    """A context manager that ends the process if the code inside exceeds a limit.
+
+    It also ends the process if the code does not stop soon after Ctrl-C or SIGTERM.
 
     Args:
         interrupt: Asks the search to end soon.
         last_words: Takes the reason for the end. Returns what remains to be printed, and the exit
             code.
-        limit: Seconds; None for no limit.
-        memory: MiB; None for no limit.
-        given_up: Whether nobody wants the answer any more.
-        print_last: Prints the last words; to standard output by default.
+        limit: The time limit in seconds; None for no limit.
+        memory: The memory limit in MiB; None for no limit.
+        given_up: Returns whether the answer is not needed any more.
+        print_last: Prints the first result of `last_words`; None prints to standard output.
     """
 
     def __init__(
@@ -81,11 +83,15 @@ class Guard:
         self._signals.close()
 
     def say(self, text: Callable[[], str]) -> None:
-        """Make a text and print it. The last words come before it or after it, never between."""
+        """Make a text and print it. The last words never interrupt this text.
+
+        Args:
+            text: Returns the text.
+        """
         self._printer.say(text)
 
     def _watch(self) -> None:
-        """Run in the second thread until the `with` block ends."""
+        """Watch the limits and signals, in the second thread, until the `with` block ends."""
         speaking = self._printer.speaking
         while not self._over.wait(POLL):
             if self._is_called() and self._deaf_at is None:
@@ -102,14 +108,14 @@ class Guard:
                 self._leave(program.interrupted_code())
 
     def _is_called(self) -> bool:
-        """Whether the user or the caller asks for an end."""
+        """Whether the search has to end: there was a signal, or the answer is not needed."""
         numbers = self._signals.received()
         # The handler in the main thread may not have run yet, and may never run.
         program.heard.extend(numbers)
         return bool(numbers) or self._given_up()
 
     def _why(self) -> Stop | None:
-        """The limit that is broken; None if all are kept."""
+        """The reason to end the process now; None if there is none."""
         if self._is_deaf():
             return "interrupted"
         seconds = time.monotonic() - self._began - self._printer.waited
@@ -120,11 +126,15 @@ class Guard:
         return None
 
     def _is_deaf(self) -> bool:
-        """Whether the search did not end after Ctrl-C."""
+        """Whether the search still runs although it was asked to end more than DEAF seconds ago."""
         return self._deaf_at is not None and time.monotonic() > self._deaf_at
 
     def _end(self, why: Stop) -> None:
-        """Print the last words and end the process with its helpers, without any clean-up."""
+        """Print the last words, and end the process and its helper processes without clean-up.
+
+        Args:
+            why: The reason for the end.
+        """
         self._interrupt()
         code = 1
         try:
@@ -147,14 +157,14 @@ class Guard:
 
 
 class _Signals:
-    """Receives SIGINT and SIGTERM while the main thread is busy."""
+    """Receives SIGINT and SIGTERM in a second thread, while the main thread is busy."""
 
     def __init__(self) -> None:
         self._ends: tuple[socket.socket, socket.socket] | None = None
         self._before = -1  # the file that received signals before
 
     def open(self) -> None:
-        """Begin to listen. Only the main thread may call it."""
+        """Begin to listen. Only the main thread may call this."""
         self._ends = socket.socketpair()
         for end in self._ends:
             end.setblocking(False)
@@ -168,7 +178,7 @@ class _Signals:
                 end.close()
 
     def received(self) -> list[int]:
-        """The signals since the last call."""
+        """Return the numbers of the signals since the last call."""
         if self._ends is not None:
             with suppress(BlockingIOError):
                 return [n for n in self._ends[0].recv(64) if n in (signal.SIGINT, signal.SIGTERM)]
@@ -176,11 +186,11 @@ class _Signals:
 
 
 class _Printer:
-    """Prints to standard output and measures how long its reader takes.
+    """Prints to standard output, and measures how long the reader of the output takes.
 
     Attributes:
-        speaking: The lock of the thread that prints. After the last words, no thread gets it.
-        waited: Seconds that the reader of the output took. They do not count as search time.
+        speaking: A lock for the thread that prints.
+        waited: The seconds that the reader of the output took. They do not count as search time.
     """
 
     def __init__(self) -> None:
@@ -189,7 +199,11 @@ class _Printer:
         self._writes_since: float | None = None  # when the current piece of text was begun
 
     def say(self, text: Callable[[], str]) -> None:
-        """Make a text while holding the lock, and print it piece by piece."""
+        """Make a text while holding the lock, and print it in pieces.
+
+        Args:
+            text: Returns the text.
+        """
         with self.speaking:
             made = text()
             for start in range(0, len(made), PIECE):
@@ -199,7 +213,7 @@ class _Printer:
                 self._writes_since = None
 
     def is_unread(self) -> bool:
-        """Whether the reader has not taken the current piece for too long."""
+        """Whether the reader of the output has not read the current piece for DEAF seconds."""
         since = self._writes_since
         return since is not None and time.monotonic() > since + DEAF
 

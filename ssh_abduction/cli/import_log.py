@@ -115,7 +115,7 @@ def add_reading(parser: Parser) -> None:
 
 
 def metres(text: str) -> float:
-    """A length that a building may have."""
+    """Convert text to metres, from 0.1 to 50. Raise ArgumentTypeError for anything else."""
     try:
         value = float(text)
     except ValueError:
@@ -126,14 +126,14 @@ def metres(text: str) -> float:
 
 
 def read(path: str, options: argparse.Namespace) -> RobotLog:
-    """Read a log as the options say. Raises AbductionError."""
+    """Read the log at `path` as the options say. Raises AbductionError."""
     from perception.readers.logs import read_log
 
     return read_log(path, **reading_of(options))
 
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
-    """The arguments of `read_log` that the options ask for."""
+    """Collect the options that are arguments of `read_log`, by name."""
     return {
         name: getattr(options, name)
         for name in ("format", "scan_topic", "odom_topic", "fov", "mount", "no_return", "zero_is")
@@ -141,7 +141,12 @@ def reading_of(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _told(field: str, text: str) -> Any:
-    """The value of a field of `Told`, which checks what the user says about the laser."""
+    """Convert text to the value of a field of `Told`, which describes the laser, and check it.
+
+    Args:
+        field: The name of the field.
+        text: A number, or numbers separated by commas.
+    """
     from perception.readers.echoes import Told
 
     try:
@@ -191,10 +196,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 def doors_of(options: argparse.Namespace) -> bool | None:
-    """Whether doors are the places; None if the log decides.
+    """Whether --places asks for doors; None if the option is missing, so that the log decides.
 
     Raises:
-        AbductionError: Doors are asked for together with a scale of junctions.
+        AbductionError: Doors are asked for together with a gateway or radius, which is for
+            junctions.
     """
     if options.places is None:
         return None
@@ -209,7 +215,7 @@ def doors_of(options: argparse.Namespace) -> bool | None:
 
 
 def named_after(path: str) -> str:
-    """The name of a log without its endings, for its trace and the folder of its map."""
+    """Return the name of a log file without its endings, to name its trace and its run's folder."""
     name = Path(path).name
     if not name.strip("."):
         name = Path(path).resolve().name

@@ -1,6 +1,6 @@
-"""Answer a question about many files, in processes of this machine.
+"""Answer the same question about many files, in processes of this machine.
 
-`cluster_jobs.py` does the same on a Dask cluster. Both yield answers as soon as they are ready.
+`cluster_jobs.py` does so on a Dask cluster. Both yield each answer as soon as it is ready.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ssh_abduction.solver import workers
 
 
 class StopFlag:
-    """Whether all work is to stop. Signal handlers may set it, unlike a `threading.Event`."""
+    """A flag that asks all work to stop. Unlike a `threading.Event`, signal handlers may set it."""
 
     def __init__(self) -> None:
         self._is_set = False
@@ -30,67 +30,68 @@ class StopFlag:
 
 
 def in_a_line(error: Exception) -> str:
-    """The message of an error on one line."""
+    """Write an error on one line. An unexpected error also gets its type."""
     is_ours = isinstance(error, AbductionError)
     message = str(error) if is_ours else f"{type(error).__name__}: {error}"
     return printable(" ".join(message.split()))
 
 
 class Asked(Protocol):
-    """A question about each of many files.
+    """A question to be answered for each of many files.
 
-    Questions and answers are plain data: they are sent to other processes and machines.
+    Questions and answers are plain data, because they are sent to other processes and machines.
     """
 
     @property
     def overdue(self) -> float | None:
-        """Seconds after which a process without an answer counts as lost; None waits for ever."""
+        """The seconds after which a process without an answer is given up; None for no limit."""
 
     @property
     def has_limits(self) -> bool:
-        """Whether each answer needs a process of its own, which can be killed."""
+        """Whether each answer needs its own process, which can be killed at a limit."""
 
     @property
     def limit(self) -> float | None:
-        """Seconds for each file; None for no limit."""
+        """The seconds for each file; None for no limit."""
 
     @property
     def patience(self) -> float:
-        """Seconds to wait for the answers under way when all work is to stop."""
+        """The seconds to wait for unfinished answers after Ctrl-C."""
 
     def load(self, path: str) -> Any:
-        """Read what a worker without this disk needs. An error becomes the answer."""
+        """Read a file, to send its content to a worker without this disk."""
 
     def answer(self, number: int, path: str, content: Any, given_up: Callable[[], bool]) -> Any:
-        """Answer for one file.
+        """Answer the question for one file.
 
         Args:
-            number: The number of the file, which the answer repeats.
+            number: The index of the file, which the answer repeats.
             path: The file.
-            content: What `load` returned; None to read the file here.
-            given_up: Whether nobody wants the answer any more.
+            content: The result of `load`; None to read the file here.
+            given_up: Returns whether the answer is not needed any more.
         """
 
     def lost(self, lost: workers.Lost, path: str) -> Any:
-        """The answer for a file whose process ended without an answer."""
+        """Make the answer for a file whose process ended without an answer."""
 
     def failed(self, number: int, path: str, error: Exception) -> Any:
-        """The answer for a file that raised an error."""
+        """Make the answer for a file that raised an error."""
 
 
 def answers_here(
     question: Asked, paths: Sequence[str], jobs: int, stop: StopFlag
 ) -> Generator[Any]:
-    """Yield answers from processes of this machine, as they are ready.
+    """Yield answers from processes of this machine, in the order in which they are ready.
 
-    If a process is killed, only its own file is lost. The processes do not receive Ctrl-C; `stop`
-    says so to them. After that, unfinished files still yield what is known.
+    If a process is killed, only its own file is lost. Ctrl-C sets `stop`, which the processes
+    watch. Unfinished files then still yield what is known. A second Ctrl-C raises
+    KeyboardInterrupt.
 
     Args:
         question: The question.
         paths: The files.
-        jobs: The number of processes; -1 for one a core.
-        stop: Set by Ctrl-C, or by the caller to stop early.
+        jobs: The number of processes; -1 for one per core.
+        stop: Ends the work early when it is set.
     """
 
     def end() -> None:
@@ -113,13 +114,13 @@ def answers_here(
 
 
 def final_code(codes: Sequence[int], asked: int, stop: StopFlag, files: str) -> int:
-    """The exit code after many files. Reports interruptions and errors on stderr.
+    """Compute the exit code for many files, and report interruptions and errors on stderr.
 
     Args:
         codes: The exit codes of the answers.
         asked: The number of files.
-        stop: Set if Ctrl-C was pressed.
-        files: What messages call the files, such as "traces".
+        stop: Is set if the work was interrupted.
+        files: The word for the files in messages, such as "traces".
     """
     if stop.is_set():
         missing = asked - sum(code <= SIGNALLED for code in codes)

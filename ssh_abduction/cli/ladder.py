@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
     under_way = UnderWay()
 
     def told() -> str:
-        """The table, if the rungs were not printed as they came."""
+        """The table of all rungs; empty with --json, as these are printed when they are ready."""
         return "" if options.json else f"{table(HEAD, list(map(_row, rungs)))}\n"
 
     def last_words(_: Stop) -> tuple[str, int]:

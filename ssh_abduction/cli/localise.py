@@ -115,7 +115,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _localiser(options: argparse.Namespace) -> Localiser:
-    """The localiser that the options ask for. Raises AbductionError that names a wrong file."""
+    """Make the localiser that the options ask for. Raises AbductionError, which names the file."""
     from ssh_abduction.online.chances import Chances
     from ssh_abduction.online.localiser import Localiser
 
@@ -148,7 +148,7 @@ def _localiser(options: argparse.Namespace) -> Localiser:
 
 
 def _headline(beliefs: Sequence[Mapping[str, Any]]) -> str:
-    """The steps where the robot was located, unsure, lost or outside, or the belief collapsed."""
+    """List the steps at which the robot was located, unsure, lost or nowhere, and the collapses."""
     steps: dict[str, list[int]] = {}
     for step, belief in enumerate(beliefs):
         steps.setdefault(belief["verdict"], []).append(step)

@@ -1,7 +1,7 @@
 """ssh-abduction map LOG …: map many logs, here or on a Dask cluster, each into a folder.
 
-Runs that are finished with the same settings are skipped. So after an interruption, give the same
-command again.
+A log that is already mapped with the same settings is skipped. So to go on after an interruption,
+give the same command again.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ KILLED = (
 )
 GIVEN_UP = "expected time to map this log, got an interruption; map it again"
 PATIENCE = 10.0  # seconds that a worker has to report what is known when all work is to stop
-KEPT = 64  # characters at the end of a log's name that the copy for a worker keeps
+KEPT = 64  # the copy of a log for a worker keeps this many last characters of its name
 
 
 @dataclass(frozen=True, slots=True)
 class MapAnswer:
-    """The result of one log.
+    """The result of one log, as plain data.
 
     Attributes:
-        number: The number of the log.
+        number: The index of the log, from 0.
         line: The line to print.
         code: The exit code.
-        warnings: Messages for stderr.
-        files: The names and contents of the files of its folder.
+        warnings: Warnings to print on stderr.
+        files: The names and contents of the files for its folder.
     """
 
     number: int
@@ -64,19 +64,19 @@ class MapAnswer:
 
 @dataclass(frozen=True, slots=True)
 class MapQuestion:
-    """What to do with each log. It implements `jobs.Asked`.
+    """The settings for mapping each of many logs. It implements `jobs.Asked`.
 
     Attributes:
-        theory: The theory; None if it depends on the log.
-        choices: Fields of the theory that the user set.
-        reading: How to read logs.
-        gateway: The least width of a gateway, in metres; None for the default.
-        radius: How far a way out must lead from the middle of a place, in metres; None for the
-            default.
+        theory: The theory; None to choose it for each log.
+        choices: The fields of the theory that the user set, by name.
+        reading: The arguments of `read_log`, by name.
+        gateway: The minimum width of a gateway, in metres; None to choose it by the log.
+        radius: How far a way out must lead from the centre of a place, in metres; None to choose it
+            by the log.
         doors: Whether doors are the places; None to decide by the log.
-        limit: Seconds for the minimal maps; None for the default.
-        maps: The number of maps to list at most; 0 for all.
-        ladder: Whether to work out the worth of each kind of evidence.
+        limit: Seconds for the search for minimal maps; None for the default of `map_log`.
+        maps: The largest number of maps to list; 0 for all.
+        ladder: Whether to compute what each kind of evidence contributes.
     """
 
     theory: Theory | None
@@ -91,7 +91,7 @@ class MapQuestion:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Everything but the log that a run depends on."""
+        """All settings that a run depends on, as a dict for JSON, to recognise finished runs."""
         theory = self.theory.to_dict() if self.theory else None
         laid_over = (self.theory or Theory.topological()).replace(**self.choices).to_dict()
         return {
@@ -107,7 +107,7 @@ class MapQuestion:
         }
 
     def load(self, path: str) -> bytes | None:
-        """The log, for a worker that does not share the disk; None if it is a folder."""
+        """Read a log, to send it to a worker without this disk; None if the log is a folder."""
         file = Path(path)
         return file.read_bytes() if file.is_file() else None
 
@@ -119,14 +119,14 @@ class MapQuestion:
         given_up: Callable[[], bool] = lambda: False,
         answer_last: Callable[[MapAnswer], None] = workers.reply,
     ) -> MapAnswer:
-        """Map one log. An error becomes the answer.
+        """Map one log. If that fails, the answer says why.
 
         Args:
-            number: The number of the log, which the answer repeats.
-            path: The log.
-            content: The content of the log, if it was sent along.
-            given_up: Whether nobody wants the answer any more.
-            answer_last: Takes the answer if clingo cannot be stopped. The process ends then.
+            number: The index of the log, which the answer repeats.
+            path: The file or folder of the log.
+            content: The content of the log if it was sent along; None to read it here.
+            given_up: Returns whether the answer is not needed any more.
+            answer_last: Takes the answer if the process has to end because clingo does not stop.
         """
         try:
             if given_up():
@@ -152,10 +152,16 @@ class MapQuestion:
         given_up: Callable[[], bool],
         answer_last: Callable[[MapAnswer], None],
     ) -> MapAnswer:
-        """Map the log in the file `here`.
+        """Map one log.
 
-        `content` is a digest made before the log is read. If the log changes meanwhile, the next
-        call sees another digest and maps the log again.
+        Args:
+            number: The index of the log.
+            path: The log as the user named it.
+            here: The file to read, which may be a copy.
+            content: The digest of the log before it is read; None if there is none. If the log
+                changes later, the next call sees another digest and maps the log again.
+            given_up: Returns whether the answer is not needed any more.
+            answer_last: Takes the answer if the process has to end because clingo does not stop.
         """
         begun: list[tuple[RobotLog, LogMapping]] = []  # one entry, once the log is read
 
@@ -204,7 +210,7 @@ class MapQuestion:
     def _told(
         self, number: int, path: str, log: RobotLog, done: LogMap, content: str | None
     ) -> MapAnswer:
-        """The answer for a log that was mapped."""
+        """Make the answer for a log that was mapped."""
         files = done.files()
         run = json.loads(files["run.json"])
         run["log"]["source"], run["settings"], run["digest"] = path, self.settings, content
@@ -237,22 +243,22 @@ class MapQuestion:
         )
 
     def _given_up(self, number: int, path: str) -> MapAnswer:
-        """The answer for a log that was interrupted before anything was known."""
+        """Make the answer for a log that was interrupted before anything was known."""
         return MapAnswer(number, f"{named(path)}: {GIVEN_UP}", interrupted_code())
 
     @property
     def has_limits(self) -> bool:
-        """True: each log has its own process, which can be killed."""
+        """True, as each log needs its own process, which can be killed."""
         return True
 
     @property
     def overdue(self) -> float | None:
-        """None: nobody knows how long it takes to read a log."""
+        """None for no limit, as it is unknown how long it takes to read a log."""
         return None
 
     @property
     def patience(self) -> float:
-        """Seconds to wait for an answer when all work is to stop."""
+        """The seconds to wait for unfinished answers after Ctrl-C."""
         return PATIENCE
 
     def lost(self, lost: workers.Lost, path: str) -> MapAnswer:
@@ -325,7 +331,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _alone(question: MapQuestion, left: list[str], folders: dict[str, Path]) -> int:
-    """Map a single log in this process, unless it is done. Returns the exit code."""
+    """Map a single log in this process, and return the exit code.
+
+    Args:
+        question: The settings.
+        left: The log; empty if it is already mapped.
+        folders: The folder of each log.
+    """
 
     def keep(answer: MapAnswer) -> None:
         if answer.code == EXIT_ERROR:
@@ -349,7 +361,13 @@ def _alone(question: MapQuestion, left: list[str], folders: dict[str, Path]) -> 
 def _kept(
     answers: Iterator[MapAnswer], paths: list[str], folders: dict[str, Path]
 ) -> Iterator[int]:
-    """Write the files of each answer as it comes, and print its line. Yields the exit codes."""
+    """Write the files of each answer and print its line, as they come. Yield the exit codes.
+
+    Args:
+        answers: The answers in any order.
+        paths: The logs.
+        folders: The folder of each log.
+    """
     for answer in answers:
         path, code = paths[answer.number], answer.code
         try:
@@ -369,9 +387,14 @@ def _say(answer: MapAnswer, folder: Path) -> None:
 
 
 def _theory(options: argparse.Namespace) -> tuple[Theory | None, dict[str, Any]]:
-    """The theory that is named, and what is laid over it.
+    """Find the theory that the options ask for.
 
-    If none is named, it is None, as it then depends on the log. Raises TheoryError.
+    Returns:
+        The theory, and no further fields. If the user names no theory: None, as it depends on the
+        log, and the fields that the user set.
+
+    Raises:
+        TheoryError: A choice is wrong, or contradicts another one.
     """
     asked = theory_of(options)
     choices = {name: getattr(asked, name) for name in choices_of(options)}

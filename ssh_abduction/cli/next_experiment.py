@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.consequences import Consequence
     from ssh_abduction.rivals.experiment import Experiment, Plan, Untried
 
-# At most this many columns of a table and lines of a plan are printed. --json has all.
+# The largest number of columns of a table, and of lines of a plan, that are printed. --json prints
+# all.
 SHOWN_COLUMNS, SHOWN_LINES = 6, 40
-# Exit codes if a limit ended the search: with a plan that may not be the best, and without a plan.
+# Exit codes if a limit ended the search: with a plan that may not be the best, or without a plan.
 EXIT_CUT_SHORT, EXIT_NOTHING = 10, 30
 HOW = {"link": "known", "implied": "implied", "expected": "expected", "open": "open"}
 
@@ -117,7 +118,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _lines(experiment: Experiment) -> Iterator[str]:
-    """The lines to print for people."""
+    """Yield the lines that describe an experiment to people."""
     yield experiment.sentence
     plan = experiment.plan
     if plan.branches:
@@ -149,7 +150,11 @@ def _lines(experiment: Experiment) -> Iterator[str]:
 
 
 def _tree(plan: Plan, indent: str) -> Iterator[str]:
-    """A plan as lines: the actions, then for each possible view the maps left and the next plan."""
+    """Yield a plan as indented lines.
+
+    First come the actions. Then, for each view that may be seen, come the maps that remain and the
+    plan for these.
+    """
     if plan.branches:
         yield f"{indent}{printable(', '.join(plan.actions))}"
     for branch in plan.branches:
@@ -160,7 +165,10 @@ def _tree(plan: Plan, indent: str) -> Iterator[str]:
 
 
 def _untried(plan: Plan) -> str:
-    """Lines about what to try if known links cannot distinguish several rivals."""
+    """Say which untried action to try if known links cannot distinguish the remaining rivals.
+
+    The text continues a line. It is empty if one rival remains or the plan goes on.
+    """
     if len(plan.rivals) == 1 or plan.branches:
         return ""
     if plan.untried is None:
@@ -172,7 +180,7 @@ def _untried(plan: Plan) -> str:
 
 
 def _expected(untried: Untried) -> Iterator[str]:
-    """What the rivals predict for an untried action."""
+    """Yield a table of what the rivals predict for an untried action."""
     shown = untried.expects[:SHOWN_LINES]
     yield table(
         ["maps", "leads to", "seen there", "which is"],

@@ -1,4 +1,4 @@
-"""Options that several verbs share, such as those that choose a theory."""
+"""Options that several verbs have in common, such as those that choose a theory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ssh_abduction.theory.fields import ASSERTIONS, CHOICES
 from ssh_abduction.theory.settle import settle
 from ssh_abduction.theory.theory import PRESETS, SETTLED, Theory
 
-# The fields of a theory that have a flag of their own. The others are settings.
+# The fields of a theory that have their own option. All other fields are settings (--set).
 PRICES = ("misread", "slipped")
 FLAGS = ("star", *PRICES, "rules", *ASSERTIONS)
 
@@ -28,11 +28,11 @@ Verbs = Any  # the return type of argparse's add_subparsers is private
 
 
 def add_theory(parser: Parser, default: str = "topological") -> None:
-    """Add the options that choose a theory: a preset or a file, and single choices.
+    """Add the options that choose a theory: a preset or a file, and options for single fields.
 
     Args:
         parser: The parser of a verb.
-        default: What the help calls the theory if none is named.
+        default: The words of the help for the theory that is used if the user names none.
     """
     group = parser.add_argument_group("theory", "A preset or a file, with single choices changed")
     said = helps()
@@ -83,14 +83,14 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
 
 
 def helps() -> dict[str, str]:
-    """The help text of each field of Theory, from its docstring."""
+    """Read the help text of each field of Theory from the docstring of that class."""
     _, _, attributes = (Theory.__doc__ or "").partition("Attributes:")
     entries = re.findall(r"^ {8}(\w+): (.+(?:\n {12}.+)*)", attributes, re.MULTILINE)
     return {name: " ".join(text.split()).rstrip(".") for name, text in entries}
 
 
 def add_output(parser: argparse.ArgumentParser) -> None:
-    """Add -o TRACE."""
+    """Add the option -o TRACE, which names the trace file to write."""
     parser.add_argument(
         "-o",
         "--output",
@@ -102,9 +102,12 @@ def add_output(parser: argparse.ArgumentParser) -> None:
 
 
 def write(trace: Trace, target: str, said: str) -> None:
-    """Write a trace to the file of `add_output`, and print a message about it.
+    """Write a trace, and print a message about it.
 
-    If the trace goes to standard output, the message goes to stderr.
+    Args:
+        trace: The trace.
+        target: The file from the option of `add_output`; "-" for standard output.
+        said: The message. If the trace goes to standard output, it is printed on stderr.
     """
     if target == "-":
         sys.stdout.writelines(line + "\n" for line in trace.to_lines())
@@ -115,7 +118,7 @@ def write(trace: Trace, target: str, said: str) -> None:
 
 
 def output(text: str) -> str:
-    """The name of a file or folder to write."""
+    """Check the name of a file or folder to write. Raise ArgumentTypeError if it is none."""
     if not text or "\0" in text:
         raise argparse.ArgumentTypeError(
             f"expected the name of a file or folder, got {text!r}; name one"
@@ -124,14 +127,14 @@ def output(text: str) -> str:
 
 
 def seed(text: str) -> int:
-    """A seed of random numbers."""
+    """Convert text to a seed of random numbers. Raise ArgumentTypeError for anything else."""
     if not text.isdecimal() or int(text) >= 2**32:
         raise argparse.ArgumentTypeError(f"expected a number from 0 to {2**32 - 1}, got {text!r}")
     return int(text)
 
 
 def picture_file(text: str) -> str:
-    """The name of a file for a figure."""
+    """Check the name of a file for a figure. Raise ArgumentTypeError for a wrong ending."""
     if Path(text).suffix.lower() not in (".png", ".pdf", ".svg"):
         raise argparse.ArgumentTypeError(
             f"expected a name that ends in .png, .pdf or .svg, got {text!r}"
@@ -140,7 +143,11 @@ def picture_file(text: str) -> str:
 
 
 def check_picture(file: str | None) -> None:
-    """Check, before hours of work, that a figure can be drawn. Raises AbductionError."""
+    """Check before long work that a figure can be drawn. Raise AbductionError if it cannot.
+
+    Args:
+        file: The file of the figure; None if none was asked for.
+    """
     if file is None:
         return
     from ssh_abduction.evaluation.paper.figures import require_matplotlib
@@ -149,7 +156,13 @@ def check_picture(file: str | None) -> None:
 
 
 def check_number(number: int | None, maps: Sequence[object], where: str) -> None:
-    """Check that there is a map with this number, counted from 1. Raises MapError."""
+    """Check that there is a map with this number. Raise MapError if there is none.
+
+    Args:
+        number: The number of the map, from 1; None if the user gave none.
+        maps: The maps.
+        where: The file of the maps, for the message.
+    """
     if number is not None and not 1 <= number <= len(maps):
         raise MapError(
             f"{where}: --map: expected 1 to {len(maps)}, got {number}"
@@ -159,7 +172,7 @@ def check_number(number: int | None, maps: Sequence[object], where: str) -> None
 
 
 def in_order(options: argparse.Namespace) -> None:
-    """Swap `maps` and `trace` if the trace came first, as in version 0.1.0, and warn."""
+    """Warn and swap `maps` and `trace` if the trace came first, as in version 0.1.0."""
     if options.maps == "-" or not _is_trace(options.maps) or _is_trace(options.trace):
         return
     print(
@@ -171,14 +184,14 @@ def in_order(options: argparse.Namespace) -> None:
 
 
 def read_maps(file: str, mend: str = "name the maps first, and then the trace") -> Any:
-    """The JSON in a file of maps.
+    """Read the JSON in a file of maps.
 
     Args:
-        file: The file.
-        mend: What to do if the file is a trace instead; None for verbs that take maps first.
+        file: The file; "-" for standard input.
+        mend: The advice in the message if the file is a trace.
 
     Raises:
-        MapError: The file holds no maps.
+        MapError: The file cannot be read, is no JSON, or is a trace.
     """
     try:
         return read_json(file)
@@ -196,14 +209,17 @@ def _is_trace(file: str) -> bool:
 
 
 def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theory:
-    """The theory that the options ask for.
+    """Find the theory that the options ask for.
 
     Args:
         options: The options of a verb with `add_theory`.
-        found: The theory to change if the user names none.
+        found: The theory to use if the user names none; None for the default one.
+
+    Returns:
+        The named theory, or `found`, with the fields changed that the user set.
 
     Raises:
-        TheoryError: A choice is wrong, or contradicts another one.
+        TheoryError: A field has a wrong value, or contradicts another one.
         MapError: The file that --theory names holds no theory.
     """
     chosen = choices_of(options)
@@ -234,7 +250,7 @@ def theory_of(options: argparse.Namespace, found: Theory | None = None) -> Theor
 
 
 def choices_of(options: argparse.Namespace) -> dict[str, Any]:
-    """The fields of a theory that the user set, by name."""
+    """Collect the fields of a theory that the user set, by name."""
     chosen = {
         f.name: getattr(options, f.name)
         for f in fields(Theory)
@@ -246,11 +262,12 @@ def choices_of(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def flags_of(theory: Theory, trace: Trace | None = None) -> list[str]:
-    """The flags that choose this theory: the inverse of `theory_of`.
+    """List the words of the command line that choose a theory. This inverts `theory_of`.
 
     Args:
         theory: The theory.
-        trace: Its trace. Fields that the default theory gets from this trace need no flag.
+        trace: The trace that it is for; None if unknown. Fields to which this trace sets the
+            default theory need no words.
     """
     default = Theory.causal() if theory.level == "causal" else Theory.topological()
     flags = ["--theory", "causal"] if theory.level == "causal" else []

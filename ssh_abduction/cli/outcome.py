@@ -1,4 +1,4 @@
-"""The result of a search for the shell: JSON, the exit code, and why there is no map."""
+"""Turn the result of a search into JSON, an exit code, warnings, and why there is no map."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ssh_abduction.solver import (
 from ssh_abduction.solver import ending as written_ending
 from ssh_abduction.solver import opening as written_opening
 
-# After Ctrl-C, only traces of at most this many steps are searched for noise. 40,000 take 2 s.
+# After Ctrl-C, only traces of at most this many steps get warnings. 40,000 steps would take 2 s.
 SOON = 10_000
 
 Given: TypeAlias = tuple[SSHMap, Cost | None]
@@ -39,7 +39,7 @@ EXIT_CODES = {Status.OPTIMAL: 0, Status.FEASIBLE: 10, Status.UNSATISFIABLE: 20, 
 
 
 def exit_code(solution: Solution) -> int:
-    """The exit code for a solution."""
+    """Find the exit code for a solution."""
     return (
         program.interrupted_code()
         if solution.stopped == "interrupted"
@@ -48,7 +48,7 @@ def exit_code(solution: Solution) -> int:
 
 
 def explained(search: Search) -> Explanation | None:
-    """Why there is no map; None if there is one, or no time to find out."""
+    """Explain why there is no map; None if there is a map, or no time to find out."""
     if search.status is not Status.UNSATISFIABLE or search.theory.jumped:
         return None
     try:
@@ -58,23 +58,32 @@ def explained(search: Search) -> Explanation | None:
 
 
 def opening(search: Search) -> dict[str, Any]:
-    """The fields of a solution's JSON before its maps."""
+    """Make the fields of a solution's JSON that come before its maps."""
     return written_opening(search.theory, len(search.trace), search.limits.within)
 
 
 def told(given: Given) -> dict[str, Any]:
-    """The JSON of a map, with its cost if maps of several costs are listed."""
+    """Make the JSON of a map, with its cost if maps of several costs are listed.
+
+    Args:
+        given: The map; and its cost, or None to leave the cost out.
+    """
     ssh_map, cost = given
     return written_map(ssh_map, cost)
 
 
 def given_by(search: Search, ssh_map: SSHMap) -> Given:
-    """The map that a search gave last, with its cost if maps of several costs are listed."""
+    """Pair a map with its cost, or with None if only maps of one cost are listed.
+
+    Args:
+        search: The search.
+        ssh_map: The map that the search found last.
+    """
     return ssh_map, search.cost if search.limits.within else None
 
 
 def all_given(solution: Solution) -> list[Given]:
-    """All maps of a solution in its order, as `given_by` gives them."""
+    """List the maps of a solution in its order, each paired with its cost as in `given_by`."""
     return list(zip_longest(solution.maps, solution.costs if solution.within else ()))
 
 
@@ -85,14 +94,14 @@ def ending(
     maps: int,
     backbone: Backbone | None,
 ) -> dict[str, Any]:
-    """The fields of a solution's JSON after its maps, with all warnings.
+    """Make the fields of a solution's JSON that come after its maps, with all warnings.
 
     Args:
         search: The search.
         solution: The solution.
-        explanation: Why there is no map, if so.
+        explanation: Why there is no map; None if there is a map or it is unknown.
         maps: The number of maps that were written.
-        backbone: What the minimal maps share, as far as it is known.
+        backbone: What all minimal maps share; None if it is unknown.
     """
     end = written_ending(solution, maps, backbone)
     found = warnings_of(search, solution)
@@ -105,7 +114,7 @@ def ending(
 
 
 def warnings_of(search: Search, solution: Solution) -> list[str]:
-    """Sentences about what makes the trace suspicious."""
+    """List sentences about reasons to distrust the trace or its views."""
     if solution.stopped == "interrupted" and len(search.trace) > SOON:
         return []
     return [*solution.warnings, *_second_opinion(search, solution)]
@@ -116,7 +125,10 @@ _second_opinions: WeakKeyDictionary[Search, list[str]] = WeakKeyDictionary()
 
 
 def _second_opinion(search: Search, solution: Solution) -> list[str]:
-    """A sentence if the runner-up's views give another map. Needs a search that ended in time."""
+    """Warn if the second best number of views (the runner-up) gives another map.
+
+    The list is empty if it gives the same map, or if too little time is left to find out.
+    """
     if search not in _second_opinions:
         limit = search.limits.time_limit
         left = None if limit is None else limit - solution.seconds.total
@@ -135,19 +147,20 @@ def warn(warnings: Sequence[str]) -> None:
 
 
 def dump(value: dict[str, Any]) -> str:
-    """JSON on one line."""
+    """Write a value as JSON on one line."""
     return json_line(value)
 
 
 @contextlib.contextmanager
 def on_ctrl_c(action: Callable[[], None] | None) -> Iterator[None]:
-    """On Ctrl-C and SIGTERM, call `action` instead of ending the program.
+    """While the block runs, call `action` at Ctrl-C and SIGTERM instead of ending the program.
 
-    The guard of the whole program receives no signals meanwhile. So code that may not react to
-    `action` needs a guard of its own.
+    During this time, the Guard of the whole program receives no signals. So if the code may ignore
+    `action`, it needs its own Guard.
 
     Args:
-        action: What to do; None to ignore these signals, also in processes that are started.
+        action: The function to call; None ignores these signals, also in processes that are
+            started.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # Python lets only the main thread handle signals

@@ -1,4 +1,4 @@
-"""The parser of the command line: groups of verbs, settings, and hints for misspelt names."""
+"""Parse the command line, with groups of verbs, settings, and hints for misspelt names."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from typing import Any, NoReturn
 
 from ssh_abduction.data.errors import printable
 
-# Flags of version 0.1.0 that have another name now. They still work, with a warning.
+# Options of version 0.1.0 that have another name now. They still work, with a warning.
 REPLACED = {
     "as": "format",
     "theory-of": "theory",
     "localize": "run",
 }
 OTHER_VERBS = {"localize": "localise"}
-DRAWN = ("dot", "graphml", "svg")  # flags of `show` in version 0.1.0: `export --to` now
+DRAWN = ("dot", "graphml", "svg")  # options of `show` in version 0.1.0, now `export --to`
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A choice that is made by --set NAME=VALUE.
+    """An option that the user gives as --set NAME=VALUE.
 
     Attributes:
         name: The name, with underscores.
         help: The help text.
-        type: Converts text to a value. Raises ValueError or argparse.ArgumentTypeError.
+        type: Converts the text of the value. Raises ValueError or argparse.ArgumentTypeError.
         choices: The texts that are allowed; None if `type` decides.
-        metavar: The placeholder for the value in the help.
-        many: Whether it may be repeated. The value is then a list.
+        metavar: The word for the value in the help.
+        many: Whether the setting may be given several times. Its value is then a list.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Setting:
 
     @property
     def shown(self) -> str:
-        """The setting as the help shows it: `star={auto,none}`."""
+        """The setting as the help shows it, such as `star={auto,none}`."""
         return f"{self.name}={'{' + ','.join(self.choices) + '}' if self.choices else self.metavar}"
 
     @property
@@ -52,7 +52,7 @@ class Setting:
         return self.type is true_or_false
 
     def read(self, text: str) -> Any:
-        """Convert text to a value. Raises argparse.ArgumentTypeError."""
+        """Convert text to a value. Raise argparse.ArgumentTypeError if it is wrong."""
         if self.choices and text not in self.choices:
             expected = " or ".join(filter(None, (", ".join(self.choices[:-1]), self.choices[-1])))
             raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
@@ -64,14 +64,14 @@ class Setting:
 
 
 def true_or_false(text: str) -> bool:
-    """Convert "true" or "false" to a value."""
+    """Convert "true" or "false" to a bool. Raise ArgumentTypeError for anything else."""
     if text not in ("true", "false"):
         raise argparse.ArgumentTypeError(f"expected true or false, got {text!r}")
     return text == "true"
 
 
 class _Set(argparse.Action):
-    """Reads NAME=VALUE into the setting of that name."""
+    """The argparse action of --set: stores VALUE of NAME=VALUE as the option of that name."""
 
     def __call__(
         self,
@@ -105,7 +105,7 @@ class Parser(argparse.ArgumentParser):
 
     Attributes:
         settings: The settings of this verb, by name.
-        groups: The verbs of this program, by the heading in the help.
+        groups: The names of this program's verbs, by their heading in the help.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -114,13 +114,13 @@ class Parser(argparse.ArgumentParser):
         self.groups: dict[str, tuple[str, ...]] = {}
 
     def add_setting(self, name: str, help_text: str, default: Any = None, **details: Any) -> None:
-        """Add a setting. Its value becomes an attribute of the options.
+        """Add a setting. Its value becomes the attribute `name` of the options.
 
         Args:
             name: The name, with underscores.
             help_text: The help text.
-            default: The value if the setting is not given.
-            details: Other fields of Setting.
+            default: The value if the user does not give the setting.
+            details: Other fields of Setting, by name.
         """
         if not self.settings:
             self.add_argument(
@@ -134,7 +134,7 @@ class Parser(argparse.ArgumentParser):
         self.set_defaults(**{name: default})
 
     def format_help(self) -> str:
-        """The help of argparse, with the settings and with the verbs in groups."""
+        """Make the help text, with verbs in groups and with the settings."""
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)
@@ -177,9 +177,16 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"{error.message}{hint}") from None
 
     def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """Parse the words. The verb reports unknown options, not the program.
+        """Parse the words of a command line. The parser of the verb reports unknown options.
 
-        Flags of version 0.1.0 are replaced by their new form. `options.notes` says so.
+        Options of version 0.1.0 are replaced by their new form.
+
+        Args:
+            args: The words; None takes those of this process.
+            namespace: The object that gets the options; None makes a new one.
+
+        Returns:
+            The options. Their attribute `notes` has a sentence for each replacement.
         """
         notes: list[str] = []
         words = self._with_replacements(list(sys.argv[1:] if args is None else args), notes)
@@ -193,7 +200,15 @@ class Parser(argparse.ArgumentParser):
         return options
 
     def _with_replacements(self, words: list[str], notes: list[str]) -> list[str]:
-        """Replace flags of version 0.1.0. Appends a sentence for each to `notes`."""
+        """Replace options of version 0.1.0 by their new form.
+
+        Args:
+            words: The words of the command line.
+            notes: Gets a sentence for each replacement.
+
+        Returns:
+            The new words.
+        """
         at = next((i for i, word in enumerate(words) if not word.startswith("-")), None)
         if at is None:
             return words
@@ -214,12 +229,15 @@ class Parser(argparse.ArgumentParser):
         return done
 
     def _replacement(self, word: str, rest: list[str], notes: list[str]) -> list[str] | None:
-        """The new form of a flag of version 0.1.0; None for any other word.
+        """Find the new form of an option of version 0.1.0.
 
         Args:
-            word: The flag, perhaps with "=VALUE".
-            rest: The words behind it. The value is removed from here if `word` does not contain it.
-            notes: Gets a sentence for each flag that is replaced.
+            word: The option, perhaps with "=VALUE".
+            rest: The words behind it. If the value is the first of these, it is removed.
+            notes: Gets a sentence if the option is replaced.
+
+        Returns:
+            The words of the new form; None if `word` is no such option.
         """
         flag, equals, value = word.partition("=")
         name = flag[2:].replace("-", "_")
@@ -244,22 +262,31 @@ class Parser(argparse.ArgumentParser):
 
     @property
     def verbs(self) -> Mapping[str, Parser]:
-        """The parsers of the verbs."""
+        """The parsers of the verbs, by name; empty for the parser of a verb."""
         groups = (a.choices for a in self._actions if isinstance(a, argparse._SubParsersAction))
         return next(groups, {})
 
     @property
     def names(self) -> list[str]:
-        """The names of all options."""
+        """The names of all options, such as "--json"."""
         return [name for action in self._actions for name in action.option_strings]
 
     def error(self, message: str) -> NoReturn:
-        """Print a message and the usage, and exit with code 2."""
+        """Print the usage and a message, and exit with code 2."""
         super().error(printable(message))  # the message repeats what the user typed
 
 
 def _exported(words: list[str], at: int, notes: list[str]) -> list[str]:
-    """The `export` command for `show --dot`, `--graphml` or `--svg` of version 0.1.0."""
+    """Replace `show --dot`, `--graphml` or `--svg` of version 0.1.0 by an `export` command.
+
+    Args:
+        words: The words of the command line.
+        at: The index of the verb.
+        notes: Gets a sentence about the replacement.
+
+    Returns:
+        The new words.
+    """
     kept, target = [], None
     rest = words[at + 1 :]
     while rest:
@@ -283,6 +310,11 @@ def _note(old: str, new: str) -> str:
 
 
 def _meant(word: object, names: Iterable[str]) -> str:
-    """A question such as "; did you mean star?" if a name is close to the word; else empty."""
+    """Make a hint such as "; did you mean star?" if a name is similar to a word; else "".
+
+    Args:
+        word: The word.
+        names: The names that it may mean.
+    """
     near = difflib.get_close_matches(str(word), list(names), n=1)
     return f"; did you mean {near[0]}?" if near else ""

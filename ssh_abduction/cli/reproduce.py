@@ -1,4 +1,4 @@
-"""ssh-abduction reproduce EXPERIMENT: the paper's two experiments, end to end."""
+"""ssh-abduction reproduce EXPERIMENT: repeat one of the paper's two experiments, end to end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ssh_abduction.cli.parsing import true_or_false
 from ssh_abduction.cli.text import table
 from ssh_abduction.data.errors import AbductionError, brief, named
 
-# A seed takes seconds. More seeds are surely a typing error, and would fill the memory.
+# Each seed takes seconds. More than this many seeds are a typing error, and would fill the memory.
 MOST_SEEDS = 10_000
 
 
@@ -114,7 +114,7 @@ def _print(options: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
 
 
 def _seeds(text: str) -> list[int]:
-    """The seeds in a text such as "0-19" or "1,5,7". Raises AbductionError."""
+    """List the seeds in a text such as "0-19" or "1,5,7". Raise AbductionError for others."""
     try:
         found: list[int] = []
         for part in text.split(","):

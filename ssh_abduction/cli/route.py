@@ -102,5 +102,5 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _names(words: list[str] | None) -> list[str]:
-    """The names to avoid: a word may hold several, separated by commas."""
+    """Split words at commas, to list the names of dstates and places to avoid."""
     return [name for word in words or () for name in word.split(",") if name]

@@ -1,6 +1,6 @@
-"""The folders of mapped logs: which log has which folder, and which are done.
+"""Manage the folders of mapped logs: which folder belongs to a log, and which logs are done.
 
-A run is done if its run.json is there, and does not say that the run was interrupted.
+A run is done if its folder has a run.json that does not say that the run was interrupted.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ def write_run(folder: Path, files: Sequence[tuple[str, bytes]]) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Check, before hours of work, that a folder can be made and written.
+    """Check before long work that a folder can be made and written.
 
     Raises:
-        AbductionError: It cannot.
+        AbductionError: The folder cannot be made or written.
     """
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not there.is_dir():
@@ -71,10 +71,11 @@ def check_folder(folder: Path) -> None:
 def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict[str, str]]:
     """Choose a folder for each log, and find logs with the same content.
 
-    - A log that has a run in `folder` keeps the folder of that run.
-    - A single new log gets `folder` itself; several get folders in it, named after the logs.
-    - If that folder holds the run of another log, or two logs have one name, a part of the
-      digest of the log is appended.
+    - A log that already has a run in `folder` keeps the folder of that run.
+    - A single new log gets `folder` itself. Each of several logs gets a folder in it, named after
+      the log.
+    - If that folder holds the run of another log, or if two logs have the same name, a part of the
+      log's digest is appended to the name.
 
     So the order of the logs does not matter.
 
@@ -83,7 +84,8 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
         folder: The output folder.
 
     Returns:
-        The folder of each log, and for each log that is left out, the log with the same content.
+        The folder of each log. And for each log that is left out, another log with the same
+        content.
     """
     contents = {path: _content(path) for path in dict.fromkeys(logs)}
     runs = _runs_in(folder)
@@ -133,7 +135,13 @@ def folders_of(logs: Sequence[str], folder: Path) -> tuple[dict[str, Path], dict
 
 
 def is_done(folder: Path, path: str, settings: dict[str, Any]) -> bool:
-    """Whether a folder holds a finished run of this log with these settings."""
+    """Whether a folder holds a finished run of a log with the same settings.
+
+    Args:
+        folder: The folder.
+        path: The log.
+        settings: The settings, from `MapQuestion.settings`.
+    """
     run = _run_in(folder)
     content = run.get("digest")
     return bool(
@@ -145,10 +153,12 @@ def is_done(folder: Path, path: str, settings: dict[str, Any]) -> bool:
 
 
 def digest(path: str) -> str | None:
-    """A SHA-256 digest of a log; for a folder, of the names and contents of its files.
+    """Compute the SHA-256 digest of the unpacked content of a log.
+
+    For a folder, it is the digest of the names and contents of its files.
 
     Returns:
-        The digest; None for a pipe, which can be read only once.
+        The digest as hexadecimal text; None for a pipe, which can be read only once.
 
     Raises:
         LogError: The log cannot be unpacked.
@@ -173,7 +183,7 @@ def digest(path: str) -> str | None:
 
 
 def _runs_in(folder: Path) -> dict[str, list[Path]]:
-    """The folders that hold runs, by the digest of the log: `folder` and its subfolders."""
+    """Find the runs in `folder` and its subfolders. List their folders by the digest of the log."""
     found: dict[str, list[Path]] = {}
     with suppress(OSError):
         for place in (folder, *sorted(one for one in folder.iterdir() if one.is_dir())):
@@ -184,7 +194,7 @@ def _runs_in(folder: Path) -> dict[str, list[Path]]:
 
 
 def _run_in(folder: Path) -> dict[str, Any]:
-    """The content of run.json in a folder; empty if there is none that can be read."""
+    """Read run.json in a folder; an empty dict if it is missing or cannot be read."""
     with suppress(OSError, ValueError, RecursionError):
         run = json.loads((folder / RUN).read_text(encoding="utf-8"))
         return run if isinstance(run, dict) else {}
@@ -192,18 +202,18 @@ def _run_in(folder: Path) -> dict[str, Any]:
 
 
 def _content(path: str) -> str | None:
-    """The digest of a log; None if it cannot be read twice."""
+    """Compute the digest of a log; None if the log cannot be read, or only once."""
     with suppress(OSError, AbductionError):
         return digest(path)
     return None
 
 
 def _key(folder: Path) -> str:
-    """A key that is equal for names that some file systems do not distinguish."""
+    """Make a key that is equal for folders whose names some file systems do not distinguish."""
     return unicodedata.normalize("NFC", os.path.abspath(folder)).casefold()
 
 
 def _cut(name: str) -> str:
-    """The start of a name that leaves room for a part of a digest."""
+    """Cut a name, so that there is room to append a part of a digest."""
     room, encoded = LONGEST - DIGITS - 1, os.fsencode(name)
     return os.fsdecode(encoded[:room]) if len(encoded) > room else name

@@ -169,7 +169,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _drive(options: argparse.Namespace) -> Drive:
-    """The drive to write as a robot's log. Raises AbductionError."""
+    """Simulate the drive to write as a robot's log. Raise AbductionError for wrong options."""
     import math
 
     from simulator.drive import EVERY
@@ -211,7 +211,7 @@ def _drive(options: argparse.Namespace) -> Drive:
 
 
 def _write_log(options: argparse.Namespace, drive: Drive) -> int:
-    """Write a drive as a robot's log, and the truth beside it."""
+    """Write a drive as a robot's log, and the truth to a file beside it. Return the exit code."""
     import json
     from pathlib import Path
 
@@ -245,7 +245,7 @@ def _write_log(options: argparse.Namespace, drive: Drive) -> int:
 
 
 def scans_of(drive: Drive) -> Iterator[Scan]:
-    """The scans of a drive, with the true poses as corrected poses."""
+    """Yield the scans of a drive. Their corrected poses are the true ones."""
     from perception.readers.scans import Laser, Scan
     from simulator.laser import BEAMS, BEARINGS
 
@@ -262,7 +262,7 @@ def scans_of(drive: Drive) -> Iterator[Scan]:
 
 
 def _camera(options: argparse.Namespace) -> Camera | None:
-    """The camera that the options ask for. Raises AbductionError."""
+    """Make the camera that the options ask for; None for laser ranges. Raises AbductionError."""
     from simulator.panorama import Camera, Paint
 
     if options.images == "ranges":
@@ -287,7 +287,15 @@ def _camera(options: argparse.Namespace) -> Camera | None:
 
 
 def _with_table(trace: Trace, target: str) -> Trace:
-    """Write the panoramas to a file beside the trace. Returns the trace that refers to it."""
+    """Write the panoramas of a trace to an .npz file beside it.
+
+    Args:
+        trace: The trace.
+        target: The file of the trace.
+
+    Returns:
+        The trace, whose images are now indices into that file.
+    """
     import io
     from dataclasses import replace
     from pathlib import Path

@@ -44,10 +44,10 @@ from ssh_abduction.solver import (
 )
 from ssh_abduction.theory.speedups import SPEEDUPS, Speedups
 
-# At most this many maps are compared on the terminal, and sorted in JSON. If there are more, the
-# first ones are compared, and all are printed as they are found.
+# At most this many maps are kept in memory, to compare them on the terminal or to sort them for
+# JSON. If there are more, only the first ones are compared, and JSON has all in the order found.
 HELD = 1000
-# The maps that are held for sorting have at most this many dstates together, or about 100 MB.
+# The maps in memory have at most this many dstates together, which is about 100 MB.
 HELD_DSTATES = 500_000
 
 
@@ -167,10 +167,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 class _Text:
-    """The output of a search for people.
+    """Prints the result of a search for people.
 
     Attributes:
-        kept: The first maps. Further maps are only counted.
+        kept: The first maps that were found. Further maps are only counted.
     """
 
     def __init__(self, search: Search) -> None:
@@ -179,7 +179,7 @@ class _Text:
         self._room = HELD_DSTATES
 
     def searched(self, _: Callable[[Callable[[], str]], None]) -> Explanation | None:
-        """Search, and explain why there is no map, if so."""
+        """Run the search. Return why there is no map; None if there is one."""
         for ssh_map in self._search:
             if len(self.kept) < HELD and self._room > 0:
                 self.kept.append(ssh_map)
@@ -187,11 +187,18 @@ class _Text:
         return explained(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
-        """The whole output."""
+        """Make the whole output as text."""
         return _text(_lines(self._search, solution, explanation, self._search.backbone))
 
     def last_words(self, why: Stop) -> tuple[str, int]:
-        """What is known if the search cannot be stopped in time, and the exit code."""
+        """Make the output for a search that cannot be stopped in time.
+
+        Args:
+            why: The reason for the end.
+
+        Returns:
+            The text, and the exit code.
+        """
         solution = self._search.snapshot(why)
         kept = (
             tuple(self.kept) if solution.status is Status.OPTIMAL and self.kept else solution.maps
@@ -203,9 +210,10 @@ class _Text:
 
 
 class _Json:
-    """The output of a search for programs: JSON with one map a line.
+    """Prints the result of a search as JSON, with one map per line.
 
-    The maps are held to sort them. If there are too many, all are printed as they are found.
+    Maps are kept in memory, to sort them at the end. If there are too many, they are printed in the
+    order in which they are found.
     """
 
     def __init__(self, search: Search) -> None:
@@ -217,11 +225,18 @@ class _Json:
 
     @property
     def kept(self) -> list[SSHMap]:
-        """The list of held maps: all maps, or none."""
+        """The maps in memory: all maps, or none if they are too many."""
         return [ssh_map for ssh_map, _ in self._held]
 
     def searched(self, say: Callable[[Callable[[], str]], None]) -> Explanation | None:
-        """Search, and hold the maps or print them. Explain why there is none, if so."""
+        """Run the search, and keep or print the maps.
+
+        Args:
+            say: Prints the text that a function returns.
+
+        Returns:
+            Why there is no map; None if there is one.
+        """
         say(self._opening)
         for ssh_map in self._search:
             given = given_by(self._search, ssh_map)
@@ -235,7 +250,7 @@ class _Json:
         return explained(self._search)
 
     def end(self, solution: Solution, explanation: Explanation | None) -> str:
-        """The maps that are held, and the end of the JSON."""
+        """Make the rest of the JSON: the maps in memory, and the fields after the maps."""
         maps = "".join(map(self._line, all_given(solution)))
         return maps + self._end(solution, explanation, self._search.backbone)
 
@@ -249,7 +264,14 @@ class _Json:
         )
 
     def last_words(self, why: Stop) -> tuple[str, int]:
-        """The rest of the JSON if the search cannot be stopped in time, and the exit code."""
+        """Make the rest of the JSON for a search that cannot be stopped in time.
+
+        Args:
+            why: The reason for the end.
+
+        Returns:
+            The text, and the exit code.
+        """
         solution = self._search.snapshot(why)
         warn(warnings_of(self._search, solution))
         words = ("" if self._begun else self._opening()) + self._let_go()
@@ -263,7 +285,7 @@ class _Json:
         return dump(opening(self._search))[:-1] + ', "maps": ['
 
     def _let_go(self) -> str:
-        """The held maps in the order in which they were found. They are not held any longer."""
+        """Write the maps in memory in the order in which they were found, and forget them."""
         held, self._held = self._held, []
         return "".join(map(self._line, held))
 
@@ -317,11 +339,14 @@ def _lines(
 
 @contextlib.contextmanager
 def _progress(prints_meanwhile: bool) -> Iterator[Any]:
-    """Show a line of progress on stderr while solving, if stderr is a terminal.
+    """Show a line of progress on stderr while the block runs, if stderr is a terminal.
 
     Args:
-        prints_meanwhile: Whether output is printed during the search. If it goes to the same
-            terminal, no progress is shown.
+        prints_meanwhile: Whether output is printed during the search. If that goes to a terminal,
+            no progress is shown.
+
+    Yields:
+        A function that shows a Progress; None if no progress is shown.
     """
     if (
         not sys.stderr.isatty()

@@ -1,4 +1,7 @@
-"""Maps as text for a terminal."""
+"""Write maps and solutions as text for a terminal.
+
+A dstate (distinctive state) is a place and the direction that the robot faces there.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,9 @@ if TYPE_CHECKING:
     from ssh_abduction.rivals.comparison import Comparison
     from ssh_abduction.rivals.questions import Matter
 
-# At most this many pairs of steps, questions of a choice, and options of a choice are printed.
+# The largest number of pairs of steps, questions of a choice, and options of a choice to print.
 SHOWN_PAIRS = SHOWN_QUESTIONS = SHOWN_OPTIONS = 12
-# What two maps differ in: in singular and plural.
+# Words for what two maps differ in, in singular and plural.
 NOUNS: dict[Matter, tuple[str, str]] = {
     "faults": ("fault", "faults"),
     "dstates": ("dstate", "dstates"),
@@ -31,12 +34,12 @@ NOUNS: dict[Matter, tuple[str, str]] = {
 
 
 def headline(solution: Solution, count: int, explanation: Explanation | None) -> str:
-    """One line about how a search ended.
+    """Write one line about how a search ended.
 
     Args:
         solution: The solution.
         count: The number of maps that the search found. The solution may hold fewer.
-        explanation: Why there is no map, if so.
+        explanation: Why there is no map; None if there is one, or if the reason is unknown.
     """
     if explanation:
         return f"{solution.status.value}: {explanation}"
@@ -85,7 +88,7 @@ def headline(solution: Solution, count: int, explanation: Explanation | None) ->
 
 
 def _levels_above(solution: Solution) -> str:
-    """The number and the cost of the maps above the minimum."""
+    """Write the number and the counts of the maps above the minimum, for each cost."""
     return "".join(
         f"; {level.count} with {', '.join(counted(v, k) for k, v in level.cost.to_dict().items())}"
         for level in solution.levels[1:]
@@ -93,9 +96,9 @@ def _levels_above(solution: Solution) -> str:
 
 
 def by_displacements(solution: Solution) -> Iterator[str]:
-    """Lines about displacements: what they excluded, and how well the maps close.
+    """Yield lines about displacements: what they exclude, and how well the maps fit them.
 
-    There are none if displacements are not used.
+    There are no lines if displacements are not used.
     """
     said = solution.evidence.get("displacement")
     if said is None:
@@ -124,7 +127,12 @@ def by_displacements(solution: Solution) -> Iterator[str]:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A table with aligned columns. Control characters are escaped."""
+    """Write a table with aligned columns. Control characters are escaped.
+
+    Args:
+        head: The titles of the columns.
+        rows: The cells of each row.
+    """
     cells = [[*head], *([printable(str(cell)) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     return "\n".join(
@@ -135,7 +143,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def describe(ssh_map: SSHMap) -> str:
-    """A map as text: its paths with their places in order, and its dstates with their links."""
+    """Write a map as text: each path with its places in order, and each dstate with its links."""
     parts = []
     if ssh_map.faults:
         parts.append(
@@ -167,7 +175,11 @@ def describe(ssh_map: SSHMap) -> str:
 
 
 def describe_backbone(backbone: Backbone, trace: Trace) -> str:
-    """The steps that are one dstate in all minimal maps, and the pairs that are in some."""
+    """Write what the minimal maps share.
+
+    A table lists the steps that are one dstate in all maps. Then come pairs of steps that are one
+    dstate, or at one place, in some maps only.
+    """
     steps: dict[int, list[int]] = {}
     for t, number in enumerate(backbone.dstates.always):
         steps.setdefault(number, []).append(t)
@@ -201,9 +213,10 @@ def describe_backbone(backbone: Backbone, trace: Trace) -> str:
 
 
 def compared(found: Comparison) -> Iterator[str]:
-    """Lines about the choices in which maps differ, and the questions that decide between them.
+    """Yield lines about how maps differ: the choices, their options, and the questions to ask.
 
-    There are none if the maps do not differ.
+    A choice is a set of questions that maps answer differently. An option is one way to answer
+    them. There are no lines if the maps do not differ.
     """
     number = {question: i for i, question in enumerate(found.deciding, 1)}
     if found.product:
@@ -254,7 +267,7 @@ def compared(found: Comparison) -> Iterator[str]:
 
 
 def depending(differing: Mapping[Matter, Sequence[int]]) -> str:
-    """Words for what differs, such as "the dstates of steps 48 and 51; the paths of step 66"."""
+    """Say what differs, such as "the dstates of steps 48 and 51; the paths of step 66"."""
     shown = {
         sort: steps
         for sort, steps in differing.items()
@@ -272,10 +285,10 @@ def _numbered(numbers: Sequence[int], count: int) -> str:
 
 
 def told_steps(steps: Sequence[int]) -> str:
-    """Words for steps, such as "step 40" or "steps 12–15 and 40"."""
+    """Write step numbers in words, such as "step 40" or "steps 12–15 and 40"."""
     return f"{'step' if len(steps) == 1 else 'steps'} {stretches(steps)}"
 
 
 def course(path: int | None, direction: int | None) -> str:
-    """A path and a direction along it, such as "2+" or "2-"."""
+    """Write a path and a direction along it, such as "2+" or "2-"; "" without a path."""
     return "" if path is None else f"{path}{'+' if direction == 1 else '-'}"

@@ -98,7 +98,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def pair(text: str) -> tuple[int, int]:
-    """Two numbers with a comma between them."""
+    """Convert text such as "0,4" to two numbers. Raise ArgumentTypeError for anything else."""
     first, comma, second = text.partition(",")
     if not (comma and first.strip().isdecimal() and second.strip().isdecimal()):
         raise argparse.ArgumentTypeError(
@@ -108,7 +108,12 @@ def pair(text: str) -> tuple[int, int]:
 
 
 def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
-    """The images of a trace with reliable labels, the labels, and an untrained recogniser."""
+    """Load what a recogniser can learn from.
+
+    Returns:
+        The images of steps with a known label, (n, d); these labels, (n,); and a recogniser that is
+        not trained yet.
+    """
     from perception.recognition import recogniser
 
     images, labels, _, features = _mapped(options)
@@ -116,7 +121,12 @@ def _labelled(options: argparse.Namespace) -> tuple[Any, Any, Any]:
 
 
 def _mapped(options: argparse.Namespace) -> tuple[Any, Any, SSHMap, Any]:
-    """The images, their labels, the map that the labels come from, and the maker of features."""
+    """Load the images and labels of the trace and map that the options name.
+
+    Returns:
+        The images of steps with a known label, (n, d); these labels, (n,); the map that they come
+        from; and a transformer of images to vectors, which is not fitted yet.
+    """
     from perception.appearance import features_of
     from perception.images import images_of
     from ssh_abduction.learning.learner import labels_of

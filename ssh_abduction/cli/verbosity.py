@@ -1,4 +1,4 @@
-"""The options -q and -v, and lines of progress on stderr."""
+"""Add the options -q and -v, and print lines of progress on stderr."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from collections.abc import Iterator
 from ssh_abduction.data.errors import printable
 from ssh_abduction.runtime.logs import PACKAGE, PROGRESS
 
-# Seconds before the first line of progress, and between two lines. Most commands end earlier.
+# Seconds before the first line of progress, and between lines. Most commands end earlier.
 EVERY = 10.0
 LEVELS = {1: logging.INFO, 2: logging.DEBUG}
 
 
 def add_verbosity(parser: argparse.ArgumentParser) -> None:
-    """Add -q and -v to a parser. They may stand before or behind the verb."""
+    """Add -q and -v to a parser, so that they may come before or behind the verb."""
     told = parser.add_argument_group("messages").add_mutually_exclusive_group()
     none = argparse.SUPPRESS  # a default of the verb would overwrite a flag before the verb
     told.add_argument(
@@ -40,12 +40,12 @@ def add_verbosity(parser: argparse.ArgumentParser) -> None:
 
 @contextlib.contextmanager
 def telling(options: argparse.Namespace, for_programs: bool) -> Iterator[None]:
-    """Log on stderr, while a command runs, as much as the options ask for.
+    """While the block runs, log on stderr as much as the options ask for.
 
     Args:
         options: The options, with those of `add_verbosity`.
-        for_programs: Whether other programs read the output. Then there are no lines of progress
-            if stdout and stderr are one file.
+        for_programs: Whether other programs read the output. If so, and stdout and stderr are the
+            same file, there are no lines of progress.
     """
     verbose = getattr(options, "verbose", 0)
     if getattr(options, "quiet", False):
@@ -77,14 +77,14 @@ def _handled(log: logging.Logger, handler: logging.Handler, level: int) -> Itera
 
 
 def _is_one_file() -> bool:
-    """Whether stdout and stderr are one file, so that progress would mix with the answer."""
+    """Whether stdout and stderr are the same file, so that progress would mix with the output."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         return os.path.samestat(os.fstat(sys.stdout.fileno()), os.fstat(sys.stderr.fileno()))
     return False
 
 
 class _Told(logging.Handler):
-    """Prints each record with its module and the seconds since the command began."""
+    """A log handler that prints each record with its module and the seconds since the start."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -96,7 +96,7 @@ class _Told(logging.Handler):
 
 
 class _NowAndThen(logging.Handler):
-    """Prints a record if none was printed in the last EVERY seconds."""
+    """A log handler that prints a record if it has printed none for EVERY seconds."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -110,6 +110,6 @@ class _NowAndThen(logging.Handler):
 
 
 def _say(text: str) -> None:
-    # The reader of the log may quit: the command goes on.
+    # If the reader of stderr quits, the command goes on.
     with contextlib.suppress(OSError, ValueError):
         print(f"ssh-abduction: {printable(text)}", file=sys.stderr, flush=True)

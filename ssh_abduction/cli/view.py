@@ -135,11 +135,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
-    """What the page can say about the cost of assumptions without a server.
+    """Compute the costs of assumptions that the page can show without a server.
 
     Returns:
-        The texts, and for each pair of steps the numbers of the texts for one dstate and for
-        different dstates.
+        A dict. `texts` lists the different texts. `pairs` has, for each pair of steps "i,j", the
+        indices of two texts: the cost if both are one dstate, and if they are different ones.
     """
     from ssh_abduction.page.assumed import assumptions
 
@@ -159,7 +159,16 @@ def _assuming(listing: Listing, trace: Trace, theory: Theory) -> dict[str, Any]:
 
 
 def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | None:
-    """The localised run that the options ask for. Raises AbductionError."""
+    """Make the localised run that the options ask for; None if they ask for none.
+
+    Args:
+        options: The options.
+        trace: The trace that was mapped; None if it is unknown.
+        data: The content of the file of maps.
+
+    Raises:
+        AbductionError: A file is wrong, or the run is missing.
+    """
     from ssh_abduction.data.trace import Trace
     from ssh_abduction.page.replays import Run
 
@@ -179,7 +188,16 @@ def _run(options: argparse.Namespace, trace: Trace | None, data: Any) -> Run | N
 
 
 def _with_beliefs(followed: Trace, file: str, data: Any) -> Run:
-    """The run with the beliefs in a file. Raises MapError."""
+    """Make a run with beliefs from a file.
+
+    Args:
+        followed: The trace of the run.
+        file: The file, as `localise --json` writes it.
+        data: The content of the file of maps.
+
+    Raises:
+        MapError: The file is malformed, or is of another run or other maps.
+    """
     from ssh_abduction.data.map_file import read_json
     from ssh_abduction.data.maps import maps_of
     from ssh_abduction.page.replays import Run
