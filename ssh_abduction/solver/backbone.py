@@ -51,7 +51,8 @@ class Rivals:
     Attributes:
         sharing: What these maps share.
         listed: Whether they are all minimal maps of the trace.
-        engine: The engine that found the maps; None if it is not needed or broken.
+        engine: The engine that found the maps. None if no proof is needed, or if an error left the
+            engine unusable.
         reasons: Whether engines can prove what all minimal maps share. They cannot if the maps
             come from mended traces.
     """
@@ -242,7 +243,7 @@ class _Reasoning:
         )
 
     def _replay(self, found: SSHMap) -> Replay:
-        """Replay the trace over a map of a prefix."""
+        """Replay the trace over a map of a prefix: follow the links of the map to the end."""
         return self._task.log.replay(
             found.labels, None, [s.place for s in found.dstates] if self._task.log.pairs else None
         )

@@ -61,7 +61,7 @@ def solve(
             first, paths or places are counted instead.
         memory_limit: MiB of memory. The search stops when the process reaches this peak.
         speedups: The speed-ups that are on. None of them changes the answer.
-        on_progress: A function that is called with a `Progress` several times a search.
+        on_progress: A function that is called now and then with a `Progress`.
 
     Returns:
         The maps, their cost, and what is proven about them.

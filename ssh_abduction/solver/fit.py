@@ -1,4 +1,4 @@
-"""Fit poses to a map: those of its dstates that agree best with the displacements of the trace.
+"""Fit poses to the dstates of a map, so that they agree best with the trace's displacements.
 
 >>> from ssh_abduction import Theory, Trace, solve
 >>> from ssh_abduction.solver.fit import fit
@@ -167,6 +167,7 @@ class _Problem:
 
         The rotations are complex numbers on the unit circle that minimise a quadratic form. The
         power method for its inverse finds them (Boumal 2016, "Nonconvex phase synchronization").
+        If positions do not determine a rotation, it is arbitrary.
 
         Args:
             onward: The displacements n x 2 in metres, turned by the present headings.

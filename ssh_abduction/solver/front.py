@@ -54,7 +54,7 @@ class Front:
     A number of faults has no point if the assertions of the theory allow no map with so few faults.
 
     Attributes:
-        points: The points, by number of faults.
+        points: The points, those for fewer faults first.
         stopped: Whether a time limit or Ctrl-C ended the search.
     """
 
@@ -81,8 +81,8 @@ class Front:
     def prices(self) -> tuple[float, float] | None:
         """The costs of a fault for which the map at the knee is the best one, as (low, high).
 
-        Costs are in dstates. Each cost between the two numbers will do. None if there is no such
-        cost, or no knee.
+        Costs are in dstates, and `low` and `high` are excluded. None if there is no such cost, or
+        no knee.
         """
         if self.knee is None:
             return None

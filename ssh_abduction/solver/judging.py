@@ -98,7 +98,10 @@ class Judging:
         return not others and own.isdisjoint(AXIOMS) and can_be_asked(self._theory)
 
     def accepts(self, ssh_map: SSHMap) -> bool:
-        """Whether a map of the whole trace provably satisfies all axioms and all evidence."""
+        """Whether a map of the whole trace satisfies all axioms and agrees with all evidence.
+
+        False also if some axioms cannot be checked.
+        """
         accepted = (
             self.can_accept
             and next(violations(self._trace, ssh_map, self._theory), None) is None

@@ -95,7 +95,7 @@ class Solution:
     support: Support = field(default=Support(), repr=False, compare=False)
 
     def __len__(self) -> int:
-        """The number of maps."""
+        """The number of maps in this solution."""
         return len(self.maps)
 
     def __bool__(self) -> bool:
@@ -222,7 +222,7 @@ class Solution:
     def weights(self) -> tuple[float, ...]:
         """The probability of each map by displacements alone.
 
-        They add up to 1. Empty if displacements are not used.
+        The probabilities add up to 1. Empty if displacements are not used.
         """
         return weights(self.maps)
 
@@ -279,7 +279,7 @@ class Solution:
 
     @property
     def evidence(self) -> Mapping[str, Mapping[str, int]]:
-        """What each kind of evidence excluded, by its name.
+        """For each kind of evidence, by name, how much it excluded.
 
         "pairs" is the number of excluded pairs of steps. "refused" is the number of sets of
         equalities that were rejected during the search.

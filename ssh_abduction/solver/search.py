@@ -141,12 +141,12 @@ class Search:
 
     @property
     def status(self) -> Status:
-        """What is proven so far."""
+        """What is proven so far, such as that `best` is minimal."""
         return self._parts.known.status
 
     @property
     def bound(self) -> Bound:
-        """The proven lower bounds so far."""
+        """The proven lower bounds so far on the counts of any map."""
         return self._parts.known.bound
 
     @property
@@ -161,7 +161,7 @@ class Search:
 
     @property
     def complete(self) -> bool:
-        """Whether no further map exists."""
+        """Whether no further map exists: no minimal one and, with `within`, none to list."""
         return self._parts.known.complete
 
     @property

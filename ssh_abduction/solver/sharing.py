@@ -41,9 +41,9 @@ class Shared:
     """Which steps are one dstate (or one place, path or course) in all, some or none of the maps.
 
     Two steps with the same number are one in all maps. Two steps with different numbers are one in
-    some maps if their numbers are a pair in `sometimes`, else in none. A dstate that is along no
-    path has a number of its own for paths. A pair of a step with itself means that the step is
-    along a path in some maps, and along none in others.
+    some maps if `sometimes` has a pair of steps with these numbers, else in none. A dstate that is
+    along no path has a number of its own for paths. A pair of a step with itself means that the
+    step is along a path in some maps, and along none in others.
 
     Attributes:
         always: A number for each step of the trace, counted from 0 in the order of first steps.
@@ -211,7 +211,7 @@ class Sharing:
         self._kept: dict[Sort, Kept] = {}
 
     def absorb(self, ssh_map: SSHMap) -> None:
-        """Take in a map."""
+        """Take in a map: keep only what it shares with all maps before."""
         self.maps += 1
         if ssh_map.labels != self._labels:
             self._split_by(ssh_map.labels)

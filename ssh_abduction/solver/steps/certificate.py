@@ -1,4 +1,6 @@
-"""A certificate that proves a lower bound on dstates. `checker/proof.py` checks it by itself.
+"""A certificate that proves a lower bound on the number of dstates.
+
+`checker/proof.py` checks certificates without a solver.
 
 >>> from ssh_abduction import Trace, solve
 >>> trace = Trace.from_steps(["a", "b", "a", "c"], ["travel", "travel", "travel"])

@@ -2,10 +2,10 @@
 
 Engines that find dstates before places work on a chart. In the causal theory each step is a node,
 and each action is a link to the next node. With frames (star=frame), a turn rotates the robot by a
-known number of quarters (right angles), and the steps between two travels are at one place. They
-are called a *visit*. The steps of a visit that face the same way are one node. Rotations link the
-nodes of a visit in both directions. Two nodes are *apart* if the views and actions of the trace
-show that they are different dstates, as in `steps/apart.py`.
+known number of quarters (right angles). A *visit* is the steps between two travels, which are all
+at one place. The steps of a visit that face the same way are one node. Rotations link the nodes of
+a visit in both directions. Two nodes are *apart* if the views and actions of the trace show that
+they are different dstates, as in `steps/apart.py`.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.solver.steps.chart import Chart
@@ -313,7 +313,7 @@ class FramedChart(Chart):
         )
 
     def visits_with(self, pairs: int) -> int:
-        """The largest n for which at most `pairs` pairs of n first visits may be at one place."""
+        """The largest n so that at most `pairs` pairs of the first n visits may be at one place."""
         import numpy as np
 
         return int(np.searchsorted(self.fitting, pairs, side="right")) - 1

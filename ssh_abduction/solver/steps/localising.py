@@ -36,7 +36,8 @@ class Located:
 
     Attributes:
         states: The state of each visit; empty if the map does not locate all of them.
-        missed: The visits that the map needs to locate more of them; empty if it locates all.
+        missed: The visits to add to the map so that it locates more visits; empty if it locates
+            all.
     """
 
     states: tuple[State, ...]

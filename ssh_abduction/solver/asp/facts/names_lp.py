@@ -30,8 +30,8 @@ def name_facts(
         spares: For each view its spare names; the last one is the rest.
         links: Triples of a node, an action, and the node that the action leads to.
         choices: For each node, the names that it can have.
-        ordered: Whether nodes use the spare names of a view in order, which spares clingo
-            equivalent answers. If False, a single search can still assume it by `ordered()`.
+        ordered: Whether nodes use the spare names of a view in order, so that there are no
+            equivalent answers. If False, a single search can still assume this by `ordered()`.
     """
     view_of = dict(names)
     rests = {spare[-1] for spare in spares}
@@ -166,7 +166,9 @@ class NameReader:
 
 
 def not_together(number: int, pairs: Sequence[tuple[int, int]]) -> str:
-    """The rules that, of some pairs of steps, not each pair is at one dstate, rests aside.
+    """The rules that forbid that all of some pairs of steps are one dstate.
+
+    Two steps at a rest do not count as one dstate.
 
     Args:
         number: A number that no other such rule has.

@@ -173,7 +173,7 @@ class Segments:
 
     @classmethod
     def read(cls, control: Control) -> Segments:
-        """Read them from a control in which the parts base and segments are grounded."""
+        """Read these values from a control in which the parts base and segments are grounded."""
         symbols = control.symbolic_atoms
 
         def atoms(name: str, arity: int) -> list[tuple[int, ...]]:
@@ -233,7 +233,7 @@ def settled_labels(labels: Iterable[tuple[int, int]]) -> str:
 
 
 def open_labels(labels: Sequence[int]) -> str:
-    """The rules by which clingo chooses nodes whose labels already have no places and paths.
+    """The rules by which clingo chooses some nodes such that no places and paths fit their labels.
 
     Args:
         labels: The dstate of each node.

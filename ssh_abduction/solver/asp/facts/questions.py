@@ -30,8 +30,8 @@ def forbidden_equalities(
     Args:
         equalities: The equalities.
         where: The rule applies only if this atom is true. None if it always applies.
-        excusable: Whether the rule does not apply if a displacement between two of these steps is
-            treated as wrong.
+        excusable: Whether a wrong displacement excuses: then the rule does not apply if, for one of
+            the equalities, a displacement between its two steps is treated as wrong.
     """
     atoms = [str(where)] if where else []
     if excusable:
