@@ -26,19 +26,21 @@ EXIT_VIOLATED = 20
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Check maps against a trace and the axioms, without clingo. Reports each axiom that a "
-        "map breaks, and the steps where it does."
+        "map breaks, and at which steps."
     )
     parser = verbs.add_parser("check", help="do these maps satisfy the axioms?", description=text)
     parser.add_argument("maps", help="output of solve --json, or one saved map")
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     parser.add_argument(
-        "--bound", action="store_true", help="also check the proof that no map has fewer dstates"
+        "--bound",
+        action="store_true",
+        help="also check the proof in the file that no map has fewer dstates",
     )
     add_theory(parser, default="the theory of the maps, or topological")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "Without --theory, the theory is that of the file of maps. Other flags change single "
-        "choices of it."
+        "Without --theory, the theory is that of the file of maps. The other options change "
+        "single fields of it."
     )
 
 

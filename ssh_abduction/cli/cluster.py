@@ -22,9 +22,9 @@ from ssh_abduction.theory.theory import Theory
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Cluster the images of a trace into views, and write the trace with its views. The number "
-        "of views k is the one that separates best (largest M). If another number of views is "
-        "about as good, the trace keeps those views too, and a warning says whether they give "
-        "another map."
+        "of views k is chosen by M, the smallest distance between clusters divided by the largest "
+        "distance within one: the largest M wins. If another number of views is about as good, "
+        "the trace also keeps those views, and a warning says whether they give another map."
     )
     parser = verbs.add_parser("cluster", help="cluster images into views", description=text)
     parser.add_argument("trace", help="trace file with images, or - for standard input")
@@ -37,17 +37,20 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.add_setting(
         "by",
-        "choose k by M, the ratio of two distances, or by trimmed M, the ratio of two medians of "
-        "distances (default: M)",
+        "choose k by M, or by trimmed M, which has medians of distances instead of the smallest "
+        "and largest ones, so that no single image decides (default: M)",
         "M",
         choices=("M", "trimmed"),
     )
-    parser.add_argument("--seed", type=seed, default=0, help="seed of k-means (default: 0)")
+    parser.add_argument("--seed", type=seed, default=0, help="random seed of k-means (default: 0)")
     parser.add_argument(
         "--plot",
         type=picture_file,
         metavar="PNG",
-        help="draw M, and U if the truth is known, against k",
+        help=(
+            "draw M against k; and, if the truth is known, U, which says how well the views agree "
+            "with the true dstates"
+        ),
     )
     parser.set_defaults(run=run)
 

@@ -23,7 +23,7 @@ UNSTEADY = ("seconds", "limit", "ladder", "drove", "log.source")
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Compare the minimal maps of a trace. Reports what all of them share, where they "
-        "differ, and which steps decide between them."
+        "differ, and which questions about steps decide between them."
     )
     parser = verbs.add_parser(
         "compare", help="what do rival maps share, and where do they differ?", description=text

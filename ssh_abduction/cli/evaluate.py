@@ -59,29 +59,33 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument("trace", help="trace file (JSON Lines) with truth")
     parser.add_setting(
         "near",
-        "also judge by poses; poses within this distance count as one place (default: 2)",
+        "also judge by true poses; visits within this distance count as one place (default: 2)",
         type=float,
         metavar="METRES",
     )
     parser.add_argument(
         "--relations",
         metavar="FILE",
-        help="also judge by hand-checked relative poses: lines of time1 time2 x y z roll pitch yaw",
+        help=(
+            "also judge by hand-checked relative poses in this file: lines of time1 time2 x y z "
+            "roll pitch yaw"
+        ),
     )
     parser.add_argument(
         "--truth",
         metavar="FILE",
         help=(
-            "judge by the robot's true trajectory in TUM format: lines of timestamp tx ty tz qx "
-            "qy qz qw"
+            "judge by the robot's true trajectory in this file, in TUM format: lines of timestamp "
+            "tx ty tz qx qy qz qw"
         ),
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     parser.epilog = (
-        "For pairs of steps at one place, edges and links, the two shares are precision and "
-        "recall. If steps have true poses but no true names, as in an imported log, visits "
-        "near each other count as one place. docs/reference/formats.md says what is counted."
+        "The table gives two shares each for pairs of steps at one place, for edges, and for "
+        "links: precision and recall. If steps have true poses but no true names, as in an "
+        "imported log, visits near each other count as one place. docs/reference/formats.md "
+        "describes what is counted."
     )
 
 

@@ -13,8 +13,8 @@ from ssh_abduction.data.files import shipped, write_file
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Copy the examples of the package into a folder: traces, programs and a notebook. "
-        "Files with other content are not overwritten."
+        "Copy the examples of the package into a folder: traces, programs and a notebook. If a "
+        "file of the same name has other content, nothing is copied."
     )
     parser = verbs.add_parser("examples", help="copy the examples into a folder", description=text)
     parser.add_argument(
@@ -23,7 +23,7 @@ def add_parser(verbs: Verbs) -> None:
         type=output,
         default="examples",
         metavar="FOLDER",
-        help="the folder (default: examples)",
+        help="folder to write (default: examples)",
     )
     parser.set_defaults(run=run)
 

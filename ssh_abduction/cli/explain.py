@@ -25,9 +25,9 @@ EXIT_NO_MAP, EXIT_UNKNOWN = 20, 30
 def add_parser(verbs: Verbs) -> None:
     text = (
         "Explain why two steps of a trace are one dstate in every map, or different dstates "
-        "in every map, and name the axioms that force it. If maps differ in this, report "
-        "which maps have it which way, and what each way costs. Without steps, explain why "
-        "the trace has no map, and which single observation could be wrong."
+        "in every map, and name the axioms that force it. If maps differ in this, report which "
+        "maps have one dstate and which have two, and the cost of either. Without steps, explain "
+        "why the trace has no map, and which single observation could be wrong."
     )
     parser = verbs.add_parser(
         "explain",
@@ -41,7 +41,7 @@ def add_parser(verbs: Verbs) -> None:
         type=int,
         default=(),
         metavar="step",
-        help="two steps, counted from 0; leave them out to learn why there is no map",
+        help="the numbers of two steps, from 0; leave them out to learn why there is no map",
     )
     parser.add_argument(
         "-n",
@@ -66,7 +66,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     add_theory(parser)
     parser.epilog = (
-        "Exit codes: 0 explained; 20 the trace has no map; 30 not found out in time; 1, 2, 130 "
+        "Exit codes: 0 explained; 20 the trace has no map; 30 no explanation in time; 1, 2, 130 "
         "and 143 as for the other verbs."
     )
     parser.set_defaults(run=run)

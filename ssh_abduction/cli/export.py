@@ -25,7 +25,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "maps", help="output of solve --json, or one saved map; - for standard input"
     )
-    parser.add_argument("--to", required=True, choices=FORMATS, help="the format")
+    parser.add_argument("--to", required=True, choices=FORMATS, help="the format to write")
     parser.add_argument(
         "--map",
         default="1",
@@ -36,24 +36,32 @@ def add_parser(verbs: Verbs) -> None:
         "--level",
         choices=("places", "dstates"),
         help=(
-            "what a node stands for (default: places for nav2 and tmap2 if the map has places, "
-            "else dstates)"
+            "what a node is: a place or a dstate (default: places for nav2 and tmap2 if the map "
+            "has places, else dstates)"
         ),
     )
     parser.add_argument(
         "--trace",
         metavar="TRACE",
-        help=("the trace that was mapped; its turns help to lay out a map without poses"),
+        help=("the trace that was mapped; its turns give a better layout of a map without poses"),
     )
     parser.add_argument(
         "-o",
         "--output",
         default="-",
         metavar="FILE",
-        help="the file to write (default: standard output)",
+        help="file to write (default: standard output)",
     )
-    parser.add_setting("name", "the name of the map (default: ssh-abduction)", "ssh-abduction")
-    parser.add_setting("frame", "the coordinate frame of the positions (default: map)", "map")
+    parser.add_setting(
+        "name",
+        "the name of the map in nav2 and tmap2 files (default: ssh-abduction)",
+        "ssh-abduction",
+    )
+    parser.add_setting(
+        "frame",
+        "the name of the coordinate frame in nav2 and tmap2 files (default: map)",
+        "map",
+    )
     parser.set_defaults(run=run)
     parser.epilog = (
         "Positions are in metres from the first dstate if the map has poses. Otherwise they "

@@ -13,7 +13,10 @@ from ssh_abduction.theory.settle import settle
 
 
 def add_parser(verbs: Verbs) -> None:
-    text = "Print a trace and a theory as facts for the encodings, with the command that runs them."
+    text = (
+        "Print a trace and a theory as facts for clingo, with the command that solves them with "
+        "the encodings of this package."
+    )
     parser = verbs.add_parser("facts", help="print a trace as .lp facts", description=text)
     parser.add_argument("trace", help="trace file (JSON Lines), or - for standard input")
     add_theory(parser)

@@ -38,7 +38,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "log",
         help=(
-            "CARMEN log, g2o-style log with scans, ROS 1 bag, ROS 2 bag or MCAP; may be "
+            "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
             "compressed by gzip, bzip2, xz or zstd"
         ),
     )
@@ -58,8 +58,8 @@ def add_reading(parser: Parser) -> None:
         type=partial(_told, "fov"),
         metavar="DEGREES",
         help=(
-            "the angle that the laser's beams cover; negative for a laser mounted upside down "
-            "(default: from the log, else 180)"
+            "the angle from the first to the last beam of the laser; negative for a laser mounted "
+            "upside down (default: from the log, else 180)"
         ),
     )
     group.add_argument(
@@ -73,7 +73,7 @@ def add_reading(parser: Parser) -> None:
     )
     parser.add_setting(
         "scan_topic",
-        "topic of the scans, if a bag has several; repeat it to read several lasers at once",
+        "topic of the scans, if a bag has several; may be given again to read several lasers",
         metavar="TOPIC",
         many=True,
     )
@@ -90,8 +90,8 @@ def add_reading(parser: Parser) -> None:
     parser.add_setting(
         "no_return",
         (
-            "ranges of at least this mean that the beam hit nothing (default: the laser's maximum "
-            "range, or a shorter range that often repeats and is no wall)"
+            "a range of at least this length means that the beam hit nothing (default: the "
+            "laser's maximum range, or a shorter range that often repeats and is no wall)"
         ),
         type=partial(_told, "no_return"),
         metavar="METRES",
@@ -105,10 +105,16 @@ def add_reading(parser: Parser) -> None:
         ),
         choices=MEANINGS,
     )
-    parser.add_setting("gateway", "the minimum width of a gateway", type=metres, metavar="METRES")
+    parser.add_setting(
+        "gateway",
+        "the minimum width of a gateway, a way out of a place (default: chosen by the log)",
+        type=metres,
+        metavar="METRES",
+    )
     parser.add_setting(
         "radius",
-        "how far from the centre of a place a way out must lead",
+        "the minimum distance that a way out leads from the centre of a place (default: chosen by "
+        "the log)",
         type=metres,
         metavar="METRES",
     )

@@ -25,10 +25,10 @@ HEAD = ("", "minimal maps", "dstates", "places", "paths", "the true one", "accur
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Solve a trace by its views alone, then add one kind of evidence on each rung: stars, "
-        "pairs of steps that displacements tell apart, sets of two returns, planarity. "
-        "Reports the number and the size of the minimal maps on each rung, and which of them "
-        "is true, if the trace has truth."
+        "Solve a trace several times, to show what each kind of evidence is worth. Begin with "
+        "views alone, then add one kind at a time: stars, pairs of steps that displacements "
+        "distinguish, sets of two returns, planarity. Each time, called a rung, report the number "
+        "and the size of the minimal maps; and, if the trace has truth, which map is true."
     )
     parser = verbs.add_parser(
         "ladder", help="what is each kind of evidence worth?", description=text

@@ -46,23 +46,23 @@ def add_parser(verbs: Verbs) -> None:
         ),
     )
     parser.add_argument(
-        "--map", type=int, metavar="I", help="take the I-th map, from 1 (default: the first)"
+        "--map", type=int, metavar="I", help="the number of the map, from 1 (default: 1)"
     )
     parser.add_argument(
         "--trace",
         metavar="TRACE",
-        help="the trace that was mapped; probabilities are estimated from its steps",
+        help="the trace that was mapped, to estimate probabilities by counting its steps",
     )
     parser.add_argument(
         "--recogniser",
         metavar="FILE.skops",
-        help="recogniser that train wrote for this map; uses images instead of views",
+        help="recogniser that train wrote for this map, to use images instead of views",
     )
     said = {
-        "misread": "the robot sees a view or star of another dstate",
-        "slipped": "the action fails, or the robot is kidnapped",
-        "unmapped": "a robot of unknown position is outside the map",
-        "reentered": "a robot outside the map is back on it after its next action",
+        "misread": "the robot sees a view or star of another dstate (default: 0.01)",
+        "slipped": "the action fails, or the robot is kidnapped (default: 0.01)",
+        "unmapped": "a robot of unknown position is outside the map (default: 0.1)",
+        "reentered": "a robot outside the map is back on it after its next action (default: 0.1)",
     }
     for name in CHANCES:
         parser.add_setting(
@@ -73,7 +73,8 @@ def add_parser(verbs: Verbs) -> None:
         )
     parser.add_setting(
         "zero_one",
-        "whether to set all these probabilities to 0, so that the map holds without exception",
+        "whether the map holds without exception: the defaults of misread, slipped and unmapped "
+        "are then 0, and that of reentered is 1 (default: false)",
         default=False,
         type=true_or_false,
         metavar="true|false",

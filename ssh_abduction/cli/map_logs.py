@@ -13,8 +13,8 @@ def add_parser(verbs: Verbs) -> None:
     text = (
         "Find the minimal maps of a building from a robot's log. Writes trace.jsonl, "
         "maps.json, page.html, report.html and run.json into a folder. With several logs, "
-        "each gets its own folder, and its result is one line. Logs that are mapped already "
-        "are skipped."
+        "each gets its own folder, and its result is one line. Logs that are already mapped with "
+        "the same settings are skipped."
     )
     parser = verbs.add_parser("map", help="map a building from a robot's log", description=text)
     parser.add_argument(
@@ -22,7 +22,7 @@ def add_parser(verbs: Verbs) -> None:
         nargs="+",
         metavar="log",
         help=(
-            "CARMEN log, g2o-style log with scans, ROS 1 bag, ROS 2 bag or MCAP; may be "
+            "a CARMEN log, a g2o-style log with scans, a ROS 1 bag, a ROS 2 bag or MCAP; may be "
             "compressed by gzip, bzip2, xz or zstd"
         ),
     )
@@ -47,7 +47,7 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         metavar="S",
         help=(
-            "seconds for finding minimal maps (default: reading and mapping together take a "
+            "seconds for finding minimal maps (default: import and mapping together take a "
             "twentieth of the time that the robot drove, but this part gets at least 5)"
         ),
     )
@@ -59,7 +59,7 @@ def add_parser(verbs: Verbs) -> None:
         metavar="true|false",
     )
     parser.add_argument(
-        "--again", action="store_true", help="map logs again that are mapped already"
+        "--again", action="store_true", help="also map logs that are already mapped"
     )
     many = parser.add_argument_group("many logs")
     many.add_argument(
@@ -77,8 +77,8 @@ def add_parser(verbs: Verbs) -> None:
     add_theory(
         parser,
         default=(
-            "topological; without stars and sides where doors are the places, where walls do not "
-            "meet at right angles, and where no map fits the stars"
+            "topological; without stars and sides if doors are the places, if walls do not meet "
+            "at right angles, or if no map fits the stars"
         ),
     )
     parser.set_defaults(run=run)

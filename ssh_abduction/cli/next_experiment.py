@@ -35,11 +35,11 @@ def add_parser(verbs: Verbs) -> None:
     text = (
         "Find the fewest actions, from where the robot is now, after which two maps predict "
         "different views. For more maps, find a plan that depends on what the robot sees. If "
-        "known links cannot tell the maps apart, find the untried action that tells most, and "
-        "the way to it."
+        "known links cannot distinguish the maps, find the untried action that distinguishes "
+        "most of them, and the way to it."
     )
     parser = verbs.add_parser(
-        "next", help="what should the robot do to tell these maps apart?", description=text
+        "next", help="what should the robot do to distinguish these maps?", description=text
     )
     parser.add_argument(
         "maps",

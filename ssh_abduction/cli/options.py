@@ -40,8 +40,8 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
         "--theory",
         metavar="PRESET|FILE",
         help=(
-            f"{', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file of maps, to "
-            f"use their theory (default: {default})"
+            f"a preset: {', '.join(PRESETS)}; or a .toml file with fields of a theory; or a file "
+            f"of maps, to use their theory (default: {default})"
         ),
     )
     group.add_argument("--star", choices=CHOICES["star"], help=said["star"])
@@ -52,8 +52,8 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
         action="append",
         metavar="FILE",
         help=(
-            "add a file of your own rules, written with the predicates of the encodings; may be "
-            "given again"
+            "add a file of your own rules for clingo, written with the predicates of the "
+            "encodings; may be given again"
         ),
     )
     for name, text in (
@@ -65,7 +65,7 @@ def add_theory(parser: Parser, default: str = "topological") -> None:
             f"--{name}",
             action="append",
             metavar="I,J",
-            help=f"say that steps I and J {text}; may be given again",
+            help=f"assume that steps I and J {text}; may be given again",
         )
     for field in fields(Theory):
         if field.name in FLAGS or field.name in SETTLED:

@@ -28,16 +28,25 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "experiment", choices=("notched-rectangle", "taylor-hall"), help="the experiment"
     )
-    parser.add_argument("--seeds", default="0-19", help="seeds, as 0-19 or 1,5,7 (default: 0-19)")
+    parser.add_argument(
+        "--seeds", default="0-19", help="random seeds, such as 0-19 or 1,5,7 (default: 0-19)"
+    )
     parser.add_argument(
         "--json",
         action="store_true",
-        help="print each claim, the paper's figure and ours by seed, as JSON",
+        help="print each claim, with the paper's value and ours for each seed, as JSON",
     )
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default: 2)")
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=2,
+        metavar="N",
+        help="the number of processes; -1 for one per core (default: 2)",
+    )
     parser.add_setting(
         "outcomes",
-        "whether to map the outcomes over notch and spread (default: true)",
+        "for notched-rectangle, whether to try other depths of the notch and other spreads of the "
+        "robot's poses, too (default: true)",
         True,
         type=true_or_false,
         metavar="true|false",

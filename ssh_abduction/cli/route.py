@@ -24,8 +24,8 @@ def add_parser(verbs: Verbs) -> None:
         dest="start",
         metavar="A",
         help=(
-            "start: the number of a dstate, or a place such as p3 (default: the robot's last "
-            "dstate)"
+            "start: the number of a dstate, or a place such as p3, which means any dstate there "
+            "(default: the robot's last dstate)"
         ),
     )
     parser.add_argument(
@@ -43,8 +43,8 @@ def add_parser(verbs: Verbs) -> None:
         help="dstates, and places such as p3, that the route must not visit",
     )
     by = (
-        "what to minimise: actions or metres, over links that were driven before; or places, "
-        "along the paths of the map, even where nobody drove (default: actions)"
+        "what to minimise: actions or metres, by moves that the robot did before; or places, by "
+        "all moves along the paths of the map, even if the robot never did them (default: actions)"
     )
     parser.add_argument("--by", choices=("actions", "places", "metres"), default="actions", help=by)
     parser.add_argument(

@@ -20,7 +20,7 @@ def add_parser(verbs: Verbs) -> None:
         "--map",
         type=int,
         metavar="I",
-        help="show only the I-th map, from 1 (default: all)",
+        help="show only the map with this number, from 1 (default: all)",
     )
     parser.set_defaults(run=run)
 

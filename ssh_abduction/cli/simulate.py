@@ -38,17 +38,17 @@ SHARE: dict[str, Any] = {"type": float, "metavar": "SHARE"}
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Drive a robot through a world. Logs an image, an action and the odometry at each "
-        "dstate; run cluster on the result to get views. With --format, logs scans and "
-        "odometry all along the way, like a real robot, and writes the true places to a file "
-        "beside the log."
+        "Drive a robot through a world, and write a trace with an image, an action and the "
+        "odometry at each dstate. Run cluster on the trace to get views. With --format, write a "
+        "log of scans and odometry all along the way, as of a real robot, and a file with the "
+        "truth beside it."
     )
     parser = verbs.add_parser("simulate", help="drive a robot through a world", description=text)
     parser.add_argument(
         "world",
         help=(
-            f"{', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or a floor "
-            "plan (.xml)"
+            f"the world: {', '.join(SHIPPED)}, a world file (.json), an occupancy map (.yaml), or "
+            "a floor plan (.xml)"
         ),
     )
     parser.add_argument(
@@ -67,13 +67,15 @@ def add_parser(verbs: Verbs) -> None:
         metavar="N",
         help="drive the route N times (default: 1)",
     )
-    parser.add_argument("--seed", type=seed, default=0, help="seed of all noise (default: 0)")
+    parser.add_argument(
+        "--seed", type=seed, default=0, help="random seed of all noise (default: 0)"
+    )
     parser.add_argument(
         "--route",
         metavar="ACTIONS",
         help=(
-            "drive this route instead of the world's: travel, right, left and around, separated "
-            "by commas"
+            "drive this route instead of the world's own: actions (travel, right, left, around) "
+            "separated by commas"
         ),
     )
     parser.add_argument(
@@ -86,27 +88,39 @@ def add_parser(verbs: Verbs) -> None:
         ),
     )
     for name, text, default, details in (
-        ("stars", "whether to log the openings at each place", True, FLAG),
+        ("stars", "whether to log the openings seen at each place (default: true)", True, FLAG),
         (
             "every",
-            "log an image each so many metres, not at dstates; a scan with --format (default: "
-            "0.25)",
+            "metres from one image to the next, to log images all along the way instead of at "
+            "dstates; with --format, metres from one scan to the next (default: 0.25)",
             None,
             METRES,
         ),
-        ("start", "another start than the world's", None, {"metavar": "X,Y,DEGREES"}),
-        ("reach", "how far from a wall the robot follows it", None, METRES),
+        (
+            "start",
+            "start here instead of at the world's own start: metres, metres, and degrees "
+            "counterclockwise from x",
+            None,
+            {"metavar": "X,Y,DEGREES"},
+        ),
+        ("reach", "the distance from a wall at which the robot follows it", None, METRES),
         (
             "odometry_noise",
             "standard deviation of the odometry, as a share of each motion (default: 0.02); with "
-            "--format metres after one metre, the rest in proportion (default: 0.05)",
+            "--format, standard deviation after one metre, to which other errors are proportional "
+            "(default: 0.05)",
             None,
             SHARE,
         ),
-        ("scale_error", "all ways are reported longer by this share (default: 0)", 0.0, SHARE),
+        (
+            "scale_error",
+            "the odometry reports distances that are too long by this share (default: 0)",
+            0.0,
+            SHARE,
+        ),
         (
             "bend_error",
-            "drift of the heading, in degrees a metre (default: 0)",
+            "drift of the reported heading to the left, in degrees per metre (default: 0)",
             0.0,
             {"type": float, "metavar": "DEGREES"},
         ),
@@ -119,13 +133,14 @@ def add_parser(verbs: Verbs) -> None:
         ),
         (
             "paint_seed",
-            "seed of the textures (default: 0)",
+            "random seed of the textures in panoramas (default: 0)",
             None,
             {"type": seed, "metavar": "SEED"},
         ),
         (
             "hours",
-            "hours of the day at which the drive begins and ends (default: 12,12)",
+            "hours of the day at which the drive begins and ends, which decide the light in "
+            "panoramas (default: 12,12)",
             None,
             {"metavar": "FROM,TO"},
         ),

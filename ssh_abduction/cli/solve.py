@@ -71,8 +71,8 @@ def add_parser(verbs: Verbs) -> None:
         help="list at most K maps; 0 for all (default: 100)",
     )
     more = (
-        "also list maps with up to K dstates more than the minimum; of each number of "
-        "dstates, only the best maps (default: 0)"
+        "also list maps with up to K dstates more than the minimum; for each number of dstates, "
+        "only the best maps (default: 0)"
     )
     parser.add_argument("--within", type=int, default=0, metavar="K", help=more)
     parser.add_argument(
@@ -81,8 +81,9 @@ def add_parser(verbs: Verbs) -> None:
         help="print the solution as JSON; for many traces, one line each",
     )
     front = (
-        "report the fewest dstates for 0 to K faults, and the knee, by the causal theory; "
-        "with --misread or --slipped, only faults of these kinds"
+        "report the fewest dstates of a map with at most 0, 1, … K faults (steps treated as "
+        "wrong), by the causal theory; with --misread or --slipped, only faults of these kinds. "
+        "The knee is the number of faults after which further ones save much fewer dstates"
     )
     parser.add_argument("--front", type=int, metavar="K", help=front)
     parser.add_argument(
@@ -100,16 +101,16 @@ def add_parser(verbs: Verbs) -> None:
     many = parser.add_argument_group(
         "many traces",
         (
-            "With several traces, or with one of these options, each result is a line, in the "
-            "order of the traces. An error is printed on the line of its trace, and the other "
-            "traces go on. The exit code is 1 if there was an error, else the highest code of the "
+            "With several traces, or with one of these options, each result is one line, in the "
+            "order of the traces. If a trace fails, its line says why, and the others are still "
+            "solved. The exit code is 1 if there was an error, else the highest code of the "
             "traces. Limits hold for each trace. The memory is that of the whole process: it "
             "includes other threads of a Dask worker and, except on Linux, earlier traces."
         ),
     )
     jobs = (
         "solve N traces at a time, each in its own process; -1 for one per core (default: 1; "
-        "with --scheduler, as many as its workers can)"
+        "with --scheduler, two per core of its workers)"
     )
     many.add_argument("--jobs", type=int, metavar="N", help=jobs)
     many.add_argument(

@@ -25,17 +25,19 @@ from ssh_abduction.data.trace import Trace
 
 def add_parser(verbs: Verbs) -> None:
     text = (
-        "Train a nearest-neighbour recogniser on the labels that a map gives to the images of a "
-        "trace."
+        "Train a nearest-neighbour recogniser on the images of a trace. The label of an image is "
+        "its dstate in a map."
     )
-    train = verbs.add_parser("train", help="train a recogniser on a map's labels", description=text)
+    train = verbs.add_parser(
+        "train", help="train a recogniser on the labels of a map", description=text
+    )
     train.add_argument(
         "-o", "--output", type=output, required=True, metavar="FILE.skops", help="file to write"
     )
     train.set_defaults(run=run_train)
     text = (
-        "Compute the recognition rate for growing numbers of images, by 10-fold "
-        "cross-validation on the labels that a map gives."
+        "Compute the share of images that are recognised, for growing numbers of training images, "
+        "by cross-validation. The label of an image is its dstate in a map."
     )
     curve = verbs.add_parser(
         "learning-curve",
@@ -43,19 +45,19 @@ def add_parser(verbs: Verbs) -> None:
         description=text,
     )
     curve.add_setting(
-        "folds", "parts of the cross-validation (default: 10)", 10, type=int, metavar="N"
+        "folds", "number of folds of the cross-validation (default: 10)", 10, type=int, metavar="N"
     )
-    curve.add_argument("--seed", type=seed, default=0, help="seed of the folds (default: 0)")
+    curve.add_argument("--seed", type=seed, default=0, help="random seed of the folds (default: 0)")
     curve.add_argument("--plot", type=picture_file, metavar="PNG", help="draw the learning curve")
     curve.add_argument("--json", action="store_true", help="print JSON")
     curve.set_defaults(run=run_learning_curve)
     text = (
-        "Find the beams that differ between two dstates that look alike: by default, for each "
+        "Find the laser beams that distinguish two dstates that look alike, by default for each "
         "pair of dstates with the same view."
     )
     apart = verbs.add_parser(
         "tell-apart",
-        help="find the beams that tell apart dstates with the same view",
+        help="find the laser beams that distinguish dstates with the same view",
         description=text,
     )
     apart.add_argument(
@@ -68,31 +70,34 @@ def add_parser(verbs: Verbs) -> None:
         "--plot", type=picture_file, metavar="PNG", help="draw the beams over the scans"
     )
     apart.add_argument(
-        "--json", action="store_true", help="print the share of each beam, by method, as JSON"
+        "--json",
+        action="store_true",
+        help="print how much each beam helps, by each method, as JSON",
     )
     apart.set_defaults(run=run_tell_apart)
     for parser in (train, curve, apart):
-        parser.add_argument(
-            "maps", help="what solve --json printed for this trace, or one saved map"
-        )
+        parser.add_argument("maps", help="output of solve --json for this trace, or one saved map")
         parser.add_argument("trace", help="trace file with images")
         parser.add_argument(
             "--map",
             type=int,
             metavar="I",
-            help="take the I-th map, from 1 (default: the labels all maps agree on)",
+            help=(
+                "the number of the map that gives the labels, from 1 (default: use only labels on "
+                "which all maps agree)"
+            ),
         )
     text = (
-        "Find the dstate where each image of a trace was taken, or nowhere if the recogniser "
-        "does not know it."
+        "Find the dstate at which each image of a trace was taken, or nowhere if the image looks "
+        "like no dstate that the recogniser knows."
     )
     recognise = verbs.add_parser(
         "recognise", help="recognise dstates from images", description=text
     )
-    recognise.add_argument("recogniser", help="what train wrote")
+    recognise.add_argument("recogniser", help="file that train wrote")
     recognise.add_argument("trace", help="trace file with images")
     recognise.add_argument(
-        "--json", action="store_true", help="print the labels as a JSON list, null for nowhere"
+        "--json", action="store_true", help="print the dstates as a JSON list, null for nowhere"
     )
     recognise.set_defaults(run=run_recognise)
 

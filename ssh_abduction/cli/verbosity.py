@@ -27,7 +27,7 @@ def add_verbosity(parser: argparse.ArgumentParser) -> None:
         "--quiet",
         action="store_true",
         default=none,
-        help="no warnings and no progress on stderr, only errors",
+        help="print only errors on stderr, no warnings and no progress",
     )
     told.add_argument(
         "-v",

@@ -40,19 +40,19 @@ def add_parser(verbs: Verbs) -> None:
         "-o", "--output", metavar="FILE", help="write the page to this file and do not open it"
     )
     localised = (
-        "also replay this run, a trace, with the belief about the robot's position at each "
-        "step in each map. It may be TRACE itself. It is localised by its views, or by "
-        "--belief"
+        "the trace of a robot in the mapped world, to be replayed too, with a belief about where "
+        "the robot is at each step. It may be TRACE itself. Beliefs come from its views, or from "
+        "the file of --belief"
     )
     parser.add_argument("--run", dest="followed", metavar="RUN", help=localised)
     parser.add_argument(
         "--belief",
         metavar="FILE",
-        help="output of localise --json for the run of --run, or for TRACE",
+        help="output of localise --json for the trace of --run, or for TRACE",
     )
     serve = (
-        "serve the page, on this computer only, so that it can explain, and solve again with "
-        "assumptions; needs TRACE. Ctrl-C ends it"
+        "serve the page, on this computer only, so that it can explain pairs of steps and solve "
+        "again with assumptions; needs TRACE. Ctrl-C ends the server"
     )
     parser.add_argument("--serve", action="store_true", help=serve)
     parser.add_argument(
@@ -60,7 +60,7 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         default=30.0,
         metavar="S",
-        help="with --serve, the seconds for each answer (default: 30)",
+        help="with --serve, seconds for each answer (default: 30)",
     )
     parser.add_setting(
         "port",
@@ -78,8 +78,8 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.set_defaults(run=run)
     parser.epilog = (
-        "The page is one file that works without a network. Without --serve, it shows the "
-        "commands that answer its questions."
+        "The page is one file that works without a network. Without --serve, it shows commands "
+        "that answer its questions."
     )
 
 
