@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
             f"{options.maps}: maps: expected one to check, got none; see the status that solve "
             "printed, or check its bound (--bound)"
         )
-    # Once for all maps: counting returns takes long.
+    # Choose the values of `auto` once for all maps, because counting returns takes long.
     resolved = settle(trace, theory).theory
     broken = 0
     for i, ssh_map in enumerate(maps):

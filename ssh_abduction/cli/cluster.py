@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
         ).fit(images)
     except AbductionError as error:
         raise AbductionError(f"{options.trace}: {error}") from None
-    except ValueError as error:  # scikit-learn says why these images cannot be clustered
+    except ValueError as error:  # the message of scikit-learn says why it cannot cluster them
         raise AbductionError(
             f"{options.trace}: images: {error}; log more images, or others"
         ) from None
@@ -137,7 +137,7 @@ def doubts(trace: Trace) -> list[str]:
             if runner_up(trace)
             else None
         )
-    except AbductionError:  # the trace lacks what the theory needs: `solve` will say so
+    except AbductionError:  # the trace lacks what the theory needs; `solve` will report that
         return []
     return [found.sentence] if found else []
 

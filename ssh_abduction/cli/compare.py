@@ -57,7 +57,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from ssh_abduction.rivals.comparison import compare  # which loads numpy
+    from ssh_abduction.rivals.comparison import compare  # loads numpy
     from ssh_abduction.rivals.differences import difference
     from ssh_abduction.rivals.listing import Listing
 

@@ -90,7 +90,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    # Which load scipy.
+    # These are imported here because they load scipy.
     from ssh_abduction.evaluation import (
         Relations,
         Trajectory,

@@ -95,7 +95,7 @@ def answers_here(
     """
 
     def end() -> None:
-        if stop.is_set():  # Ctrl-C once more
+        if stop.is_set():  # this is the second Ctrl-C
             raise KeyboardInterrupt
         stop.set()
 

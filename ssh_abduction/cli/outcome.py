@@ -120,7 +120,7 @@ def warnings_of(search: Search, solution: Solution) -> list[str]:
     return [*solution.warnings, *_second_opinion(search, solution)]
 
 
-# The warnings of a search are needed twice, but computed once.
+# The warnings of a search are needed twice. They are kept here, to be computed only once.
 _second_opinions: WeakKeyDictionary[Search, list[str]] = WeakKeyDictionary()
 
 

@@ -153,7 +153,7 @@ def run(options: argparse.Namespace) -> int:
                 speedups=Speedups.without(options.without_speedups),
                 on_progress=on_progress,
             )
-            # Half of the output would be useless.
+            # Ctrl-C must not cut the output, as half of it would be useless.
             until_printed.enter_context(on_ctrl_c(search.interrupt))
             printed = (_Json if options.json else _Text)(search)
             guard = Guard(

@@ -196,7 +196,7 @@ def run_learning_curve(options: argparse.Namespace) -> int:
         ]
         print(table(["images", "recognised", "worst fold", "best fold"], rows))
     if options.plot:
-        sys.stdout.flush()  # a picture that fails loses nothing of this
+        sys.stdout.flush()  # print first, in case drawing fails
         from ssh_abduction.evaluation.paper.figures import draw_learning
 
         draw_learning(options.plot, {"map": curve})
@@ -283,7 +283,7 @@ def run_tell_apart(options: argparse.Namespace) -> int:
             )
         )
     if options.plot:
-        sys.stdout.flush()  # a picture that fails loses nothing of this
+        sys.stdout.flush()  # print first, in case drawing fails
         from ssh_abduction.evaluation.paper.figures import draw_telling
 
         draw_telling(options.plot, ranges, labels, found)

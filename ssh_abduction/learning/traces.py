@@ -57,7 +57,7 @@ class Traces:
 
     @cached_property
     def images(self) -> NDArray[np.float64]:
-        """The images of all steps, (n, d), each with d numbers.
+        """The images of all n steps, (n, d). Each image has d numbers.
 
         Raises:
             PerceptionError: A step has no image, or traces have images of different lengths.

@@ -19,7 +19,7 @@ class Abilities:
     def __init__(self) -> None:
         self.here: dict[str, Action] = {}
         self.ever: dict[str, Action] = {}
-        # By view and star, and by view alone.
+        # The names of actions by view and star, and by view alone.
         self._names: dict[tuple[object, object], set[str]] = {}
 
     def note(self, seen: Step, can: Collection[Action | str]) -> None:

@@ -91,7 +91,7 @@ class Drafts:
 
         Args:
             ssh_map: The map.
-            trace: The steps so far, of which the first ones are mapped.
+            trace: All steps so far.
         """
         if not self._may_sketch:
             return

@@ -283,7 +283,7 @@ class Explorer:
         )
         self._truths.append(seen.truth)
         self._abilities.note(seen, self._robot.can())
-        # New or fewer maps call for a new plan.
+        # Make a new plan if the maps changed.
         if self.mapper.searches > asked or self.mapper.solution.count != known:
             self._plan = []
             self._doubts.reopen()
@@ -383,13 +383,16 @@ class Explorer:
         return found
 
     def _doubting_plan(self, best: SSHMap) -> tuple[str, ...]:
-        """Find actions that distinguish a map from a rival without one of its returns.
+        """Find actions that test whether one of the returns of the minimal map is wrong.
+
+        A return is a pair of visits that the map has at one place. The actions distinguish the map
+        from the best map without this return.
 
         Args:
             best: The minimal map.
 
         Returns:
-            The actions; an empty tuple if no doubt is left that the robot can test.
+            The actions; empty if no doubt is left that the robot can test.
         """
         trace, theory, dstates = self.mapper.trace, self.mapper.theory, len(best.dstates)
         for doubt in self._doubts.open(best, trace):
@@ -399,7 +402,8 @@ class Explorer:
             experiment = self._experiment([best, rival])
             if experiment.actions:
                 return experiment.actions
-            # Either nothing distinguishes the two, or they are one map and differ in the past.
+            # Two groups: the maps differ, but nothing distinguishes them. One group: both are the
+            # same map and differ only in the past.
             if len(experiment.alike) > 1:
                 self._doubts.twins[doubt] = rival
             self._doubts.dispel(doubt, dstates)

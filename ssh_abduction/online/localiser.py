@@ -287,14 +287,14 @@ class Localiser:
         if (known := self._followed.get(key)) is not None:
             return known
         alike = 1.0
-        # The dstates that look like `before` and have a link for the action, as a distribution.
+        # A distribution over the dstates that look like `before` and have a link for the action.
         shares = np.zeros(self._number)
         shares[before.where] = before.ratio
         shares *= 1 - links.missing
         total = float(shares.sum())
         if total > TINY:
             shares /= total
-            # The effective number of dstates that the average is over (Kish 1965).
+            # The effective number of dstates in the average (Kish 1965).
             count = (1 - before.novel) / float(shares @ shares)
             follows = (
                 float((links.leads @ shares)[seen.where] @ seen.ratio)

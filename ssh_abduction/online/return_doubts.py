@@ -96,7 +96,7 @@ class ReturnDoubts:
         self._least[doubt] = dstates + self._margin + 1
 
     def reopen(self) -> None:
-        """Doubt the undecided returns and those with a twin again, as more was seen since."""
+        """Doubt all returns in `undecided` and `twins` again, because the robot has seen more."""
         for doubt in (*self.twins, *self.undecided):
             self._least.pop(doubt, None)
         self.undecided, self.twins = set(), {}

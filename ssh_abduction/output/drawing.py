@@ -75,8 +75,8 @@ def text(
     """Make a label that is centred at a point.
 
     Args:
-        x: The centre.
-        y: The centre.
+        x: The x coordinate of the centre.
+        y: The y coordinate of the centre.
         label: The plain text.
         colour: The colour of the text.
         size: The font size.
@@ -101,8 +101,8 @@ def fault_mark(x: float, y: float, title: str, size: float = 1.0) -> str:
     """Make a red diamond with an exclamation mark, which shows a fault of a map.
 
     Args:
-        x: The centre.
-        y: The centre.
+        x: The x coordinate of the centre.
+        y: The y coordinate of the centre.
         title: The text that browsers show under the pointer.
         size: A factor for the size; 1 is 16 units across.
     """

@@ -30,15 +30,15 @@ from ssh_abduction.output.drawing import (
 )
 from ssh_abduction.output.layout import travelled
 
-# In units of the page: the distance of the two nearest places, unless the other limits forbid it;
-# the largest usual distance of a place from its nearest; and the largest size of the whole map.
+# In units of the page. NEAREST is the distance of the two nearest places, if the limits allow it.
+# APART limits the median distance of a place from the nearest one, LARGEST the size of the map.
 NEAREST, APART, LARGEST = 110.0, 240.0, 1600.0
-# In units of the page, if there is room: the radius of the dot of a place, and how far from its
-# middle the arrow of a dstate begins and ends.
+# In units of the page, if there is room: the radius of the dot of a place, and the distances from
+# its centre at which the arrow of a dstate begins and ends.
 DOT, BEGIN, END = 4.5, 8.0, 27.0
 MARGIN = 24.0
-SMALLEST = 0.6  # the size of marks if places are near each other
-WIDEST = LARGEST / 4  # half axes of ellipses that are drawn: larger ones would fill the page
+SMALLEST = 0.6  # the least factor for the size of marks, if places are near each other
+WIDEST = LARGEST / 4  # the largest half axis of an ellipse; a larger one would fill the page
 DEVIATIONS = 2.0  # the half axes of ellipses, in standard deviations
 # In a map without places, dstates nearer than this share of the longest link are drawn as if the
 # robot only turned between them.

@@ -30,11 +30,11 @@ from ssh_abduction.output.layout import Layout, layout, located, travelled
 from ssh_abduction.output.metric_picture import metric_svg
 from ssh_abduction.output.turns import Turns, degrees_of
 
-# In units of the page: between neighbouring places, from the middle of a place to the name of a
-# dstate, and from the line of a path to the marks of its dstates.
+# Distances in units of the page. SPACING is between neighbouring places, DSTATE from the centre of
+# a place to the name of a dstate, LANE from the line of a path to the marks of its dstates.
 SPACING, DSTATE, LANE = 130.0, 38.0, 9.0
-# Characters of a view below a dstate. Of a longer view the end is shown, as long names often begin
-# alike.
+# The largest number of characters of a view below a dstate. A longer view is cut at the beginning,
+# because long names often begin alike.
 LONGEST_LABEL = 20
 
 

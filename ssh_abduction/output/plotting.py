@@ -13,8 +13,9 @@ from ssh_abduction.output.drawing import ALARM, COLOURS
 from ssh_abduction.output.layout import Layout, layout, travelled
 from ssh_abduction.output.turns import Turns
 
-# Inches between neighbouring places. As shares of the distance of the two nearest places: how far
-# the mark of a dstate is ahead of its place, and beside the line of its path.
+# APART is the number of inches between neighbouring places. AHEAD and LANE are shares of the
+# distance of the two nearest places: the mark of a dstate is AHEAD of its place, and LANE beside
+# the line of its path.
 APART, AHEAD, LANE = 0.9, 0.27, 0.07
 
 

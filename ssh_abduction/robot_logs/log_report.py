@@ -27,7 +27,7 @@ from ssh_abduction.solver import Solution, Status
 Array = NDArray[np.float64]
 Point = tuple[float, float]
 
-# The picture has one point of a wall in each square of this many metres.
+# The picture has at most one point of a wall in each square with sides of this many metres.
 GRAIN = 0.2
 # A metre has this many units of the page, or fewer, so that the picture is at most LARGEST wide.
 METRE, LARGEST = 14.0, 1500.0
@@ -231,7 +231,7 @@ def _walls(log: RobotLog, poses: Sequence[Pose]) -> Array:
 
 
 def _ladder(rungs: Sequence[Rung]) -> str:
-    """Make the table of the ladder, with a row for each rung."""
+    """Make the table of the ladder. Each rung is a row, with one more kind of evidence."""
     rows = []
     for rung in rungs:
         cost = rung.solution.cost
