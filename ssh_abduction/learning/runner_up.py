@@ -29,7 +29,7 @@ class RunnerUpWarning(UserWarning):
 
 @dataclass(frozen=True)
 class SecondMap:
-    """The result for the runner-up's views, where it differs from that for the chosen views.
+    """The result for the second best number of views (the runner-up), if it is another map.
 
     Attributes:
         views: Number of chosen views.
@@ -147,7 +147,11 @@ def second_map(
 def warn_of_second_map(
     trace: Trace, maps: Sequence[SSHMap], theory: Theory | None, limit: float | None
 ) -> SecondMap | None:
-    """Issue a RunnerUpWarning if the runner-up's views give another map. Return `second_map`."""
+    """Issue a RunnerUpWarning if the second best number of views gives another map.
+
+    Returns:
+        The result of `second_map`: None if there is nothing to warn of.
+    """
     found = second_map(trace, maps, theory, limit)
     if found:
         warnings.warn(found.sentence, RunnerUpWarning, stacklevel=3)

@@ -74,7 +74,7 @@ def solved(
 
 
 class BackgroundSolve(BackgroundTask[Solved]):
-    """A background task that solves a trace in another process, for at most MEANWHILE seconds.
+    """A background task that solves a trace in another process, for at most 60 seconds.
 
     Args:
         trace: The steps so far.

@@ -127,7 +127,7 @@ class Belief:
 
     @property
     def lost(self) -> bool:
-        """Whether a belief collapsed and the robot has not been found again since.
+        """Whether a belief collapsed (see `collapsed`) and the robot was not found again since.
 
         The robot is found again if one dstate has a probability of at least 0.9, or if the entropy
         is about as low as before the collapse. The second condition is for maps with dstates that

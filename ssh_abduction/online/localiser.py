@@ -138,7 +138,8 @@ class Localiser:
 
         Args:
             view: The view, for a localiser without a recogniser.
-            image: The d ranges of the laser in metres, (d,), for a localiser with a recogniser.
+            image: The image, (d,), for a localiser with a recogniser: laser ranges in metres, or
+                whatever it was trained on.
 
         Raises:
             TraceError: The view is malformed.
@@ -162,7 +163,8 @@ class Localiser:
             belief: The belief before the action.
             action: The action, or its name.
             view: The view after it, for a localiser without a recogniser.
-            image: The d ranges of the laser in metres, (d,), for a localiser with a recogniser.
+            image: The image after it, (d,), for a localiser with a recogniser: laser ranges in
+                metres, or whatever it was trained on.
 
         Raises:
             TraceError: The action or the view is malformed.
@@ -349,7 +351,7 @@ class Localiser:
         return products
 
     def _likelihood(self, recogniser: Any) -> ImageLikelihood:
-        """Make what computes the probabilities of images at the dstates that a recogniser knows.
+        """Make the object that computes how probable an image is at each dstate.
 
         Raises LocaliserError if a label of the recogniser is no dstate of the map.
         """

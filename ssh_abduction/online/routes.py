@@ -126,7 +126,7 @@ class Route:
 
     @property
     def is_known(self) -> bool:
-        """Whether the robot has done all of these moves before."""
+        """Whether the robot has done all moves of the route before."""
         return all(move.known for move in self.moves)
 
     @property
