@@ -3,8 +3,9 @@
     python benchmarks/ablation.py [--limit S] [--memory MIB] [--only PATTERN]
                                   [--out benchmarks/results/ablation.json]
 
-The table has the form of bench.py, with the solver without a speed-up in place of a peer. "without
-all" is the plain encoding of the axioms, with the whole trace at once.
+The table has the form of that of bench.py, but its columns are solvers without one speed-up instead
+of other programs. The column "without all" is the plain encoding of the axioms, which gets the
+whole trace at once.
 """
 
 from __future__ import annotations
@@ -59,7 +60,11 @@ USED = {
 
 
 def variants(instance: Instance) -> list[str]:
-    """The speed-ups to leave out, one at a time and all: those that the instance's theory uses."""
+    """List the runs of an instance: each without some speed-ups.
+
+    Returns:
+        First each speed-up that the theory of the instance uses; last all, separated by commas.
+    """
     theory = "causal" if instance.causal else "framed" if instance.name in FRAMED else "full"
     return [*(name for name in SPEEDUPS if name in USED[theory]), ",".join(SPEEDUPS)]
 

@@ -5,7 +5,8 @@
 
 A bad image shows a person in front of the laser, a person at its side, or random ranges
 (benchmarks/doubts.py). The solver has ten seconds for a map. It uses the default theory, with
-stars and displacements. The recogniser is tested on another drive: three circuits, no bad images.
+stars and displacements. The recogniser is tested on another drive, of three circuits without bad
+images.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class Unsure(BootstrapLearner):
 
 
 def learners() -> Iterator[tuple[str, BootstrapLearner]]:
-    """The learners that are compared, with their names: one row of the table each."""
+    """Yield the name and the learner of each row of the table."""
     by = {name: ViewClusterer(by=name, random_state=0) for name in ("M", "trimmed")}
     yield "no faults, M", BootstrapLearner(PLAIN, by["M"], time_limit=SECONDS)
     yield "no faults, trimmed M", BootstrapLearner(PLAIN, by["trimmed"], time_limit=SECONDS)
@@ -69,7 +70,16 @@ def learners() -> Iterator[tuple[str, BootstrapLearner]]:
 
 
 def with_bad_images(trace: Trace, kind: str, seed: int) -> tuple[Trace, NDArray[np.intp]]:
-    """The trace with one image in twenty made bad, and the indices of the bad images."""
+    """Copy a trace, with one image in twenty made bad.
+
+    Args:
+        trace: The trace.
+        kind: What is wrong with the bad images, one of KINDS.
+        seed: Seed of the random choices.
+
+    Returns:
+        The copy, and the indices of the bad images.
+    """
     images, bad = spoilt(
         images_of(trace), kind, round(SHARE * len(trace)), np.random.default_rng(seed)
     )
@@ -88,9 +98,9 @@ class Found:
     Attributes:
         right: Whether the map is the true one.
         said: Whether there was a warning, or no map.
-        named: Number of images without a view or called misread by the map.
-        hits: Number of the named images that are bad.
-        accuracy: Accuracy of the recogniser on images of another drive.
+        named: Number of images that have no view, or whose view the map treats as wrong.
+        hits: Number of those images that are really bad.
+        accuracy: Share of the images of another drive that the recogniser labels correctly.
     """
 
     right: bool
@@ -113,7 +123,7 @@ def found(learner: BootstrapLearner, trace: Trace, bad: NDArray[np.intp], other:
         np.flatnonzero(learner.views_ == NOISE).tolist()
     )
     said = any(issubclass(w.category, DOUBTS) for w in caught)
-    # A label stands for the true dstate that most of its images show.
+    # A label means the true dstate that most of its images show.
     meant = {label: _most(truth[labels == label]) for label in set(labels.tolist())}
     hit = [
         meant.get(int(label)) == name
@@ -135,7 +145,14 @@ def _most(names: NDArray[Any]) -> Any:
 
 
 def rows(world: str, tours: int, seeds: list[int], only: str) -> Iterator[str]:
-    """The table of one world, row by row."""
+    """Make the table of one world, line by line.
+
+    Args:
+        world: Name of the world.
+        tours: Number of circuits of a drive.
+        seeds: Seeds of the drives.
+        only: Text that the names of the learners must contain.
+    """
     yield (
         f"| {world}, {len(seeds)} drives of {tours} circuits | bad images | map right | "
         "wrong, and nothing said | precision | recall | 1-NN, relative: mean | least |"

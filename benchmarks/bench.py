@@ -99,8 +99,8 @@ def run(
     """Measure one tool on one trace, in a process of its own.
 
     Returns:
-        The cell: status, seconds by this clock, CPU seconds, peak MiB, states, and whether the
-        number of states is proven minimal.
+        A dict: status, reason of a failure, seconds by the clock ("wall" or "cpu"), CPU seconds,
+        peak MiB, number of dstates, and whether that number is proven minimal.
     """
     cell = {
         "instance": instance.name,
@@ -135,8 +135,8 @@ def run(
         process.returncode = os.waitstatus_to_exitcode(status)
     start = said[0] if said else {}
     cell |= {"images": start.get("images"), "true_dstates": start.get("true_dstates")}
-    # The first line says what the trace is, the second one is the result. Without a second line
-    # the process was ended by its time limit, or it crashed.
+    # The process prints a line about the trace, then a line with the result. If the second line is
+    # missing, the process was ended by its time limit, or it crashed.
     if len(said) == 2:
         return {**cell, **said[1]}
     peak = usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
@@ -151,7 +151,7 @@ def run(
 
 
 def store(results: dict[str, Any], path: Path) -> None:
-    """Write the results as JSON, with one cell on each line."""
+    """Write the results as JSON, with one cell of the table on each line."""
     head, cells = (
         {k: v for k, v in results.items() if k != "cells"},
         ",\n".join(json.dumps(cell) for cell in results["cells"]),
@@ -163,7 +163,7 @@ def store(results: dict[str, Any], path: Path) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """Describe the machine of the measurements without its name."""
+    """Describe this machine without its name: processor, cores, MiB of memory, system, Python."""
     details = Path("/proc/cpuinfo")
     named = re.search(r"model name\s*: (.*)", details.read_text()) if details.exists() else None
     return {
@@ -176,7 +176,7 @@ def machine() -> dict[str, Any]:
 
 
 def packages() -> dict[str, str]:
-    """The versions of the measured packages."""
+    """Return the version of each measured package that is installed, by name."""
     found = {}
     for name in dict.fromkeys(
         [OURS, "clingo", *(package for peer in PEERS.values() for package in peer.packages)]

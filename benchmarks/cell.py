@@ -2,14 +2,15 @@
 
     python benchmarks/cell.py TOOL INSTANCE SEED SECONDS MIB [CLOCK]
 
-TOOL is a peer, ssh-abduction, or "ssh-abduction without" and names of speed-ups, separated by
-commas. Users cannot switch `following` off: here it leaves out the guesses at the beginning of a
-long causal trace, which are followed along the rest. CLOCK is wall, or cpu: then seconds and
-limits are CPU seconds of this process.
+TOOL is another program (a peer), ssh-abduction, or "ssh-abduction without" and names of speed-ups,
+separated by commas. `following` is a name for this script only, and no speed-up that users can
+switch off. Without it, the solver does not guess maps of the beginning of a long causal trace, to
+follow them along the rest. CLOCK is wall, or cpu: then seconds and limits are CPU seconds of this
+process.
 
 A first line is printed when the clock starts, and a second line with the result. A signal ends the
 process when its time is over. Loading programs, making the trace and checking the answer do not
-count. The checker checks a map; a peer's machine is run along the trace.
+count. A map is checked by the checker, and a peer's machine by running it along the trace.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ from ssh_abduction.solver.asp import limits
 from ssh_abduction.solver.asp.limits import peak_memory
 from ssh_abduction.theory import Speedups
 
-AROUND = 300  # seconds for everything that the clock does not count
-MARGIN = 0.1  # share of its limit that our solver has on top, to hand over its answer
+AROUND = 300  # seconds for what the clock does not count, before and after
+MARGIN = 0.1  # share of the limit that our solver gets in addition, to return its answer
 SHARE = 0.8  # share of the memory that is our solver's own limit, for the same reason
 
 
@@ -111,7 +112,7 @@ def main() -> None:
 
 
 def of_solution(solution: Solution, trace: Trace, theory: Theory) -> dict[str, Any]:
-    """The result of our solver: status, bound and times, after the checker has tested its maps."""
+    """Check the maps of our solver, and return its result: status, dstates, bound and times."""
     wrong = [
         violation.message
         for ssh_map in solution.maps
@@ -134,7 +135,13 @@ def of_solution(solution: Solution, trace: Trace, theory: Theory) -> dict[str, A
 
 
 def of_machine(machine: Machine, trace: Trace, proven: bool) -> dict[str, Any]:
-    """The result of a peer: its machine, if it shows the views of the trace."""
+    """Check that a peer's machine shows the views of the trace, and return its result.
+
+    Args:
+        machine: The machine.
+        trace: The trace.
+        proven: Whether the peer proves that its machine is minimal.
+    """
     states = machine.states(trace)
     if states is None:
         return {"status": "wrong", "reason": "the machine does not show the views of the trace"}
@@ -142,7 +149,7 @@ def of_machine(machine: Machine, trace: Trace, proven: bool) -> dict[str, Any]:
 
 
 def all_but(names: str) -> Speedups:
-    """All speed-ups except these."""
+    """Return all speed-ups except those named, separated by commas."""
     off = names.split(",")
     if "following" in off:
         off.remove("following")
@@ -152,7 +159,7 @@ def all_but(names: str) -> Speedups:
 
 
 def cpu_seconds() -> float:
-    """CPU seconds of this process with its threads, and of the child processes it waited for."""
+    """Return the CPU seconds of this process, and of the child processes that it waited for."""
     return sum(
         used.ru_utime + used.ru_stime
         for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
@@ -160,7 +167,7 @@ def cpu_seconds() -> float:
 
 
 def end_after(seconds: float, timer: int = signal.ITIMER_REAL) -> None:
-    """Let the system end this process after these seconds of a timer; 0 switches it off."""
+    """Let the system end this process after some seconds of a timer; 0 switches the timer off."""
     signal.setitimer(timer, seconds)
 
 

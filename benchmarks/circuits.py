@@ -2,8 +2,9 @@
 
     python benchmarks/circuits.py
 
-Solves two to 5,000 circuits, and short traces also without prefixes. Times are medians of three
-runs on this machine. Compare the ratios, not the seconds.
+The script solves traces of two to 5,000 circuits. Short traces are also solved as a whole, without
+solving growing prefixes. Times are medians of three runs on this machine. Compare the ratios, not
+the seconds.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ AT_ONCE = 48  # images; solving longer traces without prefixes takes too long
 
 
 def circuits(steps: int) -> Trace:
-    """The notched rectangle driven round, with so many images."""
+    """Make a trace of circuits of the notched rectangle with `steps` images."""
     return Trace.from_steps(
         [f"v{i % 4}" for i in range(steps)], [("right", "travel")[i % 2] for i in range(steps - 1)]
     )
 
 
 def median(trace: Trace, theory: Theory, prefixes: bool = True) -> float:
-    """The median time of three solves, in seconds."""
+    """Solve a trace three times, and return the median time in seconds."""
     seconds = []
     for _ in range(3):
         began = time.perf_counter()

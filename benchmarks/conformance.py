@@ -2,10 +2,10 @@
 
     python benchmarks/conformance.py [CHECKOUT]
 
-The traces are those with known results (tests/test_tables.py). Times are CPU milliseconds: the
-minimum of five runs of each trace in one process. With a second checkout, two processes take
-turns trace by trace, so that other load affects both alike. The ratio of one trace is noisy, so
-the deciles of all ratios are printed.
+The traces are those with known results (tests/test_tables.py). The time of a trace is the minimum
+of five runs in one process, in CPU milliseconds. With a second checkout, two processes take turns
+trace by trace, so that other load affects both alike. The ratio of one trace is noisy, so the
+deciles of all ratios are printed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ RUNS = 5
 
 
 def cases() -> list[tuple[Trace, Theory]]:
-    """The traces and theories of the tables, and ten parts of the notched rectangle."""
+    """List the traces and theories of the tests: small traces, and parts of a notched rectangle."""
     sys.path.insert(0, str(ROOT / "tests"))
     import test_tables as tables
 
@@ -44,7 +44,7 @@ def cases() -> list[tuple[Trace, Theory]]:
 
 
 def milliseconds(trace: Trace, theory: Theory) -> float:
-    """The CPU milliseconds of the fastest of five solves."""
+    """Find all minimal maps five times, and return the least CPU milliseconds."""
     taken = []
     for _ in range(RUNS):
         began = time.process_time()
@@ -54,7 +54,7 @@ def milliseconds(trace: Trace, theory: Theory) -> float:
 
 
 def answer() -> None:
-    """Serve one process: read a trace file and a theory from each line, print the milliseconds."""
+    """Serve another process: for each input line with a trace file and a theory, print the time."""
     for line in sys.stdin:
         path, theory = json.loads(line)
         print(milliseconds(Trace.load(path), Theory.from_dict(theory)), flush=True)

@@ -4,9 +4,10 @@
                                 [--page docs/measurements/reproduction.md]
     python benchmarks/doubts.py --tolerances      # spread of poses and k by the tolerance
 
-This makes the table of docs/measurements/reproduction.md. Each row is the notched rectangle with
-one change: the size of the room, the notch, the noise, single scans instead of medians of nine, or
-images that show somebody. The map is solved from the views alone, in at most two seconds.
+The script makes the table of docs/measurements/reproduction.md. M and trimmed M measure how well
+views separate images (`perception.quality`). Each row is the notched rectangle with one change: the
+size of the room, the notch, the noise, single scans instead of medians of nine, or images that show
+a person. The map is solved from the views alone, in at most two seconds.
 """
 
 from __future__ import annotations
@@ -51,9 +52,11 @@ class Case:
     """A row of the table.
 
     Attributes:
+        name: Name of the row.
+        world: The world.
         noise: Standard deviation of a range, in metres.
-        single: Whether images are single scans, with their lost beams.
-        bad: What stands in front of the laser in some images, and the number of these images.
+        single: Whether images are single scans, in which some beams are lost.
+        bad: What is wrong with some images, and the number of these images.
     """
 
     name: str
@@ -79,7 +82,7 @@ def cases() -> Iterator[Case]:
 
 
 def room(times: float) -> World:
-    """The notched rectangle enlarged by a factor; the notch keeps its size."""
+    """Enlarge the notched rectangle by a factor; the notch keeps its size."""
     walls = WORLD.segments.copy()
     walls[walls > 0] *= times
     x, y = 4 * times - 0.6, 2 * times - 0.6
@@ -97,7 +100,7 @@ def room(times: float) -> World:
 
 
 def corner(side: float) -> World:
-    """A rectangle without a square at one corner."""
+    """Make a rectangle in which a square is cut off at one corner; its side is in metres."""
     points = np.array([[0, 0], [4 - side, 0], [4 - side, side], [4, side], [4, 2], [0, 2]])
     return replace(WORLD, segments=np.hstack([points, np.roll(points, -1, axis=0)]))
 
@@ -105,7 +108,17 @@ def corner(side: float) -> World:
 def spoilt(
     images: NDArray[np.float64], kind: str, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """The images with some of them made bad, and the indices of the bad ones."""
+    """Copy images, and make some of them bad.
+
+    Args:
+        images: (n, 180) metres.
+        kind: "person in front", "person at the side", or "random image".
+        count: Number of bad images.
+        rng: Source of random choices.
+
+    Returns:
+        The copy, and the indices of the bad images.
+    """
     images, which = images.copy(), rng.choice(len(images), count, replace=False)
     for i in which:
         if kind == "random image":
@@ -119,7 +132,7 @@ def spoilt(
 
 
 def driven(case: Case, tours: int, seed: int) -> tuple[Trace, NDArray[np.intp]]:
-    """A trace with its images, and the indices of the bad images."""
+    """Simulate a drive. Return its trace with images, and the indices of the bad images."""
     laser, rng = Laser(noise=case.noise), np.random.default_rng(seed)
     trace = simulate(case.world, tours, seed, laser=laser)
     images = images_of(trace)
@@ -140,9 +153,10 @@ class Found:
 
     Attributes:
         k: Number of views.
-        right: Whether the map is true.
-        mended: Whether it is true after the doubtful images got the right views.
-        said: Whether there was a warning.
+        right: Whether the map is the true one.
+        mended: Whether the map is the true one if the images that a warning names get the right
+            views.
+        said: Whether there was a warning, or no map.
     """
 
     k: int
@@ -152,7 +166,12 @@ class Found:
 
 
 def found(trace: Trace, by: str) -> Found:
-    """Cluster the images of a trace by one criterion, solve the map, and judge it."""
+    """Cluster the images of a trace, solve the map, and compare it with the truth.
+
+    Args:
+        trace: The trace.
+        by: Criterion for the number of views: "M" or "trimmed".
+    """
     truth = true_dstates(trace)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -194,7 +213,7 @@ def _mended(
 
 
 def rows(seeds: list[int], tours: int) -> Iterator[str]:
-    """The table, row by row."""
+    """Make the table, line by line."""
     yield (
         "| the notched rectangle, but | k by M | map right | wrong, and nothing said | "
         "right, and doubted | k by trimmed M | map right | with doubtful images mended |"
@@ -219,11 +238,11 @@ def rows(seeds: list[int], tours: int) -> Iterator[str]:
 
 
 def tolerances(seeds: list[int], tours: int) -> Iterator[str]:
-    """Measure each tolerance of hill-climbing, at which the robot stops.
+    """Make a table of tolerances of hill-climbing, which are the errors with which the robot stops.
 
     Yields:
-        Rows with the root mean square distance of positions from the mean of their dstate, and
-        the k chosen by M.
+        The head, and a row for each tolerance: the root mean square distance of positions from the
+        mean of their dstate in millimetres, and the number of views chosen by M.
     """
     usual = Tolerance()
     yield "| tolerance | spread, mm | k by M |"

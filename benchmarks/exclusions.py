@@ -2,9 +2,10 @@
 
     python benchmarks/exclusions.py [--cells 6] [--steps 400] [--apart 3] [--seeds 5] [--limit S]
 
-Each maze with stars is solved twice in one run: without and with exclusions. Excluded are all
-pairs of steps whose true cells are more than --apart cells from each other. The last column is
-the time without exclusions divided by the time with them.
+Each maze with stars is solved twice in one run: without and with exclusions. An exclusion is a pair
+of steps that cannot be at one place. Here, all pairs are excluded whose true cells are more than
+--apart cells from each other. The last column is the time without exclusions divided by the time
+with them.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ from ssh_abduction import Solution, Theory, solve
 
 
 def far(walk: Walk, apart: int) -> list[tuple[int, int]]:
-    """The pairs of steps at cells further apart than `apart` (Manhattan distance)."""
+    """List the pairs of steps whose cells are more than `apart` cells from each other.
+
+    The distance is the Manhattan distance.
+    """
     cells = [(state[0], state[1]) for state in walk.truth if isinstance(state, tuple)]
     pairs = combinations(range(len(cells)), 2)
     return [
@@ -31,7 +35,7 @@ def far(walk: Walk, apart: int) -> list[tuple[int, int]]:
 
 
 def timed(walk: Walk, theory: Theory, limit: float) -> tuple[float, Solution]:
-    """Find one minimal map. Returns the seconds it took and the solution."""
+    """Find one minimal map; return the seconds that it took, and the solution."""
     began = time.perf_counter()
     solution = solve(walk.trace, theory, max_maps=1, time_limit=limit)
     return time.perf_counter() - began, solution

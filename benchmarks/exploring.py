@@ -4,24 +4,25 @@
     python benchmarks/exploring.py --family plans --only Borchen4,Sabadell1 --out results.jsonl
     python benchmarks/exploring.py --table results.jsonl [--plot docs/figures/exploring.png]
 
-All strategies begin in the same world at the same dstate. A robot *has the map* after some number
-of steps if all minimal maps of these steps have the true dstates, and the true places if the
-theory has places, and if the robot has done every travel. Maps that differ only in paths count as
-one. For the walks the number is searched afterwards: solve growing prefixes from the step at which
-everything was visited, then halve the interval. The explorer also says itself when it is done.
+All strategies begin in the same world at the same dstate. A robot *has the map* after a number of
+steps if it has done every travel, and if all minimal maps of these steps have the true dstates and,
+if the theory has places, the true places. Maps that differ only in paths count as one. The number
+is searched after the drive: growing prefixes are solved, beginning with the step at which
+everything was visited, and then the interval is halved. The explorer also says itself when it is
+done.
 
     explorer  Explorer of ssh_abduction/online/explorer.py.
     random    Any action that the robot can do, drawn uniformly.
     rule      Mazes: look around at each place, then follow the wall to the right.
               Plans: the drive of simulator/plan_tours.py, which knows where the robot is and
               goes through the door that it passed least often.
-    hW        AALpy's learner without resets. Its oracle knows the truth and costs only the steps
-              of a shortest counterexample. An impossible action costs nothing. So hW does better
-              here than it could in reality. It sees views, with stars on plans, and it learns all
+    hW        AALpy's learner without resets. Its oracle knows the truth, and only the steps of a
+              shortest counterexample are counted. An impossible action costs nothing. So hW does
+              better here than it could in reality. It sees views and stars, and it learns all
               links. It is done when its machine predicts the same as the world.
 
-The table also has the length of the shortest walk that sees and does everything, as a driver who
-knew the world would choose it.
+The table also has the length of the shortest walk that sees and does everything, which a driver
+could choose who knows the world.
 
 Theories: topological with stars for mazes; causal with stars compared by tolerance for plans.
 """
@@ -57,7 +58,14 @@ Record = dict[str, Any]
 
 
 class World(Protocol):
-    """A world for a robot to drive in. Its states are the true dstates."""
+    """A world for a robot to drive in. Its states are the true dstates.
+
+    Attributes:
+        name: Name of the world.
+        theory: Theory of the maps.
+        margin: The `margin` of `Explorer` in this world.
+        start: State in which a robot begins.
+    """
 
     name: str
     theory: Theory
@@ -71,7 +79,7 @@ class World(Protocol):
     def place(self, state: Any) -> Hashable: ...
 
     def rule(self) -> Iterator[Action]:
-        """A drive by a fixed rule."""
+        """Yield the actions of a drive by a fixed rule, without end."""
 
 
 class Maze:
@@ -106,7 +114,7 @@ class Maze:
         return state[:2]
 
     def rule(self) -> Iterator[Action]:
-        """Look around at each place, then follow the wall to the right."""
+        """Yield the actions of a drive: look around at each place, then follow the right wall."""
         state = self.start
         while True:
             yield from [MOVES["right"]] * 4
@@ -119,7 +127,7 @@ class Maze:
 
 
 def ahead(state: tuple[int, int, int], turn: int) -> tuple[int, int]:
-    """The cell that the robot faces after it has turned by this many quarter turns."""
+    """Return the cell that the robot would face after some quarter turns clockwise."""
     dx, dy = HEADINGS[(state[2] + turn) % 4]
     return state[0] + dx, state[1] + dy
 
@@ -138,9 +146,9 @@ class Building:
         return state.room
 
     def rule(self) -> Iterator[Action]:
-        """Travel through the door of the room that was passed least often.
+        """Yield the actions of a drive: leave each room by the door that was passed least often.
 
-        The robot takes the door behind it only where there is no other.
+        The robot goes back through the same door only if the room has no other.
         """
         state, passed, came_by = self.start, dict[int, int](), -1
         while True:
@@ -158,7 +166,7 @@ class Building:
 
 @dataclass
 class Driven:
-    """A robot in a world, with everything that it did and saw."""
+    """A robot in a world, with everything that it did and saw. The explorer can drive it."""
 
     world: World
 
@@ -178,7 +186,7 @@ class Driven:
         self.truth.append(self.world.ends(self.truth[-1])[action])
 
     def trace(self, actions: int) -> Trace:
-        """The trace of the first actions."""
+        """Make the trace of the first `actions` actions."""
         seen = [self.world.sight(state) for state in self.truth[: actions + 1]]
         return Trace.from_steps(
             [step.view for step in seen], self.done[:actions], stars=[step.star for step in seen]
@@ -186,7 +194,7 @@ class Driven:
 
 
 def states_of(world: World) -> dict[Any, dict[Action, Any]]:
-    """All dstates, and for each the dstates that its actions lead to."""
+    """Return a dict from each dstate of a world to its actions and where they lead."""
     found: dict[Any, dict[Action, Any]] = {}
     left = [world.start]
     while left:
@@ -198,14 +206,17 @@ def states_of(world: World) -> dict[Any, dict[Action, Any]]:
 
 
 def everything(ends: dict[Any, dict[Action, Any]]) -> set[Any]:
-    """What the robot has to see and do: all dstates and all travels."""
+    """Return the set of what a robot has to see and do: all dstates and all travels.
+
+    A travel is a pair of a dstate and the name of the action.
+    """
     return {*ends} | {
         (state, action.name) for state in ends for action in ends[state] if action.kind == "travel"
     }
 
 
 def shortest(world: World) -> int:
-    """The length of a shortest walk through all dstates and travels, if the world is known."""
+    """Compute the number of actions of the shortest walk through all dstates and travels."""
     ends = states_of(world)
     number = {state: n for n, state in enumerate(ends)}
     moves = [
@@ -222,7 +233,7 @@ def shortest(world: World) -> int:
 
 
 def covered_after(robot: Driven) -> int | None:
-    """The number of actions until all dstates were visited and all travels done; None if never."""
+    """Count the actions until all dstates were visited and all travels done; None if never."""
     ends = states_of(robot.world)
     missing = everything(ends) - {robot.truth[0]}
     for t, action in enumerate(robot.done, 1):
@@ -233,7 +244,13 @@ def covered_after(robot: Driven) -> int | None:
 
 
 def has_map(robot: Driven, actions: int, limit: float) -> bool:
-    """Whether the minimal maps of the first actions are true and differ only in paths."""
+    """Check whether the minimal maps of the first actions are true, and differ only in paths.
+
+    Args:
+        robot: The robot, with what it did and saw.
+        actions: Number of actions.
+        limit: Seconds for the solve.
+    """
     trace = robot.trace(actions)
     truth = tuple(robot.truth[: actions + 1])
     known = Known("", trace, truth, tuple(map(robot.world.place, truth)))
@@ -246,7 +263,12 @@ def has_map(robot: Driven, actions: int, limit: float) -> bool:
 
 
 def steps_to_map(robot: Driven, limit: float) -> int | None:
-    """The number of actions after which the robot had the map; None if it never had it."""
+    """Find the number of actions after which the robot had the map; None if it never had it.
+
+    Args:
+        robot: The robot, with what it did and saw.
+        limit: Seconds for each solve.
+    """
     low = covered_after(robot)
     if low is None:
         return None
@@ -274,10 +296,14 @@ def explorer(
     Args:
         world: The world to explore.
         seed: Not used; all strategies have the same arguments.
-        most: Stop after this many actions.
+        most: Largest number of actions.
         limit: Seconds for a solve.
-        seconds: Stop after this much CPU time.
-        judged: Stop as soon as the robot has the true map.
+        seconds: Largest number of CPU seconds.
+        judged: Whether to stop as soon as the robot has the true map.
+
+    Returns:
+        Results by name: steps until the robot had the map, actions, CPU seconds; and how the
+        explorer ended, if it did.
     """
     robot, missing = Driven(world), everything(states_of(world))
     found = Explorer(robot, world.theory, margin=world.margin, time_limit=limit)
@@ -317,7 +343,11 @@ def rule(world: World, seed: int, most: int, limit: float) -> Record:
 
 
 def walked(robot: Driven, actions: Iterator[Action], limit: float) -> Record:
-    """Do these actions, and stop some time after everything was visited."""
+    """Do the actions, and stop some time after everything was visited.
+
+    Returns:
+        Results by name: steps until the robot had the map, actions, and seconds.
+    """
     began = time.perf_counter()
     missing = everything(states_of(robot.world))
     after = 0
@@ -335,7 +365,7 @@ def walked(robot: Driven, actions: Iterator[Action], limit: float) -> Record:
 
 
 def learnt(world: World, seed: int, most: int, limit: float) -> Record:
-    """Run AALpy's hW."""
+    """Run hW, the learner of AALpy. Arguments are those of `explorer`."""
     from aalpy import SUL, hWOracle, run_hW
 
     ends, chance = states_of(world), random.getstate()
@@ -405,7 +435,7 @@ def learnt(world: World, seed: int, most: int, limit: float) -> Record:
 
 
 class TooLongError(Exception):
-    """The run is given up, as it has done too many steps."""
+    """A run was stopped because it took too many steps."""
 
 
 RUN: dict[str, Callable[..., Record]] = {
@@ -432,10 +462,10 @@ def worlds(options: argparse.Namespace) -> Iterator[tuple[World, int]]:
 
 
 def table(records: Sequence[Record]) -> str:
-    """Markdown with a row for each world, and the medians.
+    """Make a table in Markdown, with a row for each world and one for the medians.
 
-    A row has the steps until each robot has the map, and when the explorer stops. That column is
-    empty where the explorer was not driven to its end.
+    A row has the number of steps until each robot has the map, and the number after which the
+    explorer stops. That column is empty if the explorer was stopped before its end.
     """
     names = [*dict.fromkeys(record["world"] for record in records)]
     by = {(record["world"], record["strategy"]): record for record in records}
@@ -504,7 +534,7 @@ def _number(steps: float) -> str:
 
 
 def plot(records: Sequence[Record], file: Path) -> None:
-    """Draw a dot for each run and a line for each world."""
+    """Draw the steps until a robot has the map: a dot for each run, and a line for each world."""
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -37,8 +37,9 @@ class Case:
     """A walk whose trace has faults.
 
     Attributes:
+        walk: The trace, and the true states.
         wrong: Steps with a wrong view.
-        jumps: Steps whose action jumped.
+        jumps: Steps whose action jumped, which means that it led to another state than usual.
         misseen: Steps with a wrong star.
     """
 
@@ -60,9 +61,12 @@ class Case:
 
 @dataclass(frozen=True)
 class Family:
-    """Cases of one kind, made from seeds, and the theory to solve them under.
+    """Cases of one kind.
 
-    Optional families are measured only if they are asked for.
+    Attributes:
+        make: Makes a case from a seed.
+        theory: Theory to solve the cases under.
+        optional: Whether the family is measured only if it is asked for.
     """
 
     make: Callable[[int], Case]
@@ -72,7 +76,13 @@ class Family:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Labels of the steps, the fewest faults they need, and their cost in tenths of dstates."""
+    """An explanation of a trace.
+
+    Attributes:
+        labels: Label of the dstate of each step.
+        faults: The fewest faults that the labels need: steps with their kind of fault.
+        tenths: Cost of dstates and faults, in tenths of a dstate.
+    """
 
     labels: tuple[Hashable, ...]
     faults: Faults
@@ -80,10 +90,10 @@ class Explanation:
 
     @classmethod
     def of(cls, trace: Trace, labels: Sequence[Hashable]) -> Explanation:
-        """The causal map of these labels, with its faults.
+        """Make the explanation with these labels under the causal theory.
 
-        A dstate shows its most frequent view. An action leads to its most frequent end. All else
-        are faults.
+        A dstate shows its most frequent view, and an action leads to its most frequent end. All
+        other views and ends are faults.
         """
         shows, leads = _read_off(trace, labels)
         misread = {
@@ -107,9 +117,9 @@ class Explanation:
 
 
 def is_true(labels: Sequence[Hashable], faults: Faults, case: Case) -> bool:
-    """Whether labels and faults are the true ones.
+    """Check whether labels and faults are the true ones.
 
-    Labels are compared up to renaming. Steps with a wrong view are left out.
+    Labels are compared up to renaming. Labels of steps with a wrong view are not compared.
     """
     kept = [t for t in range(len(labels)) if t not in case.wrong]
     return faults == case.faults and partition([labels[t] for t in kept]) == partition(
@@ -132,10 +142,10 @@ def _read_off(
 
 
 def refined(trace: Trace, labels: Sequence[Hashable]) -> Explanation:
-    """The best explanation near these labels.
+    """Improve labels to a cheaper explanation.
 
-    Read the map off the labels, give the steps the labels with the fewest faults in that map, and
-    repeat while the cost falls. Remove rarely visited dstates where that is cheaper.
+    Read the map off the labels, and give the steps the labels that need the fewest faults in that
+    map. Also try the map without each of its rarely visited dstates. Repeat while the cost falls.
     """
     best = Explanation.of(trace, labels)
     while True:
@@ -160,7 +170,13 @@ def refined(trace: Trace, labels: Sequence[Hashable]) -> Explanation:
 def _laid_over(
     trace: Trace, shows: dict[Hashable, object], leads: dict[tuple[Hashable, str], Hashable]
 ) -> list[Hashable]:
-    """The labels with the fewest faults that a map gives to the steps of a trace (Viterbi 1967)."""
+    """The labels of the steps of a trace with the fewest faults in a map (Viterbi 1967).
+
+    Args:
+        trace: The trace.
+        shows: View of each dstate of the map.
+        leads: Dstate that each action leads to, by dstate and name of the action.
+    """
     names = list(shows)
     number = {s: i for i, s in enumerate(names)}
     seen = {
@@ -183,7 +199,7 @@ def _laid_over(
 
 
 def misread(walk: Walk, wrong: int, seed: int) -> Case:
-    """The walk with wrong views: another view of the trace at `wrong` of its steps."""
+    """Give a walk wrong views: at `wrong` of its steps, another view of the trace."""
     chance = random.Random(f"misread {seed}")
     steps = tuple(sorted(chance.sample(range(MARGIN, len(walk.trace) - MARGIN), wrong)))
     seen, views = list(walk.trace.views), sorted(set(walk.trace.views), key=str)
@@ -193,7 +209,10 @@ def misread(walk: Walk, wrong: int, seed: int) -> Case:
 
 
 def machine(seed: int, *, jumps: bool) -> Case:
-    """A random machine of 5 to 12 states and 4 to 9 views, with 1 or 2 faults in 200 steps."""
+    """Make a walk of 200 steps in a random machine of 5 to 12 states and 4 to 9 views.
+
+    It has 1 or 2 faults: jumps, or else wrong views.
+    """
     chance = random.Random(f"size {seed}")
     states = chance.randint(5, 12)
     views, faults = chance.randint(4, min(9, states)), chance.randint(1, 2)
@@ -211,11 +230,17 @@ def sized(
 
 
 def rectangle_of_five(seed: int, *, steps: int, wrong: int = 0, jumps: int = 0) -> Case:
-    """Circuits of a notched rectangle whose eight states show five views.
+    """Make circuits of a notched rectangle whose eight states show five views.
 
-    Opposite corners look alike, but one of them shows the notch before the turn. The actions are
-    right and travel in turn. Where an action jumps, the robot is two states further on or back: a
-    jump by half a circuit would not show until the notch is due.
+    Opposite corners look alike, except that one shows the notch before the turn. The actions
+    alternate between right and travel. An action that jumps leads two states too far or two states
+    back. A jump by half a circuit would not be visible until the notch is missing.
+
+    Args:
+        seed: Seed of the faults.
+        steps: Number of actions.
+        wrong: Number of wrong views.
+        jumps: Number of jumps.
     """
     chance = random.Random(f"rectangle {seed}")
     jumped = tuple(sorted(chance.sample(range(MARGIN, steps - MARGIN), jumps)))
@@ -230,14 +255,18 @@ def rectangle_of_five(seed: int, *, steps: int, wrong: int = 0, jumps: int = 0) 
 
 
 def left_out(walk: Walk, chance: random.Random) -> tuple[Walk, int]:
-    """The walk without one of its steps, as after a doubled action; and the step that jumps."""
+    """Leave out a random step of a walk, as if an action had been done twice.
+
+    Returns:
+        The walk without the step, and the index of the step whose action now jumps.
+    """
     t = chance.randrange(MARGIN, len(walk.trace) - MARGIN)
     steps = (*walk.trace.steps[:t], *walk.trace.steps[t + 1 :])
     return Walk(replace(walk.trace, steps=steps), (*walk.truth[:t], *walk.truth[t + 1 :])), t - 1
 
 
 def star_turned(walk: Walk, steps: Iterable[int], chance: random.Random) -> Walk:
-    """The walk with wrong stars at these steps: one gateway is added or removed."""
+    """Give a walk wrong stars at some steps. One gateway of each star is added or removed."""
     changed = list(walk.trace.steps)
     for t in steps:
         openings = list(changed[t].openings or ())
@@ -248,7 +277,10 @@ def star_turned(walk: Walk, steps: Iterable[int], chance: random.Random) -> Walk
 
 
 def tour_of_taylor_hall(seed: int) -> Case:
-    """A drive of 240 images in Taylor Hall with a wrong view, a wrong star and a doubled action."""
+    """Make a drive in Taylor Hall of about 240 images, with one fault of each kind.
+
+    The faults are a wrong view, a wrong star, and an action that was done twice.
+    """
     chance = random.Random(f"taylor hall {seed}")
     walk, jumped = left_out(taylor_hall(seed), chance)
     case = misread(walk, 1, seed)
@@ -258,9 +290,12 @@ def tour_of_taylor_hall(seed: int) -> Case:
 
 
 def large_maze(seed: int, share: float) -> Case:
-    """A walk of 400 steps with stars and displacements in a maze of 6 x 6.
+    """Make a walk of 400 steps with stars and displacements in a maze of 6 x 6 cells.
 
-    `share` of the steps have a fault: one half wrong views, the other half wrong stars.
+    Args:
+        seed: Seed of the maze, the walk and the faults.
+        share: Share of the steps that have a fault. Half of the faults are wrong views, and half
+            are wrong stars.
     """
     chance = random.Random(f"large {seed}")
     walk = maze(6, 6, steps=400, seed=seed, stars=True, follow=True, odometry=NOISE)

@@ -1,9 +1,9 @@
 """Other programs that explain a trace with faults: functions from a case to labels of its steps.
 
-Each function gets a case and a limit in CPU seconds. It reads the trace, and only those parts of
-the truth that its docstring names. Dstates, links and faults are read off the labels in the same
-way for all programs (`Explanation`): a dstate shows its most frequent view, and what disagrees is
-a fault.
+Each function gets a case and a limit in CPU seconds. It reads the trace. It reads only those parts
+of the truth that its docstring names. Dstates, links and faults are derived from the labels in the
+same way for all programs (`Explanation`): a dstate shows its most frequent view, and other views
+are faults.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ssh_abduction import Trace
 
-NOISY = 10  # One minority observation weighs as much as this many merged states; see `merged`.
-LEAST = 10  # The least score of a merge.
+NOISY = 10  # An observation that is not the most frequent one costs this many merged states.
+LEAST = 10  # The smallest score of a merge.
 CLONES = (2, 3, 4, 6)  # The numbers of clones of a view that are tried; see `cloned`.
 RESTARTS = 5  # Random starts of EM for each number of clones, as EM finds local optima.
 ROUNDS = 200  # The most EM steps from each start.
@@ -32,7 +32,14 @@ PSEUDOCOUNT = 2e-3  # Added to all counts, as by George et al.
 
 @dataclass(frozen=True)
 class Peer:
-    """A program: its function, what it needs, and whether it proves that its faults are fewest."""
+    """A program.
+
+    Attributes:
+        explain: Function from a case and a limit in CPU seconds to an explanation.
+        modules: Modules that the function imports.
+        package: Package to install.
+        proves: Whether the program proves that no explanation has fewer faults.
+    """
 
     explain: Callable[[Case, float], Explanation]
     modules: tuple[str, ...]
@@ -45,13 +52,14 @@ class Peer:
 
 
 def maxsat(case: Case, seconds: float) -> Explanation:
-    """RC2 (Ignatiev, Morgado & Marques-Silva 2019) in python-sat.
+    """Explain a trace by MaxSAT: RC2 (Ignatiev, Morgado & Marques-Silva 2019) in python-sat.
 
-    It is given the number of states and the kind of the faults. Variables: step t is at state s;
-    action a leads from s to x; state s shows view v. Each is a function. If views may be wrong,
-    links are hard constraints, and a soft clause for each step makes the state show the view. If
-    actions may jump, views are hard and links soft. States are ordered by the views they show, to
-    break the symmetry of their names. RC2 proves that no machine of this size has fewer faults.
+    RC2 reads the true number of states and the true kinds of faults. The variables say that step t
+    is at state s, that action a leads from s to x, and that state s shows view v. Each of these is
+    a function. If views may be wrong, links are hard constraints, and a soft clause for each step
+    makes the state show the view. If actions may jump, views are hard and links soft. States are
+    ordered by the views that they show, to break the symmetry of their names. RC2 proves that no
+    machine of this size has fewer faults.
     """
     from pysat.examples.rc2 import RC2
     from pysat.formula import WCNF, IDPool
@@ -104,13 +112,14 @@ def maxsat(case: Case, seconds: float) -> Explanation:
 
 
 def merged(case: Case, seconds: float) -> Explanation:
-    """AALpy's general state merging, with a score that tolerates noise.
+    """Explain a trace by AALpy's general state merging, with a score that tolerates noise.
 
-    AALpy lets its users write a score. A merge scores one for each state it saves, as in
-    evidence-driven state merging. It loses NOISY for each observation that is not the most frequent
-    one after its action. States may have several outcomes of an action. Of the scores that were
-    tried on other seeds (AALpy's AIC, its Hoeffding bound, and NOISY of 3, 5, 10 and 20) this one
-    came nearest to the truth. Its machine is followed along the trace, and the labels are refined.
+    Users of AALpy can write a score. This score of a merge adds one for each state that the merge
+    saves, as in evidence-driven state merging. It subtracts NOISY for each observation that is not
+    the most frequent one after its action. States may have several outcomes of an action. Of the
+    scores that were tried on other seeds (AALpy's AIC, its Hoeffding bound, and NOISY of 3, 5, 10
+    and 20), this one came nearest to the truth. The machine is followed along the trace, and the
+    labels are refined.
     """
     from aalpy.learning_algs import run_GSM
     from aalpy.learning_algs.general_passive.DataHandler import CountDataHandler
@@ -153,13 +162,13 @@ def merged(case: Case, seconds: float) -> Explanation:
 
 
 def cloned(case: Case, seconds: float) -> Explanation:
-    """A cloned hidden Markov model (George et al. 2021), written from its equations.
+    """Explain a trace by a cloned hidden Markov model (George et al. 2021).
 
-    EM, then Viterbi training, then the most probable clones. Each view has the same number of
-    clones, and a clone always shows its view. The probabilities of the links between clones are
-    learned. A wrong view has a clone, too, so the labels are refined. The result is the cheapest
-    explanation over all numbers of clones and random starts. No start begins in the second half
-    of the time.
+    The model is written from the equations of the paper. Each view has the same number of clones,
+    and a clone always shows its view. The probabilities of the links between clones are learnt by
+    EM, then by Viterbi training. The most probable clones are the labels. A wrong view also has a
+    clone, so the labels are refined. The result is the cheapest explanation over all numbers of
+    clones and random starts. No start begins in the second half of the time.
     """
     trace = case.walk.trace
     explanations = []
@@ -174,9 +183,10 @@ def cloned(case: Case, seconds: float) -> Explanation:
 
 
 class Clones:
-    """The messages of a cloned hidden Markov model along one trace.
+    """A cloned hidden Markov model of one trace, with the same number of clones for each view.
 
-    Link probabilities have the shape (actions, views from, views to, clones from, clones to).
+    The probabilities of links have the shape (actions, views from, views to, clones from, clones
+    to).
     """
 
     def __init__(self, trace: Trace, clones: int) -> None:
@@ -190,7 +200,7 @@ class Clones:
         self.links = [actions[a.name] for a in trace.actions], self.seen[:-1], self.seen[1:]
 
     def trained(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Link probabilities by EM from a random start, then by Viterbi training."""
+        """Learn the probabilities of links by EM from a random start, then by Viterbi training."""
         chances = _normal(rng.random(self.shape))
         before = -np.inf
         for _ in range(ROUNDS):
@@ -209,7 +219,10 @@ class Clones:
         return chances
 
     def expected(self, chances: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-        """The expected counts of links (forward and backward messages), and the log-likelihood."""
+        """Compute the expected counts of links, and the log-likelihood of the trace.
+
+        Counts have the shape of the probabilities. They come from forward and backward messages.
+        """
         blocks = chances[self.links]
         ahead, behind = np.ones((2, len(self.seen), self.clones)) / self.clones
         likelihood = 0.0
@@ -226,7 +239,7 @@ class Clones:
         return counts, likelihood
 
     def labels(self, chances: NDArray[np.float64]) -> list[tuple[int, int]]:
-        """The most probable clones of all steps, each as its view and number."""
+        """Find the most probable clone of each step: its view and its number, both as indices."""
         blocks = np.log(chances)[self.links]
         spent, came = np.zeros(self.clones), []
         for block in blocks:
@@ -240,7 +253,7 @@ class Clones:
 
 
 def _normal(counts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The counts as probabilities of where an action leads."""
+    """Normalise counts of links to probabilities of where an action leads."""
     return counts / counts.sum(axis=(2, 4), keepdims=True)
 
 

@@ -4,13 +4,14 @@
                                 [--limit S] [--memory MIB] [--out RESULTS.jsonl]
     python benchmarks/faults.py --show RESULTS.jsonl
 
-fault_cases.py has the families. Optional families run only if --only matches them. A cell is one
-solver on one case, in its own process, which ends after its CPU seconds. Its result is a line of
-RESULTS.jsonl, and cells in that file are not repeated. The table is printed at the end. With
---show only the table of a stored run is printed.
+The families of cases are in fault_cases.py. Optional families run only if --only matches them. A
+cell is one solver on one case, in its own process, which is ended after its CPU seconds. Its result
+is a line of RESULTS.jsonl, and cells in that file are not repeated. The table is printed at the
+end. With --show, only the table of a stored run is printed.
 
-CPU seconds count until the answer is found, and proven if the solver proves it. ssh-abduction
-runs twice: without and with knowledge of which kinds of faults there are. RC2 always knows it.
+CPU seconds are counted until the answer is found and, if the solver proves answers, proven.
+ssh-abduction runs twice: without and with knowledge of which kinds of faults there are. RC2 always
+knows the kinds.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from ssh_abduction.solver.asp import limits
 
 OURS, TOLD = "ssh-abduction", "ssh-abduction, told the kind"
 SOLVERS = (OURS, TOLD, *PEERS)
-MARGIN = 2.0  # CPU seconds beyond its limit for our solver to hand over its answer.
+MARGIN = 2.0  # CPU seconds beyond its limit in which our solver may return its answer.
 LISTING = 10.0  # CPU seconds to list more optimal maps after the proof; they are not counted.
 PATIENCE = 10  # Wall-clock seconds for each CPU second, as the machine may be busy.
 AROUND = 120  # Wall-clock seconds to load programs and make the trace.
@@ -129,7 +130,18 @@ def main() -> None:
 
 
 def measured(name: str, solver: str, seed: int, limit: float, memory: int) -> Record:
-    """Run a solver on a case: status, CPU seconds, and what `judged` says of its answer."""
+    """Run a solver on a case, in a process of its own.
+
+    Args:
+        name: Name of the family.
+        solver: Name of the solver.
+        seed: Seed of the case.
+        limit: CPU seconds.
+        memory: Address space in MiB.
+
+    Returns:
+        The record of the cell: status, CPU seconds, and what `judged` returns for its answer.
+    """
     record = {"family": name, "solver": solver, "seed": seed, "limit": limit}
     if solver in PEERS and not PEERS[solver].installed:
         return {**record, "status": "not installed"}
@@ -157,7 +169,7 @@ def measured(name: str, solver: str, seed: int, limit: float, memory: int) -> Re
 
 
 def work(sender: Connection, name: str, solver: str, seed: int, limit: float, memory: int) -> None:
-    """Run a cell in its process: send the size of the case, then the result."""
+    """Run a cell in this process; send the size of the case, then the result, to another one."""
     for module in PEERS[solver].modules if solver in PEERS else ():
         importlib.import_module(module)
     case = FAMILIES[name].make(seed)
@@ -187,10 +199,10 @@ def work(sender: Connection, name: str, solver: str, seed: int, limit: float, me
 
 
 def search(sender: Connection, case: Case, theory: Theory, limit: float) -> None:
-    """Run our search.
+    """Run our search, and send its answer when it is proven.
 
-    Sends the answer when it is proven, and again when all optimal maps are listed. Listing has
-    LISTING more seconds.
+    The answer is sent again when all optimal maps are listed. Listing may take LISTING more CPU
+    seconds.
     """
     began, proven_at = cpu_seconds(), math.inf
 
@@ -218,14 +230,14 @@ def search(sender: Connection, case: Case, theory: Theory, limit: float) -> None
 
 
 def explained(ssh_map: SSHMap, tenths: int) -> Explanation:
-    """A map as an explanation."""
+    """Convert a map with its cost, in tenths of a dstate, to an explanation."""
     return Explanation(
         ssh_map.labels, frozenset((fault.step, fault.kind) for fault in ssh_map.faults), tenths
     )
 
 
 def theory_for(case: Case, theory: Theory, *, told: bool) -> Theory:
-    """The theory; if `told`, without the kinds of faults that the case lacks."""
+    """Return the theory; if `told`, one that allows only the kinds of faults of the case."""
     return (
         theory.replace(misread=PRICE if case.wrong else 0.0, slipped=PRICE if case.jumps else 0.0)
         if told
@@ -234,7 +246,16 @@ def theory_for(case: Case, theory: Theory, *, told: bool) -> Theory:
 
 
 def judged(case: Case, explanations: Sequence[Explanation], proven: bool) -> Record:
-    """Compare explanations, the first of which is the answer, with the truth."""
+    """Compare explanations with the truth.
+
+    Args:
+        case: The case.
+        explanations: The answer, and other explanations of the same cost.
+        proven: Whether the answer is proven minimal.
+
+    Returns:
+        Results by name; empty without an answer.
+    """
     if not explanations:
         return {}
     first = explanations[0]
@@ -252,9 +273,9 @@ def judged(case: Case, explanations: Sequence[Explanation], proven: bool) -> Rec
 
 
 def accuracy(labels: Sequence[int], truth: Sequence[Hashable]) -> float:
-    """The share of steps with the right label.
+    """Compute the share of steps with the right label.
 
-    Labels and true states are assigned one to one so that the share is largest (Kuhn 1955).
+    Labels are matched with true states one to one so that the share is largest (Kuhn 1955).
     """
     votes = Counter(zip(labels, truth, strict=True))
     names, states = list(dict.fromkeys(labels)), list(dict.fromkeys(truth))
@@ -264,14 +285,14 @@ def accuracy(labels: Sequence[int], truth: Sequence[Hashable]) -> float:
 
 
 def true_tenths(case: Case) -> int:
-    """The cost of the truth as an explanation: its states, and the faults these need."""
+    """Compute the cost of the true states and faults, in tenths of a dstate."""
     if case.misseen:
         return 10 * case.states + round(10 * PRICE) * len(case.faults)
     return Explanation.of(case.walk.trace, case.walk.truth).tenths
 
 
 def contradictions(records: Iterable[Record]) -> list[str]:
-    """Answers that are proven minimal but cost more than the truth."""
+    """Describe answers that are proven minimal but cost more than the truth; empty if none do."""
     return [
         f"{r['family']}, seed {r['seed']}: {r['solver']} proved {r['tenths'] / 10} to "
         f"be the least, the truth costs {r['true_tenths'] / 10}"
@@ -281,7 +302,7 @@ def contradictions(records: Iterable[Record]) -> list[str]:
 
 
 def table(records: Iterable[Record]) -> str:
-    """Markdown with a row for each family and solver."""
+    """Make a table in Markdown, with a row for each family and solver."""
     rows: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         rows.setdefault((record["family"], record["solver"]), []).append(record)
@@ -294,7 +315,7 @@ def table(records: Iterable[Record]) -> str:
 
 
 def cells(solver: str, records: Sequence[Record]) -> list[str]:
-    """The cells of a row, from the records of one solver."""
+    """Make the cells of a row of the table, from the records of one solver and family."""
     ran = [r for r in records if r["status"] in ("ok", "timeout", "error")]
     if not ran:
         return [records[0]["status"], *["–"] * (len(COLUMNS) - 3)]
@@ -329,7 +350,7 @@ def rivals(records: Iterable[Record]) -> str:
 
 
 def cheaper(records: Iterable[Record]) -> str:
-    """Markdown with the cases in which our answer costs less than the truth, and both costs."""
+    """Make a table in Markdown of the cases in which our answer costs less than the truth."""
     rows = [
         f"| {r['family']} | {r['seed']} | {'yes' if r['solver'] == TOLD else 'no'} | "
         f"{r['states']} + {r['named']} = {r['tenths'] / 10} | "
@@ -346,7 +367,7 @@ def cheaper(records: Iterable[Record]) -> str:
 
 
 def time_of(seconds: float, limit: float) -> str:
-    """Seconds as text, "> limit" if the time ran out."""
+    """Format seconds; "> limit" for infinite ones, which mean that the time ran out."""
     return f"{seconds:.2f}" if seconds < math.inf else f"> {limit:g}"
 
 

@@ -2,8 +2,9 @@
 
     python benchmarks/gateways.py [--seeds 3] [--limit S]
 
-Streets meet at any angles. A map is right if its dstates are the true ones. Bearings have errors
-of up to `noise` degrees. Seconds are CPU seconds.
+A star is the gateways seen at a place, with their bearings. Streets meet at any angles. A map is
+right if its dstates are the true ones. Bearings have errors of up to `noise` degrees. Seconds are
+CPU seconds.
 """
 
 from __future__ import annotations
@@ -19,7 +20,12 @@ from ssh_abduction import solve
 
 
 def cases(seed: int) -> list[tuple[str, nx.Graph, int, float, set[object]]]:
-    """For each world: name, graph, steps, noise in degrees, and the places that views reveal."""
+    """List the worlds.
+
+    Returns:
+        For each world: its name, its graph, the number of steps, the noise of bearings in degrees,
+        and the places that views reveal.
+    """
     rng = random.Random(seed)
     honeycomb = planar.honeycomb(1, 2)
     return [

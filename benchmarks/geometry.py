@@ -3,8 +3,8 @@
     python benchmarks/geometry.py [--cells 4 6] [--steps 40 150] [--seeds 10] [--first 200]
                                   [--limit 60] [--views]
 
-Geometry is the work of three parts: the evidence `displacement`, which refuses returns alone and
-together; the checker's own geometry; and the fit of the maps.
+Geometry is the work of three parts: the evidence `displacement`, which rejects single returns and
+sets of returns; the checker's own geometry; and the fit of the maps.
 """
 
 from __future__ import annotations
@@ -39,7 +39,11 @@ BEGINS = (
 
 @contextmanager
 def timed() -> Iterator[list[float]]:
-    """Measure the CPU seconds spent in geometry; they are added up in a list of one number."""
+    """Measure the CPU seconds spent in geometry during a `with` block.
+
+    Yields:
+        A list of one number, to which the seconds are added.
+    """
     spent, inside = [0.0], [False]
 
     def wrapped(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -65,7 +69,11 @@ def timed() -> Iterator[list[float]]:
 
 
 def measured(trace: Trace, theory: Theory, limit: float) -> tuple[float, float, bool]:
-    """CPU seconds, those of them in geometry, and whether the answer is proven."""
+    """Solve a trace.
+
+    Returns:
+        CPU seconds, the part of them that was spent in geometry, and whether the answer is proven.
+    """
     with timed() as spent:
         began = time.process_time()
         solution = solve(trace, theory, time_limit=limit)

@@ -8,10 +8,10 @@ Monte Carlo localisation with random particles (8.3), KLD sampling (8.3.7).
 Fox, Burgard & Thrun 1999, Markov localization for mobile robots in dynamic environments: a table
 of expected ranges that is made beforehand (4.1).
 
-A pose is a free cell and a heading. The belief is p(pose | all ranges and displacements so far).
-A displacement moves the belief and blurs it by its covariance and the size of the cells. An image
-weighs the belief by the beam model. With a small probability the robot was kidnapped and is
-anywhere.
+A pose is a free cell and a heading. The belief is p(pose | all ranges and displacements so far). A
+displacement moves the belief, and blurs it by the covariance of the displacement and the size of
+the cells. An image weighs the belief by the beam model. With a small probability, the robot was
+kidnapped (carried without notice) and is anywhere.
 """
 
 from __future__ import annotations
@@ -49,14 +49,15 @@ class BeamModel:
 
     Attributes:
         hit: Weight of the expected wall, with Gaussian noise.
-        short: Weight of nearer things such as persons: exponential up to the expected range.
-        lost: Weight of a beam that does not return; it reads as `reach`.
-        any: Weight of a uniform range.
+        short: Weight of nearer things such as persons, with an exponential density up to the
+            expected range.
+        lost: Weight of a beam that does not return; its range is `reach`.
+        any: Weight of a range that is uniform between 0 and `reach`.
         sigma: Standard deviation of `hit`, in metres.
-        rate: Rate of `short`, per metre.
-        reach: The longest range, in metres. Anything further away reads as this.
-        beams: Use one beam every so many degrees. The model takes beams as independent, but
-            neighbouring beams err together.
+        rate: Rate of the exponential density of `short`, per metre.
+        reach: The longest range, in metres. Anything farther away has this range.
+        beams: Degrees from each beam that is used to the next. The model assumes independent
+            beams, but neighbouring beams err together.
     """
 
     hit: float = 0.95
@@ -69,11 +70,14 @@ class BeamModel:
     beams: int = 10
 
     def log_likelihood(self, measured: float | Array, expected: Array) -> Array:
-        """Log density of ranges below `reach`, log probability of `reach` itself.
+        """Compute the log likelihood of ranges.
 
         Args:
-            measured: Ranges in metres.
-            expected: Ranges in metres, in a shape that broadcasts with `measured`.
+            measured: Measured ranges in metres.
+            expected: Expected ranges in metres, in a shape that broadcasts with `measured`.
+
+        Returns:
+            The log density for a range below `reach`, and the log probability for `reach` itself.
         """
         z, e = np.broadcast_arrays(np.asarray(measured, float), np.asarray(expected, float))
         total = self.hit + self.short + self.lost + self.any
@@ -98,13 +102,14 @@ class Grid:
 
     Attributes:
         resolution: Side of a cell, in metres.
-        headings: Number of evenly spaced headings; ranges are expected in as many directions.
-        origin: x and y of the corner of cell (0, 0).
-        occupied: Walls, (rows, columns).
-        free: Cells where the robot may be, (rows, columns). They are connected with its start.
-        ranges: Expected range from the middle of each free cell in the direction of each heading,
-            (free cells, headings), in units of STEP. Directions are turned by half a degree, like
-            the beams.
+        headings: Number of evenly spaced headings.
+        origin: x and y of the corner of cell (0, 0), in metres.
+        occupied: (rows, columns) mask of the cells with walls.
+        free: (rows, columns) mask of the cells where the robot may be, which are connected with its
+            start.
+        ranges: (free cells, headings) expected range from the middle of each free cell in the
+            direction of each heading, in units of STEP. Directions are turned by half a degree,
+            like the beams of the laser.
     """
 
     resolution: float
@@ -118,7 +123,17 @@ class Grid:
     def of(
         cls, world: World, resolution: float = 0.1, headings: int = 72, reach: float = 8.0
     ) -> Grid:
-        """The grid of a world's walls. Clutter stands where the world's file has it."""
+        """Make the grid of a world's walls. Clutter is where the world's file has it.
+
+        Args:
+            world: The world.
+            resolution: Side of a cell in metres.
+            headings: Number of headings, a multiple of 72.
+            reach: Largest expected range in metres.
+
+        Raises:
+            ValueError: The number of headings is no multiple of 72.
+        """
         if headings % 72:
             raise ValueError(
                 f"headings: expected a multiple of 72, so that beams point along headings, "
@@ -145,7 +160,7 @@ class Grid:
 
     @cached_property
     def centres(self) -> Array:
-        """The middles of the free cells in metres, (free cells, 2)."""
+        """The middles of the free cells: (free cells, 2), metres."""
         rows, columns = np.nonzero(self.free)
         return np.asarray(
             (np.column_stack([columns, rows]) + 0.5) * self.resolution + np.array(self.origin),
@@ -154,24 +169,29 @@ class Grid:
 
     @cached_property
     def number(self) -> NDArray[np.int32]:
-        """The number of each free cell, -1 for the others; (rows, columns)."""
+        """The number of each free cell, and -1 for other cells: (rows, columns)."""
         found = np.full(self.free.shape, -1, np.int32)
         found[self.free] = np.arange(self.free.sum())
         return found
 
     @cached_property
     def angles(self) -> Array:
-        """The headings in radians."""
+        """The headings: (headings,), radians."""
         return np.asarray(np.arange(self.headings) * (math.tau / self.headings), np.float64)
 
     def likelihoods(
         self, image: Array, model: BeamModel
     ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        """Tables to weigh poses by the used beams of an image.
+        """Make tables by which poses are weighed, for the b beams of an image that are used.
+
+        Args:
+            image: (180,) ranges in metres.
+            model: The beam model.
 
         Returns:
-            The direction of each used beam relative to the heading, in headings, (b,); and
-            log p(range | expected) for each expected range in units of STEP, (b, units).
+            (b,) direction of each beam relative to the heading of the robot, as a number of
+            headings; and (b, units) log p(range | expected range) for each beam and each expected
+            range in units of STEP.
         """
         every = model.beams
         used = np.arange(every // 2, len(image), every)
@@ -183,7 +203,7 @@ class Grid:
 
 
 def _along(segment: Array, step: float) -> Array:
-    """Points on a segment, at most `step` apart."""
+    """Points on a segment, (n, 2), at most `step` metres apart."""
     start, end = segment[:2], segment[2:]
     count = max(2, math.ceil(float(np.hypot(*(end - start))) / step) + 1)
     return np.asarray(start + np.linspace(0, 1, count)[:, None] * (end - start))
@@ -196,9 +216,10 @@ def _cast(
     headings: int,
     reach: float,
 ) -> NDArray[np.uint16]:
-    """The range of each direction from each free cell.
+    """The expected ranges of a grid: (free cells, headings), in units of STEP.
 
-    All cells walk at once, in strides of half a cell, until they meet an occupied cell.
+    For each direction, the rays from all cells grow at once, by half a cell at a time, until they
+    meet an occupied cell.
     """
     rows, columns = np.nonzero(free)
     ranges = np.full((len(rows), headings), round(reach / STEP), np.uint16)
@@ -232,24 +253,24 @@ class Filter(Protocol):
         """Update the belief with a displacement.
 
         Args:
-            displacement: (dx, dy, dtheta) in the robot's frame, in metres and radians.
-            covariance: Its covariance, (3, 3).
+            displacement: Metres ahead, metres to the left, and radians turned.
+            covariance: (3, 3) covariance of the displacement.
         """
 
     def seen(self, image: Array) -> None:
         """Update the belief with an image: 180 ranges in metres."""
 
     def best(self) -> Pose:
-        """The most probable pose."""
+        """Return the most probable pose: x and y in metres, heading in radians."""
         ...
 
     def mass(self, pose: Sequence[float], near: float, turned: float) -> float:
-        """The probability that the robot is within `near` metres and `turned` radians of a pose."""
+        """Compute the probability that the robot is within `near` m and `turned` rad of a pose."""
         ...
 
     @property
     def bytes(self) -> int:
-        """The size of the belief."""
+        """The size of the belief in bytes."""
         ...
 
 
@@ -257,8 +278,8 @@ class Histogram:
     """A probability for each pose of a grid (Probabilistic Robotics, table 8.1).
 
     Attributes:
-        slipped: Probability at each step that the robot is anywhere, whatever its wheels say.
-        probability: The belief, (headings, rows, columns).
+        slipped: Probability at each step that the robot is anywhere, whatever its odometry says.
+        probability: (headings, rows, columns) probability of each pose.
     """
 
     def __init__(self, grid: Grid, model: BeamModel | None = None, slipped: float = 0.01) -> None:
@@ -275,9 +296,13 @@ class Histogram:
     def moved(self, displacement: Sequence[float], covariance: Array) -> None:
         """Move the belief and blur it with a Gaussian, separately for each heading.
 
-        In the frequency domain both are one product, also for parts of a cell. A heading stands for
-        its whole bin, so the belief spreads sideways with the distance. The correlation of errors
-        of heading and position within a step is neglected.
+        In the frequency domain, both are a single product, even if the motion is no multiple of a
+        cell. A heading represents all directions of its bin, so the belief spreads sideways with
+        the distance. The correlation of errors of heading and position within a step is neglected.
+
+        Args:
+            displacement: Metres ahead, metres to the left, and radians turned.
+            covariance: (3, 3) covariance of the displacement.
         """
         grid = self.grid
         dx, dy, turned = displacement
@@ -342,17 +367,18 @@ class Histogram:
 class Particles:
     """Poses drawn from the belief: Monte Carlo localisation (Probabilistic Robotics, 8.2 and 8.4).
 
-    Uses the same table of ranges as `Histogram`.
+    The expected ranges are the same as for `Histogram`.
 
     Attributes:
-        dense: Particles per square metre of free cells if the robot may be anywhere.
-        error: KLD sampling draws enough particles to be within this distance of the belief with
-            a probability of 99 %. The default is AMCL's.
-        least: The least number of particles. It is twenty times AMCL's, as fewer particles lose
-            poses that look alike.
-        slipped: Probability at each step that the robot is anywhere. At each step this share of
-            the particles is drawn from anywhere. If they explain an image better than the others,
-            the belief is drawn anew by that image (sensor resetting, Lenser & Veloso 2000).
+        dense: Number of particles per square metre of free cells if the robot may be anywhere.
+        error: KLD sampling draws enough particles to be within this distance (Kullback-Leibler
+            divergence) of the belief with a probability of 99 %. The default is that of AMCL.
+        least: The smallest number of particles. The default is twenty times that of AMCL, as fewer
+            particles lose poses that look alike.
+        slipped: Probability at each step that the robot is anywhere. At each step, particles that
+            are drawn from anywhere get this weight. If they explain an image better than the
+            others, all particles are drawn from anywhere and weighed by that image (sensor
+            resetting, Lenser & Veloso 2000).
     """
 
     BIN = np.array(
@@ -384,7 +410,7 @@ class Particles:
         return self.poses.nbytes + self.weights.nbytes
 
     def _drawn(self, count: int) -> Array:
-        """Uniformly drawn poses."""
+        """Draw poses uniformly: (count, 3)."""
         cells = self.grid.centres[self.rng.integers(len(self.grid.centres), size=count)]
         return np.column_stack(
             [
@@ -418,7 +444,8 @@ class Particles:
         """Weigh the particles by an image.
 
         Returns:
-            Whether those that followed the robot explain the image better than the random ones.
+            Whether the particles that followed the robot explain the image at least as well as
+            those that were drawn from anywhere.
         """
         grid = self.grid
         offsets, logs = grid.likelihoods(image, self.model)
@@ -441,7 +468,10 @@ class Particles:
         return float(self.weights[len(weights) - self.fresh :].sum()) <= 0.5
 
     def _resample(self) -> None:
-        """Draw as many particles as KLD sampling needs, evenly by weight (tables 4.4 and 8.4)."""
+        """Draw the number of particles that KLD sampling needs, in proportion to their weights.
+
+        Probabilistic Robotics, tables 4.4 and 8.4.
+        """
         bins = len(np.unique(self._bins(self.poses[np.unique(self._chosen(self.most))])))
         self.poses = self.poses[
             self._chosen(min(self.most, max(self.least, _kld(bins, self.error))))
@@ -449,7 +479,7 @@ class Particles:
         self.weights = np.full(len(self.poses), 1 / len(self.poses))
 
     def _bins(self, poses: Array) -> NDArray[np.intp]:
-        """The number of the bin of each pose."""
+        """The number of the bin of each pose, (n,)."""
         indices = np.floor(poses / self.BIN).astype(np.intp)
         return np.asarray(indices @ (1, 1 << 20, 1 << 40))
 
@@ -458,7 +488,7 @@ class Particles:
         return np.minimum(np.searchsorted(np.cumsum(self.weights), places), len(self.weights) - 1)
 
     def best(self) -> Pose:
-        """The mean of the particles in the bin with the most weight."""
+        """Compute the mean pose of the particles in the bin with the most weight."""
         _, of = np.unique(self._bins(self.poses), return_inverse=True)
         heaviest = of == np.bincount(of, self.weights).argmax()
         x, y, heading = np.average(self.poses[heaviest], axis=0, weights=self.weights[heaviest])
@@ -470,7 +500,7 @@ class Particles:
 
 
 def _kld(bins: int, error: float) -> int:
-    """The number of particles for this many bins.
+    """The number of particles that KLD sampling needs for a number of occupied bins.
 
     Probabilistic Robotics, equation 8.12, with Wilson and Hilferty's approximation of chi-square.
     2.326 is the normal quantile of 99 %.

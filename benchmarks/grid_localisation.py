@@ -4,16 +4,18 @@
                                            [--first 600] [--save JSON] [--plot PNG] [--maps]
     python benchmarks/grid_localisation.py --from JSON [--plot PNG]
 
-Compares memory, time per step, steps until localised and accuracy, in the same drives. Prints
-tables for docs/measurements/localisation.md and draws its figure, which needs all parts. With
---from, prints and draws stored results. A simulated robot drives at random for 30 steps. Then it
-is carried to another dstate and drives for 30 more.
+The script compares memory, time per step, steps until the robot is localised, and accuracy, on the
+same drives. It prints tables for docs/measurements/localisation.md and draws the figure of that
+page, for which all parts are needed. With --from, it prints and draws stored results. In each
+drive, a simulated robot drives at random for 30 steps. Then it is carried to another dstate (a
+place and a heading), and drives for 30 more.
 
     dstates by image, by view
         The bootstrap loop has mapped the world from one exploration run, which tries each action
-        at each dstate twice. Localiser follows the robot in this map by its images, or by the
-        views they are clustered to. It reads neither odometry nor stars. Like its peers it is
-        told that the robot is in the map. This is measured where the world has changed.
+        at each dstate at least twice. Localiser follows the robot in this map by its images, or by
+        the views that the images are clustered into. It reads neither odometry nor stars. If the
+        world has changed, it is also measured with the knowledge that the robot is in the map,
+        which grid and particles always have ("never nowhere").
     grid
         A histogram filter over cells and headings of an occupancy grid, with a beam model
         (grid_filter.py).
@@ -21,7 +23,8 @@ is carried to another dstate and drives for 30 more.
         Monte Carlo localisation in the same grid, with the same beam model.
 
 Grid and particles are given the true metric map, odometry, and the noise of that odometry. All
-see the same images, which were taken at dstates. Nothing was tuned on the seeds of the table.
+methods see the same images, which were taken at dstates. Nothing was tuned on the seeds of the
+table.
 """
 
 from __future__ import annotations
@@ -68,11 +71,12 @@ class Case:
     """A row of a table.
 
     Attributes:
+        name: Name of the row.
         scene: Makes the scene from a seed.
-        change: Changes the world after it was mapped.
-        people: Share of images with somebody in front.
+        change: Changes the world after it was mapped; None for no change.
+        people: Share of images with a person in front of the laser.
         explored: Number of exploration tours.
-        fine: Also measure a fine grid, whose beam model expects less noise.
+        fine: Whether to measure also a fine grid, whose beam model expects less noise.
     """
 
     name: str
@@ -87,8 +91,14 @@ class Case:
 class Judged:
     """How well a method followed one drive.
 
-    Has for each step whether the most probable place is the true one, and whether some place is
-    certain. Also has bytes, and the CPU seconds to make the map and for all steps.
+    Attributes:
+        method: Name of the method.
+        right: For each step, whether the most probable place is the true one.
+        sure: For each step, whether some place is certain.
+        map_bytes: Size of the map.
+        belief_bytes: Largest size of the belief.
+        making: CPU seconds to make the map.
+        following: CPU seconds for all steps.
     """
 
     method: str
@@ -100,7 +110,10 @@ class Judged:
     following: float
 
     def localised(self, start: int, stop: int) -> int | None:
-        """The number of steps from `start` until the belief is certain and right, and stays so."""
+        """Count the steps from `start` until the belief is certain and right.
+
+        The belief must stay so for STAYS steps. None if this does not happen before `stop`.
+        """
         good = [r and s for r, s in zip(self.right, self.sure, strict=True)][start:stop]
         return first(
             [all(good[i : i + STAYS]) and i + STAYS <= len(good) for i in range(len(good))]
@@ -111,7 +124,12 @@ class Judged:
 class Drive:
     """What a robot does and sees, and its true dstate and pose at each step.
 
-    When the robot is carried, its wheels report the displacement of its first action.
+    Attributes:
+        trace: The trace, with images.
+        odometry: Displacement to each step but the first, and its covariance. When the robot is
+            carried, its odometry reports the displacement of its first action.
+        at: Name of the true dstate of each step.
+        poses: True pose of each step.
     """
 
     trace: Trace
@@ -142,7 +160,13 @@ class Drive:
 
 @dataclass(frozen=True)
 class Learnt:
-    """What the bootstrap loop learnt from an exploration run, its true dstates, and CPU seconds."""
+    """What the bootstrap loop learnt from an exploration run.
+
+    Attributes:
+        learner: The fitted learner.
+        truth: Name of the true dstate of each step of the run.
+        seconds: CPU seconds for learning.
+    """
 
     learner: BootstrapLearner
     truth: list[str]
@@ -167,7 +191,7 @@ BY_IMAGE, SOMEWHERE, BY_VIEW = (
 
 
 def by_dstates(drive: Drive, learnt: Learnt, method: str) -> Judged:
-    """Follow a drive with Localiser in the learnt map.
+    """Follow a drive with Localiser in the learnt map, by one of its three methods.
 
     A dstate of the map counts as the true dstate that most of its images show.
     """
@@ -203,7 +227,15 @@ def by_dstates(drive: Drive, learnt: Learnt, method: str) -> Judged:
 
 
 def by_poses(drive: Drive, belief: Filter, method: str, grid: Grid, making: float) -> Judged:
-    """Follow a drive with a filter over poses."""
+    """Follow a drive with a filter over poses.
+
+    Args:
+        drive: The drive.
+        belief: The filter.
+        method: Name of the method.
+        grid: Grid of the filter.
+        making: CPU seconds to make the grid.
+    """
     right, sure, following, most = [], [], 0.0, 0
     for i, (image, pose) in enumerate(zip(images_of(drive.trace), drive.poses, strict=True)):
         began = process_time()
@@ -303,7 +335,7 @@ def measured(parts: Sequence[str], seeds: range, save: str | None) -> Saved:
 
 
 def maps(parts: Sequence[str], seeds: range) -> None:
-    """Only run the bootstrap loop, and count its true maps."""
+    """Run only the bootstrap loop, and print a table with the number of true maps."""
     print("| world | dstates | steps explored | maps that are the true one |\n|---|---|---|---|")
     for case in (case for part in parts for case in PARTS[part] if part != "clutter"):
         learnt = [Learnt.of(case.scene(seed), case, seed) for seed in seeds]
@@ -359,13 +391,13 @@ def cells(runs: Sequence[Judged]) -> list[str]:
 
 
 def reached(steps: Sequence[int | None]) -> tuple[str, str]:
-    """The steps until localised, and how many robots were localised."""
+    """Make two cells: steps until robots were localised, and how many robots were localised."""
     known = [s for s in steps if s is not None]
     return spread([float(s) for s in known], "{:g}"), f"{len(known)} of {len(steps)}"
 
 
 def spread(values: Sequence[float], form: str, ranged: bool = True) -> str:
-    """The median, and the range if it is asked for and not a single value."""
+    """Format the median of values; if `ranged`, with their range, unless all are equal."""
     if not values:
         return "–"
     told = [form.format(v) for v in (float(np.median(values)), min(values), max(values))]
@@ -386,7 +418,11 @@ LOCATING = (
 
 
 def draw(path: str, found: Saved) -> None:
-    """Draw the share of located robots by step, and below it memory and time by size of a maze."""
+    """Draw the figure of the page.
+
+    Above is the share of located robots at each step, below are memory and time by the size of a
+    maze.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")

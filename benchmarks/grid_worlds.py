@@ -35,8 +35,10 @@ class Scene:
     """A world as it is mapped, and the actions that lead from one dstate to another.
 
     Attributes:
-        moves: For each dstate, by its name in the world: its actions and the dstates they lead to.
-        explore: The exploration: the dstate where the robot starts and ends, and its route.
+        world: The world.
+        moves: Dict from the name of each dstate to its actions, each with the dstate that it leads
+            to.
+        explore: An exploration: the dstate where the robot starts and ends, and its route.
     """
 
     world: World
@@ -44,7 +46,7 @@ class Scene:
     explore: tuple[str, tuple[str, ...]]
 
     def at(self, dstate: str, route: tuple[str, ...]) -> World:
-        """The world with a robot at a dstate that has this route."""
+        """Copy the world, with a robot that starts at a dstate and drives a route."""
         pose = next(s.pose for s in self.world.dstates if s.name == dstate)
         return replace(self.world, start=pose, route=route)
 
@@ -57,10 +59,15 @@ class Scene:
         seed: int,
         change: Callable[[World, np.random.Generator], World] | None = None,
     ) -> Trace:
-        """A random drive from a random dstate, in the world as it is or as it was changed.
+        """Simulate a random drive from a random dstate.
+
+        Args:
+            steps: Number of actions.
+            seed: Seed of the drive.
+            change: Changes the world before the drive; None for no change.
 
         Raises:
-            SimulatorError: If every draw fails.
+            SimulatorError: The robot could not do any of TRIES drives that were drawn.
         """
         for attempt in range(TRIES):
             chance, rng = (
@@ -90,9 +97,14 @@ class Scene:
 
 
 def of_streets(graph: nx.Graph, start: Leg, reach: float, like: World | None = None) -> Scene:
-    """The scene of a street map whose streets meet at right angles.
+    """Make the scene of a street map whose streets meet at right angles.
 
-    `like` is a world with the same places, whose walls, clutter and names are used instead.
+    Args:
+        graph: The street map, as in planar.py.
+        start: The place where the robot starts, and the place that it faces.
+        reach: Half the width of a street in metres.
+        like: A world with the same places, whose walls, clutter and names are used; None to draw
+            walls along the streets.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.json"
@@ -116,9 +128,9 @@ def of_streets(graph: nx.Graph, start: Leg, reach: float, like: World | None = N
 
 
 def _all_moves(moves: dict[str, dict[str, str]], start: str) -> list[str]:
-    """Actions that try each action at each dstate and lead back to the start.
+    """A route that tries each action at each dstate, and leads back to the start.
 
-    The robot always goes on to the nearest action it has not tried.
+    The robot always goes to the nearest action that it has not tried.
     """
     graph = nx.DiGraph(
         [(a, b, {"action": action}) for a, ways in moves.items() for action, b in ways.items()]
@@ -140,7 +152,10 @@ def _all_moves(moves: dict[str, dict[str, str]], start: str) -> list[str]:
 
 
 def rectangle(depth: float) -> Scene:
-    """The notched rectangle with a notch of this depth in metres, which has only the way round."""
+    """Make the notched rectangle with a notch of some depth in metres.
+
+    The robot can only drive round it in one direction.
+    """
     world = World.named("notched-rectangle")
     walls = world.segments.copy()
     walls[:, 1::2] = np.where(walls[:, 1::2] < 0, -depth, walls[:, 1::2])
@@ -174,7 +189,7 @@ def taylor_hall() -> Scene:
 
 
 def comb(halls: int) -> Scene:
-    """A main hallway with similar side hallways, 6 m apart."""
+    """Make a main hallway with a number of similar side hallways, 6 m apart."""
     at: dict[object, complex] = {f"P{i}": 6.0 * i + 0j for i in range(halls)}
     at |= {f"D{i}": 6.0 * i - 6j for i in range(halls)}
     streets: list[tuple[object, object]] = [(f"P{i}", f"P{i + 1}") for i in range(halls - 1)]
@@ -184,9 +199,9 @@ def comb(halls: int) -> Scene:
 
 
 def ring(marked: bool) -> Scene:
-    """A square of hallways, each with two side hallways to the outside.
+    """Make a square of hallways, each with two side hallways to the outside.
 
-    All sides are alike. In a marked ring one side hallway is missing.
+    All sides of the square are alike. If `marked`, one side hallway is missing.
     """
     corners = [0j, 18 + 0j, 18 + 18j, 18j]
     at: dict[object, complex] = {f"C{k}": z for k, z in enumerate(corners)}
@@ -207,10 +222,10 @@ def ring(marked: bool) -> Scene:
 
 
 def maze(size: int, seed: int, cell: float = 5.0) -> Scene:
-    """A maze of `size` by `size` cells.
+    """Make a maze of `size` by `size` cells, each `cell` metres wide.
 
-    It has the streets of a random spanning tree of the grid, and each other street with a
-    probability of a tenth. A cell on a straight street is not a place.
+    The maze has the streets of a random spanning tree of the grid, and each other street with a
+    probability of a tenth. A cell through which a street goes straight is not a place.
     """
     chance = random.Random(seed)
     grid = nx.grid_2d_graph(size, size)
@@ -234,7 +249,10 @@ def maze(size: int, seed: int, cell: float = 5.0) -> Scene:
 
 
 def boxes(count: int) -> Callable[[World, np.random.Generator], World]:
-    """Put boxes along the walls, 0.3 to 0.8 m long and 0.3 m deep."""
+    """Return a function that puts boxes along the walls of a world.
+
+    Boxes are 0.3 to 0.8 m long, and reach 0.3 m into the room.
+    """
 
     def changed(world: World, rng: np.random.Generator) -> World:
         walls = world.segments

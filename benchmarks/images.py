@@ -2,9 +2,9 @@
 
     python benchmarks/images.py [SIZE ...]
 
-Prints time and peak memory of one run each, in its own process. Images are of the notched
-rectangle: from poses near its eight dstates ("dstates"), or from uniformly drawn poses
-("anywhere"). The latter have no clusters, which is the slowest case.
+The script prints time and peak memory. Each measurement is a single run in its own process. Images
+are of the notched rectangle: from poses near its eight dstates ("dstates"), or from uniformly drawn
+poses ("anywhere"). Images from anywhere have no clusters, which is the slowest case.
 """
 
 from __future__ import annotations
@@ -31,7 +31,13 @@ WORLD = World.named("notched-rectangle")
 
 
 def ranges(kind: str, count: int, seed: int = 0) -> NDArray[np.float64]:
-    """Images, (count, 180), in metres."""
+    """Simulate images: (count, 180), metres.
+
+    Args:
+        kind: "dstates" for poses near dstates, or "anywhere".
+        count: Number of images.
+        seed: Seed of poses and noise.
+    """
     rng = np.random.default_rng(seed)
     if kind == "dstates":
         ideal = np.array([s.pose for s in WORLD.dstates])
@@ -44,7 +50,7 @@ def ranges(kind: str, count: int, seed: int = 0) -> NDArray[np.float64]:
 
 
 def simulated(world: str) -> None:
-    """Simulate scans from many poses at once, and a drive. Prints two lines of the table."""
+    """Simulate scans from many poses at once, and a drive; print two lines of the table."""
     room, rng = World.named(world), np.random.default_rng(0)
     poses = np.repeat([s.pose for s in room.dstates], 20_000 // len(room.dstates), axis=0)
     began = time.perf_counter()
@@ -63,7 +69,7 @@ def simulated(world: str) -> None:
 
 
 def search(kind: str, count: int) -> None:
-    """Search for k. Prints a line of the table."""
+    """Search for k, the number of views; print a line of the table."""
     images = ReciprocalTransformer().fit_transform(ranges(kind, count))
     began = time.perf_counter()
     views = ViewClusterer(k_max=MOST_VIEWS, random_state=0).fit(images)
@@ -77,7 +83,7 @@ def search(kind: str, count: int) -> None:
 
 
 def queries(kind: str, count: int) -> None:
-    """Query the nearest of `count` images. Prints a line of the table."""
+    """Query the nearest of `count` images; print a line of the table."""
     images = ReciprocalTransformer().fit_transform(ranges(kind, count + 2_000))
     recogniser = PlaceRecogniser().fit(images[:count], np.arange(count) % 8)
     began = time.perf_counter()

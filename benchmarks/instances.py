@@ -27,7 +27,7 @@ CELL = 10.0
 
 @dataclass(frozen=True)
 class Walk:
-    """A trace, and the true state at each of its steps."""
+    """A trace, and the true state at each of its steps; no states if they are unknown."""
 
     trace: Trace
     truth: tuple[object, ...]
@@ -42,9 +42,15 @@ def displaced(
     scale: float = 0.0,
     bend: float = 0.0,
 ) -> Trace:
-    """The trace with displacements between the true poses, as an odometer reports them.
+    """Copy a trace, with displacements between the true poses as an odometer reports them.
 
-    See `simulator.motion.reported`.
+    Args:
+        trace: The trace.
+        poses: True pose of each step.
+        odometry: Model of the noise, which the copy also states.
+        seed: Seed of the noise.
+        scale: Share by which reported distances are too long.
+        bend: Radians a metre by which the reported heading drifts to the left.
     """
     rng = np.random.default_rng(seed)
     moved = [
@@ -63,9 +69,10 @@ Cell = tuple[int, int]
 def doors_of(
     width: int, height: int, chance: random.Random, loops: float = 0.1
 ) -> set[tuple[Cell, Cell]]:
-    """The corridors of a maze between cells, each in both directions.
+    """Draw the corridors of a maze: pairs of neighbouring cells, each in both directions.
 
-    They are a random spanning tree of the grid. Each other wall is open with probability `loops`.
+    The corridors are a random spanning tree of the grid. Each other wall is open with probability
+    `loops`.
     """
     walls = [
         ((x, y), (x + dx, y + dy))
@@ -104,25 +111,27 @@ def maze(
     scale: float = 0.0,
     bend: float = 0.0,
 ) -> Walk:
-    """A random walk in a maze of corridors.
+    """Make a random walk in a maze of corridors.
 
-    A state is a cell and a heading. A view is the openings ahead, right, back and left. Where the
-    way ahead is open the robot travels half of the time; otherwise it turns. It turns around only
-    where it cannot travel.
+    A state is a cell and a heading. A view is the openings ahead, right, back and left. If the way
+    ahead is open, the robot travels with probability 1/2; otherwise it turns right or left. If the
+    way ahead is closed, it turns right, left or around.
 
     Args:
-        width: Cells from west to east.
-        height: Cells from south to north.
+        width: Number of cells from west to east.
+        height: Number of cells from south to north.
         steps: Number of actions.
         seed: Seed of the maze and the walk.
-        loops: Probability that a wall beyond the spanning tree is open.
-        stars: Whether the trace has stars.
-        follow: Whether the robot follows corridors: it travels in four of six cases where it can.
-            Otherwise it turns to an open way on its right or left, and around only in a dead end.
-        odometry: If given, the trace has displacements with this noise. The walk is the same.
+        loops: Probability that a wall that the spanning tree leaves closed is open.
+        stars: Whether the trace has stars, which are the openings as evidence.
+        follow: Whether the robot follows corridors. Then it travels with probability 2/3 if the way
+            ahead is open, and otherwise turns right or left. If the way ahead is closed, it turns
+            to an opening on its right or left, and around only in a dead end.
+        odometry: Noise of the displacements of the trace; None for a trace without displacements.
+            It does not change the walk.
         cell: Metres from one cell to the next.
-        scale: Systematic error of distances, as a share.
-        bend: Systematic error of headings, in radians per metre.
+        scale: Share by which reported distances are too long.
+        bend: Radians a metre by which the reported heading drifts to the left.
     """
     chance = random.Random(seed)
     doors = doors_of(width, height, chance, loops)
@@ -166,9 +175,16 @@ def maze(
 
 
 def moore(states: int, views: int, *, steps: int, seed: int, actions: int = 2) -> Walk:
-    """A random walk in a random Moore machine.
+    """Make a random walk in a random Moore machine.
 
     Links and views are drawn uniformly. Each view occurs, and a random walk can visit all states.
+
+    Args:
+        states: Number of states.
+        views: Number of views.
+        steps: Number of actions of the walk.
+        seed: Seed of the machine and the walk.
+        actions: Number of different actions.
     """
     chance = random.Random(seed)
     shown = [*range(views), *(chance.randrange(views) for _ in range(states - views))]
@@ -201,9 +217,19 @@ def faulty_machine(
     jumps: int = 0,
     actions: int = 3,
 ) -> tuple[Walk, tuple[int, ...], tuple[int, ...]]:
-    """A random walk in a random Moore machine, with wrong views and with actions that end anywhere.
+    """Make a random walk in a random Moore machine, with wrong views and jumps.
 
-    The walk goes on from where a jump ended. The first and last five steps have no faults.
+    A jump is an action that leads to a wrong state, from which the walk goes on. The first and last
+    five steps have no faults.
+
+    Args:
+        states: Number of states.
+        views: Number of views.
+        steps: Number of actions of the walk.
+        seed: Seed of machine, walk and faults.
+        wrong: Number of wrong views.
+        jumps: Number of jumps.
+        actions: Number of different actions.
 
     Returns:
         The walk, the steps with a wrong view, and the steps whose action jumped.
@@ -235,7 +261,10 @@ def faulty_machine(
 
 
 def rectangle(circuits: int) -> Walk:
-    """Circuits of the notched rectangle of Kuipers & Beeson (2002): eight states, four views."""
+    """Make circuits of the notched rectangle of Kuipers & Beeson (2002).
+
+    It has eight states, which show four views.
+    """
     steps = 8 * circuits
     trace = Trace.from_steps(
         [f"v{i % 4}" for i in range(steps + 1)], [("right", "travel")[i % 2] for i in range(steps)]
@@ -244,9 +273,16 @@ def rectangle(circuits: int) -> Walk:
 
 
 def circuits(width: int, height: int, *, rounds: int, seed: int, views: int = 4) -> Walk:
-    """Circuits of a block: from place to place along each side, and right at the corners.
+    """Make circuits of a block: the robot travels along each side, and turns right at the corners.
 
     The view of each state is drawn uniformly.
+
+    Args:
+        width: Number of travels along two of the sides.
+        height: Number of travels along the two other sides.
+        rounds: Number of circuits.
+        seed: Seed of the views.
+        views: Number of views.
     """
     chance = random.Random(seed)
     once = [

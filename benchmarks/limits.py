@@ -2,11 +2,12 @@
 
     python benchmarks/limits.py --cases 40 --seed 0 [--python]
 
-Flaws make most places look new. The promise is: at most 1.2 times the time limit and 1 s more,
-including the start; at most 1.2 times the memory limit and 200 MiB more; and valid JSON on the
-output. Each case runs in its own process. By default it is the command line, whose guard ends
-it in time whatever clingo does. With --python it is `solve` of the Python interface, which has no
-guard. The same seed gives the same cases. Their times depend on the load of the machine.
+With flaws, most places look new. The package promises three things: at most 1.2 times the time
+limit plus 1 s, including the start; at most 1.2 times the memory limit plus 200 MiB; and valid JSON
+as output. Each case runs in its own process. By default, the process is the command line, which has
+a guard that ends it in time whatever clingo does. With --python, it is `solve` of the Python
+interface, which has no guard. The same seed gives the same cases. Their times depend on the load of
+the machine.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ CODES = {"optimal": 0, "feasible": 10, "unsatisfiable": 20, "unknown": 30}
 
 
 def aces(circuits: int, seed: int) -> Trace:
-    """A drive like that in the ACES building: circuits of corridors with mostly new views."""
+    """Make a drive like that in the ACES building: circuits of corridors with many views."""
     chance = random.Random(seed)
     corridor = [f"v{chance.randrange(12)}" for _ in range(23)]
     done = [chance.choice(["travel", "travel", "right", "around"]) for _ in corridor]
@@ -72,9 +73,9 @@ FAMILIES: dict[str, tuple[str, Callable[[int, int], Trace]]] = {
 
 
 def flawed(trace: Trace, flaws: int, chance: random.Random) -> Trace:
-    """A trace with flaws.
+    """Copy a trace, with random flaws.
 
-    A flaw is the view of another step, a missing or doubled step, or a confused action.
+    A flaw is a wrong view and star, a missing or doubled step, or a wrong action.
     """
     # Draw the kind of each flaw, then its step.
     steps = list(trace.steps)
@@ -98,7 +99,14 @@ def flawed(trace: Trace, flaws: int, chance: random.Random) -> Trace:
 
 @dataclass(frozen=True)
 class Case:
-    """A trace and its limits: seconds, and MiB or None."""
+    """A trace to solve.
+
+    Attributes:
+        family: Name of the family.
+        trace: The trace.
+        seconds: Time limit.
+        mebibytes: Memory limit in MiB; None for no limit.
+    """
 
     family: str
     trace: Trace
@@ -106,7 +114,12 @@ class Case:
     mebibytes: int | None
 
     def command(self, path: Path, *, python: bool) -> list[str]:
-        """The command line of the process."""
+        """Make the command line of the process that solves the case.
+
+        Args:
+            path: File of the trace.
+            python: Whether to use the Python interface.
+        """
         if python:
             return [
                 sys.executable,
@@ -138,9 +151,10 @@ class Outcome:
     """The result of a case.
 
     Attributes:
+        case: The case.
         seconds: Time of the process, as a share of the promised time.
         mebibytes: Peak memory of the process, as a share of the promised memory.
-        status: The printed status, or what was wrong with the output.
+        status: The printed status, or a text that says what was wrong with the output.
     """
 
     case: Case
@@ -152,7 +166,14 @@ class Outcome:
 def cases(
     count: int, seed: int, longest: int = 2000, seconds: Sequence[float] = (0.5, 1, 2, 5, 10)
 ) -> Iterator[Case]:
-    """Make cases, taking turns between the families."""
+    """Draw cases from each family in turn.
+
+    Args:
+        count: Number of cases.
+        seed: Seed of the cases.
+        longest: Steps of the longest traces.
+        seconds: Time limits to draw from.
+    """
     chance = random.Random(seed)
     families = list(FAMILIES)
     for number in range(count):
@@ -169,7 +190,13 @@ def cases(
 
 
 def outcome(case: Case, folder: Path, *, python: bool = False) -> Outcome:
-    """Solve a case in a process of its own."""
+    """Solve a case in a process of its own, and measure the process.
+
+    Args:
+        case: The case.
+        folder: Folder for the files of the trace and the solution.
+        python: Whether to use the Python interface.
+    """
     path, output = folder / "trace.jsonl", folder / "solution.json"
     case.trace.save(path)
     command = case.command(path, python=python)
@@ -197,9 +224,10 @@ def outcome(case: Case, folder: Path, *, python: bool = False) -> Outcome:
 
 
 def _peak(process: int) -> float:
-    """The peak MiB of a running process; 0 where the system does not say.
+    """The peak MiB of a running process; 0 if the system does not say.
 
-    The usage that the system reports at the end also includes this parent process.
+    The usage that the system reports at the end of a process is no substitute. It also includes
+    this parent process.
     """
     with suppress(OSError, StopIteration), open(f"/proc/{process}/status", "rb") as status:
         return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) / 2**10
@@ -216,7 +244,7 @@ def _status(output: Path, code: int) -> str:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Markdown with a row for each family."""
+    """Make a table in Markdown, with a row for each family."""
     rows = [
         f"| traces | cases | {' | '.join(CODES)} | other | time, worst share of what is "
         "promised | memory, the same |",

@@ -3,18 +3,19 @@
     python benchmarks/localisation.py [--part kidnapped|nowhere|images|speed] [--seeds 20]
                                       [--first 200] [--plot PNG]
 
-Prints tables for docs/measurements/localisation.md. With --plot, draws its figure: a robot in a
-maze of 5 x 5 that is put into another maze and back. Maps are the true ones of walks, so only
-localisation is measured. Robots walk at random along the links of the map:
+The script prints tables for docs/measurements/localisation.md. With --plot, it draws a figure of
+that page instead: a robot in a maze of 5 x 5 cells that is put into another maze and back. Maps are
+the true maps of walks, so only localisation is measured. Robots walk at random along the links of
+the map:
 
-    kidnapped  At step 40 of 80 the robot is moved to another dstate, which its action does not
-               explain. Some views are wrong: each is another random view.
-    nowhere    From step 40 to step 69 of 110 the robot is in another world; then it is put back.
+    kidnapped  At step 40 of 80, the robot is carried to another dstate, to which its action does
+               not lead. Some views are replaced by other views of the map.
+    nowhere    From step 40 to step 69 of 110, the robot is in another world. Then it is put back.
                The other world has the same views, or a third of its dstates show new views.
     images     A simulated robot learns from some tours and drives three others. In one image in
-               twenty somebody is in front of the laser. Then the robot is carried to another
+               twenty, a person is in front of the laser. Then the robot is carried to another
                place, and then to another building.
-    speed      CPU seconds, including entropy, verdict and dstate of each step.
+    speed      CPU seconds for many steps, including entropy, verdict and dstate of each step.
 """
 
 from __future__ import annotations
@@ -56,14 +57,19 @@ STEPS = 10_000
 
 @dataclass(frozen=True)
 class Drive:
-    """What a robot saw and did in a map, and its true dstate; None outside the map."""
+    """What a robot saw and did.
+
+    Attributes:
+        trace: The trace.
+        at: True dstate of each step, as in the map; None outside the map.
+    """
 
     trace: Trace
     at: tuple[int | None, ...]
 
 
 def true_map(walk: Walk) -> SSHMap:
-    """The map of a walk by its true states."""
+    """Make the true map of a walk: its states are the dstates."""
     number: dict[object, int] = {}
     labels = tuple(number.setdefault(x, len(number)) for x in walk.truth)
     views = {label: step.view for label, step in zip(labels, walk.trace, strict=True)}
@@ -99,7 +105,13 @@ class Robot:
 
 
 def kidnapped(ssh_map: SSHMap, seed: int, misread: float) -> Drive:
-    """A drive with wrong views in which the robot is moved to another dstate at step KIDNAPPED."""
+    """Draw a drive in which the robot is carried to another dstate at step KIDNAPPED.
+
+    Args:
+        ssh_map: The map.
+        seed: Seed of the drive.
+        misread: Probability of a wrong view.
+    """
     chance = random.Random(seed)
     robot = Robot(ssh_map, chance)
     names = sorted({s.view for s in ssh_map.dstates}, key=str)
@@ -120,7 +132,14 @@ def kidnapped(ssh_map: SSHMap, seed: int, misread: float) -> Drive:
 
 
 def elsewhere(ssh_map: SSHMap, other: SSHMap, seed: int, new: float) -> Drive:
-    """A drive that leaves the map at step LEFT and is put back at step BACK."""
+    """Draw a drive in which the robot is in another world from step LEFT to step BACK - 1.
+
+    Args:
+        ssh_map: The map.
+        other: Map of the other world.
+        seed: Seed of the drive.
+        new: Probability that a dstate of the other world shows a new view.
+    """
     chance = random.Random(seed)
     robot, stranger = Robot(ssh_map, chance), Robot(other, chance)
     unseen = {s.id for s in other.dstates if chance.random() < new}
@@ -166,7 +185,8 @@ def part_kidnapped(seeds: range) -> None:
         for misread in (0.0, 0.01, 0.05):
             began, noticed, found, sizes = [], [], [], []
             right = steps = sure = wrong = vain = 0
-            # Of each drive: steps until located, until the move is noticed, and until found again.
+            # Collect from each drive the steps until the robot is located, until the move is
+            # noticed, and until the robot is located again.
             for seed, ssh_map in zip(seeds, maps, strict=True):
                 drive = kidnapped(ssh_map, seed, misread)
                 beliefs = list(Localiser(ssh_map).beliefs(drive.trace))
@@ -311,9 +331,17 @@ def part_images(seeds: range) -> None:
 def in_front(
     images: NDArray[np.float64], rng: np.random.Generator, share: float = 0.05
 ) -> NDArray[np.bool_]:
-    """Put somebody in front of the laser in this share of the images.
+    """Put a person in front of the laser in some images. The images are changed in place.
 
-    The person is 0.4 to 0.8 m away and covers a sixth of the beams. Returns the changed images.
+    The person is 0.4 to 0.8 m away and covers a sixth of the beams.
+
+    Args:
+        images: (n, 180) metres.
+        rng: Source of random choices.
+        share: Probability that an image is changed.
+
+    Returns:
+        (n,) mask of the changed images.
     """
     front = rng.random(len(images)) < share
     width = images.shape[1] // 6
@@ -326,9 +354,14 @@ def in_front(
 
 
 def spliced(drives: Sequence[Sequence[Step]], images: NDArray[np.float64]) -> Trace:
-    """Join drives with these images into one trace.
+    """Join drives to one trace with images.
 
-    The robot is carried from one drive to the next. It takes that for its first travel.
+    The robot is carried from one drive to the next. The trace has the action of its first travel
+    there.
+
+    Args:
+        drives: Steps of each drive.
+        images: (n, 180) images of all steps in metres.
     """
     carried = next(
         step.action for step in drives[0] if step.action and step.action.kind == "travel"
@@ -339,7 +372,7 @@ def spliced(drives: Sequence[Sequence[Step]], images: NDArray[np.float64]) -> Tr
 
 
 def part_speed(seeds: range) -> None:
-    """Print the table of steps per second."""
+    """Print the table of localising speed, in steps per second."""
     print("| dstates | views | steps | CPU seconds | steps a second | made in, CPU seconds |")
     print("|---|---|---|---|---|---|")
     for dstates, views in ((100, 10), (1_000, 10), (10_000, 10), (10_000, 1_000), (10_000, 10_000)):
@@ -355,7 +388,7 @@ def part_speed(seeds: range) -> None:
         for _ in range(STEPS - 1):
             actions.append(robot.act())
             seen.append(robot.view)
-        # Building the localiser and following the robot are timed apart.
+        # Time the making of the localiser and the steps separately.
         trace = Trace.from_steps(seen, actions)  # type: ignore[arg-type]
         began = time.process_time()
         localiser = Localiser(ssh_map)

@@ -3,12 +3,13 @@
     python benchmarks/logs.py [LOG ...] [--plans FOLDER] --out rows.jsonl [--runs FOLDER]
                               [--page docs/measurements/logs.md]
 
-Prints tables in Markdown. With --plans a robot is simulated in each floor plan of a folder, one
-drive for each seed, and these logs are added. `ssh-abduction map` maps each log, and its events
-and its first map are judged. The peers are skeletons of occupancy grids. One grid has the scans at
-their corrected poses, which a robot does not have; its skeleton is judged without and with nodes
-at doors. The other grid has the scans at the poses of the odometry, which any robot has. The truth
-of a simulated log NAME.log is in NAME.truth.json beside it. Rows that are stored are not repeated.
+The script prints tables in Markdown. With --plans, a robot is simulated in each floor plan of a
+folder, one drive for each seed, and these logs are added. `ssh-abduction map` maps each log. Its
+events (visits according to a mapper) and its first map are compared with the truth. The same is
+done with skeletons of occupancy grids. One grid has the scans at their corrected poses, which a
+robot does not have. The skeleton of this grid is judged without and with nodes at doors. The other
+grid has the scans at the poses of the odometry, which any robot has. The truth of a simulated log
+NAME.log is in NAME.truth.json beside the log. Rows that are stored are not measured again.
 """
 
 from __future__ import annotations
@@ -63,15 +64,20 @@ def name_of(log: Path) -> str:
 
 
 def sidecar(log: Path) -> Path | None:
-    """The truth that the simulator wrote beside a log, if there is one."""
+    """Find the file with the truth that the simulator wrote beside a log; None if there is none."""
     beside = log.with_name(f"{name_of(log)}.truth.json")
     return beside if beside.exists() else None
 
 
 def driven(plans: Path, seeds: int, runs: Path) -> Iterator[Path]:
-    """A log for each floor plan of a folder and each seed from 1, simulated unless it is there.
+    """Yield a log for each floor plan of a folder and each seed from 1.
 
-    A drive is a round of 200 m with the simulator's own odometer.
+    A log that does not exist is simulated: a round of 200 m with the default odometer.
+
+    Args:
+        plans: Folder of the floor plans.
+        seeds: Number of seeds.
+        runs: Folder for the logs.
     """
     runs.mkdir(parents=True, exist_ok=True)
     for plan, seed in product(sorted(plans.glob("*.xml")), range(1, seeds + 1)):
@@ -102,10 +108,16 @@ def by_skeleton(log: Path, kind: str, doors: bool) -> Events:
 
 
 def by_map(log: Path, runs: Path) -> Events:
-    """The events and the first map of `ssh-abduction map`, which runs unless its folder is there.
+    """Return the events of `ssh-abduction map` on a log, with their places in its first map.
+
+    The command is run unless its results exist.
+
+    Args:
+        log: The log.
+        runs: Folder with a folder of results for each log.
 
     Raises:
-        OSError, ValueError: If there is no map.
+        OSError, ValueError: There is no map.
     """
     folder = runs / name_of(log)
     if not (folder / "maps.json").exists():
@@ -158,7 +170,7 @@ def shown(*values: float | None) -> str:
 
 
 def lines_of(row: dict[str, Any]) -> Iterator[str]:
-    """A row of the table of real logs, and another one for pairs by relations."""
+    """Make the row of a recorded log and, if it has relations, one for pairs by relations."""
     if "failed" in row:
         came = "{1} of {0}".format(*row["passes"]) if "passes" in row else ""
         found = shown(row["event_precision"], row["event_recall"]) if came else ""
@@ -191,7 +203,7 @@ def lines_of(row: dict[str, Any]) -> Iterator[str]:
 
 
 def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
-    """The row of one method over all simulated logs."""
+    """Make the row of one method in the table of simulated logs, from the rows of all logs."""
     done = [row for row in rows if "failed" not in row]
     if not done:
         return f"| {method} | {len(rows)} | 0 | 0 | 0 | | | | | | |"
@@ -224,10 +236,10 @@ def simulated_line(method: str, rows: Sequence[dict[str, Any]]) -> str:
 
 
 def draw(path: Path, logs: Sequence[Path], runs: Path) -> None:
-    """Draw each log with its skeleton and its first map.
+    """Draw each log with its skeleton and its first map into a file.
 
-    The grid at the corrected poses and its skeleton have blue squares. The events of the map and
-    their places are orange.
+    The skeleton, of the grid at the corrected poses, is blue with squares. Places of the map are
+    orange circles, and its events red points.
     """
     import matplotlib
 

@@ -2,10 +2,10 @@
 
     python benchmarks/odometry.py [--seeds 4] [--tours 10] [--worlds notched-rectangle taylor-hall]
 
-Prints a table in Markdown. Errors are in standard deviations of the trace's odometry, so their
-mean should be near 0 and their mean square near 1. They are measured against the motion between
-true poses, and against the motion between fixed points: the mean of all positions at a place and
-of all headings at a dstate.
+The script prints a table in Markdown. Errors are in standard deviations of the trace's odometry, so
+their mean should be near 0 and their mean square near 1. Displacements are compared with the motion
+between true poses, and with the motion between fixed points. A fixed point is the mean of all
+positions at a place, with the mean of all headings at a dstate.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def true_poses(trace: Trace) -> list[Pose]:
 
 
 def fixed_points(trace: Trace) -> list[Pose]:
-    """For each step the mean position at its place and the mean heading at its dstate."""
+    """Compute for each step the mean position at its place, and the mean heading at its dstate."""
     positions: dict[str, list[Sequence[float]]] = defaultdict(list)
     headings: dict[str, list[float]] = defaultdict(list)
     for step in trace.steps:
@@ -47,7 +47,17 @@ def fixed_points(trace: Trace) -> list[Pose]:
 
 
 def errors(trace: Trace, poses: Sequence[Pose], kind: str) -> list[NDArray[np.float64]]:
-    """The errors of all displacements of one kind of action in standard deviations, (3,) each."""
+    """Compute the errors of the displacements of one kind of action.
+
+    Args:
+        trace: The trace.
+        poses: Pose of each step.
+        kind: "travel" or "turn".
+
+    Returns:
+        For each displacement the error ahead, to the left and in heading, in standard deviations,
+        (3,).
+    """
     found = []
     for i, action in enumerate(trace.actions):
         displacement = trace.steps[i + 1].displacement

@@ -3,15 +3,15 @@
     python benchmarks/online.py [--steps 1000] [--limit 0.5] [--size 10] [--seed 0]
                                 [--drive 0.05] [--odometry tight|usual]
 
-At an optimal step the answer was proven minimal; at the others it was a consistent map and a lower
-bound. `visited` is the number of dstates of the world that the robot has been in. Between two
-steps the robot drives for --drive seconds, in which the mapper guesses maps. At the checkpoints
+At an optimal step, the answer was proven minimal. At other steps, the answer was a consistent map
+and a lower bound. `visited` is the number of true dstates that the robot has been at. Between two
+steps, the robot drives for --drive seconds, in which the mapper guesses maps. At the checkpoints,
 the trace is also solved from scratch, in at most ANEW seconds (`--anew 0` turns that off).
 
-With --odometry each action has a displacement, and cells are 10 m apart. `tight` is 5 % along
-the way, 0.5 % across it and 0.002 rad per metre, without systematic errors, as in
-benchmarks/truth.py. `usual` is the default of traces. `true` is the share of steps at which the
-first map has the true labels.
+With --odometry, each action has a displacement, and cells are 10 m apart. The noise `tight` is 5 %
+along the way, 0.5 % across it and 0.002 rad per metre, without systematic errors, as in
+benchmarks/truth.py. The noise `usual` is the default of traces. `true` in the output is the share
+of steps at which the first map has the true labels.
 """
 
 from __future__ import annotations

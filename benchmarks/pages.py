@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def seeds_from(text: str) -> list[int]:
-    """The seeds of a range such as 300-309, or the one seed.
+    """Parse a range of seeds such as 300-309, or a single seed.
 
     >>> seeds_from("300-302"), seeds_from("7")
     ([300, 301, 302], [7])
@@ -18,13 +18,13 @@ def seeds_from(text: str) -> list[int]:
 
 
 def print_rows(rows: Iterable[str], page: Path | None, begin: str) -> None:
-    """Print the rows as they come, and replace those of a page if one is given.
+    """Print rows as they are made. If a page is given, replace its rows by them.
 
     Args:
         rows: The lines of the table.
-        page: The page, or None.
-        begin: Regular expression for the beginning of the first row to replace. The last one is
-            followed by an empty line.
+        page: The page; None to print only.
+        begin: Regular expression for the beginning of the first row to replace. The rows of the
+            page end before the next empty line.
     """
     lines = []
     for line in rows:

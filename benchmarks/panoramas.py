@@ -3,9 +3,10 @@
     python benchmarks/panoramas.py [--seeds 300-302] [--page docs/measurements/panoramas.md]
     python benchmarks/panoramas.py --figure docs/figures/panoramas.png
 
-Makes the tables and the figure of docs/measurements/panoramas.md. A drive is clustered (k by M, at
-most 24) and mapped from the views alone, in at most two seconds. Its recogniser is tested on a
-second drive at other hours. Each seed has its own drive, noise and textures.
+The script makes the tables and the figure of docs/measurements/panoramas.md. The images of a drive
+are clustered into at most 24 views, whose number is chosen by M (`perception.quality`). The drive
+is mapped from the views alone, in at most two seconds. Its recogniser is tested on a second drive
+at other hours. Each seed has its own drive, noise and textures.
 """
 
 from __future__ import annotations
@@ -87,16 +88,16 @@ def world(name: str) -> World:
 
 
 def of_each_image(pixels: Pixels) -> Pixels:
-    """Each colour of each image, standardised to mean 0 and standard deviation 1."""
+    """Standardise each colour of each image to mean 0 and standard deviation 1."""
     images = pixels.reshape(len(pixels), -1, 3)
     made = (images - images.mean(axis=1, keepdims=True)) / images.std(axis=1, keepdims=True)
     return made.reshape(len(pixels), -1)
 
 
 def gradients(pixels: Pixels) -> Pixels:
-    """Histograms of oriented gradients (Dalal and Triggs 2005) of grey panoramas.
+    """Compute histograms of oriented gradients (Dalal and Triggs 2005) of grey panoramas.
 
-    There are 8 directions, in normalised cells of 6 x 12 pixels.
+    A histogram has 8 directions. There is one for each cell of 6 x 12 pixels, normalised.
     """
     grey = pixels.reshape(-1, 24, 180, 3).mean(axis=3)
     up, along = (
@@ -115,7 +116,7 @@ def gradients(pixels: Pixels) -> Pixels:
 
 
 class Whitened(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Raw pixels, whitened by the principal components that hold 95 % of the variance."""
+    """Whitens raw pixels: projects them on the principal components with 95 % of the variance."""
 
     def fit(self, X: Pixels, y: Any = None) -> Whitened:
         self.mean_ = X.mean(axis=0)
@@ -151,18 +152,19 @@ class Found:
 
     Attributes:
         k: Number of views.
-        quality: M.
-        purity: U, which is 1 if each dstate has one view.
-        distinct: Views by dstates. Below 1 dstates share views; above 1 they have several.
+        quality: M of the views.
+        purity: U of the views, which is 1 if each true dstate has one view.
+        distinct: Number of views divided by that of true dstates. Below 1, some dstates share a
+            view; above 1, some have several.
         right: Whether the map has the true dstates.
         said: Whether there was a warning, or no map.
         doubted: Whether a warning said that images are doubtful, views overlap, or another number
             of views gives another map. Warnings about unproven maps do not count, as they depend
             on the machine.
         recognised: Share of images of the second drive whose nearest image of the first drive has
-            the same true dstate. It measures the features, whatever the map.
-        by_map: Share of these images that the learnt recogniser labels correctly, with labels and
-            true dstates matched one to one; 0 without a map.
+            the same true dstate. It measures the features, and does not depend on the map.
+        by_map: Share of images of the second drive that the learnt recogniser labels correctly,
+            with labels and true dstates matched one to one; 0 without a map.
     """
 
     k: int
@@ -177,9 +179,9 @@ class Found:
 
 
 class Rotated(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Features rotated into as many dimensions as there are images.
+    """Features in the space that the fitted images span, which has at most one dimension an image.
 
-    Distances stay the same, and k-means is about ten times as fast.
+    Distances between the fitted images stay the same, and k-means is about ten times as fast.
     """
 
     def __init__(self, features: Any = None) -> None:
@@ -192,16 +194,23 @@ class Rotated(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def transform(self, X: Pixels) -> Pixels:
-        """Project images onto the space of the first ones.
+        """Project images onto the space of the fitted images.
 
-        The part of an image outside this space adds the same to all its distances, so it is
-        dropped.
+        The part of an image outside this space adds the same to the squares of all its distances
+        from fitted images. So that part can be dropped.
         """
         return np.asarray((self.features.transform(X) - self.mean_) @ self.axes_.T)
 
 
 def drives(name: str, light: str, texture: str, seed: int) -> tuple[Trace, Trace]:
-    """A drive to learn from, and a drive to recognise."""
+    """Simulate a drive to learn from, and a drive to recognise.
+
+    Args:
+        name: Name of the world.
+        light: Key of LIGHTS.
+        texture: Key of TEXTURES.
+        seed: Seed of drives, noise and textures.
+    """
     camera = Camera(paint=Paint(seed, TEXTURES[texture]))
     first, second = (replace(camera, hours=hours) for hours in LIGHTS[light])
     return simulate(world(name), TOURS[name], seed, camera=first), simulate(
@@ -210,7 +219,14 @@ def drives(name: str, light: str, texture: str, seed: int) -> tuple[Trace, Trace
 
 
 def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
-    """Learn from one drive, recognise another, and judge both."""
+    """Learn from one drive, recognise the images of another, and compare both with the truth.
+
+    Args:
+        learnt: The drive to learn from.
+        asked: The drive to recognise.
+        features: Key of FEATURES.
+        clusterer: Key of CLUSTERERS.
+    """
     truth, asked_truth = true_dstates(learnt), true_dstates(asked)
     made = Rotated(FEATURES[features])
     learner = BootstrapLearner(
@@ -257,7 +273,11 @@ def found(learnt: Trace, asked: Trace, features: str, clusterer: str) -> Found:
 
 
 def named(labels: NDArray[np.intp], truth: NDArray[Any]) -> dict[int, str]:
-    """The true dstate of each label, matched one to one so that most labels are right."""
+    """Match labels with true dstates one to one, so that most images have the right label.
+
+    Returns:
+        Dict from label to the name of the true dstate.
+    """
     of_label, of_name = np.unique(labels), np.unique(truth)
     counts = np.array(
         [[np.sum((labels == label) & (truth == name)) for name in of_name] for label in of_label]
@@ -275,7 +295,7 @@ def measured(job: tuple[str, str, str, int], pairs: list[tuple[str, str]]) -> li
 
 
 def cells(results: list[Found]) -> str:
-    """The cells of a row, from the results of its drives."""
+    """Make the cells of a row of a table, from the results of its drives."""
     ks = sorted({r.k for r in results})
     qualities = [r.quality for r in results]
     wrong_silently = sum(not r.right and not r.said for r in results)
@@ -302,7 +322,17 @@ HEAD = (
 
 
 def tables(seeds: list[int], workers: int) -> Iterator[tuple[str, str]]:
-    """Names and lines of the tables: features in all worlds, then clusterings over a day."""
+    """Measure, and make the two tables line by line.
+
+    The first table compares features in all worlds, the second one clusterings over a day.
+
+    Args:
+        seeds: Seeds of the drives.
+        workers: Number of processes.
+
+    Yields:
+        The name of a table ("features" or "clusterings"), and a line of it.
+    """
     by_k_means = [(features, "k-means") for features in FEATURES]
     others = [
         ("PanoramaTransformer", clusterer) for clusterer in CLUSTERERS if clusterer != "k-means"
@@ -342,7 +372,7 @@ def tables(seeds: list[int], workers: int) -> Iterator[tuple[str, str]]:
 
 
 def figure(path: Path, seed: int = 1) -> None:
-    """Draw some panoramas."""
+    """Draw some panoramas into a file."""
     import matplotlib as mpl
 
     mpl.use("Agg")

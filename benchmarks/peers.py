@@ -1,8 +1,8 @@
 """Other programs that find small Moore machines: functions from a trace to the machine they find.
 
-The causal theory asks for the smallest deterministic Moore machine that explains a trace, and so do
-these programs. Each function gets the whole trace and nothing of ours. Its docstring says how the
-program is given the trace, and what its answer means.
+The causal theory asks for the smallest deterministic Moore machine that explains a trace. These
+programs ask for the same. Each function gets the whole trace, and nothing that our solver found
+out. Its docstring says in which form the program gets the trace, and what the answer means.
 """
 
 from __future__ import annotations
@@ -21,19 +21,30 @@ from ssh_abduction import Trace
 
 
 class NotApplicableError(Exception):
-    """The program cannot solve this instance; the message says why."""
+    """A program cannot solve an instance. The message says why."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """A Moore machine: its start, the ends of actions, and the view of each state."""
+    """A Moore machine.
+
+    Attributes:
+        start: The start state.
+        follow: Function from a state and the name of an action to the next state.
+        shows: Function from a state to its view.
+    """
 
     start: Any
     follow: Callable[[Any, str], Any]
     shows: Callable[[Any], Any]
 
     def states(self, trace: Trace) -> int | None:
-        """The number of states that the trace visits; None if the views differ from its views."""
+        """Run the machine along a trace.
+
+        Returns:
+            The number of states that are visited; None if a state shows another view than the
+            trace.
+        """
         state, visited = self.start, set()
         for step in trace:
             if self.shows(state) != step.view:
@@ -46,7 +57,14 @@ class Machine:
 
 @dataclass(frozen=True)
 class Peer:
-    """A program: its function, what it needs, and whether it proves its machine minimal."""
+    """A program.
+
+    Attributes:
+        find: Function from a trace to the machine that the program finds.
+        modules: Modules that the function imports.
+        packages: Packages whose versions are reported; the first one is to install.
+        proves: Whether the program proves that its machine is minimal.
+    """
 
     find: Callable[[Trace], Machine]
     modules: tuple[str, ...]
@@ -62,13 +80,15 @@ class Words:
     """A trace as labelled words over the letters "0", "1", …, for learners of DFAs.
 
     Such learners get accepted and rejected words. The views are numbered. The actions up to a step
-    are a word. It is accepted if the lowest bit of the view's number is 1. Each further bit has its
-    own letter: the actions followed by this letter are accepted if the bit is 1.
+    are a word. It is accepted if the lowest bit of the number of the step's view is 1. Each further
+    bit has a letter of its own. The word of the actions, followed by that letter, is accepted if
+    the bit is 1.
 
-    The smallest DFA has as many states as the smallest Moore machine. From a DFA to a machine: take
-    the states that the trace visits, each with the bits it answers. From a machine to a DFA: accept
-    by the lowest bit, and let the letter of a bit lead to any accepting or any rejecting state.
-    Both exist as soon as there are two views.
+    The smallest DFA and the smallest Moore machine have the same number of states. A DFA gives a
+    machine: take the states that the trace visits, each with its bits, which the DFA answers. A
+    machine gives a DFA: a state is accepting if its lowest bit is 1, and the letter of another bit
+    leads to any accepting or to any rejecting state. Both kinds of states exist if there are at
+    least two views.
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -87,11 +107,11 @@ class Words:
         )
 
     def __len__(self) -> int:
-        """The number of steps of the trace."""
+        """Return the number of steps of the trace."""
         return len(self._numbers)
 
     def at(self, step: int) -> Iterator[tuple[list[str], bool]]:
-        """The words of a step, each with whether it is accepted."""
+        """Yield the words of a step, each with a flag that says whether it is accepted."""
         done, number = self._done[:step], self._numbers[step]
         yield done, bool(number & 1)
         for i, letter in enumerate(self.questions, 1):
@@ -100,7 +120,13 @@ class Words:
     def machine(
         self, start: Any, follow: Callable[[Any, str], Any], accepts: Callable[[Any], bool]
     ) -> Machine:
-        """The Moore machine of a DFA over these letters."""
+        """Make the Moore machine of a DFA over these letters.
+
+        Args:
+            start: Start state of the DFA.
+            follow: Function from a state and a letter to the next state.
+            accepts: Function from a state to whether it is accepting.
+        """
 
         def shows(state: Any) -> Any:
             number = sum(
@@ -115,9 +141,10 @@ class Words:
 
 
 def plain(trace: Trace) -> Machine:
-    """plain.lp in clingo, with a growing number of states, so the first machine is the smallest.
+    """Find a machine by plain.lp in clingo.
 
-    The number begins with that of the views.
+    The number of states grows, beginning with the number of views. So the first machine is the
+    smallest.
     """
     import clingo
 
@@ -145,13 +172,17 @@ def plain(trace: Trace) -> Machine:
 
 
 def dfainductor(trace: Trace) -> Machine:
-    """DFA-Inductor: SAT with a growing number of states, so the first DFA is the smallest.
+    """Find a machine by DFA-Inductor, which uses SAT.
 
-    The number begins with that of the views. The trace is given as `Words`. By default it breaks
-    symmetries breadth-first and uses no inconsistency graph. Counterexamples are added ten at a
-    time, the first ones first, to a start of 100 steps. On long traces this is much faster than all
-    words at once. Words are made when needed, as their total length is quadratic in that of the
-    trace.
+    The number of states grows, beginning with the number of views. So the first DFA is the
+    smallest. DFA-Inductor gets the trace as `Words`. It runs with its defaults: it breaks
+    symmetries breadth-first, and uses no inconsistency graph. It gets the words of the first 100
+    steps. Then the words of the first ten steps at which a DFA is wrong are added, again and again.
+    On long traces this is much faster than all words at once. Words are made when they are needed,
+    as their total length is quadratic in the length of the trace.
+
+    Raises:
+        NotApplicableError: There are more than ten letters.
     """
     from dfainductor.algorithms.searchers import LSUS
     from dfainductor.examples import BaseExamplesProvider
@@ -213,10 +244,11 @@ def dfainductor(trace: Trace) -> Machine:
 
 
 def z3gi(trace: Trace) -> Machine:
-    """z3gi: SMT with a growing number of states, so the first DFA is the smallest.
+    """Find a machine by z3gi, which uses SMT.
 
-    The number begins with that of the views. The trace is given as `Words`, all at once, in the
-    encoding with a node per word and without quantifiers, which is its fastest here.
+    The number of states grows, beginning with the number of views. So the first DFA is the
+    smallest. z3gi gets the trace as `Words`, all at once. Its encoding is the one with a node per
+    word and without quantifiers, which is its fastest for these traces.
     """
     import z3
     from z3gi.encoders import expressive
@@ -245,9 +277,9 @@ def z3gi(trace: Trace) -> Machine:
 
 
 def rpni(trace: Trace) -> Machine:
-    """AALpy's RPNI: merge states where possible, in order.
+    """Find a machine by AALpy's RPNI, which merges states in a fixed order if possible.
 
-    The machine explains the trace but need not be the smallest.
+    The machine explains the trace, but need not be the smallest.
     """
     from aalpy.learning_algs import run_RPNI
 
@@ -260,9 +292,9 @@ def rpni(trace: Trace) -> Machine:
 
 
 def gsm(trace: Trace) -> Machine:
-    """AALpy's general state merging by evidence: the merge that joins most comes first.
+    """Find a machine by AALpy's general state merging, which does the largest merge first.
 
-    The machine explains the trace but need not be the smallest.
+    The machine explains the trace, but need not be the smallest.
     """
     from aalpy.learning_algs import run_GSM
     from aalpy.learning_algs.general_passive.GsmNode import GsmNode

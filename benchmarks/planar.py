@@ -1,7 +1,8 @@
 """Street maps in the plane, with streets at any angles, and drives of a robot through them.
 
-The robot sees the bearings of gateways. A world is a networkx graph whose nodes have a position
-`at`: a complex number, with x to the right and y up. Edges are straight streets.
+The robot sees the bearings of gateways. A world is a networkx graph. Its nodes are places, each
+with a position `at`: a complex number, with x to the right and y up. Its edges are straight
+streets.
 """
 
 from __future__ import annotations
@@ -22,7 +23,12 @@ STRAIGHT = 20.0  # degrees; two streets within this of one line are one path
 
 @dataclass(frozen=True)
 class Tour:
-    """What a robot saw and did, and its place and direction at each step."""
+    """What a robot saw and did.
+
+    Attributes:
+        trace: The trace.
+        truth: Place of each step, and its direction as a whole number.
+    """
 
     trace: Trace
     truth: tuple[tuple[object, int], ...]
@@ -35,26 +41,31 @@ class Tour:
 
     @property
     def places(self) -> int:
-        """The number of visited places."""
+        """The number of places that were visited."""
         return len({place for place, _ in self.truth})
 
 
 def world(at: dict[object, complex], streets: list[tuple[object, object]]) -> nx.Graph:
-    """A world of these places and streets."""
+    """Make a world.
+
+    Args:
+        at: Position of each place.
+        streets: Pairs of places that streets join.
+    """
     graph = nx.Graph(streets)
     nx.set_node_attributes(graph, at, "at")
     return graph
 
 
 def triangle() -> nx.Graph:
-    """Three places with corners of 60 degrees."""
+    """Make a world of three places, with corners of 60 degrees."""
     return world(
         {k: cmath.rect(1, math.radians(120 * k)) for k in range(3)}, [(0, 1), (1, 2), (2, 0)]
     )
 
 
 def hexagon() -> nx.Graph:
-    """Six places with bends of 120 degrees."""
+    """Make a world of six places in a ring, with bends of 120 degrees."""
     return world(
         {k: cmath.rect(1, math.radians(60 * k)) for k in range(6)},
         [(k, (k + 1) % 6) for k in range(6)],
@@ -62,7 +73,7 @@ def hexagon() -> nx.Graph:
 
 
 def honeycomb(rows: int, columns: int) -> nx.Graph:
-    """Junctions of three streets, 120 degrees apart."""
+    """Make a honeycomb: junctions of three streets, 120 degrees apart."""
     graph = nx.hexagonal_lattice_graph(rows, columns)
     nx.set_node_attributes(
         graph, {node: complex(*pos) for node, pos in graph.nodes(data="pos")}, "at"
@@ -71,7 +82,7 @@ def honeycomb(rows: int, columns: int) -> nx.Graph:
 
 
 def triangles(rows: int, columns: int) -> nx.Graph:
-    """A lattice of triangles: junctions of up to six streets, 60 degrees apart."""
+    """Make a lattice of triangles: junctions of up to six streets, 60 degrees apart."""
     graph = nx.triangular_lattice_graph(rows, columns)
     nx.set_node_attributes(
         graph, {node: complex(*pos) for node, pos in graph.nodes(data="pos")}, "at"
@@ -80,7 +91,7 @@ def triangles(rows: int, columns: int) -> nx.Graph:
 
 
 def wheel(spokes: int) -> nx.Graph:
-    """A hub with spokes, and a ring road around it."""
+    """Make a hub with spokes, and a ring road around it."""
     rim = {k: cmath.rect(1, 2 * math.pi * k / spokes) for k in range(spokes)}
     return world(
         {"hub": 0j, **rim}, [("hub", k) for k in rim] + [(k, (k + 1) % spokes) for k in rim]
@@ -88,15 +99,16 @@ def wheel(spokes: int) -> nx.Graph:
 
 
 def junction(*directions: float) -> nx.Graph:
-    """A hub with a dead end in each of these directions, in degrees."""
+    """Make a hub with a dead end in each of some directions, in degrees."""
     ends = {k: cmath.rect(1, math.radians(d)) for k, d in enumerate(directions)}
     return world({"hub": 0j, **ends}, [("hub", k) for k in ends])
 
 
 def scattered(places: int, rng: random.Random) -> nx.Graph:
-    """Places at random positions with streets between them, of which no two cross.
+    """Make a world of places at random positions, with streets that do not cross.
 
-    At each place the streets are at least 40 degrees apart.
+    At each place, the streets are at least 45 degrees apart. No street is nearly, but not exactly,
+    opposite to another.
     """
     from scipy.spatial import Delaunay
 
@@ -118,9 +130,9 @@ def scattered(places: int, rng: random.Random) -> nx.Graph:
 
 
 def _crowded(graph: nx.Graph, place: object) -> bool:
-    """Whether two directions at a place are hard to tell apart.
+    """Whether two streets at a place are hard to distinguish.
 
-    Counts the directions of streets and their opposites.
+    They are if their angle is less than 45 degrees, or is 5 to 45 degrees from being opposite.
     """
     ways = [_direction(graph, place, there) for there in graph[place]]
     for i, a in enumerate(ways):
@@ -138,7 +150,10 @@ def _direction(graph: nx.Graph, here: object, there: object) -> float:
 
 
 def _aligned(graph: nx.Graph, place: object, facing: float) -> float:
-    """The direction of a robot that arrives at a place and faces the street ahead, if any."""
+    """The direction of a robot after it arrives at a place, in degrees clockwise from up.
+
+    The robot faces the street ahead, if there is one. Otherwise, it keeps its direction.
+    """
     return next(
         (
             way
@@ -160,21 +175,21 @@ def drive(
     unseen: bool = False,
     landmarks: Container[object] = (),
 ) -> Tour:
-    """A tour of so many steps.
+    """Drive a tour.
 
-    At each place the robot takes a street that it has used least often. Its views are the bearings
-    of the gateways, rounded to ten degrees.
+    At each place, the robot takes a street that it has used least often. A view is the bearings of
+    the gateways, rounded to ten degrees. A star is the same bearings with errors.
 
     Args:
         graph: The world.
         start: The place where the robot starts.
-        towards: The place that it faces.
-        steps: Number of actions.
+        towards: The neighbouring place that it faces.
+        steps: Number of steps of the trace.
         rng: Source of random choices.
         noise: Largest error of a bearing in a star, in degrees.
-        unseen: Whether gateways behind the robot are not observed. They are logged where they are,
-            but as unknown.
-        landmarks: Places that the views reveal, too.
+        unseen: Whether gateways behind the robot are not seen. Stars still have their bearings, but
+            leave unknown whether they are open.
+        landmarks: Places whose views also name the place.
     """
     here, facing = start, _direction(graph, start, towards)
     views: list[str] = []

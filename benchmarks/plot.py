@@ -56,7 +56,7 @@ STEP_UP = 1.35  # factor between the heights of tools that are over the limit
 
 
 def draw(results: dict[str, Any], picture: Path) -> None:
-    """Draw the two panels into a file."""
+    """Draw the two panels, by steps and by dstates, into a file."""
     limit = results["limit"]
     top = limit * STEP_UP ** (len(STYLES) + 1)
     figure, axes = plt.subplots(1, 2, figsize=(11, 5), sharey=True, layout="constrained")
@@ -109,9 +109,17 @@ def draw(results: dict[str, Any], picture: Path) -> None:
 
 
 def curve(results: dict[str, Any], pattern: str, tool: str, size: str) -> list[tuple[float, float]]:
-    """The size and median time of each instance of a family.
+    """Collect the size and the median time of each instance of a family.
 
-    The size is the number of images, or of states: the proven number, else that of the world.
+    Args:
+        results: The stored run.
+        pattern: Regular expression for the names of the instances.
+        tool: Name of the tool.
+        size: "images" for the number of images. "states" for the number of states: the proven one
+            or, if none is proven, that of the true world.
+
+    Returns:
+        Size and seconds of each instance.
     """
     points = []
     for name, by_tool in instances(results).items():

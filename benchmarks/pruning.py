@@ -2,14 +2,15 @@
 
     python benchmarks/pruning.py [--only SWITCHES] [--seeds N] [--resume] [--out RESULTS.json]
 
-Runs with and without a speed-up alternate. A speed-up stays if on two families the median ratio
-over the seeds is at least GAIN. The ratio compares seconds, or dstates where a limit ends the
-search, without and with the speed-up. Seconds are CPU seconds unless TRIALS says otherwise, so
-other work on the machine hardly matters. A search that hits its limit counts as if it had ended
-then, so the true ratio is at least as far from 1. `following` is not a switch: cell.py says what
-is left out. Each run has its own process, and they run one at a time. Results are stored as JSON
-after each run; --resume continues a stored run. readme.py writes the table into
-docs/measurements/performance.md.
+A family is one instance with several seeds. Runs with and without a speed-up alternate. The ratio
+of a seed is the seconds without the speed-up divided by the seconds with it. In some trials, it
+compares the dstates of the best maps at the time limit instead. A speed-up stays if the median
+ratio over the seeds is at least GAIN on two families. Seconds are CPU seconds unless TRIALS says
+otherwise, so other work on the machine hardly matters. A search that hits its limit counts as if it
+had ended at the limit, so the true ratio is at least as far from 1. `following` is no speed-up that
+users can switch off; cell.py says what is left out without it. Each run has its own process, and
+only one runs at a time. Results are stored as JSON after each run; --resume continues a stored run.
+readme.py writes the table into docs/measurements/performance.md.
 """
 
 from __future__ import annotations
@@ -43,12 +44,15 @@ MEMORY = 4096  # MiB
 
 @dataclass(frozen=True)
 class Trial:
-    """A speed-up that is switched off on a family: one instance with several seeds.
+    """A speed-up that is switched off on a family, which is one instance with several seeds.
 
     Attributes:
+        switch: Name of the speed-up.
+        family: Name of the instance.
         measure: "seconds" until one minimal map is proven, or "dstates" of the best map at the
             limit.
-        clock: As in cell.py.
+        limit: Time limit of a search in seconds.
+        clock: "cpu" for CPU seconds, or "wall".
     """
 
     switch: str
@@ -135,7 +139,14 @@ SWITCHES = tuple(
 
 
 def ratio(measure: str, limit: float, base: dict[str, Any], without: dict[str, Any]) -> float:
-    """The need without a speed-up divided by the need with it."""
+    """Divide the seconds, or dstates, without a speed-up by those with it.
+
+    Args:
+        measure: "seconds" or "dstates".
+        limit: Time limit in seconds.
+        base: Result with the speed-up.
+        without: Result without it.
+    """
     if measure == "dstates":
         here, there = (cell.get("dstates") or math.inf for cell in (base, without))
         return 1.0 if here == there else there / here
@@ -146,7 +157,11 @@ def ratio(measure: str, limit: float, base: dict[str, Any], without: dict[str, A
 
 
 def ratios(results: dict[str, Any]) -> dict[str, dict[Trial, list[float]]]:
-    """The ratios of each trial by switch, one for each seed."""
+    """Compute the ratios of stored results.
+
+    Returns:
+        Dict from the name of each speed-up to its trials, each with a ratio for each seed.
+    """
     pairs: dict[tuple[Trial, int], dict[bool, dict[str, Any]]] = {}
     for cell in results["cells"]:
         trial = Trial(
@@ -163,14 +178,18 @@ def ratios(results: dict[str, Any]) -> dict[str, dict[Trial, list[float]]]:
 
 
 def verdict(of_switch: Collection[list[float]]) -> str:
-    """Whether the ratios of a switch, a list for each family, show that it should stay."""
+    """Decide from the ratios of a speed-up, a list for each family, whether it stays.
+
+    Returns:
+        Text for the table: "stays", "**goes**" or "not measured yet".
+    """
     if sum(statistics.median(of_family) >= GAIN for of_family in of_switch) >= STAYING:
         return "stays"
     return "**goes**" if len(of_switch) >= FAMILIES else "not measured yet"
 
 
 def table(results: dict[str, Any]) -> str:
-    """Markdown with a row for each switch."""
+    """Make a table in Markdown, with a row for each speed-up."""
     rows = [
         "| speed-up | without it, as a ratio to with it: the median over the seeds "
         "(least to most) | verdict |",
@@ -195,7 +214,7 @@ def table(results: dict[str, Any]) -> str:
 
 
 def _meant(trial: Trial) -> str:
-    """What a trial compares, if not CPU seconds."""
+    """A text that says what a trial compares; empty for CPU seconds."""
     return (
         f", dstates after {trial.limit:g} s"
         if trial.measure == "dstates"
@@ -218,7 +237,14 @@ def _spread(found: list[float]) -> str:
 
 
 def measure(results: dict[str, Any], trials: Iterable[Trial], seeds: int, out: Path) -> None:
-    """Run what is not stored yet."""
+    """Run the trials that are not stored yet, and store each result.
+
+    Args:
+        results: The stored results; receives the new ones.
+        trials: The trials.
+        seeds: Number of seeds.
+        out: File for the results.
+    """
     done = {
         (c["switch"], c["instance"], c["measure"], c["limit"], c["seed"], c["tool"])
         for c in results["cells"]

@@ -3,7 +3,7 @@
     python benchmarks/readme.py RESULTS.json             # of bench.py
     python benchmarks/readme.py RESULTS.json pruning     # of pruning.py
 
-Each table stands between two comments that name it. The text around them stays.
+Each table is between two comments that name the table. The text around the comments is kept.
 """
 
 from __future__ import annotations
@@ -26,7 +26,13 @@ PAGES = {
 
 
 def block(name: str, results: dict[str, Any], path: Path) -> str:
-    """The text between the markers of a table: the table, its machine, and where it is stored."""
+    """Make the text for a table: the table, the machine, and where the results are stored.
+
+    Args:
+        name: Name of the table, a key of PAGES.
+        results: The stored run.
+        path: File of the stored run.
+    """
     machine, versions = (
         results["machine"],
         ", ".join(f"{package} {number}" for package, number in results["packages"].items()),
@@ -50,12 +56,12 @@ def block(name: str, results: dict[str, Any], path: Path) -> str:
 
 
 def _narrow(table: str) -> str:
-    """The table without the spaces that align its columns, which are a third of it."""
+    """Remove the spaces that align the columns of a table, which are a third of its length."""
     return re.sub(" {2,}", " ", re.sub("-{3,}", "--", table))
 
 
 def rewritten(page: str, name: str, results: dict[str, Any], path: Path) -> str:
-    """The page with the named table of these results."""
+    """Return the text of a page, in which a table is replaced by that of a stored run."""
     marked = re.compile(
         rf"(<!-- bench:begin {name} -->\n).*?(<!-- bench:end {name} -->)", re.DOTALL
     )

@@ -3,17 +3,19 @@
     python benchmarks/recovery.py [--only PATTERN] [--seeds 20] [--first 800] [--limit 0.5]
                                   [--out RESULTS.jsonl]
 
-Each run has one fault, at a random step that is not among the first or last five. Steps count from
-where the fault shows: at the wrong view, or at the first step after the jump.
+Each run has one fault, at a random step that is not among the first or last five. Steps are counted
+from the step at which the fault becomes visible: the step with the wrong view, or the first step
+after the jump.
 
 *Noticed* is the first step at which the mapper says that something broke. *Certain again* is the
-first step after that at which it is certain. A map is right if it has the true dstates and links
-that can be reached from the robot, and the robot's true dstate. The fault is *found* if the fault
-and all labels are the true ones, except the label of a wrong view (fault_cases.py), in the first
-map or in one of the minimal maps. Often nothing tells which of two actions in a row slipped.
+first step from there on at which the mapper is certain. A map is right if it has the true dstates
+and links that can be reached from the robot, and the robot's true dstate. The fault is *found* if a
+map has exactly the true fault and the true labels, except the label of the step with a wrong view
+(fault_cases.py). It may be found in the first map, or in another minimal map. Often nothing shows
+which of two consecutive actions slipped.
 
-Between two steps the robot drives. In this time the mapper goes on with a solve that a step did
-not finish. "Truth dearer" counts the runs in which the truth costs more than the minimum. CPU
+Between two steps the robot drives. In this time, the mapper continues a solve that a step did not
+finish. "Truth dearer" counts the runs in which the truth costs more than the minimum. CPU
 milliseconds are those of `observe`.
 """
 
@@ -65,14 +67,20 @@ Record = dict[str, Any]
 
 
 def machine(seed: int, *, wrong: int = 0, jumps: int = 0) -> Case:
-    """A random machine of 5 to 12 states and 4 to 9 views, with one fault in 200 steps."""
+    """Make a walk of 200 steps in a random machine of 5 to 12 states and 4 to 9 views.
+
+    Args:
+        seed: Seed of machine, walk and faults.
+        wrong: Number of wrong views.
+        jumps: Number of jumps.
+    """
     chance = random.Random(f"recovery {seed}")
     states = chance.randint(5, 12)
     return sized(seed, states, chance.randint(4, min(9, states)), 200, wrong=wrong, jumps=jumps)
 
 
 def corridor(seed: int, steps: int = 30) -> Case:
-    """Up and down a corridor of four places with stars, one of which is wrong."""
+    """Make a walk up and down a corridor of four places with stars. One star is wrong."""
     chance = random.Random(f"corridor {seed}")
     openings = [(1, 0, 0, 0), (1, 0, 1, 0), (1, 0, 1, 0), (0, 0, 1, 0)] * 2
     actions = ["travel", "travel", "travel", "around"] * 2
@@ -154,7 +162,18 @@ def main() -> None:
 
 
 def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int = 0) -> Record:
-    """Follow a mapper through a trace with one fault."""
+    """Give a trace with one fault to a mapper, step by step.
+
+    Args:
+        case: The trace.
+        theory: The theory.
+        limit: Seconds that a step may take.
+        drive: Seconds that the robot drives between two steps.
+        seed: Seed of the case, for the record.
+
+    Returns:
+        What happened, by name.
+    """
     trace = case.walk.trace
     shown = min([*case.wrong, *case.misseen, *(t + 1 for t in case.jumps)])
     mapper = OnlineMapper(trace.views[0], theory, star=trace.steps[0].star, time_limit=limit)
@@ -199,7 +218,7 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
 
 
 def is_right(case: Case, theory: Theory, ssh_map: SSHMap) -> bool:
-    """Whether a map of the first steps predicts what the true map does from there."""
+    """Check whether a map of the first steps makes the same predictions as the true map."""
     truth = true_map(case, theory, len(ssh_map.labels))
     return (
         Rival.of(ssh_map, case.walk.trace, theory).future()
@@ -208,14 +227,14 @@ def is_right(case: Case, theory: Theory, ssh_map: SSHMap) -> bool:
 
 
 def true_map(case: Case, theory: Theory, steps: int) -> SSHMap:
-    """The true map of the first steps, with its faults."""
+    """Make the true map of the first `steps` steps, with its faults."""
     trace = case.walk.trace
     faults = [(t, kind) for t, kind in case.faults if t + (kind == "slipped") < steps]
     return answer_maps.faulty_map(case.walk.truth[:steps], trace.prefix(steps), faults, theory)
 
 
 def cells(records: Sequence[Record]) -> list[str]:
-    """The cells of a row, from the runs of a family."""
+    """Make the cells of a row of the table, from the records of a family."""
     sure, others = (
         [r for r in records if r["certain_before"] is before] for before in (True, False)
     )

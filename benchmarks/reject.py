@@ -2,9 +2,11 @@
 
     python benchmarks/reject.py [--routes 1000] [--cells 4] [--steps 40] [--first 0]
 
-A row for each `reject`, the highest probability that a true map is refused. The first column of
-shares has white noise, and a model without systematic errors. The second one has a scale and a
-drift of heading, drawn for each route with the standard deviations of the model.
+The table has a row for each value of `reject`, the highest probability with which a true map is
+rejected. It gives the share of routes whose true map is rejected. In the first column of shares,
+the noise is white, and the model has no systematic errors. In the second one, there are also an
+error of scale and a drift of the heading. They are drawn for each route with the standard
+deviations of the model.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ MODEL = Odometry()
 
 
 def true_map(walk: Walk) -> SSHMap:
-    """The dstates and places of the true map of a walk; displacements need no more."""
+    """Make the true map of a walk with dstates and places, which displacements are checked by."""
     number: dict[object, int] = {}
     labels = tuple(number.setdefault(state, len(number)) for state in walk.truth)
     places: dict[object, int] = {}
@@ -35,7 +37,7 @@ def true_map(walk: Walk) -> SSHMap:
 
 
 def walks(cells: int, steps: int, seed: int) -> Iterator[Walk]:
-    """The route of one seed with white noise, and with systematic errors."""
+    """Yield the route of one seed twice: with white noise, and with systematic errors, too."""
     rng = np.random.default_rng(seed)
     scale, bend = rng.normal(0.0, MODEL.scale), rng.normal(0.0, MODEL.bend)
     white = replace(MODEL, scale=0.0, bend=0.0)

@@ -2,15 +2,16 @@
 
     python benchmarks/skeleton.py LOG [LOG ...] -o FOLDER [--poses corrected|odometry] [--doors]
 
-Draws for each log the occupancy grid, the graph and the way of the robot. All scans are put into
-the grid at their poses: the corrected ones, which the robot did not have, or those of the odometry.
+The script draws for each log the occupancy grid, the graph and the way of the robot. All scans are
+drawn into the grid at the corrected poses, which the robot did not have, or at the poses of the
+odometry.
 
 The skeleton of the cells where a robot fits (Zhang & Suen 1984, scikit-image) has branches to every
-niche. A branch is cut off if it ends near the circle around its junction that touches the nearest
-wall, as is usual (Thrun 1998, "Learning metric-topological maps"; Shaked & Bruckstein 1998,
-"Pruning medial axes"). Junctions in one open space, nearer to each other than to the walls, are one
-node. Nodes are junctions and dead ends, and with --doors also doors. All lengths are in metres, and
-the same for all logs.
+niche. As is usual, a branch is cut off if it ends inside or near the circle around its junction
+that touches the nearest wall (Thrun 1998, "Learning metric-topological maps"; Shaked & Bruckstein
+1998, "Pruning medial axes"). Junctions in one open space, which are nearer to each other than to
+the walls, are one node. Nodes are junctions and dead ends, and with --doors also doors. All lengths
+are in metres, and the settings are the same for all logs.
 """
 
 from __future__ import annotations
@@ -48,30 +49,34 @@ REACH = 1.5  # The robot passes a node within this, or within the node's distanc
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """What all scans say of each cell: 1 free, 0 wall, NaN not seen.
+    """An occupancy grid.
 
     Attributes:
-        cells: (rows, columns); row 0 has the least y.
-        origin: x and y of the lower left corner.
+        cells: (rows, columns), 1 if free, 0 for a wall, NaN if not seen. Row 0 has the least y.
+        origin: x and y of the lower left corner in metres.
     """
 
     cells: Array
     origin: tuple[float, float]
 
     def at(self, points: Array) -> NDArray[np.int_]:
-        """The row and column of each point; points are (n, 2)."""
+        """Return the row and column of each point, (n, 2), from x and y, (n, 2) in metres."""
         return np.floor((points[:, ::-1] - self.origin[::-1]) / CELL).astype(int)
 
     def points(self, cells: NDArray[Any]) -> Array:
-        """The middle x and y of each cell, (n, 2), from rows and columns."""
+        """Return the middle x and y of each cell, (n, 2) in metres, from row and column, (n, 2)."""
         return (np.asarray(cells, dtype=float)[:, ::-1] + 0.5) * CELL + self.origin
 
 
 def poses_of(log: RobotLog, kind: str) -> list[Pose]:
-    """The poses of all scans, corrected or by odometry.
+    """Return the poses of all scans.
+
+    Args:
+        log: The log.
+        kind: "corrected" or "odometry".
 
     Raises:
-        ValueError: If the log has none.
+        ValueError: A scan has no corrected pose.
     """
     if kind == "odometry":
         return [scan.odometry for scan in log.scans]
@@ -85,7 +90,7 @@ def poses_of(log: RobotLog, kind: str) -> list[Pose]:
 
 
 def grid_of(log: RobotLog, poses: Sequence[Pose]) -> Grid:
-    """An occupancy grid of all scans at these poses."""
+    """Make the occupancy grid of all scans, with a pose for each."""
     along = np.arange(0, FARTHEST, CELL / 2)
     low = np.floor((np.min([pose[:2] for pose in poses], axis=0) - FARTHEST) / CELL).astype(int) - 2
     columns, rows = (
@@ -121,10 +126,15 @@ def grid_of(log: RobotLog, poses: Sequence[Pose]) -> Grid:
 
 
 def free_space(grid: Grid, poses: Sequence[Pose]) -> tuple[NDArray[np.bool_], Array]:
-    """The cells where a robot fits that has been at these poses, and the clearance of each cell.
+    """Find the cells where the robot fits, in the part of the grid that it drove through.
 
-    The clearance is the distance in metres from the nearest cell not seen to be free, without
-    specks.
+    Args:
+        grid: The grid.
+        poses: Poses of the robot.
+
+    Returns:
+        (rows, columns) mask of these cells; and (rows, columns) distance in metres from each cell
+        to the nearest cell that was not seen to be free, ignoring specks.
     """
     seen = _without_specks(~_without_specks(grid.cells != 1.0))
     clear = distance_transform_edt(seen) * CELL
@@ -136,7 +146,7 @@ def free_space(grid: Grid, poses: Sequence[Pose]) -> tuple[NDArray[np.bool_], Ar
 
 
 def _without_specks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The mask without its parts that are specks."""
+    """Copy a mask without its connected parts that are smaller than SPECK."""
     parts, _ = label(mask)
     large = np.bincount(parts.ravel()) * CELL**2 >= SPECK
     large[0] = False
@@ -147,8 +157,11 @@ def _without_specks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 class Skeleton:
     """A graph in metric space.
 
-    Nodes have `at`, (x, y), and `clear`, their distance from the walls. Edges have `way`, (n, 2)
-    points, and `metres`.
+    Attributes:
+        grid: The occupancy grid.
+        free: (rows, columns) mask of the cells where the robot fits.
+        graph: A node has `at`, its (x, y), and `clear`, its distance from the walls in metres. An
+            edge has `way`, its points, (n, 2), and `metres`, its length.
     """
 
     grid: Grid
@@ -156,9 +169,15 @@ class Skeleton:
     graph: nx.MultiGraph
 
     def events(self, poses: Sequence[Pose]) -> list[tuple[int, int]]:
-        """The nodes that the robot passed, in order, each with the nearest scan.
+        """List the nodes that the robot passed, in order.
 
-        Of two nodes within reach the robot passes the nearer one.
+        If several nodes are within reach, the robot passes the nearest one.
+
+        Args:
+            poses: Pose of each scan.
+
+        Returns:
+            For each pass, the index of the scan nearest to the node, and the node.
         """
         nodes = sorted(self.graph)
         at = np.array([self.graph.nodes[n]["at"] for n in nodes])
@@ -184,7 +203,13 @@ class Skeleton:
 
 
 def skeleton_of(log: RobotLog, poses: Sequence[Pose], *, doors: bool = False) -> Skeleton:
-    """The pruned skeleton of the free space of a log, optionally with nodes at doors."""
+    """Make the pruned skeleton of the free space of a log.
+
+    Args:
+        log: The log.
+        poses: Pose of each scan.
+        doors: Whether to add nodes at doors.
+    """
     from skimage.morphology import skeletonize
 
     grid = grid_of(log, poses)
@@ -204,9 +229,9 @@ def skeleton_of(log: RobotLog, poses: Sequence[Pose], *, doors: bool = False) ->
 
 
 def _pixels(thin: NDArray[np.bool_]) -> nx.Graph:
-    """The graph of touching cells of a skeleton.
+    """The graph of the cells of a skeleton. Cells that touch are joined.
 
-    Of three cells that touch at a corner only the two straight joints are kept.
+    Two cells that touch at a corner are not joined if both touch a third cell along a side.
     """
     graph = nx.Graph()
     cells = {(int(r), int(c)) for r, c in np.argwhere(thin)}
@@ -227,7 +252,7 @@ def _pixels(thin: NDArray[np.bool_]) -> nx.Graph:
 
 
 def _chains(pixels: nx.Graph) -> nx.MultiGraph:
-    """Junctions and ends of a graph of cells, joined by the chains of cells between them.
+    """The graph of junctions and dead ends. An edge is a chain of cells between two of them.
 
     A ring without a junction gets a node at one of its cells.
     """
@@ -262,7 +287,8 @@ def _join(graph: nx.MultiGraph, cells: Sequence[tuple[int, int]]) -> None:
 def _prune(graph: nx.MultiGraph) -> None:
     """Cut off branches that hardly leave the circle of their junction, the shortest first.
 
-    Edges are joined at nodes that are no longer junctions.
+    The circle touches the nearest wall. If a node is no longer a junction, its two edges are
+    joined.
     """
     while True:
         branches = []
@@ -280,7 +306,7 @@ def _prune(graph: nx.MultiGraph) -> None:
 
 
 def _straighten(graph: nx.MultiGraph, node: Any) -> None:
-    """Remove a node that is no longer a junction, if two different edges end there."""
+    """Remove a node at which exactly two different edges end, and join these edges."""
     if graph.degree(node) == 2 and graph.number_of_edges(node, node) == 0:
         (_, _, one), (_, _, other) = graph.edges(node, data=True)
         to = one["cells"] if one["cells"][-1] == node else one["cells"][::-1]
@@ -290,9 +316,10 @@ def _straighten(graph: nx.MultiGraph, node: Any) -> None:
 
 
 def _merged(graph: nx.MultiGraph) -> nx.MultiGraph:
-    """The graph with junctions merged that lie within each other's circle.
+    """Merge junctions that are joined by an edge within the circle of one of them.
 
-    A merged node is at the junction farthest from the walls.
+    The circle of a junction touches the nearest wall. A merged node is at the junction farthest
+    from the walls.
     """
     near = nx.Graph()
     near.add_nodes_from(graph)
@@ -320,7 +347,7 @@ def _merged(graph: nx.MultiGraph) -> nx.MultiGraph:
 
 
 def _with_doors(graph: nx.MultiGraph, clear: Array) -> nx.MultiGraph:
-    """The graph with a node at each door: a narrowest point along an edge.
+    """Add a node at each door, which is a narrowest point along an edge.
 
     Critical points of Voronoi graphs are defined in the same way.
     """
@@ -349,7 +376,7 @@ def _with_doors(graph: nx.MultiGraph, clear: Array) -> nx.MultiGraph:
 
 
 def lay(axes: Any, skeleton: Skeleton, poses: Sequence[Pose]) -> None:
-    """Draw the grid, the way of the robot and the graph. Nodes that the robot passed are filled."""
+    """Draw grid, way of the robot and graph into axes. Nodes that the robot passed are filled."""
     grid = skeleton.grid
     rows, columns = grid.cells.shape
     shown = np.where(
@@ -382,7 +409,7 @@ def lay(axes: Any, skeleton: Skeleton, poses: Sequence[Pose]) -> None:
 
 
 def draw(path: Path, skeleton: Skeleton, poses: Sequence[Pose], title: str) -> None:
-    """Draw the grid, the way of the robot and the graph with its numbered nodes into a file."""
+    """Draw the grid, the way of the robot, and the graph with numbered nodes into a file."""
     import matplotlib
 
     matplotlib.use("Agg")

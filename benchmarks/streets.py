@@ -2,8 +2,9 @@
 
     python benchmarks/streets.py [--seeds 20] [--tours 2]
 
-Simulates drives in such worlds, maps them, and prints a table in Markdown. A street map is a
-networkx graph whose nodes have a position `at`, as in planar.py.
+The script simulates drives in such worlds, maps the traces, and prints a table in Markdown. A
+street map is a networkx graph whose nodes have a position `at`, as in planar.py. A dstate
+(distinctive state) is a place and a heading there.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ STRAIGHT = 20.0  # degrees; two streets within this of one line are one path
 def drawn(
     graph: nx.Graph, reach: float, start: Leg, route: list[str] | None = None, name: str = "streets"
 ) -> dict[str, Any]:
-    """The world in the form of its file.
+    """Make a world from a street map, as the content of a world file.
 
     Args:
         graph: The street map.
-        reach: Half the width of a street, and its length beyond a dead end; metres.
-        start: The place where the robot starts, and the one that it faces.
-        route: The robot's actions; None for a tour of all streets in both directions.
-        name: The name of the world.
+        reach: Half the width of a street, and its length beyond a dead end, in metres.
+        start: The place where the robot starts, and the place that it faces.
+        route: Actions of the robot; None for a tour of all streets in both directions.
+        name: Name of the world.
     """
     ways = {(a, b): _way(graph, a, b) for a, b in graph.edges} | {
         (b, a): _way(graph, b, a) for a, b in graph.edges
@@ -75,10 +76,15 @@ def _pose(graph: nx.Graph, place: object, way: complex) -> list[float]:
 
 
 def _polygons(graph: nx.Graph, ways: dict[Leg, complex], reach: float) -> list[list[complex]]:
-    """The outlines of the walls.
+    """The outlines of the walls, as lists of points.
 
-    An outline keeps the street on its right. At each place it turns to the next street
-    counter-clockwise of the one it came along.
+    An outline follows the streets from place to place. At each place, it goes on along the next
+    street counterclockwise from the one by which it came.
+
+    Args:
+        graph: The street map.
+        ways: Direction of each leg, as a unit vector.
+        reach: Half the width of a street in metres.
     """
     left = set(ways)
     found = []
@@ -115,10 +121,10 @@ def _polygons(graph: nx.Graph, ways: dict[Leg, complex], reach: float) -> list[l
 
 
 def _dstates(graph: nx.Graph, ways: dict[Leg, complex]) -> list[dict[str, Any]]:
-    """The dstates of the world.
+    """The dstates of the world, as in a world file.
 
-    A dstate faces a street, or has one behind it if no street is opposite. A path goes on through
-    opposite streets.
+    There is a dstate that faces each street of a place. If no other street is opposite, there is
+    also a dstate that has the street behind it. A path goes on through opposite streets.
     """
     course: dict[Leg, tuple[int, int]] = {}
     for leg in ways:
@@ -157,7 +163,7 @@ def _back(leg: Leg) -> Leg:
 
 
 def _straight_on(ways: dict[Leg, complex], leg: Leg) -> list[Leg]:
-    """A leg and those that lead straight on from it, at most once round."""
+    """A leg, and the legs that lead straight on from it; a circle is followed once."""
     legs = [leg]
     while (onward := _opposite(ways, _back(legs[-1]))) not in (None, leg):
         assert onward is not None
@@ -166,7 +172,7 @@ def _straight_on(ways: dict[Leg, complex], leg: Leg) -> list[Leg]:
 
 
 def _opposite(ways: dict[Leg, complex], leg: Leg) -> Leg | None:
-    """The leg that leaves a place opposite to another leg."""
+    """The leg that leaves the same place in the opposite direction; None if there is none."""
     for other, way in ways.items():
         if (
             other[0] == leg[0]
@@ -178,9 +184,9 @@ def _opposite(ways: dict[Leg, complex], leg: Leg) -> Leg | None:
 
 
 def round_trip(graph: nx.Graph, start: Leg) -> list[str]:
-    """Actions that lead along all streets in both directions and back to the start.
+    """Find actions that lead along all streets in both directions, and back to the start.
 
-    The robot always goes on to the nearest street that is left.
+    The robot always goes to the nearest street that it has not travelled in that direction.
     """
     moves = _moves(
         {(a, b): _way(graph, a, b) for edge in graph.edges for a, b in (edge, edge[::-1])}
@@ -205,7 +211,11 @@ def round_trip(graph: nx.Graph, start: Leg) -> list[str]:
 
 
 def _moves(ways: dict[Leg, complex]) -> nx.DiGraph:
-    """The dstates (place, street, whether it is ahead), and the actions between them."""
+    """The graph of dstates, with actions as edges.
+
+    A dstate is a place, the place at the other end of a street, and whether that street is ahead
+    (or behind).
+    """
     moves: nx.DiGraph = nx.DiGraph()
     facing = {(*leg, True): way for leg, way in ways.items()}
     facing |= {(*leg, False): -way for leg, way in ways.items() if _opposite(ways, leg) is None}
@@ -233,7 +243,7 @@ def _moves(ways: dict[Leg, complex]) -> nx.DiGraph:
 
 
 def turning(*turns: float) -> nx.Graph:
-    """A chain of streets, each turned to the left of the one before by these degrees."""
+    """Make a chain of streets. Each turns left from the one before, by the given degrees."""
     at, heading, found = 0j, 10.0, {0: 0j}
     for k, turn in enumerate((0.0, *turns), 1):
         heading += turn
@@ -243,7 +253,7 @@ def turning(*turns: float) -> nx.Graph:
 
 
 def hub(*directions: float) -> nx.Graph:
-    """A hub with dead ends in these directions, in degrees, each longer than the one before."""
+    """Make a hub with dead ends of different lengths in the given directions, in degrees."""
     graph = planar.junction(*directions)
     for k in range(len(directions)):
         graph.nodes[k]["at"] *= 6 + 0.7 * k
@@ -251,7 +261,7 @@ def hub(*directions: float) -> nx.Graph:
 
 
 def ring(graph: nx.Graph, size: float) -> nx.Graph:
-    """A street map, enlarged by a factor."""
+    """Enlarge a street map by a factor, in place."""
     for place in graph:
         graph.nodes[place]["at"] *= size
     return graph

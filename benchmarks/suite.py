@@ -22,9 +22,13 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 @dataclass(frozen=True)
 class Instance:
-    """A trace to solve: `walk` makes it from a seed, which is ignored unless `seeded`.
+    """A trace to solve.
 
-    `star` is the star of a topological theory.
+    Attributes:
+        name: Name of the instance.
+        walk: Makes the trace from a seed.
+        seeded: Whether the trace depends on the seed.
+        star: The setting `star` of a topological theory.
     """
 
     name: str
@@ -42,15 +46,15 @@ class Instance:
 
 
 def aces3() -> Walk:
-    """The route of a real robot through the ACES building."""
+    """Load the route of a real robot through the ACES building. Its true states are not given."""
     trace = Trace.load(EXAMPLES / "aces3-route.jsonl")
     return Walk(trace, ())
 
 
 def taylor_hall(seed: int) -> Walk:
-    """Ten tours of the stand-in for Taylor Hall: 240 images, clustered into views.
+    """Simulate ten tours of a model of Taylor Hall: 240 images, clustered into views.
 
-    It is made in another process, so that its memory does not count.
+    This is done in another process, so that its memory is not measured.
     """
     with ProcessPoolExecutor(1, get_context("spawn")) as process:
         return process.submit(_taylor_hall, seed).result()

@@ -2,7 +2,7 @@
 
     python benchmarks/table.py RESULTS.json
 
-Time and memory of all tools, then the size of our ground program.
+The first table has time and memory of all tools, the second one the size of our ground program.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ Cells: TypeAlias = Sequence[dict[str, Any]]
 
 
 def times(results: dict[str, Any]) -> str:
-    """Time and memory of each tool on each instance, and each peer's time divided by ours."""
+    """Make the table of time and memory of each tool on each instance.
+
+    It also has the time of each other program divided by ours.
+    """
     tools = list(dict.fromkeys(cell["tool"] for cell in results["cells"] if cell["tool"] != OURS))
     reasons: list[str] = []
     rows = []
@@ -59,7 +62,7 @@ def times(results: dict[str, Any]) -> str:
 
 
 def grounding(results: dict[str, Any]) -> str:
-    """The size of our ground program, and the time for grounding, solving and the rest."""
+    """Make the table of the size of our ground program, and of our times to ground and solve."""
     rows = []
     for name, by_tool in instances(results).items():
         cells = [cell for cell in by_tool.get(OURS, []) if cell.get("rules") is not None]
@@ -93,7 +96,11 @@ def grounding(results: dict[str, Any]) -> str:
 
 
 def contradictions(results: dict[str, Any]) -> list[str]:
-    """Wrong answers: failed checks, or fewer states than another tool proved possible."""
+    """Describe wrong answers: failed checks, and fewer states than another tool proved possible.
+
+    Returns:
+        A line for each; none if there are no wrong answers.
+    """
     found = [
         f"{c['instance']}, seed {c['seed']}: {c['tool']}: {c['reason']}"
         for c in results["cells"]
@@ -111,7 +118,7 @@ def contradictions(results: dict[str, Any]) -> list[str]:
 
 
 def instances(results: dict[str, Any]) -> dict[str, dict[str, list[dict[str, Any]]]]:
-    """The cells by instance and tool, one for each seed."""
+    """Group the cells of a stored run: a dict from instance to tool to a cell for each seed."""
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for cell in results["cells"]:
         found.setdefault(cell["instance"], {}).setdefault(cell["tool"], []).append(cell)
@@ -119,14 +126,18 @@ def instances(results: dict[str, Any]) -> dict[str, dict[str, list[dict[str, Any
 
 
 def median_seconds(cells: Cells) -> float:
-    """The median seconds over the seeds; seeds that hit the limit count as infinite."""
+    """Compute the median seconds over the seeds. A seed without an answer counts as infinite."""
     return statistics.median(
         cell["seconds"] if cell["status"] == "ok" else math.inf for cell in cells
     )
 
 
 def dstates(cells: Cells) -> str:
-    """The median of the fewest dstates over the seeds: exact if proven, otherwise bound to best."""
+    """Format the median, over the seeds, of the fewest dstates.
+
+    It is a number if it is proven by a tool, and otherwise the range from the lower bound to the
+    best map.
+    """
     known = {cell["seed"]: cell["dstates"] for cell in cells if cell.get("proven")}
     if known:
         return f"{statistics.median(known.values()):,g}"
@@ -148,7 +159,10 @@ def dstates(cells: Cells) -> str:
 
 
 def _peer(cells: Cells, ours: Cells, limit: float, reasons: list[str]) -> str:
-    """Time, memory and ratio of a peer, and the states of its machine if not proven minimal."""
+    """The cell of another program: time, memory, and time divided by ours.
+
+    If its machine is not proven minimal, the cell also has the number of states.
+    """
     if not any("seconds" in cell for cell in cells):
         return "–" + _mark(cells, reasons)
     there, here = median_seconds(cells), median_seconds(ours) if ours else math.inf
@@ -168,7 +182,7 @@ def _peer(cells: Cells, ours: Cells, limit: float, reasons: list[str]) -> str:
 
 
 def _time(cells: Cells, limit: float) -> str:
-    """The median over the seeds, or why there is none."""
+    """The median time over the seeds as text, or the reason why there is none."""
     seconds = median_seconds(cells)
     failed = {cell["status"] for cell in cells} - {"ok", "timeout"}
     text = (
@@ -187,7 +201,10 @@ def _memory(cells: Cells) -> str:
 
 
 def _mark(cells: Cells, reasons: list[str]) -> str:
-    """The mark of the note that says why there is no answer. A new note is added to `reasons`."""
+    """The mark of the note that says why there is no answer; empty if there is one.
+
+    A new note is added to `reasons`.
+    """
     reason = next((cell["reason"] for cell in cells if cell.get("reason")), "").removesuffix(
         ": "
     )  # an error may have no message
@@ -201,7 +218,7 @@ def _duration(seconds: float) -> str:
 
 
 def _figures(number: float) -> str:
-    """Two significant figures, and whole numbers from ten on."""
+    """Format a number with two significant figures; from ten on, as a whole number."""
     return (
         f"{number:,.0f}"
         if number >= 9.95

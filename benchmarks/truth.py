@@ -5,11 +5,12 @@
     python benchmarks/truth.py --family aces3 [--seeds 10] [--stars]
     python benchmarks/truth.py --family taylor-hall [--seeds 20] [--stars]
 
-Prints a table in Markdown with a row for each trace, and the sum below. A map is true if its labels
-are the true dstates up to renaming, and its places are the true places. The flags of the noise are
-the fields of Odometry. They set both the noise that is drawn and the noise that the trace declares;
-in Taylor Hall the robot has its own. `--scale-error` and `--bend-error` add systematic errors. With
-`--displacement none` the solver ignores displacements. Seeds begin at --first.
+The script prints a table in Markdown with a row for each trace, and a summary below. A map is true
+if its labels are the true dstates up to renaming, and its places are the true places. The options
+for noise are the fields of Odometry. They set the noise that is drawn and the noise that the trace
+states. In Taylor Hall, the robot has noise of its own. `--scale-error` and `--bend-error` add
+systematic errors. With `--displacement none`, the solver ignores displacements. Seeds begin at
+--first.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ COMPASS = {"E": 0.0, "N": math.pi / 2, "W": math.pi, "S": -math.pi / 2}
 
 @dataclass(frozen=True)
 class Known:
-    """A trace, with the true dstate and place of each step."""
+    """A trace with a name, and the true dstate and place of each step."""
 
     name: str
     trace: Trace
@@ -72,7 +73,13 @@ class Known:
 
 @dataclass(frozen=True)
 class Noise:
-    """The random noise, and the systematic errors: a share, and radians per metre."""
+    """Errors of odometry.
+
+    Attributes:
+        odometry: Model of the random noise.
+        scale: Share by which reported distances are too long.
+        bend: Radians a metre by which the reported heading drifts to the left.
+    """
 
     odometry: Odometry
     scale: float = 0.0
@@ -80,13 +87,16 @@ class Noise:
 
 
 def partition(names: Sequence[Hashable]) -> tuple[int, ...]:
-    """The names, numbered by first visit. Names that differ only by renaming get equal numbers."""
+    """Number names in the order in which they first occur.
+
+    Two sequences that differ only by renaming get equal numbers.
+    """
     numbers: dict[Hashable, int] = {}
     return tuple(numbers.setdefault(name, len(numbers)) for name in names)
 
 
 def is_true(ssh_map: SSHMap, known: Known) -> bool:
-    """Whether the labels of a map, and the places of the labels if any, are true up to renaming."""
+    """Check whether the labels of a map and, if it has any, its places are true up to renaming."""
     places = [ssh_map.dstates[label].place for label in ssh_map.labels]
     return partition(ssh_map.labels) == partition(known.dstates) and (
         not ssh_map.places or partition(places) == partition(known.places)
@@ -94,7 +104,7 @@ def is_true(ssh_map: SSHMap, known: Known) -> bool:
 
 
 def mazes(cells: int, steps: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
-    """Random walks in mazes."""
+    """Yield random walks in mazes, one for each seed."""
     for seed in seeds:
         walk = maze(
             cells,
@@ -133,9 +143,9 @@ def aces3(seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
 
 
 def taylor_hall(tours: int, seeds: Sequence[int], noise: Noise) -> Iterator[Known]:
-    """Tours of Taylor Hall with the robot's own odometry.
+    """Yield drives in Taylor Hall with the robot's own odometry, one for each seed.
 
-    Each is simulated in another process, so that its memory does not count.
+    Each is simulated in another process, so that its memory is not measured.
     """
     for seed in seeds:
         with ProcessPoolExecutor(1, get_context("spawn")) as process:
@@ -146,7 +156,7 @@ def taylor_hall(tours: int, seeds: Sequence[int], noise: Noise) -> Iterator[Know
 
 
 def drive(tours: int, seed: int, body: Body) -> Trace:
-    """Tours of Taylor Hall, whose images are clustered into views."""
+    """Simulate tours of Taylor Hall, and cluster the images into views."""
     from perception.images import images_of
     from perception.reciprocal import ReciprocalTransformer
     from perception.views import ViewClusterer
@@ -161,7 +171,7 @@ def drive(tours: int, seed: int, body: Body) -> Trace:
 
 
 def told(name: str, trace: Trace) -> Known:
-    """A trace whose steps contain their true dstate and place."""
+    """Collect the truth of a trace whose steps state their true dstate and place."""
     return Known(
         name,
         trace,
@@ -170,10 +180,10 @@ def told(name: str, trace: Trace) -> Known:
 
 
 def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
-    """Solve a trace.
+    """Solve a trace, and compare its maps with the truth.
 
     Returns:
-        A row of the table; whether all minimal maps are true and proven minimal; and the seconds.
+        A row of the table; whether all minimal maps are proven to be true; and the seconds.
     """
     began = time.perf_counter()
     solution = solve(known.trace, theory, time_limit=limit)
@@ -197,7 +207,7 @@ def row(known: Known, theory: Theory, limit: float) -> tuple[str, bool, float]:
 
 
 def share_all(solution: Solution) -> bool:
-    """Whether all minimal maps, listed or not, have the same dstates and the same places.
+    """Check whether all minimal maps have the same dstates and places, even if not all are listed.
 
     Then they differ only in paths.
     """
@@ -213,7 +223,7 @@ def share_all(solution: Solution) -> bool:
 
 
 def report(traces: Iterator[Known], theory: Theory, limit: float) -> str:
-    """Solve each trace, print a row for each, and return the sum."""
+    """Solve each trace, print a row for each, and return a line that summarises them."""
     print(
         "| trace | steps | true dstates, places | status | dstates, places, paths | "
         "true maps | s |\n|---|---|---|---|---|---|---|",
@@ -295,7 +305,7 @@ def arguments() -> argparse.ArgumentParser:
 
 
 def chosen(options: argparse.Namespace) -> Iterator[Known]:
-    """The traces that the options ask for."""
+    """Make the traces that the options ask for."""
     noise = Noise(
         Odometry(**{name: getattr(options, name) for name in NUMBERS}),
         options.scale_error,

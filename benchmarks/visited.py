@@ -2,11 +2,11 @@
 
     python benchmarks/visited.py TRACE --log LOG [--truth drive.json] [-o named.jsonl]
 
-An event is a visit according to a mapper: a scan, and the place where the mapper says that it was
-taken. The mapper is a trace or a skeleton. The truth comes from corrected poses, or from the
-file that the simulator writes beside a log (format ssh-drive). With -o the trace is written with
-the names of the true places. Then `ssh-abduction evaluate maps.json named.jsonl` can name dstates,
-places and paths.
+An event is a visit according to a mapper: a scan, and the place at which the mapper says that the
+scan was taken. The mapper is a trace, with or without a map, or a skeleton. The truth comes from
+corrected poses, or from the file that the simulator writes beside a log (format ssh-drive). With
+-o, the trace is written with the names of the true places. Then `ssh-abduction evaluate maps.json
+named.jsonl` can name dstates, places and paths.
 """
 
 from __future__ import annotations
@@ -55,7 +55,13 @@ ACES_ROUTE = ["N", "NE", "E", "SE", "S", "SW", "W", "NW", "N", "C", "S", "C", "W
 
 @dataclass(frozen=True)
 class Visit:
-    """A stay at a true place, from the first scan there to the last."""
+    """A stay at a true place.
+
+    Attributes:
+        place: Name of the place.
+        first: Index of the first scan there.
+        last: Index of the last scan there.
+    """
 
     place: str
     first: int
@@ -67,15 +73,15 @@ class Truth:
     """What is known of a log, for evaluation only.
 
     Attributes:
-        poses: Where each scan was taken, (n, 3), in metres and radians.
-        visits: The visits of places that a mapper should find, in order; empty if unknown.
-        doorways: The doors that the robot drove through, in order, if other places are unknown.
+        poses: (n, 3) true pose of each scan: x and y in metres, heading in radians.
+        visits: Visits to places that a mapper should find, in order; empty if unknown.
+        doorways: Visits to the doors that the robot drove through, in order; empty if unknown.
             Going in and out by one door counts once.
-        doors: x and y of each door, by name.
-        rooms: The room of each scan; empty if unknown.
+        doors: x and y of each door in metres, by name; None if unknown.
+        rooms: Name of the room of each scan; empty if unknown.
         grid: Whether places are the crossings of ACES3, whose corridors are the true paths.
-        times: Times of the scans, in seconds.
-        relations: Relative poses between times that were checked by hand, if there are any.
+        times: Time of each scan in seconds; empty if unknown.
+        relations: Relative poses between times that were checked by hand; None without any.
     """
 
     poses: Array
@@ -89,10 +95,13 @@ class Truth:
 
     @staticmethod
     def of_aces(poses: Array) -> Truth:
-        """The 15 visits of ACES3.
+        """Make the truth of ACES3, with its 15 visits.
+
+        Args:
+            poses: (n, 3) corrected pose of each scan.
 
         Raises:
-            ValueError: If the corrected poses do not pass the places in the known order.
+            ValueError: The poses do not pass the places in the known order.
         """
         places = {
             name: (x, y)
@@ -109,7 +118,7 @@ class Truth:
 
     @staticmethod
     def load(path: Path) -> Truth:
-        """The file that the simulator wrote beside a log."""
+        """Read the truth from the file that the simulator wrote beside a log."""
         told = json.loads(path.read_text())
         poses = np.array(told["poses"])
         doors = {name: door["at"] for name, door in told.get("doors", {}).items()}
@@ -126,9 +135,15 @@ class Truth:
         )
 
     def matched(self, scans: Sequence[int]) -> list[int | None]:
-        """The visit of each event, or None.
+        """Match events with visits.
 
-        Of several events at one visit the one nearest to its middle counts.
+        If several events are at one visit, only the one nearest to its middle is matched.
+
+        Args:
+            scans: Scan of each event.
+
+        Returns:
+            For each event, the index of its visit; None without a visit.
         """
         found: list[int | None] = [None] * len(scans)
         for number, visit in enumerate(self.visits):
@@ -139,10 +154,14 @@ class Truth:
         return found
 
     def names(self, scans: Sequence[int], poses: Array | None = None) -> list[str]:
-        """The true place of each of these scans, or the one it shows at this pose.
+        """Name the true place of each event.
 
-        It is that of the visit, else a door. Otherwise it is named after the room, together with
-        events nearby.
+        It is the place of a visit, or else a door that is near. Other events that are close
+        together get one place, which is named after their room.
+
+        Args:
+            scans: Scan of each event.
+            poses: (n, 3) pose of each event; None for the true poses of the scans.
         """
         named: list[str | None] = [
             next((v.place for v in self.visits if v.first <= scan <= v.last), None)
@@ -172,9 +191,14 @@ class Truth:
 def visits_of(
     places: Mapping[str, Sequence[float]], poses: Array, reach: float = REACH
 ) -> tuple[Visit, ...]:
-    """The stays of a robot within reach of places, given as (x, y) by name.
+    """Find the stays of a robot within reach of places.
 
-    Between two stays at one place the robot visits another place.
+    Between two visits to one place, the robot visits another place.
+
+    Args:
+        places: x and y of each place in metres, by name.
+        poses: (n, 3) pose of each scan.
+        reach: Metres.
     """
     visits: list[Visit] = []
     for scan, (x, y, _) in enumerate(poses.tolist()):
@@ -186,10 +210,14 @@ def visits_of(
 
 
 def doorways_of(crossings: Sequence[Mapping[str, Any]], poses: Array) -> tuple[Visit, ...]:
-    """The doors that a robot at these poses drove through.
+    """Make visits to the doors that a robot drove through.
 
-    A stay begins with the last scan within DOOR in front of the door, and ends with the last one
-    within DOOR behind it. Going in and out by one door counts once.
+    A visit has the scans within DOOR metres of the crossing, along the way of the robot. Going in
+    and out by one door counts once.
+
+    Args:
+        crossings: Name of the door and index of the scan of each crossing, in order.
+        poses: (n, 3) pose of each scan.
     """
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
     found: list[Visit] = []
@@ -210,10 +238,10 @@ class Events:
     """The events of a mapper, in order.
 
     Attributes:
-        scans: The scan of each event.
-        places: The mapper's place of each event; None if the mapper does not say.
-        poses: The true pose of each event as the mapper sees it from the robot, (n, 3). None: the
-            pose of the robot.
+        scans: Index of the scan of each event.
+        places: Place of each event according to the mapper; None if the mapper does not say.
+        poses: (n, 3) pose of each event, as seen by the mapper from the true pose of the robot.
+            None if the events are at the poses of the robot.
     """
 
     scans: tuple[int, ...]
@@ -222,7 +250,12 @@ class Events:
 
     @staticmethod
     def of(trace: Trace, ssh_map: SSHMap | None = None) -> Events:
-        """The visits of a trace that was made from a log, and the places that a map gives them."""
+        """List the visits of a trace that was made from a log, with their places in a map.
+
+        Args:
+            trace: The trace.
+            ssh_map: The map; None if there is none.
+        """
         starts = [t for t in range(len(trace)) if t == 0 or trace.actions[t - 1].kind != "turn"]
         places = [
             None if ssh_map is None else ssh_map.dstates[ssh_map.labels[t]].place for t in starts
@@ -237,10 +270,13 @@ class Events:
 
 
 def passes(events: Events, truth: Truth) -> tuple[int, int]:
-    """How often the robot came back to where it had an event, and how often it had an event then.
+    """Count how often the robot passed the position of an event at another time.
 
-    It comes back if it is within NEAR of the event after it was farther away than AWAY. An event
-    counts if its scan is later than that.
+    It passes the position if it comes within NEAR metres after it was farther away than AWAY, or
+    before it is.
+
+    Returns:
+        The number of passes, and the number of those during which there is also an event.
     """
     where = truth.poses[list(events.scans)] if events.poses is None else events.poses
     come = noticed = 0
@@ -258,14 +294,16 @@ class Figures:
     """How right a mapper is.
 
     Attributes:
-        nodes: Number of its places that were visited.
-        precision: Share of its events that are true visits; None if unknown.
-        recall: Share of the true visits, or else of the doors driven through, that have an event;
-            None if unknown.
-        passes: How often the robot came back to an event, and how often there is an event then.
+        nodes: Number of places of the mapper that were visited.
+        events: Number of events.
+        precision: Share of the events that match true visits; None if unknown.
+        recall: Share of the true visits that have an event or, if visits are unknown, of the doors
+            that were driven through; None if both are unknown.
+        passes: How often the robot passed the position of an event at another time, and how often
+            there was an event then.
         named: Accuracy, edges and pairs by the names of the true places, as in `evaluate`.
         posed: Pairs of events by poses, as in `evaluate`.
-        related: Pairs of events by hand-checked relations, if there are any.
+        related: Pairs of events by relations that were checked by hand; None without relations.
     """
 
     nodes: int
@@ -279,9 +317,9 @@ class Figures:
 
     @property
     def isomorphic(self) -> bool:
-        """Whether its places are the visited ones, as far as true visits are known.
+        """Whether the places of the mapper are those that were visited, as far as this is known.
 
-        Places are told apart correctly, and events and true visits correspond.
+        Events are at one place exactly if they truly are, and events and true visits correspond.
         """
         return (
             bool(self.named.maps[0].places_right)
@@ -290,7 +328,7 @@ class Figures:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The figures under short names; None if unknown."""
+        """Return the figures as a dict from short names; None for an unknown figure."""
         named, row = (
             self.named.maps[0],
             {
@@ -315,7 +353,7 @@ class Figures:
 
 
 def judged(events: Events, truth: Truth) -> Figures:
-    """Compare events with the truth."""
+    """Compare the events of a mapper with the truth."""
     hits = sum(visit is not None for visit in truth.matched(events.scans))
     noticed = sum(
         any(door.first <= scan <= door.last for scan in events.scans) for door in truth.doorways
@@ -354,9 +392,10 @@ def judged(events: Events, truth: Truth) -> Figures:
 
 
 def with_names(trace: Trace, truth: Truth) -> Trace:
-    """The trace with the true place of each step as its truth.
+    """Copy a trace, with the true place of each step as its truth.
 
-    In ACES3 also with its heading, path and direction, if the step has a pose.
+    If a step has a true pose, its truth also has that pose and the heading. In ACES3, it also has
+    path and direction.
     """
     told = told_poses(trace)
     scans = [int(step.extra["scan"]) for step in trace.steps]
@@ -427,9 +466,15 @@ def main() -> None:
 
 
 def truth_of(log: Path, truth: Path | None = None) -> Truth:
-    """The truth of a log: the simulator's file, or corrected poses.
+    """Find the truth of a log.
 
-    For ACES3 also the visits to its nine places, for Freiburg the relations beside it.
+    It comes from a file of the simulator, or from corrected poses. For ACES3, it also has the
+    visits to its nine places. For a log with a file of relations beside it, such as Freiburg, it
+    also has these.
+
+    Args:
+        log: The log.
+        truth: The file that the simulator wrote; None without one.
     """
     if truth is not None:
         return Truth.load(truth)
