@@ -24,9 +24,9 @@ from ssh_abduction import Trace
 State = tuple[
     object, object, bool
 ]  # a place, a street there, and whether the robot faces the street or has it behind
-# The share of travels in a random drive where the robot can travel; otherwise it turns.
+# If the robot can travel and turn, it travels with this probability in a random drive.
 TRAVELS = 2 / 3
-# The most draws of a drive, as some fail, for example with a box in the way.
+# A drive is drawn at most this many times, as some fail, for example because of a box in the way.
 TRIES = 20
 
 

@@ -234,7 +234,8 @@ def part_nowhere(seeds: range) -> None:
                 drive = elsewhere(ssh_map, other, seed, new)
                 beliefs = list(Localiser(ssh_map).beliefs(drive.trace))
                 nowhere = [b.verdict is Verdict.NOWHERE for b in beliefs]
-                # Steps outside the map until the localiser says so, and after it until found.
+                # Collect the steps outside the map until the localiser notices it, and the steps
+                # after that until the robot is located.
                 if (when := first(nowhere[LEFT:BACK])) is not None:
                     said.append(when)
                 there += sum(nowhere[LEFT:BACK])
@@ -285,7 +286,7 @@ def part_images(seeds: range) -> None:
                 own = simulate(World.named(name), tours=3, seed=1000 + seed)
                 more = simulate(World.named(name), tours=2, seed=2000 + seed)
                 other = simulate(World.named(foreign), tours=1, seed=3000 + seed)
-                # The robot is carried to where it is after a third of the second drive.
+                # The robot is carried to its position after a third of the second drive.
                 skipped = len(more) // 3
                 images = np.concatenate(
                     [images_of(own), images_of(more)[skipped:], images_of(other)]

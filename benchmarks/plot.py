@@ -23,7 +23,7 @@ from matplotlib import pyplot as plt
 from matplotlib.lines import Line2D
 
 PICTURE = Path(__file__).parent.parent / "docs" / "figures" / "growth.png"
-STYLES = {  # Okabe and Ito's colours and different markers, so that either is enough
+STYLES = {  # Colours (Okabe and Ito) and markers both differ, so that either is enough.
     "ssh-abduction": ("#000000", "o", "ssh-abduction"),
     "plain.lp": ("#D55E00", "s", "plain.lp"),
     "dfainductor": ("#0072B2", "^", "dfainductor"),

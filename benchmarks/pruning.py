@@ -33,12 +33,12 @@ from table import OURS, WITHOUT
 from ssh_abduction.theory.speedups import SPEEDUPS
 
 ROOT = Path(__file__).parent.parent
-GAIN = 1.5  # least ratio of seconds or dstates, without to with a speed-up that stays
-STAYING = 2  # families of instances with this gain
-FAMILIES = 3  # least number of measured families
-LIMIT = 4.0  # seconds of a search
-LONGER = 12.0  # seconds where little gain was expected, or maps take long
-SHORT = 3.0  # seconds where the first map matters, before a proof is possible
+GAIN = 1.5  # A speed-up stays if the ratio without to with it is at least this
+STAYING = 2  # on this many families of instances.
+FAMILIES = 3  # Fewer families are too few to remove a speed-up.
+LIMIT = 4.0  # Seconds of a search.
+LONGER = 12.0  # Seconds if little gain was expected, or if maps take long.
+SHORT = 3.0  # Seconds if the first map matters, before a proof is possible.
 MEMORY = 4096  # MiB
 
 

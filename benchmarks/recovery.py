@@ -181,7 +181,7 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
     right_again = False
     milliseconds = []
     for t, (action, step) in enumerate(zip(trace.actions, trace.steps[1:], strict=True), 1):
-        if mapper.solution.stopped == "time limit":  # otherwise no solve is unfinished
+        if mapper.solution.stopped == "time limit":  # Only then is there a solve to continue.
             time.sleep(drive)
         began = time.process_time()
         solution = mapper.observe(action, trace.views[t], star=step.star)

@@ -71,7 +71,7 @@ def main() -> None:
     for seed in range(options.first, options.first + options.routes):
         for column, walk in enumerate(walks(options.cells, options.steps, seed)):
             for line, reject in enumerate(REJECTS):
-                if not is_refused(walk, reject):  # then a smaller share does not refuse it either
+                if not is_refused(walk, reject):  # Smaller values of `reject` also accept the map.
                     break
                 refused[line, column] += 1
     print(

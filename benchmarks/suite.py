@@ -122,8 +122,8 @@ SUITE = {
 }
 SMALL = _maze(
     2, 60, full=True
-)  # instances that the full theory's plain encoding can solve: for ablation.py
-# Where a map with frames is sought:
+)  # an instance that the plain encoding of the topological theory can solve, for ablation.py
+# An instance for which a map with frames is sought.
 BARE = Instance(
     "full maze 3x3 n=400, loops, no stars", lambda seed: maze(3, 3, steps=400, seed=seed, loops=0.5)
 )
@@ -140,7 +140,7 @@ def _drive(name: str, side: int, steps: int, star: str = "auto", **kind: Any) ->
     return Instance(name, lambda seed: maze(side, side, steps=steps, seed=seed, **kind), star=star)
 
 
-# One speed-up less at a time, over several seeds: for pruning.py.
+# Instances for pruning.py, which switches off one speed-up at a time, over several seeds.
 PRUNED = (
     _moore(16, 2, 1600),
     _moore(16, 2, 10_000),

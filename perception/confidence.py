@@ -55,7 +55,8 @@ def confidence(X: ArrayLike, labels: ArrayLike) -> NDArray[np.float64]:
     inside = images[of != NOISE]
     distances = cdist(inside, _centres(inside, number, len(views)))
     here, size = np.arange(len(inside)), counts[number]
-    # The distance to the centre without the image itself: the centre moves away from the image.
+    # Measure the distance to the centre of the other images. It is larger than that to the centre
+    # of all images by this factor.
     own = distances[here, number] * size / np.maximum(size - 1, 1)
     distances[here, number] = np.inf
     next_ = distances.min(axis=1)

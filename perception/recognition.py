@@ -1,6 +1,6 @@
 """Recognises places: an image gets the label of the most similar image that was learnt.
 
-The labels to learn come from a map, which tells the dstate of each image (its position and
+The labels to learn come from a map, which gives the dstate of each image (a position and a
 heading).
 
 >>> recogniser().fit([[1.0, 4.0], [3.0, 3.0]], ["corner", "hall"]).predict([[1.1, 4.2]]).tolist()

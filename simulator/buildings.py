@@ -19,9 +19,9 @@ from simulator.plans import Door, Plan, Room
 from simulator.world import World, distances_to
 
 Array = NDArray[np.float64]
-# Width of a door, and distance from the corners of its rooms, in metres.
+# Width of a door, and its smallest distance from the corners of its rooms, in metres.
 DOOR, OFF = 1.0, 0.1
-# Metres on both sides of a door without drawn walls, since these would close the door.
+# Walls within this many metres before and behind a door are removed, since they would close it.
 DEPTH = 0.25
 
 

@@ -24,9 +24,10 @@ from ssh_abduction.data.errors import brief, is_finite
 Array = NDArray[np.float64]
 # Speed of driving in metres a second, and of turning in radians a second.
 SPEED, SPIN = 0.5, 1.0
-# Metres between scans by default, and at least.
+# Default and smallest distance between scans in metres.
 EVERY, CLOSEST = 0.25, 0.01
-# A motion is recorded in parts, this many from scan to scan, so that scans are evenly spaced.
+# A motion is recorded in parts, so that scans are evenly spaced. There are about this many parts
+# from one scan to the next.
 FINE = 5
 TINY = 1e-9
 
@@ -112,7 +113,7 @@ class Recorder:
     poses: list[Pose] = field(default_factory=list)
     scans: list[tuple[World, list[int]]] = field(default_factory=list)
     metres: float = 0.0
-    _seconds: list[float] = field(default_factory=list)  # Per pose.
+    _seconds: list[float] = field(default_factory=list)  # Time of each pose.
     _way: float = 0.0  # Metres since the last scan.
     _turned: float = 0.0
 

@@ -203,7 +203,7 @@ class _Reader:
 
 
 def _matched(here: Sequence[Point], there: Sequence[Point]) -> Iterator[Point]:
-    """Match the doors between two rooms, each of which may be drawn on both sides of the wall.
+    """Match the doors between two rooms. A door may be drawn on one or both sides of the wall.
 
     Args:
         here: Positions of the doors that one room lists.

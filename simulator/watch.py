@@ -25,7 +25,7 @@ from simulator.world_files import are_square
 # Largest distance from the expected place in metres (`reach` if that is larger), and largest
 # difference of heading in radians.
 NEAR, FACING = 0.5, math.radians(45)
-# Largest sideways distance of the next place on a path, as a share of the distance.
+# The next place on a path is at most this far to the side, as a share of its distance ahead.
 STRAIGHT = 0.2
 # With larger errors, the control laws may fail: relative errors of motions and odometry, and errors
 # of ranges in metres.

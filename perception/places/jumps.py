@@ -17,8 +17,8 @@ from ssh_abduction.data.odometry import between
 if TYPE_CHECKING:
     from perception.places.track import Track
 
-# A step between two scans is impossible beyond FAR metres and UNUSUAL times the usual step; it is
-# doubtful beyond half of both.
+# A step between two scans is impossible if it is longer than both FAR metres and UNUSUAL times the
+# usual step. It is doubtful if it is longer than half of that.
 FAR, UNUSUAL = 1.5, 3.5
 # After a pause of PAUSE times the usual interval, the robot may have driven on at up to FASTER
 # times its usual speed.
@@ -127,7 +127,7 @@ def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) 
     Returns:
         Notes for the user; none if nothing is wrong.
     """
-    # A cut with a step is a jump. A cut without one is a stretch in which the odometer stood still.
+    # If the odometer moved at a cut, it jumped. Otherwise, it stood still while the robot moved.
     steps = {
         cut: between(log.scans[cut - 1].odometry, log.scans[cut].odometry) for cut in track.cuts
     }

@@ -18,7 +18,7 @@ EVERY = 0.5
 ASIDE = 6.0
 # Percentiles of the width along the trajectory for narrow passages and for corridors.
 NARROW, CORRIDOR = 5, 20
-# Percentile of the width that most of the track exceeds.
+# Percentile of the width along the trajectory for `Scale.most`.
 MOST = 30
 # A gateway is at least this share of a narrow passage wide. Walls look thicker in a grid than they
 # are, and the robot needs less room than it had.

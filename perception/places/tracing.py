@@ -24,7 +24,7 @@ from ssh_abduction.data.star import Gateway
 from ssh_abduction.data.trace import Action, Step, Trace
 
 QUARTER = math.pi / 2
-# An exit that is farther than this from all quarters, in radians, does not fit a right angle.
+# An exit is at right angles to the walls if it is off by less than this, in radians.
 OFF = math.radians(27)
 # A building has right angles if this share of the exits that the robot took fit them.
 RIGHT = 0.85

@@ -42,11 +42,11 @@ POINTS = 150
 ROUGHNESS = 0.05
 # Errors of neighbouring points are correlated: this many points count as one independent point.
 TOGETHER = 3
-# Largest distance in metres from a point to a wall: in the first round and in the last, with the
-# factor for each round, and the number of rounds.
+# Largest distance in metres from a point to a wall: BEGIN in the first round, then SHRINK times as
+# large in each round, but at least END. ROUNDS is the largest number of rounds.
 BEGIN, END, SHRINK, ROUNDS = 1.0, 0.25, 0.75, 12
-# A match is poor if less than this share of the points lies on walls. Odometers miss turns and logs
-# miss lines, so this many headings are then tried.
+# A match is poor if less than the share POOR of the points lies on walls. Then HEADINGS headings are
+# tried, because odometers miss turns, and logs miss lines.
 POOR, HEADINGS = 0.5, 24
 # A scan is of an unseen place if less than STRANGE of its points lies on walls, in IN_A_ROW scans
 # in a row.
@@ -61,8 +61,8 @@ TURNED = math.radians(60)
 CARRIED = 1.0
 # Share of points on walls that a match needs without odometry.
 SURE = 0.7
-# In a bare corridor, moving on and standing still match equally well, up to this share. Then the
-# robot moved on.
+# In a bare corridor, moving on and standing still match equally well. If their shares of points on
+# walls differ by at most this, the robot is taken to have moved on.
 ALIKE = 0.03
 
 

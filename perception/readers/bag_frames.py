@@ -110,7 +110,7 @@ def _record(frames: Frames, child: str, parent: str, transform: Any, is_static: 
     if edge is None or (edge.track is None) != is_static:
         edge = Frame(parent, np.zeros(3), np.eye(3), flat, None if is_static else Track())
     parents.pop(parent, None)
-    parents[parent] = edge  # The last parent comes last.
+    parents[parent] = edge  # The parent in the last message comes last.
     edge.translation = np.array([move.x, move.y, move.z])
     if edge.track is None or edge.count == 0 or edge.off != (0.0, 0.0) or flat != edge.first:
         edge.rotation = _rotation(turn)

@@ -286,7 +286,7 @@ def _of_one_source(track: Track, called: str, notes: list[str]) -> Track:
     sources = sources_of(track)
     if len(sources) == 1:
         return track
-    # The gap between the first two sources shows the error.
+    # For the note, measure how far the poses of the two largest sources differ.
     table = track.table()
     first, second = (Track() for _ in range(2))
     for number in sources[0]:

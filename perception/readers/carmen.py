@@ -74,12 +74,12 @@ from perception.readers.scans import Damage, Laser, Reading, Scan
 from ssh_abduction.data.files import LINE_OF_A_LOG
 from ssh_abduction.data.odometry import Pose, between, moved
 
-# Poses of vertices within this many metres of the chain of the edges are not corrected.
+# Poses of vertices were corrected if one is farther than this from its pose by odometry, in metres.
 CORRECTED = 0.05
 # Lines of CARMEN that are ignored.
 OTHERS = (b"SYNC", b"RLASER", b"ROBOTLASER2", b"RAWLASER2", *(kind.encode() for kind in KINDS))
-# Numbers of beams of a FLASER that cover half a circle by convention: a SICK at 2, 1, 1/2 and 1/4
-# degree, with the last beam or without it.
+# With these numbers of beams, a FLASER line covers half a circle by convention. They are those of a
+# SICK with steps of 2, 1, 1/2 and 1/4 degree, with or without the last beam.
 HALF_A_CIRCLE = (90, 91, 180, 181, 360, 361, 720, 721)
 # Largest number of scans that wait for the next ODOM line.
 MOST_WAITING = 100
