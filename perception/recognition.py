@@ -122,7 +122,7 @@ class PlaceRecogniser(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 def recogniser(floor: float = 0.05, n_neighbors: int = 1, features: Any = None) -> Pipeline:
     """Make a pipeline that predicts labels of images, (n, d), by the nearest neighbour.
 
-    It first turns images into features. The pipeline is not fitted yet.
+    The pipeline first turns images into features. It is not fitted yet.
 
     Args:
         floor: Smallest range in metres, if the features are reciprocals of ranges (the default).

@@ -45,8 +45,8 @@ TOGETHER = 3
 # Largest distance in metres from a point to a wall: BEGIN in the first round, then SHRINK times as
 # large in each round, but at least END. ROUNDS is the largest number of rounds.
 BEGIN, END, SHRINK, ROUNDS = 1.0, 0.25, 0.75, 12
-# A match is poor if less than the share POOR of the points lies on walls. Then HEADINGS headings are
-# tried, because odometers miss turns, and logs miss lines.
+# A match is poor if less than the share POOR of the points lies on walls. Then HEADINGS headings
+# are tried, because odometers miss turns, and logs miss lines.
 POOR, HEADINGS = 0.5, 24
 # A scan is of an unseen place if less than STRANGE of its points lies on walls, in IN_A_ROW scans
 # in a row.

@@ -154,6 +154,9 @@ def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
 
     Args:
         *others: Errors to add to these.
+
+    Returns:
+        Classes of errors, as for an `except` clause.
     """
     zstd = zstd_module()
     return (
