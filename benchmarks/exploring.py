@@ -4,12 +4,12 @@
     python benchmarks/exploring.py --family plans --only Borchen4,Sabadell1 --out results.jsonl
     python benchmarks/exploring.py --table results.jsonl [--plot docs/figures/exploring.png]
 
-All strategies begin in the same world at the same dstate. A robot *has the map* after a number of
-steps if it has done every travel, and if all minimal maps of these steps have the true dstates and,
-if the theory has places, the true places. Maps that differ only in paths count as one. The number
-is searched after the drive: growing prefixes are solved, beginning with the step at which
-everything was visited, and then the interval is halved. The explorer also says itself when it is
-done.
+All strategies begin in the same world at the same dstate (distinctive state: a place and a heading
+there). A robot *has the map* after a number of steps if it has done every travel, and if all
+minimal maps of these steps have the true dstates and, if the theory has places, the true places.
+Maps that differ only in paths count as one. The number is searched after the drive: growing
+prefixes are solved, beginning with the step at which everything was visited, and then the interval
+is halved. The explorer also says itself when it is done.
 
     explorer  Explorer of ssh_abduction/online/explorer.py.
     random    Any action that the robot can do, drawn uniformly.

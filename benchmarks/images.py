@@ -3,8 +3,9 @@
     python benchmarks/images.py [SIZE ...]
 
 The script prints time and peak memory. Each measurement is a single run in its own process. Images
-are of the notched rectangle: from poses near its eight dstates ("dstates"), or from uniformly drawn
-poses ("anywhere"). Images from anywhere have no clusters, which is the slowest case.
+are of the notched rectangle. They are from poses near its eight dstates, which are places with
+headings ("dstates"), or from uniformly drawn poses ("anywhere"). Images from anywhere have no
+clusters, which is the slowest case.
 """
 
 from __future__ import annotations

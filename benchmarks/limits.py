@@ -226,8 +226,8 @@ def outcome(case: Case, folder: Path, *, python: bool = False) -> Outcome:
 def _peak(process: int) -> float:
     """The peak MiB of a running process; 0 if the system does not say.
 
-    The usage that the system reports at the end of a process is no substitute. It also includes
-    this parent process.
+    The peak that the system reports at the end of a process cannot be used, as it includes this
+    parent process.
     """
     with suppress(OSError, StopIteration), open(f"/proc/{process}/status", "rb") as status:
         return next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:")) / 2**10

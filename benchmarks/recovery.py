@@ -172,7 +172,8 @@ def run(case: Case, theory: Theory, limit: float, drive: float = 0.0, seed: int 
         seed: Seed of the case, for the record.
 
     Returns:
-        What happened, by name.
+        A dict with the step at which the fault shows, the steps until the mapper noticed it and was
+        certain again, whether its maps were right, and the CPU milliseconds of each step.
     """
     trace = case.walk.trace
     shown = min([*case.wrong, *case.misseen, *(t + 1 for t in case.jumps)])

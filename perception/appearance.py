@@ -34,7 +34,7 @@ class PanoramaTransformer(TransformerMixin, BaseEstimator):  # type: ignore[misc
 
     The pixels of each patch are averaged. The logarithm of each patch is compared with those of the
     patch on its right and the patch below, for each colour. A factor that multiplies a colour in
-    both patches cancels out. So time of day, tint of the light and exposure change nothing. Light
+    both patches cancels out. So time of day, tint of the light and exposure hardly matter. Light
     from one side changes the features only at corners, where walls face different ways. The
     distance between two panoramas is the Euclidean distance of their features.
 

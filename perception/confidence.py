@@ -1,4 +1,6 @@
-"""Measures the confidence of views: is an image near its own cluster and far from the next?
+"""Measures how surely each image belongs to its view, which is a cluster of similar images.
+
+An image belongs surely if it is near its own cluster and far from the next one.
 
 >>> confidence([[0.0], [0.2], [4.0], [4.2], [1.9]], [0, 0, 1, 1, 0]).round(2).tolist()
 [0.94, 0.96, 1.0, 1.0, 0.6]

@@ -69,8 +69,8 @@ class SpanningTree:
     """A minimum spanning tree of n images under Euclidean distance.
 
     Attributes:
-        edges: (n - 1, 2) indices of images.
-        lengths: (n - 1,) distances, ascending. Edges between equal images have length 0.
+        edges: (n - 1, 2) indices of the two images that each edge joins, the shortest edge first.
+        lengths: (n - 1,) length of each edge, ascending; 0 between equal images.
     """
 
     edges: Integers
@@ -313,10 +313,11 @@ class _Cells:
         """Find the shortest edge that leaves each component.
 
         Args:
-            components: (n,) component of each image, 0 … c - 1.
+            components: (n,) component of each image, a number from 0 to c - 1.
 
         Returns:
-            Squared lengths, (c,), and ends, (c, 2), of these edges.
+            For each component, the squared length of the edge, (c,), and the indices of the images
+            at its ends, (c, 2).
         """
         search = _Search(self.images, components[self.order])
         pairs = np.argsort(self.bounds, kind="stable")

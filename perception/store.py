@@ -147,7 +147,10 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
 
 
 def load(path: str | os.PathLike[str]) -> Stored:
-    """Read what `save` wrote, without running anything in the file.
+    """Read a recogniser that `save` wrote, without running anything in the file.
+
+    Args:
+        path: The file.
 
     Raises:
         PerceptionError: The file is unreadable or has other content.

@@ -1,5 +1,7 @@
 """Clusters images into views and chooses the number of views.
 
+A view is a cluster of images that look alike.
+
 >>> import numpy as np
 >>> images = np.concatenate([np.random.default_rng(0).normal(c, 0.1, (20, 3)) for c in (0, 2, 5)])
 >>> ViewClusterer(random_state=0).fit(images).k_
@@ -269,7 +271,7 @@ class ViewClusterer(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         return max(finer, key=finer.__getitem__, default=None)
 
     def _cluster(self, images: NDArray[np.float64], k: int | None, seed: int) -> Any:
-        """A fitted clusterer for k views."""
+        """Fit a clusterer with k views. If k is None, the clusterer chooses the number."""
         if self.clusterer is None:
             return self._k_means(images, k, seed)
         chosen = clone(self.clusterer)

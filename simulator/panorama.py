@@ -319,9 +319,9 @@ class Camera:
 
 
 def _beginnings(segments: Array) -> Array:
-    """Where the line on which a segment lies begins, in metres along its direction, (n,).
+    """The position at which textures of segments begin, in metres along their direction, (n,).
 
-    Textures are measured from there, so that a texture continues behind a gap in a wall.
+    Segments on one line have the same position, so that a texture continues behind a gap in a wall.
     """
     ways = segments[:, 2:] - segments[:, :2]
     ways = ways / np.maximum(np.hypot(*ways.T), 1e-9)[:, None]

@@ -153,10 +153,10 @@ class Plan:
 
     @cached_property
     def courses(self) -> dict[Leg, tuple[int, int]]:
-        """Dict from each room and door of that room to the path through the door.
+        """The path and direction of a robot that leaves a room through a door.
 
-        A path is given by its index in `paths`, and by the direction in which the robot is on the
-        path when it leaves the room: 1 or -1.
+        It is a dict. The key is the index of the room and that of the door. The value is the index
+        of the path in `paths`, and 1 if the robot goes along the path or -1 if it goes against it.
         """
         return {
             leg: (number, direction)

@@ -1,8 +1,8 @@
 """Checks that each action ends at the expected place, and each tour at its start.
 
 The control laws see only images, so they do not notice when they confuse places. This module
-compares the true pose with the true dstates of the world, if the world has any. Errors name the
-action and the likely cause.
+compares the true pose with the true dstates (places with headings) of the world, if the world has
+any. Errors name the action and the likely cause.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Watch:
 
     @contextmanager
     def action(self, number: int, name: str) -> Iterator[None]:
-        """Watch one action.
+        """Watch one action, and check its end.
 
         Args:
             number: Number of the action, counted on from tour to tour.

@@ -69,7 +69,7 @@ class Agreement:
         angle: Direction of motion by scans minus that by odometry; radians to the left.
         turning: Median ratio of turns by scans to turns by odometry; None if there are few turns.
         parted: Number of stretches in which the two trajectories diverge.
-        of: Number of stretches that are compared for `parted`, which are those with motion.
+        of: Number of stretches that are compared for `parted`. The robot drives in each of them.
     """
 
     odometry: float

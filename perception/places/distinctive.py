@@ -401,7 +401,7 @@ def _taken(ways: list[Way], crossing: Array | None, middle: Array) -> tuple[list
 
 
 def _walls(log: RobotLog, track: Track, visit: Visit) -> tuple[float, float]:
-    """The main direction of the walls around a visit, and how well they agree with it.
+    """The main direction of the walls around a visit, and how well the walls agree with it.
 
     Returns:
         Radians modulo a quarter turn, and the agreement from 0 to 1.

@@ -65,7 +65,8 @@ def find_doors(log: RobotLog, track: Track) -> tuple[Door, ...]:
     Each unbroken part of the track is searched separately.
 
     Returns:
-        Doors in order. A door occurs once for each time that the robot drove through it.
+        The doors in the order of the drive, one entry for each time that the robot drove through a
+        door.
     """
     return tuple(
         replace(
@@ -147,12 +148,17 @@ def _gap(patch: Patch, at: Array, across: float) -> tuple[float, Array]:
 
 
 def is_wide(scale: Scale) -> bool:
-    """Whether most of the trajectory is wider than corridors, as in a building of rooms."""
+    """Check whether most of the trajectory is wider than corridors, as in a building of rooms."""
     return scale.most > WIDE
 
 
 def are_frequent(doors: Sequence[Door], track: Track) -> bool:
-    """Whether the robot drives through doors often, as in a building of rooms."""
+    """Check whether the robot drives through doors often, as in a building of rooms.
+
+    Args:
+        doors: The doors that the robot drove through, once for each pass.
+        track: Trajectory of the robot.
+    """
     return bool(len(doors) * OFTEN > track.way[-1])
 
 

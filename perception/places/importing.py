@@ -78,7 +78,8 @@ def import_log(
 
     Args:
         log: The log of one drive.
-        gateway: Smallest width of a gateway in metres; None estimates it from the log.
+        gateway: Smallest width of a gateway (a way out of a place) in metres; None estimates it
+            from the log.
         radius: Distance in metres that an exit must lead from the middle of a place; None estimates
             it.
         name: Name of the trace.

@@ -490,7 +490,7 @@ def _rotation(angle: float) -> Array:
 
 
 def points_turned(angle: float, points: Array) -> Array:
-    """Rotate points or directions, (n, 2), counterclockwise."""
+    """Rotate points or directions, (n, 2), counterclockwise by an angle in radians."""
     return np.asarray(points @ _rotation(angle).T)
 
 

@@ -39,6 +39,9 @@ PACKERS = {
 def opened(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
     """Open a file so that it can be read more than once. A pipe is copied to a temporary file.
 
+    Yields:
+        The file, as a stream of bytes.
+
     Raises:
         LogError: The file cannot be read.
     """

@@ -150,7 +150,8 @@ def _wrong_recording(name: str, times: Array, stamps_are_wrong: bool) -> str | N
     Args:
         name: Name of the topic.
         times: (n, 2) stamps and times of recording in seconds.
-        stamps_are_wrong: Whether the stamps cannot be compared with.
+        stamps_are_wrong: Whether the stamps are wrong. Then recording that stands still is an
+            error whatever the stamps say.
     """
     stamps, recorded = times.T
     if len(times) < 3:
