@@ -38,6 +38,7 @@ STAYING = 2  # on this many families of instances.
 FAMILIES = 3  # Fewer families are too few to remove a speed-up.
 LIMIT = 4.0  # Seconds of a search.
 LONGER = 12.0  # Seconds if little gain was expected, or if maps take long.
+PROVING = 60.0  # seconds where only a long search proves anything
 SHORT = 3.0  # Seconds if the first map matters, before a proof is possible.
 MEMORY = 4096  # MiB
 
@@ -125,7 +126,10 @@ TRIALS = (
     *_timed("annealed", QUICK_MAZE),
     *_ended("annealed", "maze 6x6 n=1600", "full maze 10x10 n=400", limit=2 * LIMIT),
     *_ended("annealed", "maze 6x6 n=10000", limit=LONGER),
+    *_ended("annealed", "maze 6x6 n=10000", limit=PROVING),
     *_ended("annealed", "maze 8x8 n=10000", limit=2 * LONGER),
+    *_timed("annealed", "maze 5x5 n=10000", limit=PROVING),
+    *_timed("annealed", "full maze 5x5 n=1600", limit=LONGER),
     *_timed("greedy", QUICK_MAZE),
     *_ended("greedy", "maze 6x6 n=10000", "full maze 10x10 n=4000", limit=SHORT),
     *_timed("threads", QUICK_MAZE, FEW_SEEN, MACHINE, clock="wall"),
