@@ -2,10 +2,12 @@
 nothing."""
 
 import contextlib
+import gc
 import math
 import signal
 
 from hypothesis import HealthCheck, settings
+from threadpoolctl import threadpool_limits
 
 from ssh_abduction.cli import verbosity, view
 
@@ -29,3 +31,11 @@ view.ASSUMING = 0.1
 # do, from any thread that is the main one.
 with contextlib.suppress(ValueError):
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_finish() -> None:
+    """Each core runs tests of its own, so one thread is enough for arithmetic; and what was
+    imported is not looked through for garbage again and again."""
+    threadpool_limits(1)
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 50)
