@@ -121,7 +121,7 @@ class FreeSpace:
         return found
 
     def part(self, points: Array, closed: Mask | None = None) -> Part:
-        """Cut out the part of the grid around some points.
+        """Make a `Part`: a rectangle of the grid around some points.
 
         Args:
             points: (n, 2) metres.

@@ -86,8 +86,8 @@ def are_square(walls: Array) -> bool:
 class WorldReader:
     """Reads and checks the fields of a world file.
 
-    All methods but `wrong` raise SimulatorError if a value is invalid. `name` is the name of the
-    field, for that error.
+    All methods but `wrong` return the checked value, or raise SimulatorError if it is invalid.
+    `name` is the name of the field, for that error.
 
     Args:
         where: Name of the file, for errors.
@@ -213,7 +213,7 @@ class WorldReader:
         return read_occupancy(Path(self.where).parent / value)[1]
 
     def ragged(self, walls: Array, value: Any) -> Array:
-        """Make walls uneven: cut them into pieces, and shift the ends of the pieces at random.
+        """Make walls uneven: divide them into pieces, and shift the ends of the pieces at random.
 
         The shifts are always the same, so that a world looks the same on each drive.
 

@@ -114,18 +114,19 @@ def _of_source(scans: tuple[Scan, ...], members: NDArray[np.intp]) -> tuple[Scan
 
 
 def describe_cuts(log: RobotLog, track: Track, turned: list[tuple[int, float]]) -> list[str]:
-    """Describe the cuts and breaks of a track, and turns that the odometry gets wrong.
+    """Say in notes where the odometry of a log is wrong: at cuts, breaks and some turns.
 
-    The motion across a cut is unknown. After a break, the robot may be anywhere.
+    At a *cut* the odometer jumped or hung, so the motion from one scan to the next is unknown. At a
+    *break* the scans show nothing of what was seen before: the robot may have been carried.
 
     Args:
         log: The log that the track was made from.
-        track: The track.
+        track: The poses of the robot at all scans, with `cuts` and `breaks`.
         turned: Indices of scans at which the robot turned differently from the odometry, and the
             differences in radians.
 
     Returns:
-        Notes for the user; none if nothing is wrong.
+        Sentences for the user, one for each kind of error; empty if nothing is wrong.
     """
     # If the odometer moved at a cut, it jumped. Otherwise, it stood still while the robot moved.
     steps = {

@@ -121,7 +121,7 @@ def _record(frames: Frames, child: str, parent: str, transform: Any, is_static: 
 
 
 def parent_of(frames: Frames, child: str) -> Frame:
-    """Return the transform to a frame from its parent.
+    """Return the pose of a frame in its parent, as a `Frame` that also names the parent.
 
     If a frame has several parents, one with "odom" in its name is taken, otherwise the last one.
     """

@@ -127,7 +127,8 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
         source: Name of the file, for errors.
 
     Returns:
-        A stream of unpacked bytes. It raises one of `damages()` if packed data are cut or damaged.
+        A stream of unpacked bytes. It raises one of `damages()` if packed data end early or are
+        damaged.
 
     Raises:
         LogError: The package that unpacks zstd is missing.
@@ -153,7 +154,7 @@ def unpacked(file: IO[bytes], source: str) -> IO[bytes]:
 
 
 def damages(*others: type[Exception]) -> tuple[type[Exception], ...]:
-    """List the errors that a stream of `unpacked` raises for cut (EOFError) or damaged data.
+    """List the errors of a stream of `unpacked`: data end early (EOFError) or are damaged.
 
     Args:
         *others: Errors to add to these.
@@ -194,8 +195,8 @@ def lines(file: IO[bytes], source: str) -> Iterator[tuple[int, bytes | None]]:
         None.
 
     Raises:
-        LogError: Packed data are cut or damaged; the message says up to which line they can be
-            read.
+        LogError: Packed data end early or are damaged. The message says up to which line they can
+            be read.
     """
     found = packer(file)
     stream = unpacked(file, source)

@@ -179,10 +179,14 @@ def edge_of(tokens: list[bytes]) -> tuple[tuple[int, int], Pose]:
 
 
 def parameters_of(tokens: list[bytes]) -> dict[str, float]:
-    """Parse a PARAM line.
+    """Parse a PARAM line of a CARMEN log.
+
+    Args:
+        tokens: The words of the line.
 
     Returns:
-        The parameter of the laser in the line, by its short name; empty for other parameters.
+        A dict with one entry if the line has a parameter of the front laser: its short name, such
+        as "fov", and its value. Empty for other parameters.
 
     Raises:
         Damaged: The value is no number.

@@ -50,7 +50,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class _Sender:
-    """The sender of a connection, as rosbags gives it for bags of ROS 1."""
+    """What rosbags gives for the publisher of a ROS 1 connection: the name of its node."""
 
     callerid: str
 

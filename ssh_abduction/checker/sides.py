@@ -42,7 +42,7 @@ class Branch:
 
 @dataclass(frozen=True)
 class Conflict:
-    """A place whose side contradicts another axiom.
+    """A contradiction between the sides on which a place lies and another axiom.
 
     Attributes:
         axiom: The name of the contradicted axiom.

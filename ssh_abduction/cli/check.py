@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
             f"{options.maps}: maps: expected one to check, got none; see the status that solve "
             "printed, or check its bound (--bound)"
         )
-    # Choose the values of `auto` once for all maps, because counting returns takes long.
+    # Replace each "auto" once for all maps, because counting returns takes long.
     resolved = settle(trace, theory).theory
     broken = 0
     for i, ssh_map in enumerate(maps):
@@ -118,7 +118,7 @@ def _bound(
         theory: The theory to check by.
         maps: The maps in the file.
         doubt: Why what clingo proved does not hold for this trace and theory; None if it does.
-        solved: The theory in the file, without `auto`.
+        solved: The theory in the file, in which no field is "auto".
         broken: Whether some maps break axioms.
 
     Returns:

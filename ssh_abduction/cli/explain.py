@@ -49,7 +49,8 @@ def add_parser(verbs: Verbs) -> None:
         type=int,
         default=100,
         metavar="K",
-        help="count at most K minimal maps; 0 for all (default: 100)",
+        help="list at most K minimal maps, to count those in which the two steps are one dstate; "
+        "0 for all (default: 100)",
     )
     parser.add_argument("--json", action="store_true", help="print the explanation as JSON")
     parser.add_argument(
@@ -62,7 +63,7 @@ def add_parser(verbs: Verbs) -> None:
         "--memory-limit",
         type=int,
         metavar="MIB",
-        help="stop when the process has used this much memory",
+        help="stop when the process has used this many MiB, and print what is known",
     )
     add_theory(parser)
     parser.epilog = (

@@ -99,9 +99,9 @@ def add_reading(parser: Parser) -> None:
     parser.add_setting(
         "zero_is",
         (
-            "meaning of a range that is NaN, 0 or less, or below the laser's minimum: the beam "
-            "hit nothing (free), or nothing is known (unknown) (default: free if the neighbouring "
-            "beams are long)"
+            "how to read ranges that are NaN, at most 0, or below the laser's minimum: free means "
+            "that the beam hit nothing, unknown that nothing is known (default: free if the "
+            "neighbouring beams are long, else unknown)"
         ),
         choices=MEANINGS,
     )

@@ -56,7 +56,7 @@ def add_parser(verbs: Verbs) -> None:
         "--memory-limit",
         type=int,
         metavar="MIB",
-        help="stop when the process has used this much memory",
+        help="stop when the process has used this many MiB, with the best plan so far",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_theory(parser, default="the theory of the maps, or how the maps read stars")

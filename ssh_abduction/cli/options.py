@@ -118,7 +118,7 @@ def write(trace: Trace, target: str, said: str) -> None:
 
 
 def output(text: str) -> str:
-    """Check the name of a file or folder to write. Raise ArgumentTypeError if it is none."""
+    """Return the name of a file or folder to write. Raise ArgumentTypeError if it is none."""
     if not text or "\0" in text:
         raise argparse.ArgumentTypeError(
             f"expected the name of a file or folder, got {text!r}; name one"
@@ -134,7 +134,7 @@ def seed(text: str) -> int:
 
 
 def picture_file(text: str) -> str:
-    """Check the name of a file for a figure. Raise ArgumentTypeError for a wrong ending."""
+    """Return the name of a file for a figure. Raise ArgumentTypeError for a wrong ending."""
     if Path(text).suffix.lower() not in (".png", ".pdf", ".svg"):
         raise argparse.ArgumentTypeError(
             f"expected a name that ends in .png, .pdf or .svg, got {text!r}"

@@ -96,7 +96,7 @@ def add_parser(verbs: Verbs) -> None:
         "--memory-limit",
         type=int,
         metavar="MIB",
-        help="stop when the process has used this much memory",
+        help="stop when the process has used this many MiB, and print the best answer so far",
     )
     many = parser.add_argument_group(
         "many traces",
@@ -192,13 +192,13 @@ class _Text:
         return _text(_lines(self._search, solution, explanation, self._search.backbone))
 
     def last_words(self, why: Stop) -> tuple[str, int]:
-        """Make the output for a search that cannot be stopped in time.
+        """Make the output for a process that must end although its search does not stop.
 
         Args:
-            why: The reason for the end.
+            why: Why the process must end.
 
         Returns:
-            The text, and the exit code.
+            The text to print, and the exit code.
         """
         solution = self._search.snapshot(why)
         kept = (
@@ -265,13 +265,13 @@ class _Json:
         )
 
     def last_words(self, why: Stop) -> tuple[str, int]:
-        """Make the rest of the JSON for a search that cannot be stopped in time.
+        """Complete the JSON printed so far, as the process must end and its search does not stop.
 
         Args:
-            why: The reason for the end.
+            why: Why the process must end.
 
         Returns:
-            The text, and the exit code.
+            The text that completes the JSON, and the exit code.
         """
         solution = self._search.snapshot(why)
         warn(warnings_of(self._search, solution))

@@ -213,8 +213,9 @@ def is_trajectory(lines: Iterable[Sequence[str]]) -> bool:
     """Tell whether lines of eight numbers are poses in TUM format, and not relations.
 
     In TUM format the last four numbers of each line are a quaternion, which has length 1. In a file
-    of relations they are z, roll, pitch and yaw. On a floor these also have length 1 if each yaw is
-    about 1 radian. So if all lines have only a last number, it must be exactly 1 or -1.
+    of relations they are z, roll, pitch and yaw. On a floor all but the yaw are 0, so they also
+    have length 1 if each yaw is about 1 radian. So if all but the last number are 0 in all lines,
+    the last one must be exactly 1 or -1.
     """
     try:
         tails = [[float(field) for field in fields[4:8]] for fields in lines]

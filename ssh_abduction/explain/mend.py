@@ -95,7 +95,7 @@ class Mend:
 
 @dataclass(frozen=True, slots=True)
 class TraceExplanation:
-    """The reason why a trace has no map, and the single observations that would mend it.
+    """The reason why a trace has no map, and the single observations whose change gives it one.
 
     Attributes:
         possible: Whether the trace has a map; None if a limit ended the search before this was
@@ -143,7 +143,7 @@ class TraceExplanation:
 
 
 class TraceQuestion(Question[TraceExplanation]):
-    """The search for why a trace has no map and for its mends. Parameters as in `explain_trace`."""
+    """The search for the answer of `explain_trace`. Parameters are as there."""
 
     def __init__(
         self,

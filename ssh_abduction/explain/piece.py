@@ -42,7 +42,7 @@ class Piece:
 
     @staticmethod
     def of(problem: Problem, steps: Sequence[int]) -> Piece:
-        """Cut the piece with these steps, ascending, out of the trace of a problem."""
+        """Make the piece with these steps, ascending, of the trace of a problem."""
         trace, theory = problem.trace, problem.theory
         kept: list[Step] = []
         for k, t in enumerate(steps):

@@ -74,7 +74,7 @@ class PairExplanation:
             argument was found in time.
         clash: Why the trace has no map; None if it has one, or if the reason is not known.
         stopped: The limit that ended the search; None if it ended by itself.
-        theory: The theory, with all values `auto` resolved.
+        theory: The theory, with each "auto" replaced by the value that was used.
     """
 
     first: int

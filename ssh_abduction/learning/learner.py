@@ -101,7 +101,7 @@ class BootstrapLearner(BaseEstimator):  # type: ignore[misc]
         self.choose, self.time_limit = choose, time_limit
 
     def fit(self, X: Trace | Sequence[Trace], y: Any = None) -> BootstrapLearner:
-        """Run the loop on one trace or several, and return this learner.
+        """Cluster images, find a map, and train the recogniser on it. Return this learner.
 
         Args:
             X: A trace with images, or traces of one world.

@@ -29,7 +29,7 @@ def guessed_map(trace: Trace, theory: Theory, speedups: Speedups, watch: Watch) 
 
     Args:
         trace: The trace.
-        theory: The theory without `auto`.
+        theory: The theory, in which no field is "auto".
         speedups: The speed-ups that are on.
         watch: Limits the work, and can interrupt it.
     """
@@ -44,7 +44,7 @@ def mended_map(
 
     Args:
         trace: The whole trace.
-        theory: The theory without `auto`.
+        theory: The theory, in which no field is "auto".
         known: The map of the first steps.
         speedups: The speed-ups that are on.
         watch: Limits the work, and can interrupt it; None for no limit.
@@ -67,7 +67,7 @@ class MapGuess(BackgroundTask[SSHMap]):
     Args:
         steps: The steps of the trace so far. The caller may append more to this list.
         odometry: The noise model of the trace's displacements.
-        theory: The theory without `auto`.
+        theory: The theory, in which no field is "auto".
         speedups: The speed-ups that are on.
         known: A map of the first steps, to be mended; None makes a map from a guess first.
     """

@@ -61,7 +61,7 @@ def solved(
 
     Args:
         trace: The steps so far.
-        theory: The theory without `auto`.
+        theory: The theory, in which no field is "auto".
         limit: Seconds for the search; None for no limit.
         maps: List at most this many maps; None lists all.
         speedups: The speed-ups that are on.
@@ -78,7 +78,7 @@ class BackgroundSolve(BackgroundTask[Solved]):
 
     Args:
         trace: The steps so far.
-        theory: The theory without `auto`.
+        theory: The theory, in which no field is "auto".
         maps: List at most this many maps; None lists all.
         speedups: The speed-ups that are on.
     """
@@ -135,7 +135,7 @@ class FaultSolver:
 
         Args:
             trace: The steps so far.
-            theory: The theory without `auto`.
+            theory: The theory, in which no field is "auto".
             has_map: Whether some map is known. If so, and the last search was slow, the search runs
                 in the background.
 

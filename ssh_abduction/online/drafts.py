@@ -41,7 +41,7 @@ class Drafts:
     """Keeps drafts and sketches of the steps so far.
 
     Args:
-        problem: The steps so far, and the theory without `auto`.
+        problem: The steps so far, and the theory, in which no field is "auto".
         judging: Judges maps by the evidence and the checker, for this theory.
     """
 

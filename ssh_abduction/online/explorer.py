@@ -146,7 +146,7 @@ class Exploration:
 
 
 class Explorer:
-    """Drives a robot until its minimal map is unique, closed, and beyond doubt.
+    """Drives a robot until one minimal map is left, with nothing untried and no return in doubt.
 
     Args:
         robot: The robot, with the methods `look`, `can` and `do`.

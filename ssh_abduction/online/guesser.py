@@ -80,7 +80,7 @@ class Guesser:
 
         Args:
             trace: The steps so far.
-            theory: The theory without `auto`.
+            theory: The theory, in which no field is "auto".
             contradicted: The best map of the steps before the last, if the last step contradicts
                 all known maps; else None.
             began: When the step began, by `time.perf_counter`.

@@ -69,7 +69,7 @@ class Rival:
         Args:
             ssh_map: A map of the trace or of its first steps.
             trace: The trace.
-            theory: The theory without `auto`.
+            theory: The theory, in which no field is "auto".
         """
         wrong = {fault.step for fault in ssh_map.faults if fault.kind != "slipped"}
         looks: dict[int, Seen] = {}
@@ -163,7 +163,7 @@ class Rival:
             action: The name of the action before the step.
             step: The step.
             seen: The view and star of the step.
-            theory: The theory without `auto`.
+            theory: The theory, in which no field is "auto".
         """
         t, there = len(self.labels), self.links.get((self.here, action))
         alike = [s for s, shown in enumerate(self.shows) if shown == seen]

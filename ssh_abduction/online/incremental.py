@@ -48,7 +48,7 @@ class IncrementalSolver:
 
         Args:
             trace: The steps so far.
-            theory: The theory without `auto`.
+            theory: The theory, in which no field is "auto".
             known: A map that is known to be minimal, so that only the others are searched for; None
                 if no minimal map is known.
 

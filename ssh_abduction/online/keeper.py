@@ -24,7 +24,7 @@ class MapKeeper:
     """Keeps the minimal maps up to date, or the best map that is found in time.
 
     Args:
-        problem: The steps so far, and the theory without `auto` and without faults.
+        problem: The steps so far, and the theory: it allows no faults, and no field is "auto".
         options: The time limit and the other options of a step.
         before: The keeper of fewer steps that this one replaces; None for the first.
     """
@@ -56,7 +56,7 @@ class MapKeeper:
 
     @property
     def theory(self) -> Theory:
-        """The theory without `auto`."""
+        """The theory, in which no field is "auto"."""
         return self._problem.theory
 
     @property

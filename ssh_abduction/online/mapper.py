@@ -105,7 +105,7 @@ class OnlineMapper:
 
     Attributes:
         trace: The steps so far.
-        theory: The theory, without `auto`.
+        theory: The theory, in which no field is "auto".
         solution: The minimal maps of the steps so far, or the best map found in time.
     """
 
@@ -152,7 +152,7 @@ class OnlineMapper:
 
     @property
     def theory(self) -> Theory:
-        """The theory for the steps so far, without `auto`."""
+        """The theory for the steps so far, in which no field is "auto"."""
         return self._problem.theory
 
     @property

@@ -124,7 +124,7 @@ class MoveGraph:
         return None if found is None else way[found[2]]
 
     def dstates_from(self, here: AbstractSet[Node]) -> int:
-        """Count the dstates that can be reached from the given nodes, with these."""
+        """Count the dstates that can be reached from the given nodes, including these."""
         reached = nx.multi_source_dijkstra_path_length(self._graph, here)
         return sum(isinstance(node, int) for node in reached)
 

@@ -53,7 +53,7 @@ class Recovery:
     """Keeps the maps up to date for a theory that allows faults, and says how sure they are.
 
     Args:
-        problem: The steps so far, and the theory without `auto` and with faults.
+        problem: The steps so far, and the theory: it allows faults, and no field is "auto".
         options: The limits and speed-ups for each step.
         before: The Recovery of fewer steps that this one replaces; None for the first.
 

@@ -65,7 +65,7 @@ class MinimalMaps:
 
     Args:
         trace: The steps so far.
-        theory: The theory without `auto`.
+        theory: The theory, in which no field is "auto".
         judging: Judges maps by the evidence and the checker, for this theory.
 
     Attributes:

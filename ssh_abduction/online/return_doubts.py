@@ -74,7 +74,7 @@ class ReturnDoubts:
         Args:
             doubt: The two steps of the return.
             trace: The steps so far.
-            theory: The theory without `auto`.
+            theory: The theory, in which no field is "auto".
             dstates: The number of dstates of a minimal map.
 
         Returns:

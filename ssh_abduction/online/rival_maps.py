@@ -45,7 +45,7 @@ class RivalMaps:
     """The rivals of the steps so far, with how much is proven about them.
 
     Args:
-        problem: The steps so far, and the theory without `auto` and with faults.
+        problem: The steps so far, and the theory: it allows faults, and no field is "auto".
         max_maps: Keep at most this many of the cheapest rivals; None keeps all.
         judging: Judges maps by the evidence and the checker, for this theory.
 

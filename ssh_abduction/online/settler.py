@@ -1,4 +1,4 @@
-"""Choose values for the `auto` options of a theory while the trace grows."""
+"""Choose values for the fields of a theory that are "auto", while the trace grows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ssh_abduction.theory.theory import Theory
 
 
 class TheorySettler:
-    """Replaces each `auto` of a theory by the value that fits the steps so far.
+    """Replaces each "auto" in a theory's fields by the value that fits the steps so far.
 
     The first step decides how to use stars (the openings seen at a step). All steps so far decide
     whether displacements are used, and how many returns of the robot are counted.
@@ -31,15 +31,15 @@ class TheorySettler:
         self._theory = theory.replace(star=settled.star)
 
     def settled(self, trace: Trace, known: Problem | None = None) -> Problem:
-        """Choose the values of `auto` for the steps so far.
+        """Choose the value of each field that is "auto", for the steps so far.
 
         Args:
             trace: The steps so far.
-            known: The problem of fewer steps, to reuse what its evidence computed; None if there is
-                none.
+            known: The result for fewer steps, to reuse the pairs of steps that its evidence found;
+                None without one.
 
         Returns:
-            The trace, with its theory without `auto`.
+            The trace and its theory, in which no field is "auto".
         """
         theory = self._theory
         if theory.displacement == "auto":
@@ -52,7 +52,7 @@ class TheorySettler:
         """Whether a theory chosen for fewer steps is still the right choice.
 
         Args:
-            problem: The problem of the steps before the last.
+            problem: The steps before the last, and the theory that was chosen for them.
             trace: All steps so far.
         """
         theory = problem.theory

@@ -109,10 +109,11 @@ class Confidence:
     """Computes how sure the mapper is after each step.
 
     Args:
-        theory: The theory without `auto` and with faults.
+        theory: A theory that allows faults, and in which no field is "auto" any more.
 
     Attributes:
-        known: The map that was certain last; else the best map after the first answer; None before.
+        known: The last map that was certain. As long as none was, the best map of the first answer,
+            and None before that answer.
     """
 
     def __init__(self, theory: Theory) -> None:

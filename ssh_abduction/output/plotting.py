@@ -80,7 +80,7 @@ def _draw_paths(axes: Any, ssh_map: SSHMap, found: Layout) -> None:
 
 
 def _draw_links(axes: Any, ssh_map: SSHMap, found: Layout) -> None:
-    """Draw the links of a map without places as arrows."""
+    """Draw each link as an arrow between two dstates, for a map that has no places."""
     style = {"arrowstyle": "-|>", "color": "#888", "shrinkA": 9, "shrinkB": 9}
     for source, _, target in ssh_map.links:
         start, end = found.dstates[source][:2], found.dstates[target][:2]

@@ -20,7 +20,7 @@ export default { render({ model, el }) {
 
 
 def widget_of(html: str) -> Any:
-    """Make a notebook widget that shows a page in a frame.
+    """Make a notebook widget that shows a page in an iframe of HTML.
 
     Args:
         html: The text of the page.

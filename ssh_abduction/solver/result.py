@@ -64,7 +64,7 @@ class Solution:
             counts that the theory minimises.
         bound: Proven lower bounds on the counts of any map.
         complete: Whether no further map exists: no minimal one and, with `within`, none to list.
-        theory: The theory. Each `auto` in it is replaced by the value that was used.
+        theory: The theory. Each "auto" in it is replaced by the value that was used.
         steps: The number of steps of the trace.
         effort: What the search did: time, grounding, prefix, and evidence.
         stopped: Why the search ended before it was complete; None if it did not.

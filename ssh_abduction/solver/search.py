@@ -58,7 +58,7 @@ class Search:
 
     Attributes:
         trace: The trace.
-        theory: The theory. Each `auto` in it is replaced by the value that is used.
+        theory: The theory. Each "auto" in it is replaced by the value that is used.
         limits: The limits of the search.
     """
 

@@ -304,7 +304,11 @@ class Kept:
         self._seen.clear()
 
     def absorb(self, names: tuple[Hashable, ...]) -> None:
-        """Take in the name of each class in a map; None if the class has no name there."""
+        """Update the attributes by one more map.
+
+        Args:
+            names: The name of each class in this map; None if the class has no name there.
+        """
         if names in self._seen:
             return
         if len(self._seen) == REMEMBERED:

@@ -30,7 +30,7 @@ Step = TypeVar("Step")
 
 
 def is_planar(around: Mapping[Place, Ends]) -> bool:
-    """Whether edges can be drawn without crossings if their order around each place is given.
+    """Whether edges can be drawn in the plane without crossings, in this order around each place.
 
     Args:
         around: For each place, the ends of edges around it, clockwise from any end. Edge e has the

@@ -1,4 +1,4 @@
-"""Adapt a theory to one trace: replace each `auto` by the value that fits the trace.
+"""Adapt a theory to one trace: replace each "auto" by the value that fits the trace.
 
 >>> from ssh_abduction import Theory, Trace
 >>> from ssh_abduction.theory.settle import settle
@@ -25,13 +25,13 @@ Star: TypeAlias = Literal["auto", "none", "alike", "pattern", "frame", "gateways
 
 @dataclass(frozen=True)
 class Problem:
-    """A trace and a theory without `auto`: the input of all code that works on a trace.
+    """A trace, and a theory in which no field is "auto": the input of all code for a trace.
 
     Attributes:
         trace: The trace.
         theory: The theory, with `star`, `displacement`, `prefer` and `returns` chosen.
-        evidence: The kinds of evidence that this theory uses. They remember what they computed
-            about the trace.
+        evidence: An object for each kind of evidence that this theory uses. It remembers the
+            results for the trace, such as pairs of steps that cannot be one dstate.
     """
 
     trace: Trace
@@ -40,7 +40,7 @@ class Problem:
 
     @classmethod
     def of(cls, trace: Trace, theory: Theory) -> Problem:
-        """Make a problem of a trace and a theory that has no `auto`."""
+        """Make a problem of a trace and a theory in which no field is "auto"."""
         return cls(trace, theory, evidence_of(theory))
 
     @cached_property
@@ -52,26 +52,31 @@ class Problem:
         return pairs_of(self.trace, self.theory, self.evidence)
 
     def changed(self, trace: Trace | None = None, theory: Theory | None = None) -> Problem:
-        """Return a problem with another trace or theory. It reuses what the evidence has computed.
+        """Return this problem (a trace and a theory) with another trace or theory.
+
+        The results of its evidence, such as excluded pairs of steps, are reused.
 
         Args:
-            trace: Another trace, such as this one with more steps, or a part of it.
-            theory: Another theory, without `auto`.
+            trace: Another trace, such as this one with more steps, or a part of it; None keeps it.
+            theory: Another theory, in which no field is "auto"; None keeps it.
         """
         theory = theory or self.theory
         return Problem(trace or self.trace, theory, evidence_of(theory, self.evidence))
 
 
 def settle(trace: Trace, theory: Theory | None = None, known: Problem | None = None) -> Problem:
-    """Replace each `auto` in a theory, and check that the trace has what the axioms need.
+    """Replace each "auto" in a theory, and check that the trace has what the axioms need.
 
     A step whose view is unknown may be at any dstate.
 
     Args:
         trace: The trace.
         theory: The theory; Theory.topological() by default.
-        known: A problem with the same trace, or with its first steps. What its evidence has
-            computed is reused.
+        known: A problem with the same trace, or with its first steps. The results of its evidence
+            are reused.
+
+    Returns:
+        The trace, the theory with all values chosen, and the evidence.
 
     Raises:
         TraceError: All views, the kind of an action, or a star is missing.

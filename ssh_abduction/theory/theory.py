@@ -81,7 +81,8 @@ class Theory:
             without exception. defeasible: with exceptions for pairs of paths, each at a cost.
         symmetric_sides: Whether two paths cross at a turn from one to the other. If they do, a
             branch on the right in one direction is on the left in the other.
-        path_order: Whether the places of a path have a partial or a total order.
+        path_order: Order of the places of a path. partial: some pairs may stay unordered. total:
+            every two places are ordered.
         next_place: Whether a travel leads to the next place of its path, and passes none.
         all_on_paths: Whether every dstate is on a path, even one where no travel starts or ends.
         star: How to use stars (the gateways seen at a place). none: not at all. alike: a dstate has

@@ -67,7 +67,7 @@ FRAME = """
 def can_be_asked(theory: Theory) -> bool:
     """Whether `keeps_own_rules` can check the rules of a theory.
 
-    It can if the rules read only what a map and a trace show. The theory must not have `auto`.
+    It can if the rules read only what a map and a trace show. No field may be "auto".
     """
     if not theory.rules:
         return True

@@ -43,7 +43,7 @@ EXAMPLE = (
 
 
 def check_rules(theory: Theory) -> None:
-    """Check the user's own rules in a theory without `auto`.
+    """Check the user's own rules in a theory in which no field is "auto".
 
     Raises:
         TheoryError: Clingo cannot read some rules, or would never ground them.

@@ -90,8 +90,8 @@ class Blocks:
     def least_faults(self, most: int) -> int:
         """Compute a lower bound on the cost of faults in maps with at most `most` dstates.
 
-        Blocks are cut off from the left, each as short as possible, and the least costs of their
-        faults are added up.
+        The trace is divided into blocks from its first step on. Each block ends as soon as it needs
+        a fault. The least costs of the faults of all blocks are added up.
 
         Returns:
             The bound in tenths of dstates.

@@ -47,7 +47,7 @@ class Naming:
     """Labels for which clingo is asked for places and paths.
 
     Attributes:
-        chart: The nodes.
+        chart: The chart of the nodes.
         labels: The dstate of each node.
         control: A control whose answers are the paths that fit the labels; None to make a new one.
     """
@@ -205,7 +205,7 @@ class FramedPaths:
         """Make a control whose answers are the places and paths that fit labels.
 
         Args:
-            chart: The nodes.
+            chart: The chart of the nodes.
             labels: The dstate of each node.
             options: Options of clasp.
             nodes: The nodes whose labels the paths have to fit; None for all.
@@ -252,7 +252,7 @@ class FramedPaths:
         The pairs follow from the trace alone, by the axioms of order and sides.
 
         Args:
-            chart: The nodes.
+            chart: The chart of the nodes.
             before: The chart of fewer steps, with its pairs. If given, only these pairs are added.
         """
         if before is not None:

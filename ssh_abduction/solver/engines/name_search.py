@@ -161,7 +161,7 @@ class NameSearch:
         self._had_all_help = False  # whether clingo has all links, and small maps were sought
 
     def improving(self) -> Iterator[list[int]]:
-        """Labels of all nodes; the last ones have the fewest dstates.
+        """Yield labels of all nodes. The last ones have the fewest dstates.
 
         If the search takes long, other labels with few dstates come first.
         """

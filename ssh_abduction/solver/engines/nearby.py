@@ -541,7 +541,7 @@ def seen_labels(guess: Sequence[int], chart: Chart) -> list[Key | None]:
 
     Args:
         guess: The label of each node, -1 if it is unknown.
-        chart: The nodes.
+        chart: The chart of the nodes.
     """
     return [
         None if label < 0 else (view, label) for view, label in zip(chart.seen, guess, strict=True)

@@ -155,11 +155,11 @@ class Paths:
         """A control for the paths that fit labels.
 
         Args:
-            chart: The nodes.
+            chart: The chart of the nodes.
             labels: The dstate of each node.
-            options: Of clasp.
+            options: Options of clasp.
             nodes: The nodes whose labels have to fit; all of them by default.
-            single: Ask only for separate paths, and merge none of them.
+            single: Whether to merge places and segments only if they must be one.
         """
         control = self.control(chart, options)
         control.load_encodings("preference")
@@ -185,7 +185,7 @@ class Paths:
         """A control for what holds in each map in which the nodes are at these dstates.
 
         Args:
-            chart: The nodes.
+            chart: The chart of the nodes.
             labels: The dstate of each node.
             loose: Dstates whose labels may be wrong.
         """
@@ -236,11 +236,11 @@ class Paths:
         )
 
     def guessed_labels(self, chart: FramedChart, watch: Watch) -> list[int]:
-        """Labels of a map of the causal axioms, if possible one that has separate paths.
+        """Guess labels of a map of the causal axioms, if possible one that has separate paths.
 
-        If no such map is soon found, it is one of few dstates. Of a long trace the beginning is
-        guessed, and continued along the rest. If that leads to no map, twice as many visits are
-        guessed, and so on.
+        If no such map is soon found, the labels are those of a map of few dstates. In a long trace
+        the labels of the first visits are guessed, and followed along the rest. If that leads to no
+        map, twice as many visits are guessed, and so on.
         """
         asked = self._under(watch.check)
         visits = chart.visits_with(FIRST_PAIRS)
@@ -289,12 +289,12 @@ class Paths:
         start: Sequence[int],
         check: Callable[[], None] = lambda: None,
     ) -> list[int] | None:
-        """Labels near a guess, of a map that has separate paths; None if none is soon found.
+        """Find labels near a guess, of a map that has separate paths; None if none is soon found.
 
         Args:
-            chart: The nodes.
+            chart: The chart of the nodes.
             apart: Which nodes are apart, nodes x nodes.
-            start: The guess, -1 where it is not known.
+            start: The guess: a label for each node, -1 if it is unknown.
             check: Called now and then; it may raise.
         """
         tell = partial(self._told_if_separate, chart)
@@ -346,11 +346,11 @@ class Paths:
 
 
 def pairwise_distinct(members: Sequence[int], pairs: Iterable[tuple[int, int]]) -> list[int]:
-    """A large clique of pairwise distinct segments, or places, that is soon found.
+    """Find a large clique: a list of segments, or places, that are pairwise distinct.
 
     Args:
         members: All segments or places.
-        pairs: Those that are not one.
+        pairs: The pairs that are not one.
     """
     number = {member: i for i, member in enumerate(members)}
     rivals = np.zeros((len(members), len(members)), dtype=bool)
@@ -365,7 +365,7 @@ def _apart(
     """Which nodes have visits with labels at different places: nodes x nodes.
 
     Args:
-        chart: The nodes.
+        chart: The chart of the nodes.
         labels: The dstate of each node.
         elsewhere: Pairs of dstates that are at different places.
     """

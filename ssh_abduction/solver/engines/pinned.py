@@ -18,7 +18,7 @@ class Pinned:
     """A chart and a clique of its nodes, which are pinned to the names 0, 1, and so on.
 
     Attributes:
-        chart: The nodes and the links between them.
+        chart: The chart: nodes and the links between them.
         clique: Nodes that are pairwise distinct.
         may_be: For each node, the names of the clique's nodes that it may share a dstate with.
     """
@@ -46,7 +46,7 @@ class Pinned:
         """Give each node of a clique a name of its own, in a chart with frames.
 
         Args:
-            chart: The nodes.
+            chart: The chart of the nodes.
             clique: Nodes that are pairwise distinct.
         """
         return cls(chart, clique, _not_apart(chart.apart(others=clique)))

@@ -60,7 +60,7 @@ class FramedSides:
 
         Args:
             paths: The program with the axioms of places and paths.
-            chart: The nodes.
+            chart: The chart of the nodes.
             labels: The dstate of each node.
             standing: For each dstate that has a node in clingo, the visit and the slot (direction)
                 of such a node.

@@ -61,16 +61,16 @@ class SmallMaps:
         )
 
     def merged(self, check: Callable[[], None]) -> Iterator[list[int]]:
-        """Labels of a map merged by evidence; none if that speed-up is off."""
+        """Yield labels of a map whose nodes were merged by evidence; none without that speed-up."""
         if self._task.speedups.greedy:
             chart = self._pinned.chart
             yield merged(chart.apart(), chart.links, self._pinned.clique, check)
 
     def from_beginning(self, check: Callable[[], None]) -> Iterator[list[int]]:
-        """Labels of maps that guesses at the beginning of a long trace lead to.
+        """Yield labels of maps that guesses for the first steps of a long trace lead to.
 
-        Guess ever longer beginnings, until the map of the whole trace needs no more dstates than
-        that of the beginning.
+        Guess ever longer prefixes, until the map of the whole trace needs no more dstates than that
+        of the prefix.
         """
         chart = self._pinned.chart
         size, steps = len(chart.seen), AT_ONCE
@@ -92,7 +92,7 @@ class SmallMaps:
     def near_guess(
         self, search: NearbySearch, check: Callable[[], None], tries: int | None = None
     ) -> Iterator[list[int]]:
-        """Labels of a map that is guessed, and of smaller ones near it."""
+        """Yield labels of a map that is guessed, and of smaller ones near it."""
         if not self._task.speedups.annealed:
             return
         near = self._map_of_guess(self._pinned, check)
@@ -129,16 +129,16 @@ class SmallMaps:
 
 
 def mended(guess: Sequence[int], chart: Chart) -> list[int]:
-    """Mend a guess: put each node where the same action from the same dstate mostly leads.
+    """Correct a guess: put each node where the same action from the same dstate mostly leads.
 
-    That mends a few wrong labels: from a right one on, all that follow become right.
+    This corrects a few wrong labels: after a right one, all that follow become right.
 
     Args:
-        guess: A label of each node, -1 where it is not known.
-        chart: The nodes and links.
+        guess: A label of each node, -1 if it is unknown.
+        chart: The chart of the nodes and links.
 
     Returns:
-        The mended labels. A label stays if the view at the node speaks against the new one.
+        The new labels. A label stays if the view at the node contradicts the new one.
     """
     keys = seen_labels(guess, chart)
     leads: dict[tuple[Key, int], Counter[Key]] = {}

@@ -38,7 +38,7 @@ def intransitive(pairs: Sequence[Pair], fits: Set[Pair], chart: FramedChart) -> 
     Args:
         pairs: The pairs of visits that are at one place in the answer.
         fits: The pairs that clingo may put at one place.
-        chart: The visits, and the action that ends each of them.
+        chart: The chart of the visits, with the action that ends each of them.
     """
     found: dict[Three, None] = {}
     turned: Turned = {}

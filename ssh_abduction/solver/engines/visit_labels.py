@@ -193,7 +193,7 @@ class VisitLabels:
         """Give clingo all that it lacks about these visits of a chart.
 
         Args:
-            chart: All visits and nodes.
+            chart: The chart with all visits and nodes.
             visits: The visits that clingo shall have.
             order: Nodes in the order of choice.
             anew: Make a new control first.

@@ -160,7 +160,7 @@ class VisitProgram:
     """The control of visits.lp, and a record of what it was given.
 
     Attributes:
-        chart: The visits and nodes of the first steps.
+        chart: The chart of the first steps, with their visits and nodes.
         batch: The number of the last batch of visits; -1 before the first.
         cores: The lower bound, and the assumptions that raise it.
         transitive: The propagator, which also holds the literals of pairs.
@@ -172,7 +172,7 @@ class VisitProgram:
         Args:
             task: The trace and the speed-ups that are on.
             asker: Asks the control.
-            chart: The visits and nodes of the first steps.
+            chart: The chart of the first steps, with their visits and nodes.
             sides: Adds axioms of order and sides. It is called for the new control, and for each
                 batch.
         """
@@ -216,7 +216,7 @@ class VisitProgram:
         """Give clingo a new batch: all that it lacks about these visits.
 
         Args:
-            chart: All visits and nodes.
+            chart: The chart with all visits and nodes.
             visits: The visits that clingo shall have, with those that it has already.
             order: Nodes in the order of choice. Those new to clingo are put behind the others.
             fits: The pairs of these visits that may be at one place.
@@ -384,16 +384,19 @@ class VisitProgram:
 
 
 def fits_in_time(watch: Watch, chart: FramedChart, visits: set[int], known: int) -> frozenset[Pair]:
-    """List the pairs of these visits that may be at one place, if there is time to ground them.
+    """List the pairs of some visits that may be at one place, if there is time to ground them.
 
     Args:
         watch: The limits.
-        chart: All visits.
+        chart: The chart of the prefix, with all its visits.
         visits: The visits that clingo shall have.
-        known: The number of pairs that clingo has already.
+        known: The number of pairs that clingo has grounded already. Their time is not counted.
+
+    Returns:
+        Triples (I, J, R), as from `FramedChart.fits`.
 
     Raises:
-        LimitError: There is not enough time.
+        LimitError: Grounding the other pairs would take longer than the time that is left.
     """
     told = sorted(visits)
     if len(told) == len(chart.stars):  # the number of pairs is known before they are listed

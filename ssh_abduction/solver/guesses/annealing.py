@@ -125,10 +125,10 @@ class Guess:
 
 
 def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Guess:
-    """A rough guess at the states of all visits: the first good one, or the best after SECONDS.
+    """Guess the states of all visits roughly: the first good guess, or the best after SECONDS.
 
     Args:
-        chart: The visits.
+        chart: The chart of the visits.
         check: Called now and then; may raise.
     """
     found: dict[int, Guess] = {}
@@ -143,10 +143,12 @@ def annealed(chart: FramedChart, check: Callable[[], None] = lambda: None) -> Gu
 def attempts(
     chart: FramedChart, check: Callable[[], None] = lambda: None, *, rough: bool = False
 ) -> Iterator[tuple[int, Guess]]:
-    """Endless guesses, each with the number of travels that do not lead where most such travels do.
+    """Yield guesses without end: pairs of a number of bad travels and the guess.
+
+    A travel is bad if it leads elsewhere than most travels with the same state and action.
 
     Args:
-        chart: The visits.
+        chart: The chart of the visits.
         check: Called now and then; may raise.
         rough: Whether to use fewer names and sweeps, which suffices for places visited often.
     """
@@ -165,12 +167,12 @@ def annealed_steps(
     may_be: Sequence[Sequence[int]],
     check: Callable[[], None] = lambda: None,
 ) -> Iterator[list[int]]:
-    """Endless, improving guesses at the dstates of all steps; -1 where a guess is not sure.
+    """Yield better and better guesses at the dstates of all steps; -1 if a guess is not sure.
 
     There are none if they would take too much memory.
 
     Args:
-        chart: The steps.
+        chart: The chart of the steps.
         clique: Steps that are pairwise distinct.
         may_be: For each step, the numbers of the steps of the clique that it may be one dstate
             with.

@@ -47,7 +47,7 @@ _Link: TypeAlias = tuple[int, int]  # dstate, action
 def followed(
     log: Log, labels: Sequence[int], check: Callable[[], None] = lambda: None
 ) -> list[int] | None:
-    """Labels of all steps of a trace, in a map near the given one.
+    """Find labels of all steps of a trace, in a map near that of its first steps.
 
     Args:
         log: The trace.

@@ -162,7 +162,7 @@ def thinned(
     evidence.
 
     Args:
-        chart: The nodes and links.
+        chart: The chart of the nodes and links.
         labels: The dstate of each node in the map.
         check: Called now and then; may raise to stop.
 

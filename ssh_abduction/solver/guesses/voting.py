@@ -159,7 +159,11 @@ class Merging:
                 return
 
     def mended(self) -> Trace:
-        """Return the trace with outvoted views and stars replaced by those of the majority."""
+        """Return a trace in which each step has the view and star that its group voted for.
+
+        The view is the one with the most votes at the slot that the step faces, and the star the
+        one with the most votes at the place. A vote weighs as much as it costs to outvote it.
+        """
         steps = list(self._trace.steps)
         for group in self._groups.values():
             star = _winner(group.stars)

@@ -48,7 +48,7 @@ def located(chart: FramedChart, states: Mapping[int, State]) -> Located:
     """Localise all visits by the states of some of them.
 
     Args:
-        chart: The visits.
+        chart: The chart of the visits.
         states: The states of some visits, among them the first visit. They must make a map: visits
             at one place do not contradict each other, and an action leads from a state to one
             state.
@@ -71,7 +71,7 @@ def states_of(chart: FramedChart, labels: Sequence[int]) -> list[State]:
     """Turn labels into states: visits are at one place if nodes of theirs have the same label.
 
     Args:
-        chart: The visits.
+        chart: The chart of the visits.
         labels: The dstate of each node.
 
     Returns:

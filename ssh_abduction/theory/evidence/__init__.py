@@ -52,8 +52,8 @@ def evidence_of(theory: Theory, known: Iterable[Evidence] = ()) -> tuple[Evidenc
     """Make an object for each kind of evidence that a theory uses.
 
     Args:
-        theory: The theory without `auto`.
-        known: Evidence that was made before. What it has computed about traces is reused.
+        theory: The theory, in which no field is "auto".
+        known: Evidence that was made before. Its results for traces are reused.
     """
     made = [kind.of(theory) for kind in KINDS if kind.axiom in theory.axioms]
     before = {type(evidence): evidence for evidence in known}
@@ -90,7 +90,7 @@ def pairs_of(trace: Trace, theory: Theory, evidence: Iterable[Evidence] | None =
 
     Args:
         trace: The trace.
-        theory: The theory, without `auto`.
+        theory: The theory, in which no field is "auto".
         evidence: The evidence that this theory uses; by default it is made.
     """
     kinds = evidence_of(theory) if evidence is None else evidence

@@ -21,7 +21,7 @@ def read_map(model: Model, trace: Trace, theory: Theory) -> SSHMap:
     Args:
         model: The answer set. It may have only the first steps of the trace.
         trace: The trace.
-        theory: The theory, without `auto`.
+        theory: The theory, in which no field is "auto".
     """
     is_at: dict[int, int] = {}
     place: dict[int, int] = {}

@@ -28,7 +28,7 @@ def paths_framed_facts(
 
     Args:
         trace: The trace.
-        theory: The theory, without `auto`.
+        theory: The theory, in which no field is "auto".
         chart: The chart of the trace or of its first steps.
         forbidden: Sets of equalities of steps. Evidence says that the equalities of a set do not
             all hold.
@@ -67,7 +67,7 @@ def paths_frameless_facts(
     """The facts for paths_frameless.lp about dstates and their links.
 
     Args:
-        theory: The theory, without `auto`.
+        theory: The theory, in which no field is "auto".
         dstates: The numbers of the dstates.
         links: Triples of a dstate, the number of an action, and the dstate that it leads to.
         actions: The actions by number.
@@ -119,7 +119,7 @@ def settled_facts(
     """The facts for paths_framed.lp about the labels of some nodes.
 
     Args:
-        theory: The theory, without `auto`.
+        theory: The theory, in which no field is "auto".
         chart: The chart of the nodes.
         labels: The dstate of each node.
         nodes: The nodes whose labels to use.

@@ -29,7 +29,7 @@ def theory_facts(theory: Theory, paths: int) -> str:
     """The facts for a theory: its axioms, its preference, and names for paths.
 
     Args:
-        theory: The theory, without `auto`.
+        theory: The theory, in which no field is "auto".
         paths: The number of names for paths.
     """
     facts = [f"axiom({name})." for name in theory.axioms]
@@ -49,7 +49,7 @@ def preferred(theory: Theory) -> list[str]:
 
 
 def own_rules(theory: Theory) -> str:
-    """The text of all of the user's own rules. Their axioms hold like those of the encodings."""
+    """Return the text of all rules that the user added to the theory, in clingo's language."""
     return "\n".join(rules.text for rules in theory.rules)
 
 
