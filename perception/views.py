@@ -51,7 +51,7 @@ EQUAL = 0.95
 NEIGHBOURS = 3
 # More starts of k-means than this are an error, since each takes as long as the first.
 MOST_STARTS = 10_000
-# The value of `isolated` that the learning loop uses when the theory allows wrong views.
+# The value of `isolated` that `BootstrapLearner` uses when the theory allows wrong views.
 # docs/measurements/reproduction.md has measurements.
 ISOLATED = 10.0
 

@@ -273,7 +273,7 @@ def record_plan(
     odometer: Odometer | None = None,
     every: float = EVERY,
 ) -> Drive:
-    """Drive rounds through a building and log scans.
+    """Drive rounds through a building, and return the scans with odometry and truth.
 
     Args:
         plan: The plan of the building.

@@ -128,7 +128,7 @@ def record(
     odometer: Odometer | None = None,
     every: float = EVERY,
 ) -> Drive:
-    """Drive tours as `simulate` does, or to the places of a route, and log scans.
+    """Drive tours as `simulate` does, or to the places of a route, and return the scans.
 
     The odometry in the log is not the odometry that the robot drives by. It is as noisy as that of
     recorded logs.

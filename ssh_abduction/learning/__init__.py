@@ -1,4 +1,4 @@
-"""The bootstrap loop of Kuipers & Beeson (2002): images, views, map, labels, recogniser."""
+"""Bootstrap learning (Kuipers & Beeson 2002): images, views, map, labels, recogniser."""
 
 from ssh_abduction import lazy_names
 

@@ -1,4 +1,4 @@
-"""The bootstrap loop: make views of images, a map of views, and a recogniser of its dstates.
+"""Bootstrap learning: make views of images, a map of views, and a recogniser of its dstates.
 
 A view is a cluster of images that look alike. A dstate (distinctive state) is a place and the
 direction that the robot faces there. The map labels each image with its dstate.

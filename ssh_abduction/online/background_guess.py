@@ -90,7 +90,7 @@ class MapGuess(BackgroundTask[SSHMap]):
         speedups: Speedups,
         known: SSHMap | None = None,
     ) -> MapGuess | None:
-        """Start the task; None if there is only one processor, or guesses are switched off."""
+        """Start and return the task; None with only one processor, or without guesses."""
         wanted = speedups.annealed and speedups.processes and has_processors(speedups)
         return MapGuess(steps, odometry, theory, speedups, known) if wanted else None
 

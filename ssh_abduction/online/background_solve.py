@@ -90,7 +90,7 @@ class BackgroundSolve(BackgroundTask[Solved]):
     def begun(
         trace: Trace, theory: Theory, maps: int | None, speedups: Speedups
     ) -> BackgroundSolve | None:
-        """Start the task; None if there is only one processor, or processes are switched off."""
+        """Start and return the task; None with only one processor, or without `processes`."""
         can_begin = speedups.processes and has_processors(speedups)
         return BackgroundSolve(trace, theory, maps, speedups) if can_begin else None
 

@@ -59,7 +59,7 @@ class Standing:
             certain. The step at which it becomes certain again still lists them.
         hypotheses: The possible explanations, the most probable first.
         where: The belief about where the robot is in the first map, by Markov localisation that
-            begins just before the first of these steps; None if there is no such step.
+            begins just before the first step in `broke`; None if `broke` is empty.
     """
 
     certain: bool
@@ -127,7 +127,7 @@ class Confidence:
 
         Args:
             step: The number of the step.
-            broke: A sentence about it; None if the step contradicted nothing.
+            broke: A sentence about the contradiction; None if there is none.
         """
         if broke:
             self._broke.append((step, broke))

@@ -77,7 +77,7 @@ class Worker:
         return self._process.poll() is None
 
     def done(self, number: int, work: Callable[..., Any], arguments: tuple[object, ...]) -> Any:
-        """Let the process call `work`, and wait for what it returns; Lost if the process ends.
+        """Let the process call `work`, and return the result of `work`; Lost if the process ends.
 
         Args:
             number: The number of the task, for Lost.

@@ -26,7 +26,7 @@ Doubt: TypeAlias = tuple[Sort, int, int, bool]
 
 
 class Doubts:
-    """The doubts whose rules one control of clingo has."""
+    """Doubts about what all minimal maps share, with their rules in one control of clingo."""
 
     def __init__(
         self,

@@ -105,7 +105,7 @@ class GuessBeside:
         return labels
 
     def take_labels(self) -> list[int] | None:
-        """As `new_labels`; from now on they count as tried."""
+        """Return `new_labels`. From now on these labels count as tried."""
         if labels := self.new_labels():
             self._tried = labels
         return labels
@@ -171,7 +171,7 @@ class SoonMaps:
         return beside.guess is not None or (not beside.running and waited > max(later, GUESS_FIRST))
 
     def found(self) -> Iterator[Found]:
-        """Maps near a guess, once; after that, what the search beside has found."""
+        """Yield maps near a guess, once; after that, the maps that the search beside found."""
         if not self._guessed:
             self._guessed = True
             yield from self._near_guess(

@@ -100,7 +100,7 @@ class FramedPaths:
         self._seconds = 0.0
 
     def some(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:
-        """Find a map with these dstates; None if no paths fit them."""
+        """Find a map with these dstates, as `Fitted`; None if no paths fit them."""
         return self.found_soon(chart, labels) or self.any(chart, labels)
 
     def found_soon(self, chart: FramedChart, labels: Sequence[int]) -> Fitted | None:

@@ -221,9 +221,12 @@ class Paths:
     def has_separate(
         self, chart: FramedChart, labels: Sequence[int], nodes: Iterable[int] | None = None
     ) -> bool | None:
-        """Whether the labels of all nodes, or of these, have separate paths.
+        """Whether labels have separate paths; None if this is not soon known.
 
-        None if this is not soon known.
+        Args:
+            chart: The chart of the nodes.
+            labels: The dstate of each node.
+            nodes: The nodes whose labels have to fit; None for all.
         """
         options = [f"--solve-limit={TRYING}"]
         return self.settled(chart, labels, options, nodes, single=True).solve().satisfiable
