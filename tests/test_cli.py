@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import re
@@ -13,6 +14,7 @@ import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import aces
 import networkx as nx
@@ -178,7 +180,7 @@ def test_a_map_without_proof(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     from test_solver import too_hard
 
     path = saved(too_hard(), tmp_path)
-    assert main(["solve", path, "--theory", "causal", "--time-limit", "1", "--json"]) == 10
+    assert main(["solve", path, "--theory", "causal", "--time-limit", "0.5", "--json"]) == 10
     data = json.loads(capsys.readouterr().out)
     assert (data["status"], data["stopped"], data["count"], data["complete"]) == (
         "feasible",
@@ -475,16 +477,20 @@ def test_output_that_cannot_be_written() -> None:
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
 
 
+def printed_in(letters: str, *words: str, given: bytes = b"") -> bytes:
+    """What a command prints where standard input and output have only these letters."""
+    out = io.TextIOWrapper(io.BytesIO(), letters)
+    with (
+        patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(given), letters)),
+        patch.object(sys, "stdout", out),
+    ):
+        assert main(words) == 0
+    out.flush()
+    return out.buffer.getvalue()  # type: ignore[attr-defined, no-any-return]
+
+
 def test_a_terminal_of_few_letters() -> None:
-    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
-    done = subprocess.run(
-        [sys.executable, "-m", "ssh_abduction", "solve", ACES],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "travel ? 1" in done.stdout
+    assert b"travel ? 1" in printed_in("ascii", "solve", ACES)
 
 
 def test_standard_input_and_a_reader_that_leaves(tmp_path: Path) -> None:
@@ -493,13 +499,7 @@ def test_standard_input_and_a_reader_that_leaves(tmp_path: Path) -> None:
     done = subprocess.run(command, input=trace, capture_output=True, check=True)
     assert done.stdout.startswith(b"optimal: 19 dstates")
     assert done.stderr == b""  # no progress where there is no terminal
-    maps = subprocess.run([*command, "--json"], input=trace, capture_output=True, check=True).stdout
-    shown = subprocess.run(
-        [sys.executable, "-m", "ssh_abduction", "show", "-"],
-        input=maps,
-        capture_output=True,
-        check=True,
-    ).stdout
+    shown = printed_in("utf-8", "show", "-", given=aces.answer().encode())
     assert shown.count(b"path 0: places") == 4
     pipe = subprocess.run(
         f"{sys.executable} -m ssh_abduction facts {ACES} | head -1",
@@ -527,7 +527,7 @@ def test_progress_shows_on_a_terminal(tmp_path: Path) -> None:
         "--theory",
         "causal",
         "--time-limit",
-        "2.5",
+        "1",
     ]
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "160"}
     with subprocess.Popen(
@@ -548,13 +548,9 @@ def test_progress_shows_on_a_terminal(tmp_path: Path) -> None:
 def test_what_programs_read_is_utf_8_on_every_terminal(tmp_path: Path) -> None:
     """Else views could not be told apart."""
     path = saved(Trace.from_steps(["日本", "中国", "Küche"], ["travel", "travel"]), tmp_path)
-    environment = {**os.environ, "PYTHONIOENCODING": "cp1252"}
 
     def printed(*words: str, given: bytes = b"") -> str:
-        command = [sys.executable, "-m", "ssh_abduction", *words]
-        return subprocess.run(
-            command, input=given, env=environment, capture_output=True, check=True
-        ).stdout.decode("utf-8")
+        return printed_in("cp1252", *words, given=given).decode("utf-8")
 
     maps = printed("solve", path, "--json")
     assert [s["view"] for s in json.loads(maps)["maps"][0]["dstates"]] == ["日本", "中国", "Küche"]

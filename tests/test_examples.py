@@ -6,10 +6,11 @@ import ast
 import contextlib
 import io
 import json
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
@@ -20,10 +21,15 @@ from ssh_abduction.solver import Status
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
-def run(*words: str) -> str:
-    return subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, check=True
-    ).stdout
+def run(name: str, *words: str) -> str:
+    """What an example prints, run as a program, but in this process."""
+    path = str(EXAMPLES / name)
+    with (
+        patch.object(sys, "argv", [path, *words]),
+        contextlib.redirect_stdout(io.StringIO()) as said,
+    ):
+        runpy.run_path(path, run_name="__main__")
+    return said.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -67,7 +73,7 @@ def test_x0_and_x4_share_a_view_and_are_told_apart() -> None:
 
 
 def test_demo(tmp_path: Path) -> None:
-    out = run(str(EXAMPLES / "demo.py"), str(tmp_path))
+    out = run("demo.py", str(tmp_path))
     assert "fewest: 19 dstates, 10 places, 4 paths; 4 minimal maps" in out
     assert out.count("satisfies every axiom") == 4
     assert "what tells them apart" in out
@@ -77,10 +83,8 @@ def test_demo(tmp_path: Path) -> None:
 
 
 def test_adventure(tmp_path: Path) -> None:
-    assert run(str(EXAMPLES / "adventure.py")).endswith(
-        "6 rooms, 1 minimal map(s)\nthe map is the maze\n"
-    )
-    run(str(EXAMPLES / "adventure.py"), "--play", str(tmp_path / "again.jsonl"))
+    assert run("adventure.py").endswith("6 rooms, 1 minimal map(s)\nthe map is the maze\n")
+    run("adventure.py", "--play", str(tmp_path / "again.jsonl"))
     assert (tmp_path / "again.jsonl").read_text() == (EXAMPLES / "adventure.jsonl").read_text()
 
 

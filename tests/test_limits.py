@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from in_processes import sleep, stay, vanish
 from limits import Case, cases, outcome
 from worlds import rectangle
 
@@ -111,7 +112,7 @@ def test_what_would_go_beyond_a_limit_is_not_begun(
 
 def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
     trace = Trace.load(noisy)
-    solution = solve(trace, time_limit=1)
+    solution = solve(trace, time_limit=0.5)
     assert solution.stopped == "time limit"
     assert solution.cost is not None
     assert solution.bound.dstates == len(trace) - 1
@@ -120,7 +121,7 @@ def test_the_search_ends_in_time_with_its_best_map(noisy: Path) -> None:
 
 @pytest.mark.parametrize(
     "case",
-    list(cases(6, seed=1, longest=300, seconds=(0.5, 1))),
+    list(cases(6, seed=1, longest=300, seconds=(0.3, 0.5))),
     ids=lambda case: f"{case.family}, {len(case.trace)} steps",
 )
 @POSIX
@@ -148,7 +149,7 @@ def test_rules_of_ones_own_that_are_too_large_end_with_the_limit(
         "solve",
         str(noisy),
         f"--rules={rules}",
-        "--time-limit=1",
+        "--time-limit=0.3",
         "--json",
     ]
     done = subprocess.run(command, capture_output=True, timeout=SOON, check=False)
@@ -216,7 +217,7 @@ def test_who_is_interrupted_prints_what_is_known_of_two_traces_at_a_time(
 @pytest.mark.parametrize(
     ("limit", "memory", "number", "why"),
     [
-        (0.5, 0, None, "time limit"),
+        (0.2, 0, None, "time limit"),
         (0, 50, None, "memory limit"),
         (0, 0, signal.SIGINT, "interrupted"),
         (0, 0, signal.SIGTERM, "interrupted"),
@@ -231,7 +232,7 @@ def test_the_guard_speaks_while_clingo_does_not_listen(
     ) as process:
         assert process.stderr
         assert process.stderr.readline() == "ready\n"
-        time.sleep(0.2)
+        time.sleep(0.1)
         if number is not None:
             process.send_signal(number)
         out, _ = process.communicate(timeout=SOON)
@@ -291,26 +292,6 @@ def test_an_explanation_can_be_stopped_while_it_grounds() -> None:
         )
 
 
-def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:
-    """Answers its number; after so many seconds, or when it is given up."""
-    ends = time.monotonic() + seconds
-    while time.monotonic() < ends and not given_up():
-        time.sleep(0.01)
-    return number
-
-
-def vanish(_: int, path: str, __: Callable[[], bool]) -> None:
-    """Writes which process it is, and ends without an answer."""
-    Path(path).write_text(str(os.getpid()))
-    os._exit(3)
-
-
-def stay(_: int, path: str, __: Callable[[], bool]) -> None:
-    """Writes which process it is, and does not heed anything."""
-    Path(path).write_text(str(os.getpid()))
-    time.sleep(1000)
-
-
 def test_answers_of_workers() -> None:
     tasks = [(number, 0.0) for number in range(5)]
     assert sorted(workers.answers(sleep, tasks, 2, lambda: False, None, 1.0)) == [0, 1, 2, 3, 4]
@@ -343,7 +324,7 @@ def test_what_is_given_up_is_answered_and_nothing_begins() -> None:
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "pid"
     program = (
-        "from ssh_abduction.solver.asp import workers; from test_limits import stay; "
+        "from ssh_abduction.solver.asp import workers; from in_processes import stay; "
         f"list(workers.answers(stay, [(0, {str(path)!r})], 1, bool, None, 1.0))"
     )
     with subprocess.Popen(

@@ -143,7 +143,7 @@ def test_the_map_of_a_drive_joins_what_is_one_place(runs: Path) -> None:
 
 
 def test_corrected_poses_are_not_read(hall: Path) -> None:
-    log = RobotLog(read_log(hall).scans[:60], source="x")
+    log = RobotLog(read_log(hall).scans[:45], source="x")
     blind = tuple(
         Scan(scan.ranges, scan.laser, scan.odometry, None, scan.time, scan.line)
         for scan in log.scans
@@ -443,7 +443,7 @@ def test_doors_have_no_scale(
 def test_where_a_building_has_rooms_its_doors_are_the_places(tmp_path: Path) -> None:
     """A robot drives around four rooms in a ring."""
     middles = {room: middle for room, middle in MIDDLES.items() if room != "closet"}
-    drive = record_plan(plan_of(tmp_path, xml(DOORS[:4], middles=middles)), seed=1, metres=50)
+    drive = record_plan(plan_of(tmp_path, xml(DOORS[:4], middles=middles)), seed=1, metres=36)
     done = map_log(
         RobotLog(tuple(scans_of(drive)), source="ring"),
         max_maps=1,

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ from unittest.mock import patch
 
 import pytest
 from aces import ACES
+from in_processes import from_here, from_there
 
 from ssh_abduction import AbductionError, Solution, Theory, Trace
 from ssh_abduction.cli import main
@@ -43,27 +43,6 @@ def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         )
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def modules_from(folder: str) -> list[str]:
-    """The modules that this process loaded from a folder."""
-    return sorted(
-        name
-        for name, module in list(sys.modules.items())
-        if (getattr(module, "__file__", None) or "").startswith(f"{folder}{os.sep}")
-    )
-
-
-def from_here(folder: str, _: Watch) -> list[str]:
-    import csv  # noqa: F401 - nothing else has loaded it
-
-    return modules_from(folder)
-
-
-def from_there(number: int, folder: str, _: Callable[[], bool]) -> list[str]:
-    import csv  # noqa: F401 - nothing else has loaded it
-
-    return modules_from(folder)
 
 
 def test_a_file_of_the_current_folder_is_run_if_nothing_is_done_about_it(hostile: Path) -> None:
@@ -231,21 +210,13 @@ def test_map_that_is_interrupted_says_so_and_is_done_again(
     assert "done already" in capsys.readouterr().out
 
 
-def leave_a_temporary_file(number: int, there: str, given_up: Callable[[], bool]) -> None:
-    """Tell where the temporary files of this process lie, and wait."""
-    folder = tempfile.mkdtemp()
-    Path(there).write_text(folder)
-    while not given_up():
-        time.sleep(0.05)
-
-
 @POSIX
 def test_temporary_files_of_workers_go_with_them(tmp_path: Path) -> None:
     """Also where their parent is killed."""
     told = tmp_path / "told"
     script = f"""
 from ssh_abduction.solver.asp import workers
-from test_program import leave_a_temporary_file
+from in_processes import leave_a_temporary_file
 list(workers.answers(leave_a_temporary_file, [(0, {str(told)!r})], 1, lambda: False, None, 1.0))
 """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(tmp_path)}
@@ -263,8 +234,9 @@ def test_work_in_processes_gives_results_in_order_and_raises_what_it_raises() ->
     with pytest.raises(ZeroDivisionError):
         next(found)
     assert list(report._each(divmod, [(9, 4)], 2)) == [(2, 1)]
-    with pytest.raises(AbductionError, match="expected an answer, got killed"):
-        list(report._each(os._exit, [(0,), (0,)], 2))
+    killed = patch.object(workers, "answers", lambda *_: iter([workers.Lost(0, late=False)]))
+    with killed, pytest.raises(AbductionError, match="expected an answer, got killed"):
+        list(report._each(divmod, [(9, 4), (9, 3)], 2))
 
 
 def until(condition: Callable[[], bool]) -> None:

@@ -1,0 +1,62 @@
+"""What tests let other processes do. It is a module of its own, as each of these processes loads
+it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from ssh_abduction.solver.asp.limits import Watch
+
+
+def modules_from(folder: str) -> list[str]:
+    """The modules that this process loaded from a folder."""
+    return sorted(
+        name
+        for name, module in list(sys.modules.items())
+        if (getattr(module, "__file__", None) or "").startswith(f"{folder}{os.sep}")
+    )
+
+
+def from_here(folder: str, _: Watch) -> list[str]:
+    import csv  # noqa: F401 - nothing else has loaded it
+
+    return modules_from(folder)
+
+
+def from_there(number: int, folder: str, _: Callable[[], bool]) -> list[str]:
+    import csv  # noqa: F401 - nothing else has loaded it
+
+    return modules_from(folder)
+
+
+def leave_a_temporary_file(number: int, there: str, given_up: Callable[[], bool]) -> None:
+    """Tell where the temporary files of this process lie, and wait."""
+    folder = tempfile.mkdtemp()
+    Path(there).write_text(folder)
+    while not given_up():
+        time.sleep(0.05)
+
+
+def sleep(number: int, seconds: float, given_up: Callable[[], bool]) -> int:
+    """Answers its number; after so many seconds, or when it is given up."""
+    ends = time.monotonic() + seconds
+    while time.monotonic() < ends and not given_up():
+        time.sleep(0.01)
+    return number
+
+
+def vanish(_: int, path: str, __: Callable[[], bool]) -> None:
+    """Writes which process it is, and ends without an answer."""
+    Path(path).write_text(str(os.getpid()))
+    os._exit(3)
+
+
+def stay(_: int, path: str, __: Callable[[], bool]) -> None:
+    """Writes which process it is, and does not heed anything."""
+    Path(path).write_text(str(os.getpid()))
+    time.sleep(1000)
